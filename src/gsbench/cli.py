@@ -1,0 +1,109 @@
+"""The command line: ``gsbench`` is a Hydra app; a first word without ``=``, ``+``, ``~`` or ``-`` is a verb.
+
+Nothing here loads torch, so that ``--help`` and the verbs that only read files answer at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from gsbench.errors import GsbenchError, InputError
+
+DONE, TRIAL_FAILED, BAD_INPUT = 0, 1, 2
+VERBS = {
+    "tables": ("gsbench.eval.tables_cli", "Markdown, CSV, LaTeX or HTML tables of an experiment"),
+    "bench": ("gsbench.bench", "time rasterizers and the training step"),
+    "sync": ("gsbench.verbs.sync", "mirror to MLflow what it missed"),
+    "ui": ("gsbench.verbs.ui", "open the MLflow dashboard on this machine"),
+    "status": ("gsbench.verbs.status", "what an experiment has done, runs, failed and misses"),
+    "export": ("gsbench.verbs.export", "copy a trained model or an initial cloud to where another program reads it"),
+    "doctor": ("gsbench.verbs.doctor", "check this machine and say what is missing"),
+}
+log = logging.getLogger("gsbench")
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(argv: list[str]) -> int:
+    """Run the command line ``argv``; returns the exit code and prints errors as one line."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: its idle threads must not spin beside ours
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    _set_up_logging()
+    try:
+        if argv and argv[0] in ("help", "--help", "-h"):
+            return _help()
+        if argv and not set(argv[0][:1]) & set("-+~") and "=" not in argv[0]:
+            return _verb(argv[0], argv[1:])
+        return _trials(argv)
+    except InputError as error:
+        print(f"gsbench: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except GsbenchError as error:
+        print(f"gsbench: {error}", file=sys.stderr)
+        return TRIAL_FAILED
+    except KeyboardInterrupt:
+        print("gsbench: interrupted; the same command goes on from here", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of our output, such as `head`, has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+
+
+def runs_dir() -> Path:
+    """The runs folder of the verbs: ``$GSBENCH_RUNS``, else ``runs`` here."""
+    return Path(os.environ.get("GSBENCH_RUNS", "runs")).expanduser().resolve()
+
+
+def _verb(name: str, argv: list[str]) -> int:
+    if name not in VERBS:
+        from gsbench.config import closest
+
+        raise InputError(
+            f"{name!r} is neither a verb nor a setting like key=value{closest(name, list(VERBS))} (verbs: {', '.join(VERBS)})"
+        )
+    main_function: Callable[[list[str]], int] = importlib.import_module(VERBS[name][0]).main
+    return main_function(argv)
+
+
+def _trials(argv: list[str]) -> int:
+    from gsbench.launch import launch
+
+    return launch(argv)
+
+
+def _help() -> int:
+    from gsbench.launch import options_text
+
+    print("gsbench: does an idea help 3D Gaussian Splatting?\n")
+    print("  gsbench scene=courtyard init=sfm densify=volumetric seed=0     one trial")
+    print("  gsbench -m densify=adc,volumetric seed=0,1,2                   a sweep")
+    print("  gsbench +experiment=demo                                       a sweep from a file")
+    print("  gsbench scene=photos scene.path=/my/photos                     your own photographs")
+    print("  gsbench --cfg job [settings]                                   show the configuration\n")
+    print("Verbs (gsbench VERB --help):")
+    for name, (_, text) in VERBS.items():
+        print(f"  {name:<10} {text}")
+    print("\n" + options_text())
+    return DONE
+
+
+def _set_up_logging() -> None:
+    if not log.handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(message)s"))
+        handler.setLevel(logging.INFO)
+        log.addHandler(handler)
+        log.setLevel(logging.DEBUG)
+        log.propagate = False
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,39 @@
+"""Children of Gaussians: pure functions that every densifier shares."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsbench.gaussians.model import Gaussians
+
+MIN_REVISED_OPACITY = 1e-6  # keeps the logit finite
+
+
+def sample_inside(gaussians: Gaussians, rng: torch.Generator) -> Tensor:
+    """One point drawn from each Gaussian as a density, mu + R e with e ~ N(0, diag(s^2)), [N, 3].
+
+    The draw is made on the CPU, so that a seed means the same on every device.
+    """
+    noise = torch.randn(len(gaussians), 3, generator=rng, dtype=gaussians.means.dtype)
+    offsets = noise.to(gaussians.means.device) * gaussians.scales  # [N, 3] in the axes of each ellipsoid
+    return gaussians.means + (gaussians.rotations @ offsets.unsqueeze(-1)).squeeze(-1)
+
+
+def split(
+    parents: Gaussians, children: int, child_log_scales: Tensor, rng: torch.Generator, sampled: bool = True
+) -> Gaussians:
+    """``children`` new Gaussians per parent, [children * N], parent order repeated; scales as given [N, 3].
+
+    Means are drawn from the parent's density, or are the parent's (``sampled=False``); all else is copied.
+    """
+    repeated = Gaussians.concatenate([parents] * children)
+    means = sample_inside(repeated, rng) if sampled else repeated.means.clone()
+    tensors = repeated.tensors() | {"means": means, "log_scales": child_log_scales.repeat(children, 1)}
+    return Gaussians(**tensors)
+
+
+def revised_logits(opacity_logits: Tensor) -> Tensor:
+    """Logits of 1 - sqrt(1 - o): two such children one behind the other are as opaque as the parent (arXiv 2404.06109)."""
+    transmittance = (-opacity_logits).sigmoid().sqrt()  # sqrt(1 - o)
+    return torch.logit((1 - transmittance).clamp_min(MIN_REVISED_OPACITY))

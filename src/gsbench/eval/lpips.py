@@ -1,0 +1,265 @@
+"""LPIPS v0.1 (Zhang et al. 2018, "The unreasonable effectiveness of deep features as a perceptual metric").
+
+The feature stacks of VGG16, AlexNet and SqueezeNet 1.1 are written here as plain layers in torchvision's order, so that
+its published ImageNet weights load into them; the learned linear heads are those of LPIPS v0.1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from gsbench.errors import InputError
+from gsbench.weights import MissingWeights, WeightsFile, find_weights, load_state
+
+LpipsNet = Literal["vgg", "alex", "squeeze"]
+
+# The networks' input normalisation, per channel: (x - SHIFT) / SCALE for x in [-1, 1].
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+NORM_EPSILON = 1e-10  # added to the length of a feature vector before dividing by it
+ROWS_AT_A_TIME = 64  # feature rows compared at once: bounds the memory of the comparison
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """One feature stack: its layers, the indices after which it is tapped, and where its weights come from."""
+
+    build: Callable[[], nn.Sequential]
+    taps: tuple[int, ...]
+    channels: tuple[int, ...]  # of each tap
+    min_size: int  # px; a shorter side leaves some layer without output
+    features: tuple[WeightsFile, ...]  # any of them; the first is the one to download
+    heads: WeightsFile
+
+
+class Fire(nn.Module):
+    """SqueezeNet's block: a 1x1 squeeze, then 1x1 and 3x3 expansions side by side."""
+
+    def __init__(self, channels: int, squeezed: int, expanded: int) -> None:
+        super().__init__()
+        self.squeeze = nn.Conv2d(channels, squeezed, 1)
+        self.expand1x1 = nn.Conv2d(squeezed, expanded, 1)
+        self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        squeezed = self.squeeze(x).relu_()
+        return torch.cat([self.expand1x1(squeezed), self.expand3x3(squeezed)], dim=1).relu_()  # [B, 2 * expanded, H, W]
+
+
+def _vgg16() -> nn.Sequential:
+    layers: list[nn.Module] = []
+    channels = 3
+    for width, repeats in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+        for _ in range(repeats):
+            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
+            channels = width
+        layers.append(nn.MaxPool2d(2))
+    return nn.Sequential(*layers)
+
+
+def _alexnet() -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(3, 64, 11, stride=4, padding=2),
+        nn.ReLU(inplace=True),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(64, 192, 5, padding=2),
+        nn.ReLU(inplace=True),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(192, 384, 3, padding=1),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(384, 256, 3, padding=1),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(256, 256, 3, padding=1),
+        nn.ReLU(inplace=True),
+        nn.MaxPool2d(3, 2),
+    )
+
+
+def _squeezenet1_1() -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(3, 64, 3, stride=2),
+        nn.ReLU(inplace=True),
+        nn.MaxPool2d(3, 2, ceil_mode=True),
+        Fire(64, 16, 64),
+        Fire(128, 16, 64),
+        nn.MaxPool2d(3, 2, ceil_mode=True),
+        Fire(128, 32, 128),
+        Fire(256, 32, 128),
+        nn.MaxPool2d(3, 2, ceil_mode=True),
+        Fire(256, 48, 192),
+        Fire(384, 48, 192),
+        Fire(384, 64, 256),
+        Fire(512, 64, 256),
+    )
+
+
+def _torchvision(name: str, sha256: str) -> WeightsFile:
+    url = f"https://download.pytorch.org/models/{name}"
+    return WeightsFile((name,), url, sha256, licence="BSD-3-Clause", source="torchvision, ImageNet")
+
+
+def _heads(net: str, sha256: str) -> WeightsFile:
+    url = f"https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/{net}.pth"
+    return WeightsFile(
+        (f"lpips_v0.1_{net}.pth", f"{net}.pth"), url, sha256, licence="BSD-2-Clause", source="LPIPS v0.1"
+    )
+
+
+# The convolutional part of torchvision's file alone, a copy that is small enough to keep beside a project.
+SQUEEZE_FEATURES_ONLY = WeightsFile(
+    ("squeezenet1_1_features.pth",),
+    None,
+    "435cedb387e95bc8291893f61a3a64f0345b8c23a05139aceef43947efb3d52d",
+    licence="BSD-3-Clause",
+    source="torchvision, ImageNet",
+)
+
+BACKBONES: dict[str, Backbone] = {
+    "vgg": Backbone(
+        build=_vgg16,
+        taps=(3, 8, 15, 22, 29),
+        channels=(64, 128, 256, 512, 512),
+        min_size=16,
+        features=(
+            _torchvision("vgg16-397923af.pth", "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0"),
+        ),
+        heads=_heads("vgg", "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
+    ),
+    "alex": Backbone(
+        build=_alexnet,
+        taps=(1, 4, 7, 9, 11),
+        channels=(64, 192, 384, 256, 256),
+        min_size=31,
+        features=(
+            _torchvision(
+                "alexnet-owt-7be5be79.pth", "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02"
+            ),
+        ),
+        heads=_heads("alex", "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
+    ),
+    "squeeze": Backbone(
+        build=_squeezenet1_1,
+        taps=(1, 4, 7, 9, 10, 11, 12),
+        channels=(64, 128, 256, 384, 384, 512, 512),
+        min_size=17,
+        features=(
+            _torchvision(
+                "squeezenet1_1-b8a52dc0.pth", "b8a52dc049b60e4b6ab68ad0df457362afab8b6304b2febdc1650a5dab4d7e7b"
+            ),
+            SQUEEZE_FEATURES_ONLY,
+        ),
+        heads=_heads("squeeze", "4a5350f23600cb79923ce65bb07cbf57dca461329894153e05a1346bd531cf76"),
+    ),
+}
+
+
+class Lpips:
+    """One LPIPS network, ready to compare images; it computes no gradients.
+
+    ``features`` holds the backbone's weights, keyed as torchvision's model or as its ``features`` part alone (keys of a
+    classifier are ignored); ``heads`` holds ``lin{k}.model.1.weight`` [1, C, 1, 1] for every tap k.
+    """
+
+    def __init__(
+        self,
+        net: LpipsNet,
+        features: Mapping[str, Tensor],
+        heads: Mapping[str, Tensor],
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.net = net
+        self.backbone = BACKBONES[net]
+        stack = self.backbone.build()
+        _load_features(stack, features, net)
+        last = max(self.backbone.taps)
+        self._layers = stack[: last + 1].requires_grad_(False).eval().to(device)
+        self._heads = [head.to(device) for head in _head_weights(self.backbone, heads, net)]  # [C] each
+        self._shift = torch.tensor(SHIFT, device=device).view(1, 3, 1, 1)
+        self._scale = torch.tensor(SCALE, device=device).view(1, 3, 1, 1)
+        self.device = torch.device(device)
+
+    @torch.no_grad()
+    def __call__(self, first: Tensor, second: Tensor) -> Tensor:
+        """Distances [B] of two batches [B, 3, H, W], which are fed to the network as they are.
+
+        LPIPS is defined for inputs in [-1, 1]: pass ``2 * x - 1`` for images in [0, 1]. The evaluation of 3DGS passes
+        [0, 1] itself, which is what a metric named ``..._raw`` does here.
+        """
+        if first.shape != second.shape or first.ndim != 4 or first.shape[1] != 3:
+            raise ValueError(f"lpips compares batches [B, 3, H, W], got {tuple(first.shape)} and {tuple(second.shape)}")
+        if min(first.shape[-2:]) < self.backbone.min_size:
+            raise ValueError(f"lpips {self.net} needs sides of at least {self.backbone.min_size} px")
+        return torch.stack([self._pair(a[None], b[None]) for a, b in zip(first, second, strict=True)])  # [B]
+
+    def _pair(self, first: Tensor, second: Tensor) -> Tensor:
+        """The distance [] of two images [1, 3, H, W], which pass the layers in step, so that no features are kept."""
+        first, second = (
+            (image.to(self.device, torch.float32) - self._shift) / self._scale for image in (first, second)
+        )
+        total = torch.zeros((), device=self.device)
+        heads = iter(self._heads)
+        for index, layer in enumerate(self._layers):
+            first, second = layer(first), layer(second)  # [1, C, h, w] each
+            if index in self.backbone.taps:
+                total = total + _feature_distance(first, second, next(heads))
+        return total
+
+
+def load_lpips(
+    net: LpipsNet, folder: Path | None = None, download: bool = True, device: torch.device | str = "cpu"
+) -> Lpips:
+    """An LPIPS network from weights in ``folder``, the usual places or a download; may raise ``MissingWeights``."""
+    backbone = BACKBONES[net]
+    features = _find_any(backbone.features, folder, download)
+    heads = find_weights(backbone.heads, folder, download)
+    return Lpips(net, load_state(features), load_state(heads), device)
+
+
+def _find_any(specs: tuple[WeightsFile, ...], folder: Path | None, download: bool) -> Path:
+    """The first of ``specs`` that is at hand; else the first of all, downloaded where allowed."""
+    for spec in specs[1:]:
+        try:
+            return find_weights(spec, folder, download=False)
+        except MissingWeights:
+            continue
+    return find_weights(specs[0], folder, download)
+
+
+def _feature_distance(first: Tensor, second: Tensor, head: Tensor) -> Tensor:
+    """Spatial mean of the weighted squared difference of unit feature vectors; maps [1, C, h, w], head [C]."""
+    total = torch.zeros((), dtype=torch.float64 if first.device.type == "cpu" else torch.float32, device=first.device)
+    for a, b in zip(first[0].split(ROWS_AT_A_TIME, dim=1), second[0].split(ROWS_AT_A_TIME, dim=1), strict=True):
+        a = a / (a.square().sum(dim=0).sqrt() + NORM_EPSILON)  # [C, rows, w]
+        b = b / (b.square().sum(dim=0).sqrt() + NORM_EPSILON)  # [C, rows, w]
+        per_channel = (a - b).square().sum(dim=(1, 2))  # [C]
+        total = total + (per_channel * head).sum()
+    return total / (first.shape[2] * first.shape[3])
+
+
+def _load_features(stack: nn.Sequential, state: Mapping[str, Tensor], net: str) -> None:
+    expected = stack.state_dict().keys()
+    renamed = {key.removeprefix("features."): value for key, value in state.items()}
+    missing = [key for key in expected if key not in renamed]
+    if missing:
+        raise InputError(
+            f"the weights of lpips {net} lack {missing[0]!r} and {len(missing) - 1} more: not that network"
+        )
+    stack.load_state_dict({key: renamed[key].float() for key in expected})
+
+
+def _head_weights(backbone: Backbone, state: Mapping[str, Tensor], net: str) -> list[Tensor]:
+    weights = []
+    for index, channels in enumerate(backbone.channels):
+        weight = state.get(f"lin{index}.model.1.weight")
+        if weight is None or weight.numel() != channels:
+            raise InputError(
+                f"the heads of lpips {net} lack lin{index} with {channels} weights: not that network's heads"
+            )
+        weights.append(weight.flatten().float())  # [C]
+    return weights

@@ -1,0 +1,43 @@
+"""From a point cloud to the first Gaussians, as 3DGS does it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gsbench.errors import InputError
+from gsbench.gaussians.model import NUM_SH_REST, Gaussians
+from gsbench.gaussians.spherical_harmonics import rgb_to_dc
+
+NEIGHBOURS = 3
+MIN_SQUARED_DISTANCE = 1e-7  # world units^2: the floor of the mean squared distance to the neighbours
+INITIAL_OPACITY = 0.1
+
+
+def gaussians_from_cloud(
+    points: NDArray[np.float64], colors: NDArray[np.uint8], device: torch.device | str = "cpu"
+) -> Gaussians:
+    """One isotropic Gaussian at each of ``points`` [P, 3] with ``colors`` [P, 3] (0 to 255), float32.
+
+    The standard deviation is the root of the mean *squared* distance to the 3 nearest other points (simple-knn of 3DGS).
+    Raises InputError for fewer than 4 points or points that are not finite.
+    """
+    if len(points) <= NEIGHBOURS:
+        raise InputError(f"the initial cloud has {len(points)} points, at least {NEIGHBOURS + 1} are needed")
+    if not np.isfinite(points).all():
+        raise InputError("the initial cloud has points that are not finite; rebuild it or clean the COLMAP model")
+    distances, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1)  # [P, 4], the first is the point itself
+    squared = np.maximum((distances[:, 1:] ** 2).mean(axis=1), MIN_SQUARED_DISTANCE)  # [P]
+    n = len(points)
+    log_scales = torch.from_numpy(0.5 * np.log(squared)).float()
+    logit = float(np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)))
+    return Gaussians(
+        means=torch.from_numpy(np.asarray(points)).float(),
+        log_scales=log_scales.unsqueeze(-1).repeat(1, 3),
+        quaternions=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        opacity_logits=torch.full((n,), logit),
+        sh_dc=rgb_to_dc(torch.from_numpy(np.asarray(colors)).float() / 255),
+        sh_rest=torch.zeros(n, NUM_SH_REST, 3),
+    ).map(lambda tensor: tensor.to(device))

@@ -1,0 +1,95 @@
+"""The parameters of a set of 3D Gaussians, in the raw form that is optimised, and their activations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+MAX_SH_DEGREE = 3
+NUM_SH_REST = (MAX_SH_DEGREE + 1) ** 2 - 1  # 15 coefficients per channel beyond the constant one
+
+
+@dataclass
+class Gaussians:
+    """N Gaussians, raw (before activation); all tensors share dtype (float32 or float64) and device.
+
+    | field          | shape      | activation                                   |
+    |----------------|------------|----------------------------------------------|
+    | means          | [N, 3]     | none, world units                            |
+    | log_scales     | [N, 3]     | exp: standard deviations, world units        |
+    | quaternions    | [N, 4]     | normalise: w, x, y, z                        |
+    | opacity_logits | [N]        | sigmoid                                      |
+    | sh_dc          | [N, 3]     | colour = max(0, SH + 0.5); channels r, g, b  |
+    | sh_rest        | [N, 15, 3] | degrees 1 to 3                               |
+    """
+
+    means: Tensor
+    log_scales: Tensor
+    quaternions: Tensor
+    opacity_logits: Tensor
+    sh_dc: Tensor
+    sh_rest: Tensor
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0]
+        expected = {
+            "means": (n, 3),
+            "log_scales": (n, 3),
+            "quaternions": (n, 4),
+            "opacity_logits": (n,),
+            "sh_dc": (n, 3),
+            "sh_rest": (n, NUM_SH_REST, 3),
+        }
+        for name, shape in expected.items():
+            if tuple(getattr(self, name).shape) != shape:
+                raise ValueError(f"gaussians: {name} has shape {tuple(getattr(self, name).shape)}, expected {shape}")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def scales(self) -> Tensor:
+        return self.log_scales.exp()  # [N, 3]
+
+    @property
+    def opacities(self) -> Tensor:
+        return self.opacity_logits.sigmoid()  # [N]
+
+    @property
+    def rotations(self) -> Tensor:
+        """Rotation matrices of the normalised quaternions, [N, 3, 3]; the columns are the axes of the ellipsoids."""
+        return quaternion_to_matrix(self.quaternions)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The six tensors by name, in the order of the table above."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
+        """``function`` applied to every tensor."""
+        return Gaussians(**{name: function(tensor) for name, tensor in self.tensors().items()})
+
+    def select(self, index: Tensor) -> Gaussians:
+        """The Gaussians at a boolean mask [N] or integer index [M]; copies."""
+        return self.map(lambda tensor: tensor[index])
+
+    def detach(self) -> Gaussians:
+        return self.map(Tensor.detach)
+
+    @staticmethod
+    def concatenate(parts: list[Gaussians]) -> Gaussians:
+        names = [field.name for field in fields(Gaussians)]
+        return Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
+
+
+def quaternion_to_matrix(quaternions: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), which are normalised first."""
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)  # each [N]
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, -2)

@@ -1,0 +1,171 @@
+"""Gaussians together with their Adam optimiser: the one place that edits optimiser state."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
+
+ADAM_EPSILON = 1e-15  # 3DGS
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's learning rates; the defaults are those of the 2023 code of 3DGS (later code uses 0.025 for opacity)."""
+
+    position_initial: float = 1.6e-4  # times the scene extent
+    position_final: float = 1.6e-6  # times the scene extent
+    position_steps: int = 30_000  # the position rate falls log-linearly over so many iterations
+    sh_dc: float = 2.5e-3
+    sh_rest: float = 2.5e-3 / 20
+    opacity: float = 0.05
+    scale: float = 5e-3
+    rotation: float = 1e-3
+
+    def position(self, step: int) -> float:
+        """The log-linear schedule, without the factor of the scene extent."""
+        t = min(max(step / self.position_steps, 0.0), 1.0)
+        return math.exp((1 - t) * math.log(self.position_initial) + t * math.log(self.position_final))
+
+
+class TrainableGaussians:
+    """Raw parameters as leaves of the graph, one Adam group each.
+
+    Adding, removing or overwriting Gaussians goes through ``edit``: it keeps parameters and moments in step. As in 3DGS,
+    an edited parameter is a new leaf without gradient, so the optimiser step of that iteration passes it over.
+    """
+
+    def __init__(self, gaussians: Gaussians, rates: LearningRates, spatial_scale: float) -> None:
+        self.rates = rates
+        self.spatial_scale = spatial_scale
+        self.values = gaussians.map(lambda tensor: tensor.detach().clone().requires_grad_(True))
+        initial = {
+            "means": rates.position(0) * spatial_scale,
+            "log_scales": rates.scale,
+            "quaternions": rates.rotation,
+            "opacity_logits": rates.opacity,
+            "sh_dc": rates.sh_dc,
+            "sh_rest": rates.sh_rest,
+        }
+        fused = self.values.means.device.type in ("cpu", "cuda")
+        self.optimizer = torch.optim.Adam(
+            [{"params": [tensor], "lr": initial[name], "name": name} for name, tensor in self.values.tensors().items()],
+            lr=0.0,
+            eps=ADAM_EPSILON,
+            fused=fused,
+        )
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def device(self) -> torch.device:
+        return self.values.means.device
+
+    def set_step(self, step: int) -> None:
+        """Set the learning rate of the means for iteration ``step`` (1, 2, …)."""
+        self._group("means")["lr"] = self.rates.position(step) * self.spatial_scale
+
+    def optimizer_step(self, sh_degree: int = MAX_SH_DEGREE, visible: Tensor | None = None) -> None:
+        """Adam on every parameter that has a gradient, then forget the gradients.
+
+        With ``visible`` [N] only those Gaussians move and update their moments, a departure from the baseline (the rest
+        then keep their momentum instead of coasting on it). At ``sh_degree`` 0 the gradient of ``sh_rest`` is zero: its
+        moments stay zero, and only Adam's count advances, which is the same and costs nothing.
+        """
+        if sh_degree == 0 and self.values.means.grad is not None:
+            self._count_idle_step("sh_rest")
+        if visible is None:
+            self.optimizer.step()
+        else:
+            self._step_visible(visible.nonzero().squeeze(-1))
+        self.optimizer.zero_grad(set_to_none=True)
+
+    def _count_idle_step(self, name: str) -> None:
+        parameter = getattr(self.values, name)
+        parameter.grad = None
+        state = self.optimizer.state[parameter]
+        if not state:
+            state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        state["step"] += 1
+
+    @torch.no_grad()
+    def _step_visible(self, index: Tensor) -> None:
+        """Adam (Kingma and Ba 2015) on the rows ``index`` [V] alone; the count of steps is shared by all rows."""
+        for group in self.optimizer.param_groups:
+            parameter = group["params"][0]
+            if parameter.grad is None:
+                continue
+            state, (beta1, beta2) = self.optimizer.state[parameter], group["betas"]
+            if not state:
+                state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
+                state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+            state["step"] += 1
+            step, gradient = float(state["step"]), parameter.grad[index]
+            first = state["exp_avg"][index].lerp_(gradient, 1 - beta1)
+            second = state["exp_avg_sq"][index].mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+            state["exp_avg"][index], state["exp_avg_sq"][index] = first, second
+            spread = (second / (1 - beta2**step)).sqrt_().add_(group["eps"])
+            parameter[index] -= group["lr"] / (1 - beta1**step) * first / spread
+
+    @torch.no_grad()
+    def edit(self, keep: Tensor | None = None, append: Gaussians | None = None) -> None:
+        """Keep the Gaussians at the boolean mask ``keep`` [N] (None: all), then append new ones with zero moments."""
+        for name, old in self.values.tensors().items():
+            added = None if append is None else getattr(append, name).detach()
+            self._replace(name, _edited(old.detach(), keep, added), keep, added)
+
+    @torch.no_grad()
+    def overwrite(self, name: str, values: Tensor, where: Tensor | None = None) -> None:
+        """Set parameter ``name`` to ``values`` (same shape) and zero its moments (at the mask ``where`` [N], or all)."""
+        parameter = getattr(self.values, name)
+        if values.shape != parameter.shape:
+            raise ValueError(f"overwrite: {name} has shape {tuple(parameter.shape)}, got {tuple(values.shape)}")
+        state = self._replace(name, values.detach().clone())
+        for moment in ("exp_avg", "exp_avg_sq"):
+            if moment in state:
+                if where is None:
+                    state[moment].zero_()
+                else:
+                    state[moment][where] = 0
+
+    def _replace(
+        self, name: str, values: Tensor, keep: Tensor | None = None, added: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        group = self._group(name)
+        state = self.optimizer.state.pop(group["params"][0], {})
+        for moment in ("exp_avg", "exp_avg_sq"):
+            if moment in state:
+                state[moment] = _edited(state[moment], keep, None if added is None else torch.zeros_like(added))
+        parameter = values.contiguous().requires_grad_(True)
+        group["params"][0] = parameter
+        if state:  # Adam's ``step`` is shared by a group and stays
+            self.optimizer.state[parameter] = state
+        setattr(self.values, name, parameter)
+        return state
+
+    def _group(self, name: str) -> dict:  # type: ignore[type-arg]
+        return next(group for group in self.optimizer.param_groups if group["name"] == name)
+
+    def state_dict(self) -> dict[str, object]:
+        """Everything that a resumed training needs; ``load`` is the inverse."""
+        return {
+            "gaussians": {name: tensor.detach().clone() for name, tensor in self.values.tensors().items()},
+            "optimizer": self.optimizer.state_dict(),
+        }
+
+    @classmethod
+    def load(cls, state: dict, rates: LearningRates, spatial_scale: float) -> TrainableGaussians:  # type: ignore[type-arg]
+        trainable = cls(Gaussians(**state["gaussians"]), rates, spatial_scale)
+        trainable.optimizer.load_state_dict(state["optimizer"])
+        return trainable
+
+
+def _edited(old: Tensor, keep: Tensor | None, added: Tensor | None) -> Tensor:
+    kept = old if keep is None else old[keep]
+    return kept if added is None else torch.cat([kept, added.to(kept)])

@@ -1,0 +1,34 @@
+"""Initial clouds: from photographs, or from what came with them, to a COLMAP model on disk."""
+
+from gsbench.init.base import (
+    MODEL_FOLDER,
+    OWN_GAUGE_FOLDER,
+    REPORT_FILE,
+    Gauge,
+    Initializer,
+    InitReport,
+    PointCloud,
+    PoseErrors,
+    Progress,
+    read_cloud,
+)
+from gsbench.init.dataset import Dataset
+from gsbench.init.random import Random
+from gsbench.init.sfm import Sfm, SfmDense
+
+__all__ = [
+    "MODEL_FOLDER",
+    "OWN_GAUGE_FOLDER",
+    "REPORT_FILE",
+    "Dataset",
+    "Gauge",
+    "InitReport",
+    "Initializer",
+    "PointCloud",
+    "PoseErrors",
+    "Progress",
+    "Random",
+    "Sfm",
+    "SfmDense",
+    "read_cloud",
+]

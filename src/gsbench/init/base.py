@@ -1,0 +1,141 @@
+"""What an initialiser is: capture in, a COLMAP model and a report out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbench.scene.types import Capture
+
+MODEL_FOLDER = Path("sparse", "0")  # below the output folder: where COLMAP users and 3DGS trainers look
+OWN_GAUGE_FOLDER = Path("sparse_own_gauge", "0")  # the same model as its own mapper scaled it, before alignment
+REPORT_FILE = "report.json"
+POSES = ("shared", "own")
+
+
+class Progress(Protocol):
+    """Told how far a phase is: ``done`` of ``total`` steps (images, pairs); a phase may start anew at 0."""
+
+    def __call__(self, phase: str, done: int, total: int) -> None: ...
+
+
+def no_progress(phase: str, done: int, total: int) -> None:
+    """The `Progress` that tells nobody."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Coloured points: ``points`` [P, 3] float64 in world units, ``colors`` [P, 3] uint8 sRGB."""
+
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float64:
+            raise ValueError(f"points must be [P, 3] float64, got {self.points.shape} {self.points.dtype}")
+        if self.colors.shape != self.points.shape or self.colors.dtype != np.uint8:
+            raise ValueError(f"colors must be {self.points.shape} uint8, got {self.colors.shape} {self.colors.dtype}")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def read_cloud(model_dir: Path) -> PointCloud:
+    """The points of the COLMAP model in ``model_dir``, ordered by their ids (so the order is reproducible).
+
+    Raises ``InputError`` where the folder holds no readable model.
+    """
+    from gsbench.scene.colmap import points_of, read_model
+
+    return PointCloud(*points_of(read_model(model_dir)))
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Camera poses against the reference, after the best similarity: centres in reference units, rotations in degrees.
+
+    ``exact`` says that the reference is the truth and not another estimate; the ``_relative`` value is divided by the
+    reference's scene extent.
+    """
+
+    num_images: int
+    exact: bool
+    center_rmse: float  # the absolute trajectory error (ATE)
+    center_mean: float
+    center_max: float
+    center_rmse_relative: float | None  # None where the extent is 0
+    rotation_mean_deg: float
+    rotation_max_deg: float
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """What a volume threshold in raw model units means in a model's unit of length.
+
+    COLMAP scales each model as it likes, so one threshold selects different Gaussians in another model of the same scene.
+    """
+
+    scene_extent: float  # 3DGS's cameras_extent of the training cameras, in the model's units
+    scale_to_reference: float | None  # reference units per unit of the model; None without a reference
+    volume_threshold: float  # V_th, the paper's
+    threshold_over_extent_cubed: float | None  # V_th / extent³, comparable between gauges; None where the extent is 0
+    threshold_radius: float  # radius of the sphere of volume V_th, in the model's units
+    threshold_radius_over_extent: float | None
+    threshold_in_reference: float | None  # V_th as a volume in reference units
+
+
+@dataclass(frozen=True)
+class InitReport:
+    """What came out of an initialiser; `to_dict` is what ``report.json`` holds."""
+
+    init: str
+    poses: str  # shared: the reference's; own: estimated here
+    num_images: int
+    num_registered: int
+    unregistered: tuple[str, ...]
+    num_points: int
+    mean_reprojection_error: float | None  # px; None where no point has an observation
+    mean_track_length: float | None  # images that see a point
+    focal_lengths: tuple[float, ...]  # px, one for each camera
+    gauge: Gauge  # of the written model
+    seconds: Mapping[str, float]
+    settings: Mapping[str, Any]
+    versions: Mapping[str, str]
+    own_gauge: Gauge | None = (
+        None  # of the model before it was aligned to the reference; None where nothing was aligned
+    )
+    pose_errors: PoseErrors | None = None  # None without a reference, and where the reference's poses were taken over
+    warnings: tuple[str, ...] = ()
+    counts: Mapping[str, int] = field(default_factory=dict)  # features, pairs, verified pairs, inlier matches
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return json.loads(json.dumps(asdict(self)))
+
+    def write(self, path: Path) -> None:
+        """Write the report as JSON."""
+        path.write_text(json.dumps(self.to_dict(), indent=2) + "\n")
+
+
+class Initializer(Protocol):
+    """Makes cameras and a first cloud of points for a capture."""
+
+    def needs_reference(self, capture: Capture) -> bool:
+        """Whether `run` needs a ``reference`` model for this capture because it came without cameras."""
+        ...
+
+    def run(
+        self, capture: Capture, output_dir: Path, progress: Progress = no_progress, reference: Path | None = None
+    ) -> InitReport:
+        """Write the model to ``output_dir / MODEL_FOLDER`` and the report to ``output_dir / REPORT_FILE``.
+
+        The cameras have the sizes of the files in ``capture.images``. ``reference`` is a COLMAP model of the same files
+        whose cameras stand in for those that the capture came with.
+        """
+        ...

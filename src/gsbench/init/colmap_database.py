@@ -1,0 +1,153 @@
+"""COLMAP's database: cameras first, then images with keypoints and matches from whatever extractor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from PIL import Image
+
+from gsbench.scene.colmap import rescaled_camera
+
+
+@dataclass(frozen=True)
+class CameraGroup:
+    """Images taken with one camera; ``camera_id`` is the one in the database."""
+
+    camera_id: int
+    rig_id: int
+    names: tuple[str, ...]
+
+
+def reference_groups(reference: pycolmap.Reconstruction) -> list[tuple[pycolmap.Camera, list[str]]]:
+    """The reference's cameras, taken as known, each with the images that have a pose, in order of their names."""
+    groups: dict[int, list[str]] = {}
+    for image in reference.images.values():
+        if image.has_pose:
+            groups.setdefault(image.camera_id, []).append(image.name)
+    result = []
+    for camera_id, names in sorted(groups.items(), key=lambda group: min(group[1])):
+        known = reference.cameras[camera_id]
+        camera = rescaled_camera(known, known.width, known.height, camera_id=0)  # a copy, as the database renumbers it
+        camera.has_prior_focal_length = True
+        result.append((camera, sorted(names)))
+    return result
+
+
+def guessed_groups(
+    images: Path, names: Sequence[str], sharing: str, model: str, focal_length: float | None
+) -> list[tuple[pycolmap.Camera, list[str]]]:
+    """Cameras to be estimated, each with its images.
+
+    ``sharing``: ``single`` is one camera for all images of a size, ``per_folder`` the same within each sub-folder,
+    ``per_image`` one for each. The focal length in pixels is ``focal_length``, else EXIF's of the group's first image,
+    else 1.2 x the longest side (COLMAP's guess).
+    """
+    groups: dict[tuple[object, ...], list[str]] = {}
+    for name in names:
+        with Image.open(images / name) as image:
+            size = image.size
+        folder = str(Path(name).parent)
+        key = {"single": size, "per_folder": (folder, *size), "per_image": (name,)}[sharing]
+        groups.setdefault(key, []).append(name)
+    options = pycolmap.ImageReaderOptions()
+    options.camera_model = model
+    result = []
+    for group in groups.values():
+        camera = pycolmap.infer_camera_from_image(images / group[0], options)
+        if focal_length is not None:
+            camera = pycolmap.Camera.create_from_model_name(0, model, focal_length, camera.width, camera.height)
+            camera.has_prior_focal_length = True
+        result.append((camera, group))
+    return result
+
+
+def create_database(path: Path, groups: Sequence[tuple[pycolmap.Camera, Sequence[str]]]) -> list[CameraGroup]:
+    """A new database with the cameras of ``groups``, each in a rig of its own, and no images yet."""
+    path.unlink(missing_ok=True)
+    created = []
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for camera, names in groups:
+            camera.camera_id = database.write_camera(camera)
+            rig = pycolmap.Rig()
+            rig.add_ref_sensor(camera.sensor_id)
+            created.append(CameraGroup(camera.camera_id, database.write_rig(rig), tuple(names)))
+    return created
+
+
+def write_features(
+    path: Path, groups: Sequence[CameraGroup], keypoints: dict[str, NDArray[np.float32]]
+) -> dict[str, int]:
+    """Add the images of ``groups`` with their ``keypoints`` [K, 2], and return the image ids by name.
+
+    Keypoints are in pixels of the image file in COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
+    """
+    group_of = {name: group for group in groups for name in group.names}
+    image_ids = {}
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for name in sorted(group_of):
+            points = np.ascontiguousarray(keypoints[name], dtype=np.float32)
+            if points.ndim != 2 or points.shape[1] != 2:
+                raise ValueError(f"keypoints of {name} must be [K, 2], got {points.shape}")
+            image = pycolmap.Image(name=name, camera_id=group_of[name].camera_id)
+            image.image_id = database.write_image(image)
+            frame = pycolmap.Frame()
+            frame.rig_id = group_of[name].rig_id
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame)
+            database.write_keypoints(image.image_id, points)
+            image_ids[name] = image.image_id
+    return image_ids
+
+
+def write_matches(path: Path, matches: dict[tuple[str, str], NDArray[np.uint32]]) -> None:
+    """Add ``matches`` [M, 2], indices of keypoints of the first and second image, by pairs of image names."""
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        image_ids = {image.name: image.image_id for image in database.read_all_images()}
+        for (first, second), indices in matches.items():
+            database.write_matches(
+                image_ids[first], image_ids[second], np.ascontiguousarray(indices, dtype=np.uint32).reshape(-1, 2)
+            )
+
+
+def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
+    """COLMAP's list of image pairs, one pair of names on a line; names must be free of spaces (`image_ids_as_names`)."""
+    path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
+
+
+@contextmanager
+def image_ids_as_names(path: Path) -> Iterator[dict[str, str]]:
+    """Within the context the images are named by their ids; gives the new names by the old ones.
+
+    COLMAP's pair lists are divided at spaces, which the names of photographs often contain.
+    """
+    with pycolmap.Database.open(path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+    _rename_images(path, {image_id: str(image_id) for image_id in names})
+    try:
+        yield {name: str(image_id) for image_id, name in names.items()}
+    finally:
+        _rename_images(path, names)
+
+
+def _rename_images(path: Path, names: Mapping[int, str]) -> None:
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for image in database.read_all_images():
+            image.name = names[image.image_id]
+            database.update_image(image)
+
+
+def database_counts(path: Path) -> dict[str, int]:
+    """How many features, matched and verified pairs and inlier matches the database holds."""
+    with pycolmap.Database.open(path) as database:
+        return {
+            "features": database.num_keypoints(),
+            "pairs_matched": database.num_matched_image_pairs(),
+            "pairs_verified": database.num_verified_image_pairs(),
+            "inlier_matches": database.num_inlier_matches(),
+        }

@@ -1,0 +1,63 @@
+"""The cloud and the cameras that came with a COLMAP model."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+from gsbench.errors import InputError
+from gsbench.init.base import MODEL_FOLDER, REPORT_FILE, InitReport, Progress, no_progress
+from gsbench.init.relay import run_with_progress
+from gsbench.init.timer import Timer
+from gsbench.scene.types import Capture
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dataset:
+    """Takes over the capture's model: restricted to its selected images, cameras scaled to the files."""
+
+    name: ClassVar[str] = "dataset"
+
+    def needs_reference(self, capture: Capture) -> bool:
+        """Never: what did not come with the capture is not the dataset's."""
+        return False
+
+    def run(
+        self,
+        capture: Capture,
+        output_dir: Path,
+        progress: Progress = no_progress,
+        reference: Path | None = None,
+        work_dir: Path | None = None,
+    ) -> InitReport:
+        """Write model and report; ``reference`` and ``work_dir`` are not used. ``InputError`` where there is no cloud."""
+        if capture.model is None:
+            raise InputError(f"init=dataset: scene {capture.name} came without a COLMAP model: use init=sfm")
+        output_dir.mkdir(parents=True, exist_ok=True)
+        return run_with_progress(_copy_model, (self, capture, output_dir), progress, what=self.name)
+
+
+def _copy_model(job: tuple[Dataset, Capture, Path], progress: Progress) -> InitReport:
+    from gsbench.init import reconstruct, report
+    from gsbench.scene.colmap import read_reference
+
+    options, capture, output_dir = job
+    timer = Timer()
+    with timer.phase("read"):
+        model = read_reference(capture)
+    if model.num_points3D() == 0:
+        raise InputError(f"init=dataset: the model of scene {capture.name} has no points: use init=sfm or init=random")
+    reconstruct.write_model(model, output_dir / MODEL_FOLDER)
+    result = InitReport(
+        init=options.name,
+        poses="shared",
+        **report.model_figures(model, capture),
+        gauge=report.measure_gauge(report.training_extent(model, capture), 1.0),
+        seconds=timer.rounded(),
+        settings=asdict(options),
+        versions=report.package_versions("pycolmap"),
+    )
+    result = replace(result, warnings=report.find_warnings(result, model))
+    result.write(output_dir / REPORT_FILE)
+    return result

@@ -1,0 +1,159 @@
+"""The extractors that can be chosen by name, built with their weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from gsbench.errors import InputError
+from gsbench.init.features import Extractor
+from gsbench.weights import MissingWeights, load_state
+
+SUPERPOINT_BORDER = 4  # px without keypoints, as in deep-image-matching; its network has no margin of its own
+LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."  # of SuperPoint within a LightGlue checkpoint of transformers
+
+
+@dataclass(frozen=True)
+class ExtractorSettings:
+    """What an extractor depends on; see the fields of `gsbench.init.Dim`."""
+
+    extractor: str
+    max_keypoints: int
+    keypoint_threshold: float
+    nms_radius: int
+    aliked_model: str
+
+
+def build_extractor(settings: ExtractorSettings, weights: Path | None, device: torch.device) -> Extractor:
+    """The extractor with its network on ``device``; ``weights`` is the checked file, None for one without weights.
+
+    Raises ``MissingWeights`` where the file does not fit the network.
+    """
+    return _BUILDERS[settings.extractor](settings, weights, device)
+
+
+def load_into(network: torch.nn.Module, state: Mapping[str, torch.Tensor], path: Path) -> None:
+    """Load ``state`` into ``network``: every parameter must be there in its shape, buffers may be absent."""
+    try:
+        missing, unexpected = network.load_state_dict(dict(state), strict=False)
+    except RuntimeError as error:
+        raise MissingWeights(f"weights file {path} has tensors of other shapes than the network: replace it") from error
+    learned = {name for name, _ in network.named_parameters()}
+    missing = sorted(learned.intersection(missing))
+    if missing or unexpected:
+        example = (missing or unexpected)[0]
+        raise MissingWeights(
+            f"weights file {path} is for another network ({len(missing)} tensors missing, {len(unexpected)} foreign, "
+            f"for example {example}): replace it"
+        )
+
+
+def _superpoint(settings: ExtractorSettings, weights: Path | None, device: torch.device) -> Extractor:
+    try:
+        from transformers import SuperPointConfig, SuperPointForKeypointDetection
+    except ImportError as error:
+        raise InputError(
+            "init.extractor=superpoint needs the package transformers: pip install 'gsbench[dim]' "
+            "(and pip uninstall torchvision where that cannot be imported)"
+        ) from error
+
+    assert weights is not None
+    network = SuperPointForKeypointDetection(
+        SuperPointConfig(
+            keypoint_threshold=settings.keypoint_threshold,
+            nms_radius=settings.nms_radius,
+            max_keypoints=-1,
+            border_removal_distance=0,
+        )
+    )
+    state = load_state(weights)
+    prefix = LIGHTGLUE_DETECTOR_PREFIX
+    if any(name.startswith(prefix) for name in state):
+        state = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+    load_into(network, state, weights)
+    network.to(device).eval()
+
+    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        height, width = image.shape[-2:]
+        output = network(_gray(image))  # reads the first channel only
+        size = torch.tensor([width, height], device=image.device)
+        # The output is relative; its own post-processing cuts to whole px after the division, one too few at 5 % of
+        # the columns of some widths. Keypoints are whole px, so rounding restores them.
+        keypoints = (output.keypoints[0] * size).round()  # [K, 2]
+        # border removal is done here: the network's own looks at the right and bottom border in the wrong unit
+        inside = ((keypoints >= SUPERPOINT_BORDER) & (keypoints < size - SUPERPOINT_BORDER)).all(dim=1)
+        keep = inside & output.mask[0].bool()
+        return keypoints[keep], output.descriptors[0][keep], output.scores[0][keep]
+
+    return extract
+
+
+def _aliked(settings: ExtractorSettings, weights: Path | None, device: torch.device) -> Extractor:
+    from kornia.feature import ALIKED
+
+    assert weights is not None
+    network = ALIKED(
+        f"aliked-{settings.aliked_model}",
+        max_num_keypoints=settings.max_keypoints,
+        detection_threshold=settings.keypoint_threshold,
+        nms_radius=settings.nms_radius,
+    )
+    load_into(network, load_state(weights), weights)
+    network.to(device).eval()
+
+    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        features = network(image)[0]
+        return features.keypoints, features.descriptors, features.keypoint_scores
+
+    return extract
+
+
+def _disk(settings: ExtractorSettings, weights: Path | None, device: torch.device) -> Extractor:
+    from kornia.feature import DISK
+
+    assert weights is not None
+    network = DISK()
+    load_into(network, load_state(weights, entry="extractor"), weights)
+    network.to(device).eval()
+
+    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        features = network(
+            image,
+            n=settings.max_keypoints,
+            window_size=2 * settings.nms_radius + 1,
+            score_threshold=settings.keypoint_threshold,
+            pad_if_not_divisible=True,
+        )[0]
+        return features.keypoints, features.descriptors, features.detection_scores
+
+    return extract
+
+
+def _sift_kornia(settings: ExtractorSettings, weights: Path | None, device: torch.device) -> Extractor:
+    from kornia.feature import SIFTFeatureScaleSpace, laf_is_filled
+
+    network = SIFTFeatureScaleSpace(settings.max_keypoints, device=device, descriptor_backend="pyramid").eval()
+
+    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        frames, responses, descriptors = network(_gray(image)[:, :1])
+        filled = laf_is_filled(frames)[0]  # [K]: an image with few extrema leaves slots empty
+        return frames[0, filled, :, 2], descriptors[0, filled], responses[0, filled]
+
+    return extract
+
+
+def _gray(image: torch.Tensor) -> torch.Tensor:
+    """Luma by ITU-R BT.601, in three equal channels [1, 3, H, W]."""
+    weights = image.new_tensor([0.299, 0.587, 0.114])[None, :, None, None]
+    return (image * weights).sum(dim=1, keepdim=True).expand(-1, 3, -1, -1)
+
+
+_BUILDERS: dict[str, Callable[[ExtractorSettings, Path | None, torch.device], Extractor]] = {
+    "superpoint": _superpoint,
+    "aliked": _aliked,
+    "disk": _disk,
+    "sift_kornia": _sift_kornia,
+}

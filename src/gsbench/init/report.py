@@ -1,0 +1,126 @@
+"""The gauge report: what a model holds, how far its poses are from the reference, and what V_th means in its units."""
+
+from __future__ import annotations
+
+import math
+from importlib import metadata
+
+import numpy as np
+import pycolmap
+
+from gsbench.init.alignment import Similarity, rotation_angles, transformed_rotations
+from gsbench.init.base import Gauge, InitReport, PoseErrors
+from gsbench.init.reconstruct import common_poses, poses_by_name
+from gsbench.scene.types import EXTENT_MARGIN, Capture
+
+PAPER_VOLUME_THRESHOLD = 0.03  # V_th of the paper, in raw units of its COLMAP models
+
+REGISTERED_SHARE = 0.9  # below this share of the images is a warning
+ROTATION_WARNING_DEG = 2.0  # sound models stay below 0.5; wrong ones that register every image reach 20 and more
+CENTER_WARNING = 0.05  # of the reference's scene extent
+REPROJECTION_WARNING_PX = 1.5  # sound models of SIFT are below 0.7 px, of learned features below 1.2 px
+FIELD_OF_VIEW_DEG = (5.0, 150.0)  # of the longest side; an estimate outside of it is nonsense
+FEW_POINTS = 100
+
+
+def training_extent(model: pycolmap.Reconstruction, capture: Capture) -> float:
+    """3DGS's ``cameras_extent`` of the capture's training images that the model places; 0 where it places none."""
+    poses = poses_by_name(model)
+    centers = np.array([poses[name][0] for name in capture.train_names if name in poses]).reshape(-1, 3)
+    if len(centers) == 0:
+        return 0.0
+    return float(EXTENT_MARGIN * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+
+
+def measure_gauge(extent: float, scale_to_reference: float | None) -> Gauge:
+    """What the paper's V_th is in a model with this scene extent."""
+    radius = (3 * PAPER_VOLUME_THRESHOLD / (4 * math.pi)) ** (1 / 3)
+    return Gauge(
+        scene_extent=extent,
+        scale_to_reference=scale_to_reference,
+        volume_threshold=PAPER_VOLUME_THRESHOLD,
+        threshold_over_extent_cubed=PAPER_VOLUME_THRESHOLD / extent**3 if extent > 0 else None,
+        threshold_radius=radius,
+        threshold_radius_over_extent=radius / extent if extent > 0 else None,
+        threshold_in_reference=None if scale_to_reference is None else PAPER_VOLUME_THRESHOLD * scale_to_reference**3,
+    )
+
+
+def compare_poses(
+    model: pycolmap.Reconstruction,
+    reference: pycolmap.Reconstruction,
+    similarity: Similarity,
+    reference_extent: float,
+    exact: bool,
+) -> PoseErrors:
+    """Errors of the poses of ``model``, moved by ``similarity``, over the images that both place."""
+    centers, rotations, reference_centers, reference_rotations = common_poses(model, reference)
+    distances = np.linalg.norm(similarity(centers) - reference_centers, axis=1)  # [N]
+    angles = rotation_angles(transformed_rotations(similarity, rotations), reference_rotations)  # [N]
+    rmse = float(np.sqrt(np.mean(distances**2)))
+    return PoseErrors(
+        num_images=len(distances),
+        exact=exact,
+        center_rmse=rmse,
+        center_mean=float(distances.mean()),
+        center_max=float(distances.max()),
+        center_rmse_relative=rmse / reference_extent if reference_extent > 0 else None,
+        rotation_mean_deg=float(angles.mean()),
+        rotation_max_deg=float(angles.max()),
+    )
+
+
+def package_versions(*packages: str) -> dict[str, str]:
+    """Installed versions by name of the package."""
+    return {package: metadata.version(package) for package in packages}
+
+
+def model_figures(model: pycolmap.Reconstruction, capture: Capture) -> dict[str, object]:
+    """The fields of `InitReport` that are counts and means over the model."""
+    placed = set(poses_by_name(model))
+    observed = any(point.track.length() > 0 for point in model.points3D.values())
+    return {
+        "num_images": len(capture.image_names),
+        "num_registered": len(placed),
+        "unregistered": tuple(name for name in capture.image_names if name not in placed),
+        "num_points": model.num_points3D(),
+        "mean_reprojection_error": model.compute_mean_reprojection_error() if observed else None,
+        "mean_track_length": model.compute_mean_track_length() if observed else None,
+        "focal_lengths": tuple(camera.mean_focal_length() for _, camera in sorted(model.cameras.items())),
+    }
+
+
+def find_warnings(report: InitReport, model: pycolmap.Reconstruction) -> tuple[str, ...]:
+    """What in a model should make its reader doubt it, each in one line; that all images are placed is no proof."""
+    found = []
+    if report.num_registered < REGISTERED_SHARE * report.num_images:
+        missing = ", ".join(report.unregistered[:5]) + (" …" if len(report.unregistered) > 5 else "")
+        found.append(
+            f"only {report.num_registered} of {report.num_images} images have a pose (missing: {missing}): "
+            "the other photos are not used; more overlap or texture would help"
+        )
+    if report.num_points < FEW_POINTS:
+        found.append(f"only {report.num_points} points: training starts from next to nothing")
+    error = report.mean_reprojection_error
+    if error is not None and error > REPROJECTION_WARNING_PX:
+        found.append(f"mean reprojection error {error:.2f} px is large: the cameras or the matches are probably wrong")
+    poses = report.pose_errors
+    if poses is not None:
+        truth = "true" if poses.exact else "reference"
+        if poses.rotation_mean_deg > ROTATION_WARNING_DEG:
+            found.append(
+                f"the cameras are turned {poses.rotation_mean_deg:.1f} degrees against the {truth} ones on average: "
+                "the model is wrong although its images are placed (views at most 7.5 degrees apart are safe)"
+            )
+        if poses.center_rmse_relative is not None and poses.center_rmse_relative > CENTER_WARNING:
+            found.append(
+                f"the cameras are {poses.center_rmse_relative:.1%} of the scene extent away from the {truth} ones"
+            )
+    for camera in model.cameras.values():
+        view = 2 * math.degrees(math.atan(max(camera.width, camera.height) / (2 * camera.mean_focal_length())))
+        if not FIELD_OF_VIEW_DEG[0] < view < FIELD_OF_VIEW_DEG[1]:
+            found.append(
+                f"estimated focal length {camera.mean_focal_length():.0f} px (field of view {view:.0f} degrees) is "
+                "implausible: give init.focal_length in px"
+            )
+    return tuple(found)

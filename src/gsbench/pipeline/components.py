@@ -1,0 +1,95 @@
+"""From configuration to objects: initialisers, densifiers, devices and threads, with errors that name the key."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import os
+from typing import Any
+
+import torch
+from pydantic import TypeAdapter, ValidationError
+
+from gsbench.config import check_target, closest
+from gsbench.errors import InputError
+
+RESERVED = ("_target_", "name")  # keys of a group that are not options of its class
+
+
+def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
+    """The object that ``values`` of ``group`` (init, densify) describes.
+
+    ``_target_`` names a class by its import path; the other keys are its arguments. For dataclasses, values are checked
+    against the annotations. Raises InputError naming the key that is unknown or wrong.
+    """
+    target = values["_target_"]
+    check_target(target, group, allow_targets)
+    cls = locate(target, group)
+    options = {key: value for key, value in values.items() if key not in RESERVED}
+    known = [name for name in inspect.signature(cls).parameters if name != "self"]
+    for key in options:
+        if key not in known:
+            raise InputError(f"{group}.{key} is not an option of {target}{closest(key, known)} (options: {', '.join(known)})")
+    try:
+        if dataclasses.is_dataclass(cls):
+            return TypeAdapter(cls).validate_python(options)
+        return cls(**options)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join([group, *map(str, first["loc"])])
+        message = first["msg"].removeprefix("Value error, ")
+        raise InputError(message if message.startswith(f"{group}.") else f"{where}: {message}") from error
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{group}: {error}") from error
+
+
+def locate(target: str, group: str) -> Any:
+    """The class at the import path ``package.module.Class``."""
+    module, _, name = target.rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(f"{group}._target_={target} cannot be imported ({error})") from error
+
+
+def options_of(component: Any) -> dict[str, Any]:
+    """Class and options of a component, as they enter a stage's key; ``key_ignores`` of the class names what has no effect."""
+    values = {"class": f"{type(component).__module__}.{type(component).__qualname__}"}
+    ignored = getattr(type(component), "key_ignores", ())
+    if dataclasses.is_dataclass(component):
+        fields = [field.name for field in dataclasses.fields(component) if field.init and field.name not in ignored]
+        values |= {name: _plain(getattr(component, name)) for name in fields}
+    return values
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
+
+
+def select_device(name: str) -> torch.device:
+    """``auto`` is the GPU where torch can use one, else the CPU."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise InputError(f"device={name} is not known to torch; use auto, cpu, cuda or cuda:1") from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"device={name}: torch finds no CUDA device here; use device=cpu, or install a CUDA build of torch")
+    if device.type == "cuda" and device.index is not None and device.index >= torch.cuda.device_count():
+        raise InputError(f"device={name}: there are {torch.cuda.device_count()} CUDA devices, numbered from 0")
+    return device
+
+
+def available_threads(parallel: int = 1) -> int:
+    """The CPU threads for one of ``parallel`` trials: what Slurm gave, else this process's cores, shared evenly."""
+    slurm = os.environ.get("SLURM_CPUS_PER_TASK", "")
+    if slurm.isdigit() and int(slurm) > 0:
+        return int(slurm)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, cores // parallel)

@@ -1,0 +1,51 @@
+"""Progress for people: a live bar on a terminal, a line now and then in a log."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+log = logging.getLogger(__name__)
+
+SECONDS_BETWEEN_LINES = 20.0
+
+
+class Report(Protocol):
+    """Called with how far a piece of work is; ``note`` is shown as it is."""
+
+    def __call__(self, phase: str, done: int, total: int, note: str = "") -> None: ...
+
+
+@contextmanager
+def progress(title: str) -> Iterator[Report]:
+    """Show progress of the work called ``title`` while the block runs."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines(title)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(title, total=None, note="")
+
+        def report(phase: str, done: int, total: int, note: str = "") -> None:
+            bar.update(task, description=f"{title}: {phase}", completed=done, total=total, note=note or f"{done}/{total}")
+
+        yield report
+
+
+def _lines(title: str) -> Report:
+    last = {"phase": "", "time": 0.0}
+
+    def report(phase: str, done: int, total: int, note: str = "") -> None:
+        now = time.monotonic()
+        if phase != last["phase"] or now - float(last["time"]) >= SECONDS_BETWEEN_LINES:
+            last.update(phase=phase, time=now)
+            log.info("%s: %s %d/%d %s", title, phase, done, total, note)
+
+    return report

@@ -1,0 +1,276 @@
+"""The four stages of a trial, each a function of its declared inputs, kept in the store."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import logging
+import re
+import resource
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from gsbench.config import EvalConfig, SceneConfig, TrainConfig, sha256_of
+from gsbench.densify import Densifier
+from gsbench.eval.protocol import Evaluator, get_protocol, quantize, summarize
+from gsbench.gaussians.initial import gaussians_from_cloud
+from gsbench.gaussians.model import MAX_SH_DEGREE
+from gsbench.gaussians.ply import read_ply, write_ply
+from gsbench.init import Sfm, read_cloud
+from gsbench.init.base import MODEL_FOLDER, REPORT_FILE, Initializer
+from gsbench.pipeline.components import options_of
+from gsbench.pipeline.progress import progress
+from gsbench.pipeline.store import Entry, Stage, Store, write_json
+from gsbench.pipeline.trainer import Status, Trainer
+from gsbench.raster import Rasterizer
+from gsbench.scene.courtyard import render_courtyard
+from gsbench.scene.load import load_scene
+from gsbench.scene.readers import read_colmap, read_photos
+from gsbench.scene.types import Capture, Scene
+
+log = logging.getLogger(__name__)
+
+CAPTURE = Stage("scene", 1)
+INIT = Stage("init", 1, resumable=True)
+TRAIN = Stage("train", 1, resumable=True)
+GROUND_TRUTH = Stage("ground_truth", 1)
+EVALUATE = Stage("evaluate", 1)
+
+PLY_FILE = "point_cloud.ply"
+TRAINING_FILE = "training.json"
+LINEAGE_FILE = "lineage.npz"
+PER_VIEW_FILE = "per_view.csv"
+METRICS_FILE = "metrics.json"
+
+
+def read_capture(store: Store, options: SceneConfig) -> Capture:
+    """The photographs of ``options``; the procedural courtyard is rendered into the store first."""
+    selection: dict[str, Any] = {
+        "max_images": options.max_images,
+        "test_every": options.test_every,
+        "train_list": _path(options.train_list),
+        "test_list": _path(options.test_list),
+    }
+    if options.kind == "courtyard":
+        inputs = {name: getattr(options, name) for name in ("views", "width", "height", "seed")}
+
+        def build(folder: Path) -> None:
+            with progress("scene") as report:
+                render_courtyard(folder, progress=lambda done, total: report("courtyard", done, total), **inputs)
+
+        entry = store.get(CAPTURE, inputs, build)
+        capture = read_colmap(options.name, entry.path, **selection)
+        return dataclasses.replace(capture, exact_poses=True)
+    path = Path(str(options.path)).expanduser()
+    if options.kind == "photos":
+        return read_photos(options.name, path, **selection)
+    return read_colmap(options.name, path, images=options.images, sparse=options.sparse, **selection)
+
+
+def initialize(store: Store, capture: Capture, initializer: Initializer) -> Entry:
+    """Cameras and the first cloud: a COLMAP model and its report, shared by all trials with the same options."""
+    reference = initialize(store, capture, Sfm()) if initializer.needs_reference(capture) else None
+    inputs = {
+        "capture": capture.fingerprint,
+        "test": sha256_of(list(capture.test_names)),
+        "exact_poses": capture.exact_poses,
+        "options": options_of(initializer),
+        "reference": None if reference is None else reference.key,
+        "pycolmap": version("pycolmap"),
+    }
+
+    def build(folder: Path) -> None:
+        with progress("init") as report:
+            initializer.run(
+                capture, folder, report, reference=None if reference is None else reference.path / MODEL_FOLDER
+            )
+
+    return store.get(INIT, inputs, build)
+
+
+def prepare_scene(store: Store, capture: Capture, init: Entry, options: SceneConfig) -> Scene:
+    """The views at their final size, undistorted; prepared images are cached beside the store's stages."""
+    with progress("scene") as report:
+        return load_scene(
+            capture,
+            init.path / MODEL_FOLDER,
+            store.root / "views",
+            downscale=options.downscale,
+            max_size=options.max_size,
+            resample=options.resample,
+            principal_point=options.principal_point,
+            progress=lambda done, total: report("views", done, total),
+        )
+
+
+def train(
+    store: Store,
+    scene: Scene,
+    scene_inputs: dict[str, Any],
+    init: Entry,
+    densifier: Densifier,
+    rasterizer: Rasterizer,
+    options: TrainConfig,
+    seed: int,
+    device: torch.device,
+) -> Entry:
+    """Train, and keep the model, its lineage, metrics and events."""
+    ignored = ("name", "log_every", "checkpoint_every", "volume_histogram")
+    inputs = {
+        "scene": scene_inputs,
+        "init": init.key,
+        "densify": options_of(densifier),
+        "raster": rasterizer.name,
+        "train": {key: value for key, value in dataclasses.asdict(options).items() if key not in ignored},
+        "seed": seed,
+    }
+
+    def build(folder: Path) -> None:
+        cloud = read_cloud(init.path / MODEL_FOLDER)
+        initial = gaussians_from_cloud(cloud.points, cloud.colors, device)
+        trainer = Trainer(scene, initial, densifier, rasterizer, options, seed)
+        reset_peak_memory(device)
+        with progress("train") as report:
+
+            def show(status: Status) -> None:
+                note = f"loss {status.loss:.4f} | {status.num_gaussians:,} Gaussians | {status.iterations_per_second:.1f} it/s"
+                report("iteration", status.step, options.iterations, note)
+
+            gaussians = trainer.run(folder, show)
+        write_ply(gaussians, folder / PLY_FILE)
+        lineage = {name: tensor.numpy() for name, tensor in densifier.lineage.state_dict().items()}
+        np.savez_compressed(folder / LINEAGE_FILE, **lineage)
+        summary = {
+            "iterations": trainer.step,
+            "num_init_points": len(initial),
+            "num_gaussians": len(gaussians),
+            "causes": densifier.lineage.causes_of_living(),
+            "scene_extent": scene.extent,
+            "seconds": trainer.seconds,
+            "peak_memory_mb": peak_memory_mb(device),
+        }
+        write_json(folder / TRAINING_FILE, summary)
+
+    return store.get(TRAIN, inputs, build)
+
+
+def keep_ground_truth(store: Store, scene: Scene, scene_inputs: dict[str, Any], init: Entry) -> Entry:
+    """The test photographs as they are compared with, once for all trials that share them."""
+
+    def build(folder: Path) -> None:
+        for view in scene.test:
+            Image.fromarray(view.image).save(folder / png_name(view.name))
+
+    return store.get(GROUND_TRUTH, {"scene": scene_inputs, "init": init.key}, build)
+
+
+def evaluate(
+    store: Store,
+    scene: Scene,
+    trained: Entry,
+    rasterizer: Rasterizer,
+    train_options: TrainConfig,
+    options: EvalConfig,
+    device: torch.device,
+) -> Entry:
+    """Render the test views, 8 bits, and measure them by the protocol; the metrics read what the PNGs hold."""
+    weights = None if options.weights is None else Path(options.weights).expanduser()
+    evaluator = Evaluator(
+        get_protocol(options.protocol), device, tuple(options.lpips), options.flip, weights, options.download
+    )
+    inputs = {
+        "train": trained.key,
+        "protocol": evaluator.protocol.id,
+        "unavailable": sorted(evaluator.unavailable),  # so that weights that arrive later are used
+    }
+
+    def build(folder: Path) -> None:
+        gaussians = read_ply(trained.path / PLY_FILE, device)
+        background = torch.tensor(list(train_options.background), device=device)
+        (folder / "renders").mkdir(exist_ok=True)
+        per_view: dict[str, dict[str, float]] = {}
+        with progress("evaluate") as report:
+            for done, view in enumerate(scene.test):
+                report("views", done, len(scene.test))
+                with torch.no_grad():
+                    rendered = rasterizer.render(gaussians, view.camera, MAX_SH_DEGREE, background).image
+                image = quantize(rendered).cpu().numpy()  # [H, W, 3] uint8
+                Image.fromarray(image).save(folder / "renders" / png_name(view.name))
+                per_view[view.name] = evaluator.evaluate_view(image, view.image)
+        write_per_view(folder / PER_VIEW_FILE, per_view)
+        metrics = {"metrics": summarize(per_view, evaluator.unavailable), "unavailable": evaluator.unavailable}
+        write_json(folder / METRICS_FILE, metrics)
+
+    return store.get(EVALUATE, inputs, build)
+
+
+def png_name(view_name: str) -> str:
+    """File name for the picture of a view; sub-folders become part of the name."""
+    return Path(view_name).with_suffix(".png").as_posix().replace("/", "__")
+
+
+def write_per_view(path: Path, per_view: dict[str, dict[str, float]]) -> None:
+    """One row a view, in order; a metric that a view lacks is left empty."""
+    names = sorted({name for row in per_view.values() for name in row})
+    with path.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, ["view", *names])
+        writer.writeheader()
+        for view, row in per_view.items():
+            writer.writerow({"view": view} | {name: repr(value) for name, value in row.items()})
+
+
+def scene_inputs(capture: Capture, options: SceneConfig) -> dict[str, Any]:
+    """What the prepared views depend on besides the cameras."""
+    return {
+        "capture": capture.fingerprint,
+        "test": sha256_of(list(capture.test_names)),
+        "downscale": options.downscale,
+        "max_size": options.max_size,
+        "resample": options.resample,
+        "principal_point": options.principal_point,
+    }
+
+
+def reset_peak_memory(device: torch.device) -> None:
+    """Start a new measurement of peak memory, where the platform can (Linux, CUDA)."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        return
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        log.debug("peak memory cannot be reset here: it counts from the start of the process")
+
+
+def peak_memory_mb(device: torch.device) -> float:
+    """Peak memory since ``reset_peak_memory``: of the GPU there, else resident memory of this process; MiB."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**20
+    status = Path("/proc/self/status")
+    if status.exists():
+        found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text())
+        if found:
+            return int(found.group(1)) / 2**10
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    found = {"python": sys.version.split()[0]}
+    for package in ("gsbench", "torch", "numpy", "numba", "pycolmap", "kornia", "gsplat"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _path(value: str | None) -> Path | None:
+    return None if value is None else Path(value).expanduser()

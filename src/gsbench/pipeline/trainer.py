@@ -1,0 +1,244 @@
+"""The training loop: the schedule of 3DGS, any rasterizer, any densifier."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsbench.config import TrainConfig
+from gsbench.densify import Densifier, DensifyContext
+from gsbench.densify.volume import log_volume
+from gsbench.errors import TrainingError
+from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
+from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.pipeline.checkpoint import load_checkpoint, remove_checkpoints, save_checkpoint
+from gsbench.pipeline.loss import photometric_loss
+from gsbench.raster import Rasterizer
+from gsbench.scene.types import Scene, View
+
+log = logging.getLogger(__name__)
+
+METRICS = "metrics.jsonl"
+EVENTS = "events.jsonl"
+HISTOGRAMS = "volume_histograms.jsonl"
+LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, a quarter decade each
+LOSS_SMOOTHING = 0.9  # of the loss that is shown and logged
+STREAMS = ("cameras", "densify")  # every random draw of a training belongs to one
+
+
+@dataclass(frozen=True)
+class Status:
+    """What a progress bar shows."""
+
+    step: int
+    loss: float
+    num_gaussians: int
+    iterations_per_second: float
+
+
+class CameraOrder:
+    """Training views in random order without replacement, drawn anew when all were used."""
+
+    def __init__(self, num_views: int, rng: torch.Generator) -> None:
+        self.num_views = num_views
+        self.rng = rng
+        self.remaining: list[int] = []
+
+    def next(self) -> int:
+        if not self.remaining:
+            self.remaining = torch.randperm(self.num_views, generator=self.rng).tolist()
+        return self.remaining.pop()
+
+
+class Trainer:
+    """Trains Gaussians on the training views of a scene.
+
+    All randomness comes from generators made of ``seed``. ``run`` writes metrics, events and checkpoints into a folder, and
+    goes on from the newest checkpoint that it finds there: on the CPU, to the same bits as an undisturbed run.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        initial: Gaussians,
+        densifier: Densifier,
+        rasterizer: Rasterizer,
+        options: TrainConfig,
+        seed: int,
+    ) -> None:
+        self.scene, self.densifier, self.rasterizer, self.options = scene, densifier, rasterizer, options
+        self.device = initial.means.device
+        self.background = torch.tensor(list(options.background), dtype=torch.float32, device=self.device)  # [3]
+        self.context = DensifyContext(scene.extent, white_background=bool((self.background == 1).all()))
+        self.gaussians = TrainableGaussians(initial, learning_rates(options), scene.extent)
+        self.rngs = {name: generator(seed, stream) for stream, name in enumerate(STREAMS)}
+        self.order = CameraOrder(len(scene.train), self.rngs["cameras"])
+        self.step = 0
+        self.seconds = 0.0
+        self.smoothed_loss = math.nan
+        densifier.begin(initial, self.context)
+
+    def run(self, folder: Path, on_status: Callable[[Status], None] = lambda status: None) -> Gaussians:
+        """Train to the last iteration, or to the end of the time budget; returns the Gaussians, detached."""
+        self._resume(folder)
+        first_step, started = self.step, time.perf_counter()
+        before = self.seconds
+        options = self.options
+        with (folder / METRICS).open("a") as metrics, (folder / EVENTS).open("a") as events:
+            while self.step < options.iterations:
+                record, event = self._iterate(folder)
+                self.seconds = before + time.perf_counter() - started
+                out_of_time = options.max_seconds is not None and self.seconds >= options.max_seconds
+                last = self.step == options.iterations or out_of_time
+                if event is not None:
+                    _append(events, event)
+                if self.step in options.volume_histogram:
+                    with (folder / HISTOGRAMS).open("a") as stream:
+                        _append(stream, self._volume_histogram())
+                if self.step % options.log_every == 0 or last:
+                    rate = (self.step - first_step) / max(self.seconds - before, 1e-9)
+                    _append(metrics, record | {"seconds": round(self.seconds, 3)})
+                    on_status(Status(self.step, self.smoothed_loss, len(self.gaussians), rate))
+                if last:
+                    break
+                if self.step % options.checkpoint_every == 0:
+                    metrics.flush()
+                    events.flush()
+                    save_checkpoint(folder, self.step, self._state())
+        remove_checkpoints(folder)
+        return self.gaussians.values.detach()
+
+    def _iterate(self, folder: Path) -> tuple[dict[str, Any], dict[str, object] | None]:
+        """One iteration in 3DGS's order: rates, SH degree, render, backward, statistics, refinement, optimiser step."""
+        self.step += 1
+        step, options = self.step, self.options
+        self.gaussians.set_step(step)
+        view = self.scene.train[self.order.next()]
+        render = self.rasterizer.render(
+            self.gaussians.values, view.camera, self.sh_degree, self.background, self.densifier.needs_absolute_gradient
+        )
+        loss, l1, ssim = photometric_loss(render.image, self._target(view), options.ssim_weight)
+        regularizer = self.densifier.regularizer(self.gaussians.values)
+        total = loss if regularizer is None else loss + regularizer
+        value = float(loss)
+        if not math.isfinite(float(total)):
+            raise TrainingError(
+                f"the loss became {float(total)} at iteration {step}; the last good state is the newest checkpoint in {folder}"
+            )
+        self.smoothed_loss = (
+            value
+            if math.isnan(self.smoothed_loss)
+            else LOSS_SMOOTHING * self.smoothed_loss + (1 - LOSS_SMOOTHING) * value
+        )
+        total.backward()
+        record = {
+            "step": step,
+            "loss": value,
+            "l1": float(l1),
+            "ssim": float(ssim),
+            "num_gaussians": len(self.gaussians),
+            "sh_degree": self.sh_degree,
+        }
+        if step == options.iterations:  # 3DGS saves before it would refine or step
+            return record, None
+        self.densifier.observe(step, render)
+        if options.step_after_refine:
+            self._optimize(render.visible)
+        event = self.densifier.refine(step, self.gaussians, self.rngs["densify"])
+        if not options.step_after_refine:
+            self._optimize(render.visible)
+        self.densifier.after_step(step, self.gaussians, self.rngs["densify"])
+        if len(self.gaussians) == 0:
+            raise TrainingError(f"no Gaussian was left after iteration {step}; the pruning thresholds are too high")
+        return record, None if event is None else event.as_dict()
+
+    @property
+    def sh_degree(self) -> int:
+        return min(MAX_SH_DEGREE, self.step // self.options.sh_interval)
+
+    def _optimize(self, visible: torch.Tensor) -> None:
+        self.gaussians.optimizer_step(self.sh_degree, visible if self.options.visible_adam else None)
+
+    def _target(self, view: View) -> torch.Tensor:
+        return torch.from_numpy(view.image).to(self.device)  # [H, W, 3] uint8
+
+    def _volume_histogram(self) -> dict[str, Any]:
+        volumes = (log_volume(self.gaussians.values.log_scales.detach()) / math.log(10)).cpu().numpy()
+        clipped = np.clip(volumes, LOG_VOLUME_BINS[0], LOG_VOLUME_BINS[-1])
+        counts, edges = np.histogram(clipped, LOG_VOLUME_BINS)
+        return {"step": self.step, "log10_edges": edges.tolist(), "counts": counts.tolist()}
+
+    def _state(self) -> dict[str, Any]:
+        return {
+            "step": self.step,
+            "seconds": self.seconds,
+            "smoothed_loss": self.smoothed_loss,
+            "gaussians": self.gaussians.state_dict(),
+            "densifier": self.densifier.state_dict(),
+            "rngs": {name: rng.get_state() for name, rng in self.rngs.items()},
+            "remaining_views": list(self.order.remaining),
+        }
+
+    def _resume(self, folder: Path) -> None:
+        state = load_checkpoint(folder, self.device)
+        if state is not None:
+            self.step, self.seconds, self.smoothed_loss = state["step"], state["seconds"], state["smoothed_loss"]
+            self.gaussians = TrainableGaussians.load(
+                state["gaussians"], self.gaussians.rates, self.gaussians.spatial_scale
+            )
+            self.densifier.load_state_dict(state["densifier"], self.context)
+            for name, rng in self.rngs.items():
+                rng.set_state(state["rngs"][name].cpu())
+            self.order.remaining = list(state["remaining_views"])
+            log.info("going on from iteration %d", self.step)
+        for name in (METRICS, EVENTS, HISTOGRAMS):
+            drop_after(folder / name, self.step)
+
+
+def learning_rates(options: TrainConfig) -> LearningRates:
+    return LearningRates(
+        position_initial=options.position_initial,
+        position_final=options.position_final,
+        position_steps=options.position_steps,
+        sh_dc=options.sh_dc,
+        sh_rest=options.sh_rest,
+        opacity=options.opacity,
+        scale=options.scale,
+        rotation=options.rotation,
+    )
+
+
+def generator(seed: int, stream: int) -> torch.Generator:
+    """A CPU generator for one stream of a trial's randomness; streams of all seeds are independent."""
+    state = np.random.SeedSequence([seed, stream]).generate_state(1, np.uint64)[0]
+    return torch.Generator().manual_seed(int(state >> np.uint64(1)))
+
+
+def drop_after(path: Path, step: int) -> None:
+    """Remove the records later than ``step``, and a torn last line, from a JSON-lines file, if it is there."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text().splitlines():
+        try:
+            if json.loads(line)["step"] <= step:
+                kept.append(line)
+        except (json.JSONDecodeError, KeyError):
+            break
+    path.write_text("".join(line + "\n" for line in kept))
+
+
+def _append(stream: Any, record: dict[str, Any]) -> None:
+    stream.write(json.dumps(record) + "\n")
+    stream.flush()
+
+

@@ -1,0 +1,202 @@
+"""One trial from configuration to ``results.json``."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsbench.config import EvalConfig, SceneConfig, TrainConfig, config_hash
+from gsbench.densify.events import sum_events
+from gsbench.errors import GsbenchError
+from gsbench.init.base import REPORT_FILE
+from gsbench.pipeline import stages
+from gsbench.pipeline.components import available_threads, build, select_device
+from gsbench.pipeline.store import Entry, Store, write_json
+from gsbench.pipeline.trainer import EVENTS, HISTOGRAMS, METRICS
+from gsbench.raster import create_rasterizer, resolve_name
+from gsbench.tracking import Mirror
+
+log = logging.getLogger(__name__)
+
+RESULTS = "results.json"
+FAILED = "failed.json"
+CONFIG = "config.yaml"
+LOG = "log.txt"
+
+
+@dataclass(frozen=True)
+class TrialPaths:
+    """Where a trial's files lie."""
+
+    runs: Path
+    folder: Path
+
+    @classmethod
+    def of(cls, values: dict[str, Any]) -> TrialPaths:
+        """The folders of the trial with the resolved configuration ``values``."""
+        runs = Path(values["runs"]).expanduser().resolve()
+        arm = f"{values['init']['name']}-{values['densify']['name']}"
+        leaf = f"{config_hash(values)[:8]}-seed{values['seed']}"
+        return cls(runs, runs / values["name"] / values["scene"]["name"] / arm / leaf)
+
+
+def run_trial(values: dict[str, Any], config_yaml: str) -> dict[str, Any]:
+    """Run the trial with the resolved configuration ``values``, or find it done; returns what ``results.json`` holds.
+
+    On failure ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again.
+    """
+    paths = TrialPaths.of(values)
+    paths.folder.mkdir(parents=True, exist_ok=True)
+    with _log_to(paths.folder / LOG):
+        try:
+            return _run(values, config_yaml, paths)
+        except (Exception, KeyboardInterrupt) as error:
+            log.debug("the trial failed", exc_info=True)
+            kind = type(error).__name__
+            message = str(error) if isinstance(error, GsbenchError) else f"{kind}: {error}"
+            record = {"status": "failed", "error": kind, "message": message, "traceback": traceback.format_exc()}
+            write_json(paths.folder / FAILED, record | {"time": time.time(), "seed": values["seed"]})
+            raise
+
+
+def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[str, Any]:
+    label = f"{paths.folder.parent.parent.name}/{paths.folder.parent.name} seed {values['seed']}"
+    device = select_device(values["device"])
+    threads = available_threads(values["launch"]["parallel"]) if values["threads"] == "auto" else values["threads"]
+    torch.set_num_threads(threads)
+    rasterizer = create_rasterizer(resolve_name(values["raster"]["name"], device), device, threads)
+    densifier = build("densify", values["densify"], values["allow_targets"])
+    initializer = build("init", values["init"], values["allow_targets"])
+    scene_options = SceneConfig(**values["scene"])
+    train_options = TrainConfig(**values["train"])
+    eval_options = EvalConfig(**values["eval"])
+    store = Store(paths.runs / "store")
+
+    (paths.folder / CONFIG).write_text(config_yaml)
+    mirror = Mirror(values["tracking"], paths.runs, paths.folder, values)
+    with mirror:
+        capture = stages.read_capture(store, scene_options)
+        inputs = stages.scene_inputs(capture, scene_options)
+        init = stages.initialize(store, capture, initializer)
+        _link(init.path / REPORT_FILE, paths.folder / "init_report.json")
+        scene = stages.prepare_scene(store, capture, init, scene_options)
+        log.info("%s: %d training and %d test views", label, len(scene.train), len(scene.test))
+        trained = stages.train(
+            store, scene, inputs, init, densifier, rasterizer, train_options, values["seed"], device
+        )
+        ground_truth = stages.keep_ground_truth(store, scene, inputs, init)
+        evaluated = stages.evaluate(store, scene, trained, rasterizer, train_options, eval_options, device)
+        _publish(paths.folder, trained, evaluated, ground_truth)
+        results = _results(values, capture.fingerprint, scene, init, trained, evaluated, rasterizer.name)
+        done = paths.folder / RESULTS
+        again = done.exists() and json.loads(done.read_text()).get("hashes") == results["hashes"]
+        if not again:
+            write_json(done, results)
+        (paths.folder / FAILED).unlink(missing_ok=True)
+    metrics = "  ".join(f"{key} {value:.4g}" for key, value in results["metrics"].items())
+    log.info("%s: %s  %d Gaussians%s", label, metrics, results["num_gaussians"], "  (was done)" if again else "")
+    return results
+
+
+def _results(
+    values: dict[str, Any],
+    fingerprint: str,
+    scene: Any,
+    init: Entry,
+    trained: Entry,
+    evaluated: Entry,
+    raster: str,
+) -> dict[str, Any]:
+    training = json.loads((trained.path / stages.TRAINING_FILE).read_text())
+    metrics = json.loads((evaluated.path / stages.METRICS_FILE).read_text())
+    events = [json.loads(line) for line in (trained.path / EVENTS).read_text().splitlines()]
+    views = [*scene.train, *scene.test]
+    sizes = sorted({(view.camera.width, view.camera.height) for view in views}, reverse=True)
+    return {
+        "status": "complete",
+        "experiment": values["name"],
+        "scene": values["scene"]["name"],
+        "init": values["init"]["name"],
+        "densify": values["densify"]["name"],
+        "seed": values["seed"],
+        "raster": raster,
+        "protocol": evaluated_protocol(evaluated),
+        "iterations": training["iterations"],
+        "metrics": metrics["metrics"],
+        "unavailable": metrics["unavailable"],
+        "num_init_points": training["num_init_points"],
+        "num_gaussians": training["num_gaussians"],
+        "causes": training["causes"],
+        "scene_extent": training["scene_extent"],
+        "seconds": {"init": init.seconds, "train": training["seconds"], "evaluate": evaluated.seconds},
+        "peak_memory_mb": training["peak_memory_mb"],
+        "budget": {key: values["densify"].get(key) for key in ("max_gaussians", "cap")}
+        | {"seconds": values["train"]["max_seconds"]},
+        "train_views": len(scene.train),
+        "test_views": len(scene.test),
+        "resolution": list(sizes[0]),
+        "events": sum_events(events),
+        "init_report": json.loads((init.path / REPORT_FILE).read_text()),
+        "hashes": {
+            "config": config_hash(values),
+            "data": fingerprint,
+            "init": init.key,
+            "train": trained.key,
+            "evaluate": evaluated.key,
+        },
+        "versions": stages.versions(),
+    }
+
+
+def evaluated_protocol(evaluated: Entry) -> str:
+    """The protocol's id, from the manifest of an evaluation."""
+    return str(json.loads((evaluated.path / "manifest.json").read_text())["inputs"]["protocol"])
+
+
+def _publish(folder: Path, trained: Entry, evaluated: Entry, ground_truth: Entry) -> None:
+    """Show the stages' files in the trial's folder, as hard links where the file system has them."""
+    for name in (stages.PLY_FILE, stages.LINEAGE_FILE, METRICS, EVENTS, HISTOGRAMS):
+        if (trained.path / name).exists():
+            _link(trained.path / name, folder / name)
+    _link(evaluated.path / stages.PER_VIEW_FILE, folder / stages.PER_VIEW_FILE)
+    for source, target in ((evaluated.path / "renders", "renders"), (ground_truth.path, "ground_truth")):
+        (folder / target).mkdir(exist_ok=True)
+        for picture in sorted(source.glob("*.png")):
+            _link(picture, folder / target / picture.name)
+
+
+def _link(source: Path, target: Path) -> None:
+    temporary = target.with_name(f".{target.name}.tmp-{os.getpid()}")
+    temporary.unlink(missing_ok=True)
+    try:
+        os.link(source, temporary)
+    except OSError:
+        shutil.copyfile(source, temporary)
+    os.replace(temporary, target)
+    temporary.unlink(missing_ok=True)  # os.replace leaves it where both are links to one file
+
+
+@contextmanager
+def _log_to(path: Path) -> Iterator[None]:
+    """Write everything that gsbench logs, tracebacks included, to ``path`` as well."""
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setLevel(logging.DEBUG)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logger = logging.getLogger("gsbench")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        handler.close()

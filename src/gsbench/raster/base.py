@@ -1,0 +1,73 @@
+"""The contract of every rasterizer: what goes in, what comes out, and the constants of 3DGS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from gsbench.gaussians.model import Gaussians
+from gsbench.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class RasterConstants:
+    """The numbers of the 2023 reference implementation of 3DGS (Kerbl et al.), in the order of the pipeline."""
+
+    near: float = 0.2  # world units; a Gaussian whose centre has view z <= near is culled
+    fov_margin: float = 0.3  # the Jacobian's x/z, y/z are clamped to the image plus 0.3 tan(fov/2) on each side
+    blur: float = 0.3  # px^2, added to the diagonal of the 2D covariance
+    sigma_extent: float = 3.0  # radius = ceil(3 sqrt(lambda_max)) px
+    eigenvalue_floor: float = 0.1  # inside the square root of lambda_max
+    tile: int = 16  # px; a Gaussian reaches every pixel of every tile that its square of 2 radius touches
+    alpha_min: float = 1.0 / 255.0  # a contribution below is skipped
+    alpha_max: float = 0.99  # a contribution is clamped to it (the gradient passes, as in the reference)
+    transmittance_min: float = 1e-4  # a pixel stops before the Gaussian that would bring it below
+
+
+CONSTANTS = RasterConstants()
+
+
+@dataclass
+class RenderOutput:
+    """One rendered view.
+
+    ``image`` is [H, W, 3], not clamped above; ``alpha`` is [H, W]; ``radii`` is [N] int32 in px, 0 where a Gaussian was
+    culled. ``screen_points`` is [N, 2], all zero, and a leaf: after ``backward`` its ``.grad`` is the gradient of the loss
+    with respect to the projected means in NDC units, as 3DGS's densification reads it (pixel gradient times W/2, H/2).
+    ``screen_gradient_abs`` is [N, 2], filled by ``backward`` with the same sum over pixels of absolute values (AbsGS,
+    arXiv 2404.10484), or None if it was not asked for.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    radii: Tensor
+    screen_points: Tensor
+    screen_gradient_abs: Tensor | None = None
+
+    @property
+    def visible(self) -> Tensor:
+        """[N] bool: the Gaussians that reach at least one tile."""
+        return self.radii > 0
+
+
+class Rasterizer(Protocol):
+    """An executor of the contract; every one passes ``tests/raster/test_contract.py``."""
+
+    name: str
+
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        sh_degree: int,
+        background: Tensor,
+        absolute_gradient: bool = False,
+    ) -> RenderOutput:
+        """Render ``gaussians`` from ``camera`` with spherical harmonics up to ``sh_degree`` (0 to 3) over ``background`` [3].
+
+        Differentiable in the six tensors of ``gaussians`` and in ``screen_points``. Pixel (column i, row j) is sampled at
+        its centre: a point projects to ``fx x/z + cx - 0.5`` in units where pixel centres are integers.
+        """
+        ...

@@ -1,0 +1,308 @@
+"""Compositing of tiles, forward and backward, 4x4 pixels at a time.
+
+A tile is 16 blocks of 4x4 pixels; a block's state is one vector per quantity. A bit mask says which blocks a record can
+touch; the forward pass leaves in ``masks`` the blocks that it did touch, for the backward pass.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from gsbench.raster.base import CONSTANTS
+from gsbench.raster.cpu import layout as at
+from gsbench.raster.cpu.jit import inlined, kernel
+from gsbench.raster.cpu.simd import (
+    LANES,
+    absolute,
+    exp2,
+    fma,
+    lane_sums,
+    load,
+    lowest_bit,
+    mask_bits,
+    mask_from_bits,
+    maximum,
+    minimum,
+    prefetch,
+    select,
+    splat,
+    store,
+)
+
+LOG2_ALPHA_MIN = np.float32(math.log2(CONSTANTS.alpha_min))
+ALPHA_MAX = np.float32(CONSTANTS.alpha_max)
+TRANSMITTANCE_MIN = np.float32(CONSTANTS.transmittance_min)
+# A block is kept if it comes this close to alpha = 1/255: rounding must not lose a pixel.
+LOG2_BLOCK_MIN = np.float32(math.log2(CONSTANTS.alpha_min) - 0.01)
+ONE = np.float32(1)
+ZERO = np.float32(0)
+BLOCK_SPAN = np.float32(at.BLOCK - 1)
+TO_PRECISION = np.float32(2 * math.log(2.0))  # -curve to entry of the inverse covariance, up to sign
+AHEAD = 6  # list entries that the prefetch runs ahead
+ALL_BLOCKS = np.uint64(0xFFFF)
+
+LANE_X = (np.arange(LANES) % at.BLOCK).astype(np.float32)  # px within a block
+LANE_Y = (np.arange(LANES) // at.BLOCK).astype(np.float32)
+
+
+@inlined
+def _touched_blocks(records: Any, base: int, tile_x: Any, tile_y: Any, column: Any, row: Any) -> Any:
+    """Bit b: block b of the tile at pixel (tile_x, tile_y) may have a pixel with alpha >= 1/255.
+
+    alpha is largest in a block at the mean or, if that lies outside, on an edge that faces it; on a vertical or
+    horizontal line the best point is known, and is clamped to the block. Lane b is block b.
+    """
+    left = column + (tile_x - records[base + at.MEAN_X])  # [16] dx of the first column of each block
+    top = row + (tile_y - records[base + at.MEAN_Y])
+    right, bottom = left + BLOCK_SPAN, top + BLOCK_SPAN
+    shear = records[base + at.SHEAR]
+    curve_t, curve_y = splat(records[base + at.CURVE_T]), splat(records[base + at.CURVE_Y])
+    limit = splat(LOG2_BLOCK_MIN - records[base + at.LOG2_OPACITY])
+
+    edge_x = maximum(left, minimum(right, splat(ZERO)))
+    edge_y = maximum(top, minimum(bottom, splat(ZERO)))
+    on_x = maximum(top, minimum(bottom, edge_x * records[base + at.SLOPE]))  # dy of the best point on the vertical edge
+    on_y = maximum(left, minimum(right, edge_y * (-shear)))  # dx of the best point on the horizontal edge
+    t_x = fma(on_x, shear, edge_x)
+    t_y = fma(edge_y, shear, on_y)
+    best_x = fma(curve_t * t_x, t_x, curve_y * on_x * on_x)
+    best_y = fma(curve_t * t_y, t_y, curve_y * edge_y * edge_y)
+    return mask_bits(maximum(best_x, best_y) >= limit)
+
+
+@kernel
+def composite_tiles(
+    first: int,
+    past: int,
+    starts: Any,
+    entries: Any,
+    masks: Any,
+    processed: Any,
+    records: Any,
+    width: int,
+    height: int,
+    background: Any,
+    transmittance: Any,
+    last: Any,
+    image: Any,
+    alpha: Any,
+) -> None:
+    """Blend the tiles ``first`` to ``past``.
+
+    In: ``starts`` [tiles + 1], ``entries`` [pairs], ``records``, ``background`` [3]. Out: ``image`` [H * W * 3], ``alpha``
+    [H * W]; for the backward pass ``masks`` [pairs] uint16, ``processed`` [tiles], and by tile, block and lane
+    [tiles * 256] the final ``transmittance`` and ``last``, the number of the last entry that was blended, plus one.
+    """
+    tiles_x = (width + at.TILE - 1) // at.TILE
+    lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
+    column, row = lane_x * np.float32(at.BLOCK), lane_y * np.float32(at.BLOCK)
+    red = np.empty(at.TILE_PIXELS, np.float32)
+    green = np.empty(at.TILE_PIXELS, np.float32)
+    blue = np.empty(at.TILE_PIXELS, np.float32)
+    live = np.empty(16, np.uint64)
+    for tile in range(first, past):
+        left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
+        tile_x, tile_y = np.float32(left), np.float32(top)
+        state = tile * at.TILE_PIXELS
+        alive = np.uint64(0)
+        for block in range(16):
+            place = block * LANES
+            store(red, place, splat(ZERO))
+            store(green, place, splat(ZERO))
+            store(blue, place, splat(ZERO))
+            store(transmittance, state + place, splat(ONE))
+            store(last, state + place, splat(ZERO))
+            x, y = left + block % 4 * at.BLOCK, top + block // 4 * at.BLOCK
+            live[block] = mask_bits((lane_x < np.float32(width - x)) & (lane_y < np.float32(height - y)))
+            if live[block] != 0:
+                alive |= np.uint64(1) << np.uint64(block)
+
+        begin, end = starts[tile], starts[tile + 1]
+        entry = begin
+        while entry < end and alive != 0:
+            base = entries[entry] * at.RECORD
+            prefetch(records, entries[min(entry + AHEAD, end - 1)] * at.RECORD)
+            todo = _touched_blocks(records, base, tile_x, tile_y, column, row) & alive
+            used = np.uint64(0)
+            shear = splat(records[base + at.SHEAR])
+            curve_t, curve_y = splat(records[base + at.CURVE_T]), splat(records[base + at.CURVE_Y])
+            log2_opacity = splat(records[base + at.LOG2_OPACITY])
+            r, g, b = splat(records[base + at.RED]), splat(records[base + at.GREEN]), splat(records[base + at.BLUE])
+            offset_x, offset_y = tile_x - records[base + at.MEAN_X], tile_y - records[base + at.MEAN_Y]
+            number = splat(np.float32(entry - begin + 1))
+            while todo != 0:
+                block = lowest_bit(todo)
+                todo &= todo - np.uint64(1)
+                place = block * np.uint64(LANES)
+                dx = lane_x + (offset_x + np.float32((block & np.uint64(3)) * np.uint64(4)))
+                dy = lane_y + (offset_y + np.float32((block >> np.uint64(2)) * np.uint64(4)))
+                t = fma(dy, shear, dx)
+                power = fma(curve_y * dy, dy, fma(curve_t * t, t, log2_opacity))  # log2(alpha)
+                blend = (power >= LOG2_ALPHA_MIN) & mask_from_bits(live[block])
+                opacity = minimum(exp2(power), splat(ALPHA_MAX))
+                before = load(transmittance, state + place)
+                after = before - before * opacity
+                stop = blend & (after < TRANSMITTANCE_MIN)
+                blend = blend & ~stop
+                weight = select(blend, before * opacity, ZERO)
+                store(red, place, fma(weight, r, load(red, place)))
+                store(green, place, fma(weight, g, load(green, place)))
+                store(blue, place, fma(weight, b, load(blue, place)))
+                store(transmittance, state + place, select(blend, after, before))
+                store(last, state + place, select(blend, number, load(last, state + place)))
+                bit = np.uint64(1) << block
+                if mask_bits(blend) != 0:
+                    used |= bit
+                stopped = mask_bits(stop)
+                if stopped != 0:
+                    live[block] &= ~stopped
+                    if live[block] == 0:
+                        alive &= ~bit
+            masks[entry] = used
+            entry += 1
+        processed[tile] = entry
+
+        for block in range(16):
+            place = block * LANES
+            behind = load(transmittance, state + place)
+            store(red, place, fma(behind, background[0], load(red, place)))
+            store(green, place, fma(behind, background[1], load(green, place)))
+            store(blue, place, fma(behind, background[2], load(blue, place)))
+        for y in range(top, min(top + at.TILE, height)):
+            for x in range(left, min(left + at.TILE, width)):
+                local = _place_in_tile(x - left, y - top)
+                pixel = y * width + x
+                image[3 * pixel] = red[local]
+                image[3 * pixel + 1] = green[local]
+                image[3 * pixel + 2] = blue[local]
+                alpha[pixel] = ONE - transmittance[state + local]
+
+
+@inlined
+def _place_in_tile(x: int, y: int) -> int:
+    """Where pixel (x, y) of a tile stands in the order by block and lane."""
+    return (((y >> 2) * 4 + (x >> 2)) << 4) + (y & 3) * 4 + (x & 3)
+
+
+@kernel
+def decomposite_tiles(
+    first: int,
+    past: int,
+    starts: Any,
+    entries: Any,
+    masks: Any,
+    processed: Any,
+    records: Any,
+    width: int,
+    height: int,
+    background: Any,
+    transmittance: Any,
+    last: Any,
+    g_image: Any,
+    g_alpha: Any,
+    rows: Any,
+    want_absolute: bool,
+) -> None:
+    """Add the gradient sums of the tiles ``first`` to ``past`` to ``rows`` [N * 16], back to front.
+
+    Behind a record lies light S = sum of later (c . g) alpha T plus what the background gets; the loss changes with its
+    alpha by T (c . g) - S / (1 - alpha). Going back to front S grows from the background's part, so that nothing cancels.
+    ``g_alpha`` may be empty for zero. ``want_absolute`` is True or None: a value that numba compiles out.
+    """
+    tiles_x = (width + at.TILE - 1) // at.TILE
+    lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
+    red = np.empty(at.TILE_PIXELS, np.float32)
+    green = np.empty(at.TILE_PIXELS, np.float32)
+    blue = np.empty(at.TILE_PIXELS, np.float32)
+    behind = np.empty(at.TILE_PIXELS, np.float32)  # S
+    through = np.empty(at.TILE_PIXELS, np.float32)  # T behind the current record
+    for tile in range(first, past):
+        left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
+        tile_x, tile_y = np.float32(left), np.float32(top)
+        state = tile * at.TILE_PIXELS
+        begin, end = starts[tile], processed[tile]
+        if begin == end:
+            continue
+        for place in range(at.TILE_PIXELS):
+            red[place] = green[place] = blue[place] = behind[place] = ZERO
+        for y in range(top, min(top + at.TILE, height)):
+            for x in range(left, min(left + at.TILE, width)):
+                local = _place_in_tile(x - left, y - top)
+                pixel = y * width + x
+                red[local] = g_image[3 * pixel]
+                green[local] = g_image[3 * pixel + 1]
+                blue[local] = g_image[3 * pixel + 2]
+                if len(g_alpha) > 0:
+                    behind[local] = -g_alpha[pixel]
+        for place in range(0, at.TILE_PIXELS, LANES):
+            final = load(transmittance, state + place)
+            light = fma(load(red, place), background[0], load(behind, place))
+            light = fma(load(green, place), background[1], light)
+            light = fma(load(blue, place), background[2], light)
+            store(behind, place, light * final)
+            store(through, place, final)
+
+        for entry in range(end - 1, begin - 1, -1):
+            ahead = max(entry - AHEAD, begin)
+            if masks[ahead] != 0:
+                prefetch(records, entries[ahead] * at.RECORD)
+                prefetch(rows, entries[ahead] * at.ROW)
+            todo = np.uint64(masks[entry])
+            if todo == 0:
+                continue
+            base = entries[entry] * at.RECORD
+            shear = splat(records[base + at.SHEAR])
+            curve_t, curve_y = splat(records[base + at.CURVE_T]), splat(records[base + at.CURVE_Y])
+            log2_opacity = splat(records[base + at.LOG2_OPACITY])
+            r, g, b = splat(records[base + at.RED]), splat(records[base + at.GREEN]), splat(records[base + at.BLUE])
+            offset_x, offset_y = tile_x - records[base + at.MEAN_X], tile_y - records[base + at.MEAN_Y]
+            number = splat(np.float32(entry - begin + 1))
+            sum_r, sum_g, sum_b = splat(ZERO), splat(ZERO), splat(ZERO)
+            sum_h, sum_ht, sum_hy = splat(ZERO), splat(ZERO), splat(ZERO)
+            sum_htt, sum_hty, sum_hyy = splat(ZERO), splat(ZERO), splat(ZERO)
+            sum_abs_t, sum_abs_y = splat(ZERO), splat(ZERO)
+            while todo != 0:
+                block = lowest_bit(todo)
+                todo &= todo - np.uint64(1)
+                place = block * np.uint64(LANES)
+                dx = lane_x + (offset_x + np.float32((block & np.uint64(3)) * np.uint64(4)))
+                dy = lane_y + (offset_y + np.float32((block >> np.uint64(2)) * np.uint64(4)))
+                t = fma(dy, shear, dx)
+                power = fma(curve_y * dy, dy, fma(curve_t * t, t, log2_opacity))
+                blended = (power >= LOG2_ALPHA_MIN) & (number <= load(last, state + place))
+                raw = select(blended, exp2(power), ZERO)
+                opacity = minimum(raw, splat(ALPHA_MAX))
+                inverse = ONE / (ONE - opacity)
+                after = load(through, place)
+                before = after * inverse
+                weight = before * opacity
+                g_red, g_green, g_blue = load(red, place), load(green, place), load(blue, place)
+                light = fma(g_red, r, fma(g_green, g, g_blue * b))
+                later = load(behind, place)
+                h = raw * (before * light - later * inverse)
+                store(behind, place, fma(weight, light, later))
+                store(through, place, before)
+                sum_r = fma(weight, g_red, sum_r)
+                sum_g = fma(weight, g_green, sum_g)
+                sum_b = fma(weight, g_blue, sum_b)
+                ht, hy = h * t, h * dy
+                sum_h += h
+                sum_ht += ht
+                sum_hy += hy
+                sum_htt = fma(ht, t, sum_htt)
+                sum_hty = fma(ht, dy, sum_hty)
+                sum_hyy = fma(hy, dy, sum_hyy)
+                if want_absolute is not None:
+                    sum_abs_t += absolute(ht)
+                    # d power / d mean_y = shear a t + e dy, with a and e from the curves: curve = -log2(e)/2 a
+                    sum_abs_y += absolute(fma(shear * curve_t, ht, curve_y * hy)) * TO_PRECISION
+            if want_absolute is not None:
+                sums = lane_sums(
+                    (sum_h, sum_ht, sum_hy, sum_htt, sum_hty, sum_hyy, sum_r, sum_g, sum_b, sum_abs_t, sum_abs_y)
+                )
+            else:
+                sums = lane_sums((sum_h, sum_ht, sum_hy, sum_htt, sum_hty, sum_hyy, sum_r, sum_g, sum_b))
+            store(rows, base, load(rows, base) + sums)

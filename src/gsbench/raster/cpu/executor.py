@@ -1,0 +1,290 @@
+"""The compiled CPU rasterizer as an executor of the contract, and its stages in order."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster.base import CONSTANTS, RenderOutput
+from gsbench.raster.cpu import layout as at
+from gsbench.raster.cpu.binning import balance_tiles, count_shard, fill_shard, start_tiles
+from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_tiles, decomposite_tiles
+from gsbench.raster.cpu.jit import announce_compilation
+from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, backproject_shard, project_shard
+from gsbench.raster.cpu.workspace import Arena, ArenaPool, ShardRunner, TensorPool
+from gsbench.raster.validate import check_settings, raise_for_values
+from gsbench.scene.camera import Camera
+
+# Fixed, so that the bits of every result are the same for any number of threads.
+GAUSSIAN_SHARDS = 16
+TILE_SHARDS = 8  # each has its own gradient rows: 64 bytes per Gaussian
+
+
+def available_threads() -> int:
+    """The CPUs that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class CpuRasterizer:
+    """float32 on the CPU, compiled by numba at first use; the same bits on every run and for any number of ``threads``.
+
+    Each render keeps its intermediate results until its graph is freed; memory is kept and used again. Safe to call from
+    several threads.
+    """
+
+    name = "cpu"
+
+    def __init__(self, threads: int | None = None) -> None:
+        if threads is not None and threads < 1:
+            raise ValueError(f"threads: must be at least 1, got {threads}")
+        if CONSTANTS.tile != at.TILE:
+            raise ValueError(f"the compiled rasterizer has tiles of {at.TILE} px, the contract {CONSTANTS.tile}")
+        self.threads = threads or available_threads()
+        self._runner = ShardRunner(self.threads)
+        self._frames = ArenaPool()
+        self._scratch = ArenaPool()
+        self._tensors = TensorPool()
+        announce_compilation()
+
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        sh_degree: int,
+        background: Tensor,
+        absolute_gradient: bool = False,
+    ) -> RenderOutput:
+        """See ``raster.base.Rasterizer``. Raises ValueError naming the parameter that cannot be used."""
+        check_settings(gaussians, camera, sh_degree, background)
+        if gaussians.means.dtype != torch.float32 or gaussians.means.device.type != "cpu":
+            raise ValueError(f"means: raster=cpu needs float32 on the cpu, got {gaussians.means.dtype} on {gaussians.means.device}")
+        screen_points = torch.zeros(len(gaussians), 2, requires_grad=True)
+        absolute = torch.zeros(len(gaussians), 2) if absolute_gradient else None
+        image, alpha, radii = _Render.apply(
+            self, camera, sh_degree, absolute, background, screen_points, *gaussians.tensors().values()
+        )
+        return RenderOutput(image, alpha, radii, screen_points, absolute)
+
+
+@dataclass
+class _Frame:
+    """What the forward pass leaves for the backward pass; the arrays belong to ``arena``."""
+
+    view: at.View
+    degree: int
+    visible: NDArray[np.int64]  # [GAUSSIAN_SHARDS] records
+    records: NDArray[np.float32]  # [N * RECORD]
+    starts: NDArray[np.int64]  # [tiles + 1]
+    entries: NDArray[np.int32]  # [pairs] records, by tile, front to back
+    masks: NDArray[np.uint16]  # [pairs] blocks that were blended
+    processed: NDArray[np.int64]  # [tiles] end of the entries that were looked at
+    transmittance: NDArray[np.float32]  # [tiles * TILE_PIXELS]
+    last: NDArray[np.float32]  # [tiles * TILE_PIXELS]
+    bounds: NDArray[np.int64]  # [TILE_SHARDS + 1] tiles
+    tile_shard: NDArray[np.uint8]  # [tiles]
+    background: NDArray[np.float32]  # [3]
+
+
+def _edges(count: int, shards: int) -> list[int]:
+    return [count * shard // shards for shard in range(shards + 1)]
+
+
+def _forward(
+    rasterizer: CpuRasterizer,
+    arena: Arena,
+    gaussians: Gaussians,
+    camera: Camera,
+    degree: int,
+    background: NDArray[np.float32],
+    image: Tensor,
+    alpha: Tensor,
+    radii: Tensor,
+) -> _Frame:
+    """Project, sort, bin, composite into ``image``, ``alpha`` and ``radii``."""
+    run = rasterizer._runner.run
+    count = len(gaussians)
+    view = at.make_view(camera, CONSTANTS)
+    tiles = view.tiles_x * view.tiles_y
+    arrays = _arrays(gaussians)
+    records = arena.take("records", (count * at.RECORD,), np.float32)
+    record_ints = records.view(np.int32)
+    keys = arena.take("keys", (count,), np.uint64)
+    flags = np.zeros((GAUSSIAN_SHARDS, 2), np.int64)
+    edges = _edges(count, GAUSSIAN_SHARDS)
+    radii_array = radii.numpy()
+
+    def project(shard: int) -> None:
+        begin, end = edges[shard], edges[shard + 1]
+        project_shard(begin, end, *arrays, degree, view, records, record_ints, keys, radii_array, flags[shard])
+
+    run(GAUSSIAN_SHARDS, project)
+    if flags[:, BAD_VALUE].any():
+        raise_for_values(gaussians)
+
+    order = arena.take("order", (int(flags[:, VISIBLE].sum()),), np.uint64)
+    np.concatenate([keys[begin : begin + n] for begin, n in zip(edges, flags[:, VISIBLE], strict=False)], out=order)
+    order.sort()
+
+    counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
+    starts = arena.take("starts", (tiles + 1,), np.int64)
+    cuts = _edges(len(order), GAUSSIAN_SHARDS)
+    binning = (order, records, record_ints, view.tiles_x, LOG2_ALPHA_MIN)
+    run(GAUSSIAN_SHARDS, lambda shard: count_shard(cuts[shard], cuts[shard + 1], *binning, counts[shard]))
+    start_tiles(counts, starts)
+    pairs = int(starts[tiles])
+    entries = arena.take("entries", (pairs,), np.int32)
+    run(GAUSSIAN_SHARDS, lambda shard: fill_shard(cuts[shard], cuts[shard + 1], *binning, counts[shard], entries))
+
+    frame = _Frame(
+        view,
+        degree,
+        flags[:, VISIBLE],
+        records,
+        starts,
+        entries,
+        arena.take("masks", (pairs,), np.uint16),
+        arena.take("processed", (tiles,), np.int64),
+        arena.take("transmittance", (tiles * at.TILE_PIXELS,), np.float32),
+        arena.take("last", (tiles * at.TILE_PIXELS,), np.float32),
+        np.empty(TILE_SHARDS + 1, np.int64),
+        arena.take("tile_shard", (tiles,), np.uint8),
+        background,
+    )
+    balance_tiles(starts, TILE_SHARDS, frame.bounds, frame.tile_shard)
+    image_array, alpha_array = image.numpy().reshape(-1), alpha.numpy().reshape(-1)
+
+    def composite(shard: int) -> None:
+        composite_tiles(*_tile_arguments(frame, shard), image_array, alpha_array)
+
+    run(TILE_SHARDS, composite)
+    return frame
+
+
+def _tile_arguments(frame: _Frame, shard: int) -> tuple[Any, ...]:
+    """The arguments that the two compositing kernels share."""
+    return (
+        int(frame.bounds[shard]),
+        int(frame.bounds[shard + 1]),
+        frame.starts,
+        frame.entries,
+        frame.masks,
+        frame.processed,
+        frame.records,
+        frame.view.width,
+        frame.view.height,
+        frame.background,
+        frame.transmittance,
+        frame.last,
+    )
+
+
+def _backward(
+    rasterizer: CpuRasterizer,
+    arena: Arena,
+    frame: _Frame,
+    gaussians: Gaussians,
+    g_image: NDArray[np.float32],
+    g_alpha: NDArray[np.float32],
+    absolute: Tensor | None,
+) -> tuple[list[Tensor], Tensor]:
+    """The gradients of the six tensors and of ``screen_points``; fills ``absolute`` [N, 2] if it is given."""
+    count = len(gaussians)
+    rows = arena.take("rows", (TILE_SHARDS, count * at.ROW), np.float32, zero=True)
+    want_absolute = None if absolute is None else True
+
+    def decomposite(shard: int) -> None:
+        decomposite_tiles(*_tile_arguments(frame, shard), g_image, g_alpha, rows[shard], want_absolute)
+
+    rasterizer._runner.run(TILE_SHARDS, decomposite)
+
+    means, log_scales, quaternions, logits, _, sh_rest = _arrays(gaussians)
+    gradients = [rasterizer._tensors.empty(tuple(tensor.shape)) for tensor in gaussians.tensors().values()]
+    g_screen = rasterizer._tensors.empty((count, 2))
+    g_means, g_log_scales, g_quaternions, g_logits, g_sh_dc, g_sh_rest = (tensor.numpy() for tensor in gradients)
+    g_absolute = np.empty((0, 2), np.float32) if absolute is None else absolute.numpy()
+    edges = _edges(count, GAUSSIAN_SHARDS)
+
+    def backproject(shard: int) -> None:
+        backproject_shard(
+            edges[shard],
+            edges[shard + 1],
+            int(frame.visible[shard]),
+            means,
+            log_scales,
+            quaternions,
+            logits,
+            sh_rest,
+            frame.degree,
+            frame.view,
+            frame.records,
+            frame.records.view(np.int32),
+            frame.tile_shard,
+            rows,
+            g_means,
+            g_log_scales,
+            g_quaternions,
+            g_logits,
+            g_sh_dc,
+            g_sh_rest.reshape(count, -1),
+            g_screen.numpy(),
+            g_absolute,
+            absolute is not None,
+        )
+
+    rasterizer._runner.run(GAUSSIAN_SHARDS, backproject)
+    return gradients, g_screen
+
+
+def _arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:
+    """The six tensors as arrays that share their memory; ``sh_rest`` as [N, 45]."""
+    means, log_scales, quaternions, logits, sh_dc, sh_rest = (t.detach().numpy() for t in gaussians.tensors().values())
+    return means, log_scales, quaternions, logits, sh_dc, sh_rest.reshape(len(means), 45)
+
+
+class _Holder:
+    """Lives as long as a graph; its arena goes back to the pool with it."""
+
+
+class _Render(torch.autograd.Function):
+    """The bridge between the kernels and autograd."""
+
+    @staticmethod
+    def forward(ctx: Any, rasterizer: CpuRasterizer, camera: Camera, degree: int, absolute: Tensor | None, background: Tensor, screen_points: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        gaussians = Gaussians(*(tensor.contiguous() for tensor in tensors))
+        ctx.holder = _Holder()
+        arena = rasterizer._frames.lease(ctx.holder)
+        image = rasterizer._tensors.empty((camera.height, camera.width, 3))
+        alpha = rasterizer._tensors.empty((camera.height, camera.width))
+        radii = torch.empty(len(gaussians), dtype=torch.int32)
+        background_array = background.detach().contiguous().numpy()
+        ctx.frame = _forward(rasterizer, arena, gaussians, camera, degree, background_array, image, alpha, radii)
+        ctx.rasterizer, ctx.absolute = rasterizer, absolute
+        ctx.save_for_backward(background, alpha if ctx.needs_input_grad[4] else None, *gaussians.tensors().values())
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(radii)
+        return image, alpha, radii
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
+        background, alpha, *tensors = ctx.saved_tensors
+        frame: _Frame = ctx.frame
+        if g_image is None:
+            g_image = torch.zeros(frame.view.height, frame.view.width, 3)
+        g_image_array = g_image.contiguous().numpy().reshape(-1)
+        g_alpha_array = np.empty(0, np.float32) if g_alpha is None else g_alpha.contiguous().numpy().reshape(-1)
+        holder = _Holder()
+        arena = ctx.rasterizer._scratch.lease(holder)
+        gradients, g_screen = _backward(
+            ctx.rasterizer, arena, frame, Gaussians(*tensors), g_image_array, g_alpha_array, ctx.absolute
+        )
+        g_background = None if alpha is None else (g_image * (1 - alpha).unsqueeze(-1)).sum((0, 1))
+        return None, None, None, None, g_background, g_screen, *gradients

@@ -1,0 +1,65 @@
+"""Compilation of the kernels: options, the cache on disk, and the word to the user while the first compilation runs."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+
+FIRST_COMPILE_SECONDS = 20  # about; measured on one core of a 2024 server
+
+_logger = logging.getLogger(__name__)
+
+
+def _cache_folder() -> Path:
+    """Where compiled kernels are kept: a folder of its own for each state of the sources.
+
+    numba looks at the file of a kernel, not at what that file imports, so a changed helper would leave stale machine code
+    in use. Base: ``NUMBA_CACHE_DIR``, else the user's cache folder, else the temporary folder.
+    """
+    digest = hashlib.sha256(numba.__version__.encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    bases = [Path(given)] if given else []
+    bases += [Path(home) / "gsbench" / "numba", Path(tempfile.gettempdir()) / f"gsbench-numba-{os.getuid()}"]
+    for base in bases:
+        folder = base / digest.hexdigest()[:16]
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return folder
+    raise OSError(f"no folder for compiled kernels can be written, tried {bases}; set NUMBA_CACHE_DIR")
+
+
+CACHE_FOLDER = _cache_folder()
+
+
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile ``function`` at its first call: without the GIL, without Python's division checks, cached on disk."""
+    previous = numba.config.CACHE_DIR  # read when the decorator runs; other users of numba in this process keep theirs
+    numba.config.CACHE_DIR = str(CACHE_FOLDER)
+    try:
+        return numba.njit(nogil=True, cache=True, error_model="numpy")(function)
+    finally:
+        numba.config.CACHE_DIR = previous
+
+
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile ``function`` into the kernels that call it."""
+    return numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)
+
+
+def announce_compilation() -> None:
+    """Tell the user that the first call will take a while, if the cache on disk is empty."""
+    if not any(CACHE_FOLDER.rglob("*.nbc")):
+        _logger.warning("compiling the CPU rasterizer, about %d s, once", FIRST_COMPILE_SECONDS)

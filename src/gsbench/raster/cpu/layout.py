@@ -1,0 +1,100 @@
+"""What the kernels pass to each other: the camera as numbers, and the places inside a record and a gradient row."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from gsbench.raster.base import RasterConstants
+from gsbench.raster.cpu.simd import LANES, SUM_LANES
+from gsbench.scene.camera import Camera
+
+BLOCK = 4  # px; one vector holds the 4x4 pixels of a block, row by row
+TILE = 16  # px; a tile is 4x4 blocks, row by row; fixed by the 16-bit masks, checked against RasterConstants.tile
+TILE_PIXELS = TILE * TILE
+
+# A record: what compositing needs of one visible Gaussian, 16 float32, one cache line. With d = pixel - mean and
+# t = dx + SHEAR dy, log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2: the conic as a sum of squares, which, unlike
+# a dx^2 + 2b dx dy + c dy^2, does not cancel for needles and is never positive.
+RECORD = LANES
+MEAN_X, MEAN_Y = 0, 1  # px, integer pixel centres
+SHEAR = 2  # b / a
+CURVE_T, CURVE_Y = 3, 4  # -log2(e)/2 a and -log2(e)/2 (c - b^2/a)
+LOG2_OPACITY = 5
+RED, GREEN, BLUE = 6, 7, 8
+SLOPE = 9  # -b / c: dy / dx of the highest point of a vertical line
+RIGHTMOST_Y = 10  # px; dy of the rightmost point of the contour alpha = 1/255
+DEPTH = 11  # view z
+# int32 from here on
+TILES_X, TILES_Y = 12, 13  # tiles that the contour can touch: first + past-the-last * 65536
+INDEX = 14  # of the Gaussian
+CLAMPED = 15  # bit c: colour channel c was below 0
+
+# A row: the gradient sums of one Gaussian over the pixels of one shard of tiles; h = d loss / d log(alpha).
+ROW = LANES
+SUM_H, SUM_H_T, SUM_H_Y, SUM_H_TT, SUM_H_TY, SUM_H_YY = SUM_LANES[:6]
+SUM_RED, SUM_GREEN, SUM_BLUE = SUM_LANES[6:9]
+SUM_ABS_T, SUM_ABS_Y = SUM_LANES[9:11]  # |h t|, |h (d power / d dy)|
+
+
+class View(NamedTuple):
+    """A camera and the constants of projection as plain numbers for the kernels."""
+
+    width: int
+    height: int
+    tiles_x: int
+    tiles_y: int
+    fx: float
+    fy: float
+    pixel_cx: float  # px, integer pixel centres
+    pixel_cy: float
+    slope_x_min: float  # limits of x/z in the Jacobian
+    slope_x_max: float
+    slope_y_min: float
+    slope_y_max: float
+    r00: float
+    r01: float
+    r02: float
+    r10: float
+    r11: float
+    r12: float
+    r20: float
+    r21: float
+    r22: float
+    tx: float
+    ty: float
+    tz: float
+    center_x: float
+    center_y: float
+    center_z: float
+    near: float
+    blur: float
+    sigma_extent: float
+    eigenvalue_floor: float
+    alpha_min: float
+
+
+def make_view(camera: Camera, constants: RasterConstants) -> View:
+    margin_x = constants.fov_margin * camera.width / (2 * camera.fx)
+    margin_y = constants.fov_margin * camera.height / (2 * camera.fy)
+    return View(
+        camera.width,
+        camera.height,
+        -(-camera.width // TILE),
+        -(-camera.height // TILE),
+        float(camera.fx),
+        float(camera.fy),
+        float(camera.cx) - 0.5,
+        float(camera.cy) - 0.5,
+        -camera.cx / camera.fx - margin_x,
+        (camera.width - camera.cx) / camera.fx + margin_x,
+        -camera.cy / camera.fy - margin_y,
+        (camera.height - camera.cy) / camera.fy + margin_y,
+        *(float(value) for value in camera.rotation.ravel()),
+        *(float(value) for value in camera.translation),
+        *(float(value) for value in camera.center),
+        constants.near,
+        constants.blur,
+        constants.sigma_extent,
+        constants.eigenvalue_floor,
+        constants.alpha_min,
+    )

@@ -1,0 +1,209 @@
+"""The readable definition of the rasterizer: pure torch, tile by tile, any device, float32 or float64.
+
+Faster executors are tested against this one in float64. Formulas: EWA splatting (Zwicker et al. 2001) as used by 3DGS
+(Kerbl et al. 2023); the constants stand in ``raster.base.RasterConstants``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.spherical_harmonics import colors
+from gsbench.raster.base import CONSTANTS, RasterConstants, RenderOutput
+from gsbench.raster.validate import check_inputs
+from gsbench.scene.camera import Camera
+
+MAX_RADIUS = 2**24  # px; keeps the radius of an absurdly large Gaussian inside int32
+
+
+@dataclass
+class Projection:
+    """The M Gaussians in front of the camera whose 2D covariance is usable, in image space."""
+
+    index: Tensor  # [M] into the N Gaussians
+    means: Tensor  # [M, 2] px, integer pixel centres
+    conics: Tensor  # [M, 3] inverse covariance: xx, xy, yy
+    depths: Tensor  # [M] view z
+    radii: Tensor  # [M] px
+
+
+class ReferenceRasterizer:
+    """The contract of ``raster.base`` in plain torch operations; gradients come from autograd."""
+
+    name = "reference"
+
+    def __init__(self, constants: RasterConstants = CONSTANTS) -> None:
+        self.constants = constants
+
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        sh_degree: int,
+        background: Tensor,
+        absolute_gradient: bool = False,
+    ) -> RenderOutput:
+        check_inputs(gaussians, camera, sh_degree, background)
+        half_size = gaussians.means.new_tensor([camera.width / 2, camera.height / 2])  # NDC to pixels
+        screen_points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)  # [N, 2] NDC
+        gradient_abs = torch.zeros_like(screen_points) if absolute_gradient else None
+
+        projected = project(gaussians, camera, self.constants)
+        tile_min, tile_max = tile_rectangles(projected, camera, self.constants.tile)
+        reached = ((tile_max - tile_min) > 0).all(-1)  # [M]
+        radii = torch.zeros(len(gaussians), dtype=torch.int32, device=gaussians.means.device)
+        radii[projected.index[reached]] = projected.radii[reached].to(torch.int32)
+
+        means = projected.means + screen_points[projected.index] * half_size  # [M, 2]
+        rgb = self._colors(gaussians, projected.index, camera, sh_degree)  # [M, 3]
+        opacities = gaussians.opacities[projected.index]  # [M]
+
+        image = background.expand(camera.height, camera.width, 3).clone()
+        alpha = torch.zeros(camera.height, camera.width, dtype=image.dtype, device=image.device)
+        tiles_x = -(-camera.width // self.constants.tile)
+        for tile, members in bin_gaussians(projected.depths, tile_min, tile_max, tiles_x):
+            x0, y0 = tile % tiles_x * self.constants.tile, tile // tiles_x * self.constants.tile
+            x1, y1 = min(x0 + self.constants.tile, camera.width), min(y0 + self.constants.tile, camera.height)
+            pixels = torch.cartesian_prod(
+                torch.arange(y0, y1, dtype=image.dtype, device=image.device),
+                torch.arange(x0, x1, dtype=image.dtype, device=image.device),
+            ).flip(-1)  # [P, 2] x, y
+            spread = means[members].expand(len(pixels), -1, -1)  # [P, K, 2]
+            if gradient_abs is not None and spread.requires_grad:
+                spread.register_hook(_absolute_sum_into(gradient_abs, projected.index[members], half_size))
+            tile_image, tile_alpha = checkpoint(  # recomputing a tile keeps memory at one tile's size
+                composite,
+                pixels,
+                spread,
+                projected.conics[members],
+                opacities[members],
+                rgb[members],
+                background,
+                self.constants,
+                use_reentrant=False,
+                preserve_rng_state=False,
+            )
+            image[y0:y1, x0:x1] = tile_image.reshape(y1 - y0, x1 - x0, 3)
+            alpha[y0:y1, x0:x1] = tile_alpha.reshape(y1 - y0, x1 - x0)
+        return RenderOutput(image, alpha, radii, screen_points, gradient_abs)
+
+    @staticmethod
+    def _colors(gaussians: Gaussians, index: Tensor, camera: Camera, sh_degree: int) -> Tensor:
+        center = gaussians.means.new_tensor(camera.center)
+        directions = torch.nn.functional.normalize(gaussians.means[index] - center, dim=-1)  # [M, 3]
+        return colors(gaussians.sh_dc[index], gaussians.sh_rest[index], directions, sh_degree)
+
+
+def project(gaussians: Gaussians, camera: Camera, constants: RasterConstants = CONSTANTS) -> Projection:
+    """Project the Gaussians to the image plane; those behind ``near`` or with an unusable covariance are left out.
+
+    Which are usable is decided without a graph first, so that overflow in a Gaussian that is left out cannot reach the
+    gradients of the others.
+    """
+    with torch.no_grad():
+        rotation = gaussians.means.new_tensor(camera.rotation)
+        depths = gaussians.means @ rotation[2] + camera.translation[2]  # [N]
+        index = (depths > constants.near).nonzero().squeeze(-1)  # [M]
+        means, (xx, xy, yy), _ = _to_image(gaussians.select(index), camera, constants)
+        determinant = xx * yy - xy * xy  # [M]
+        middle = 0.5 * (xx + yy)
+        root = (middle * middle - determinant).clamp_min(constants.eigenvalue_floor).sqrt()
+        radii = (constants.sigma_extent * (middle + root).sqrt()).ceil()
+        usable = (determinant > 0) & determinant.isfinite() & radii.isfinite() & means.isfinite().all(-1)
+        index, radii = index[usable], radii[usable].clamp_max(MAX_RADIUS)
+    means, (xx, xy, yy), z = _to_image(gaussians.select(index), camera, constants)
+    conics = torch.stack([yy, -xy, xx], -1) / (xx * yy - xy * xy).unsqueeze(-1)  # [M, 3]
+    return Projection(index, means, conics, z.detach(), radii)
+
+
+def _to_image(
+    gaussians: Gaussians, camera: Camera, constants: RasterConstants
+) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
+    """Means [M, 2] px, the entries xx, xy, yy of the blurred 2D covariances (each [M], px^2) and view depths [M]."""
+    rotation = gaussians.means.new_tensor(camera.rotation)  # [3, 3]
+    translation = gaussians.means.new_tensor(camera.translation)  # [3]
+    x, y, z = (gaussians.means @ rotation.T + translation).unbind(-1)  # each [M]
+    margin_x = constants.fov_margin * camera.width / (2 * camera.fx)
+    margin_y = constants.fov_margin * camera.height / (2 * camera.fy)
+    slope_x = (x / z).clamp(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
+    slope_y = (y / z).clamp(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [
+            torch.stack([camera.fx / z, zero, -camera.fx * slope_x / z], -1),
+            torch.stack([zero, camera.fy / z, -camera.fy * slope_y / z], -1),
+        ],
+        -2,
+    )  # [M, 2, 3]
+    axes = gaussians.rotations * gaussians.scales.unsqueeze(-2)  # [M, 3, 3] columns: scaled axes
+    spread = jacobian @ rotation @ axes  # [M, 2, 3]
+    covariance = spread @ spread.mT  # [M, 2, 2]
+    means = torch.stack([camera.fx * x / z + camera.cx - 0.5, camera.fy * y / z + camera.cy - 0.5], -1)
+    blurred = (covariance[:, 0, 0] + constants.blur, covariance[:, 0, 1], covariance[:, 1, 1] + constants.blur)
+    return means, blurred, z
+
+
+def tile_rectangles(projected: Projection, camera: Camera, tile: int) -> tuple[Tensor, Tensor]:
+    """The tiles that each Gaussian's square of two radii touches: first and past-the-last, int64 [M, 2] (x, y)."""
+    means, radii = projected.means.detach(), projected.radii.unsqueeze(-1)
+    grid = torch.tensor([-(-camera.width // tile), -(-camera.height // tile)], device=means.device)  # [2]
+    limit = torch.tensor(2.0**30, dtype=means.dtype, device=means.device)  # keeps the conversion to integers defined
+    first = ((means - radii) / tile).clamp(-limit, limit).floor().long()
+    past = ((means + radii + tile - 1) / tile).clamp(-limit, limit).floor().long()
+    zero = torch.zeros_like(grid)
+    return torch.maximum(torch.minimum(first, grid), zero), torch.maximum(torch.minimum(past, grid), zero)
+
+
+def bin_gaussians(
+    depths: Tensor, tile_min: Tensor, tile_max: Tensor, tiles_x: int
+) -> list[tuple[int, Tensor]]:
+    """For every tile that is reached: its row-major number and its Gaussians [K], front to back (ties by index)."""
+    order = torch.sort(depths, stable=True).indices  # [M]
+    low, size = tile_min[order], (tile_max - tile_min)[order].clamp_min(0)  # [M, 2]
+    counts = size.prod(-1)  # [M]
+    owner = torch.repeat_interleave(counts)  # [pairs] into order
+    within = torch.arange(len(owner), device=owner.device) - (counts.cumsum(0) - counts)[owner]  # [pairs]
+    column, row = within % size[owner, 0], within // size[owner, 0]
+    tiles = (low[owner, 1] + row) * tiles_x + low[owner, 0] + column  # [pairs]
+    by_tile = torch.sort(tiles, stable=True)
+    numbers, lengths = torch.unique_consecutive(by_tile.values, return_counts=True)
+    members = torch.split(order[owner[by_tile.indices]], lengths.tolist())
+    return list(zip(numbers.tolist(), members, strict=True))
+
+
+def composite(
+    pixels: Tensor,
+    means: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    rgb: Tensor,
+    background: Tensor,
+    constants: RasterConstants = CONSTANTS,
+) -> tuple[Tensor, Tensor]:
+    """Blend K Gaussians, front to back, at P pixels.
+
+    ``pixels`` [P, 2], ``means`` [P, K, 2], ``conics`` [K, 3], ``opacities`` [K], ``rgb`` [K, 3]; returns [P, 3] and the
+    opacity [P]. A pixel stops before the Gaussian that would bring its transmittance below ``transmittance_min``.
+    """
+    dx, dy = (means - pixels.unsqueeze(1)).unbind(-1)  # [P, K]
+    power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
+    raw = opacities * power.clamp_max(0).exp()  # [P, K]
+    saturated = raw + (raw.clamp_max(constants.alpha_max) - raw).detach()  # the gradient passes the clamp
+    alpha = torch.where((power <= 0) & (raw >= constants.alpha_min), saturated, 0.0)
+    after = torch.cumprod(1 - alpha, dim=1)  # [P, K] transmittance behind each Gaussian
+    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
+    weight = torch.where(after >= constants.transmittance_min, alpha * before, 0.0)  # [P, K]
+    opacity = weight.sum(1)  # [P]
+    return weight @ rgb + (1 - opacity).unsqueeze(-1) * background, opacity
+
+
+def _absolute_sum_into(buffer: Tensor, index: Tensor, half_size: Tensor):  # type: ignore[no-untyped-def]
+    def add(gradient: Tensor) -> None:  # [P, K, 2] in 1/px
+        buffer.index_add_(0, index, gradient.abs().sum(0) * half_size)
+
+    return add

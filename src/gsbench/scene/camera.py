@@ -1,0 +1,55 @@
+"""A pinhole camera with a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera in OpenCV axes (x right, y down, z forward).
+
+    ``fx, fy, cx, cy`` are in pixels, in COLMAP's convention: the centre of the first pixel is (0.5, 0.5), so a centred
+    principal point is ``cx = width / 2``. ``rotation`` [3, 3] and ``translation`` [3] take a world point to the camera:
+    ``x_camera = rotation @ x_world + translation`` (float64).
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"camera: width and height must be at least 1 px, got {self.width}x{self.height}")
+        if not (np.isfinite(self.fx) and np.isfinite(self.fy) and self.fx > 0 and self.fy > 0):
+            raise ValueError(f"camera: fx and fy must be finite and positive, got fx={self.fx}, fy={self.fy}")
+        if not (np.isfinite(self.cx) and np.isfinite(self.cy)):
+            raise ValueError(f"camera: cx and cy must be finite, got cx={self.cx}, cy={self.cy}")
+        rotation = np.asarray(self.rotation, dtype=np.float64)
+        translation = np.asarray(self.translation, dtype=np.float64)
+        if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
+            raise ValueError("camera: rotation must be an orthonormal 3x3 matrix")
+        if translation.shape != (3,) or not np.isfinite(translation).all():
+            raise ValueError("camera: translation must be three finite numbers")
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation", translation)
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """The camera centre in world units, [3]."""
+        return -self.rotation.T @ self.translation
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera for the same picture at another size in pixels."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )

@@ -1,0 +1,208 @@
+"""COLMAP models: reading them safely, fitting them to the files at hand, and taking plain cameras out of them."""
+
+from __future__ import annotations
+
+import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherwise crashes Pillow's PNG code
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from gsbench.errors import InputError
+from gsbench.scene.camera import Camera
+from gsbench.scene.colmap_files import check_binary_model, model_files
+from gsbench.scene.images import check_size, image_size
+from gsbench.scene.names import match_names
+from gsbench.scene.types import Capture
+
+PINHOLE_MODELS = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
+MIN_TRACK = 2  # a 3D point of COLMAP is seen by at least two images
+
+
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a COLMAP model, binary or text, of the current (rigs, frames) or the older three-file layout.
+
+    Raises `InputError`, one line, if it is missing or damaged.
+    """
+    files = model_files(folder)
+    if files[0].suffix == ".bin":
+        check_binary_model(folder)
+    try:
+        model = pycolmap.Reconstruction(folder)
+        for image in model.images.values():
+            if image.has_pose:
+                image.cam_from_world()
+    except (ValueError, IndexError, RuntimeError, TypeError, MemoryError) as error:
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise InputError(f"{folder}: the COLMAP model cannot be read ({reason}): export it again") from error
+    for camera in model.cameras.values():
+        if not camera.verify_params() or not np.isfinite(camera.params).all() or camera.width < 1 or camera.height < 1:
+            raise InputError(f"{folder}: camera {camera.camera_id} of the COLMAP model is damaged: export it again")
+    return model
+
+
+def registered_names(model: pycolmap.Reconstruction) -> list[str]:
+    """The sorted names of the images that have a pose."""
+    return sorted(image.name for image in model.images.values() if image.has_pose)
+
+
+def read_reference(capture: Capture) -> pycolmap.Reconstruction:
+    """The capture's reference model, fitted to its files.
+
+    Only the images in ``capture.image_names`` remain, under those names; cameras (and 2D points) are rescaled to the
+    sizes of the files, so a model of the full size serves ``images_4``; 3D points that fewer than two of the images see
+    are dropped. Images that the model has no pose for are left out.
+
+    Raises `InputError` if there is no model, or an image and its camera differ in aspect by more than rounding.
+    """
+    if capture.model is None:
+        raise InputError(
+            f"scene {capture.name}: no COLMAP model came with these photos: use init.poses=own with init=sfm"
+        )
+    model = read_model(capture.model)
+    names = match_names(registered_names(model), capture.image_names)
+    sizes = {file: image_size(capture.images / file) for file in names.values()}
+    return fit_model(model, names, sizes, capture.images)
+
+
+def fit_model(
+    model: pycolmap.Reconstruction,
+    names: Mapping[str, str],
+    sizes: Mapping[str, tuple[int, int]],
+    folder: Path,
+) -> pycolmap.Reconstruction:
+    """A new model of the images ``names`` (old name -> new name), for files of ``sizes`` (new name -> width, height in px).
+
+    Camera, image and point ids are kept; where files of one camera have different sizes, each further size gets a camera
+    of its own. ``folder`` is only for error messages.
+    """
+    fitted = pycolmap.Reconstruction()
+    next_camera_id = max(model.cameras, default=0) + 1
+    camera_ids: dict[tuple[int, tuple[int, int]], int] = {}
+    kept: set[int] = set()
+    for image_id, image in sorted(model.images.items()):
+        if not image.has_pose or image.name not in names:
+            continue
+        name, camera = names[image.name], model.cameras[image.camera_id]
+        size = sizes[name]
+        check_size(folder / name, size, (camera.width, camera.height))
+        key = (image.camera_id, size)
+        if key not in camera_ids:
+            new_id, next_camera_id = _unused_id(image.camera_id, camera_ids.values(), next_camera_id)
+            camera_ids[key] = new_id
+            fitted.add_camera_with_trivial_rig(rescaled_camera(camera, *size, camera_id=new_id))
+        scale = np.array(size) / (camera.width, camera.height)
+        points = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2) * scale  # [K, 2]
+        fitted.add_image_with_trivial_frame(
+            pycolmap.Image(name=name, keypoints=points, camera_id=camera_ids[key], image_id=image_id),
+            image.cam_from_world(),
+        )
+        kept.add(image_id)
+    _copy_points(model, fitted, kept)
+    return fitted
+
+
+def rescaled_camera(camera: pycolmap.Camera, width: int, height: int, camera_id: int) -> pycolmap.Camera:
+    """The same camera for the same picture at another size in px.
+
+    A single focal length that would become two (a side was rounded) turns SIMPLE_PINHOLE into PINHOLE; the other models
+    of one focal length take the mean of both scales, as COLMAP does.
+    """
+    if camera.model == pycolmap.CameraModelId.SIMPLE_PINHOLE:
+        focal, cx, cy = camera.params
+        camera = pycolmap.Camera(
+            model=pycolmap.CameraModelId.PINHOLE,
+            width=camera.width,
+            height=camera.height,
+            params=[focal, focal, cx, cy],
+        )
+    # a copy: Camera objects taken from a Reconstruction are views into it
+    copy = pycolmap.Camera(
+        camera_id=camera_id, model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
+    )
+    copy.has_prior_focal_length = camera.has_prior_focal_length
+    if (width, height) != (camera.width, camera.height):
+        copy.rescale(width, height)
+    return copy
+
+
+def camera_of(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Camera:
+    """The pinhole camera of one registered image.
+
+    Raises `InputError` if its COLMAP camera is neither PINHOLE nor SIMPLE_PINHOLE.
+    """
+    return pinhole_camera(model.cameras[image.camera_id], image.cam_from_world())
+
+
+def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) -> Camera:
+    """A COLMAP camera and pose as a `Camera`; `InputError` if the camera is not an undistorted pinhole."""
+    if camera.model not in PINHOLE_MODELS:
+        raise InputError(f"a camera of the model {camera.model_name} is distorted: undistort the images first")
+    return Camera(
+        width=camera.width,
+        height=camera.height,
+        fx=camera.focal_length_x,
+        fy=camera.focal_length_y,
+        cx=camera.principal_point_x,
+        cy=camera.principal_point_y,
+        rotation=cam_from_world.rotation.matrix(),
+        translation=np.array(cam_from_world.translation),
+    )
+
+
+def cameras_of(model: pycolmap.Reconstruction) -> dict[str, Camera]:
+    """The cameras of all registered images by name, sorted; `InputError` if one is not (SIMPLE_)PINHOLE."""
+    cameras = {image.name: camera_of(model, image) for image in model.images.values() if image.has_pose}
+    return dict(sorted(cameras.items()))
+
+
+def rigid_pose(camera: Camera) -> pycolmap.Rigid3d:
+    """The world-to-camera pose of a `Camera` in pycolmap's type."""
+    return pycolmap.Rigid3d(np.column_stack([camera.rotation, camera.translation]))
+
+
+def points_of(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """The 3D points, sorted by id: positions [P, 3] in world units and colours [P, 3] uint8."""
+    points = [point for _, point in sorted(model.points3D.items())]
+    xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
+    return xyz, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
+
+
+def write_model(folder: Path, cameras: Mapping[str, Camera], text: bool = False) -> None:
+    """Write PINHOLE cameras with their poses as a COLMAP model without points; equal intrinsics share one camera."""
+    model = pycolmap.Reconstruction()
+    ids: dict[tuple[float, ...], int] = {}
+    for image_id, (name, camera) in enumerate(sorted(cameras.items()), start=1):
+        intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        if intrinsics not in ids:
+            ids[intrinsics] = len(ids) + 1
+            model.add_camera_with_trivial_rig(
+                pycolmap.Camera(
+                    camera_id=ids[intrinsics],
+                    model=pycolmap.CameraModelId.PINHOLE,
+                    width=camera.width,
+                    height=camera.height,
+                    params=list(intrinsics[2:]),
+                )
+            )
+        image = pycolmap.Image(name=name, camera_id=ids[intrinsics], image_id=image_id)
+        model.add_image_with_trivial_frame(image, rigid_pose(camera))
+    folder.mkdir(parents=True, exist_ok=True)
+    (model.write_text if text else model.write_binary)(folder)
+
+
+def _copy_points(model: pycolmap.Reconstruction, target: pycolmap.Reconstruction, image_ids: set[int]) -> None:
+    for point_id, point in sorted(model.points3D.items()):
+        elements = [element for element in point.track.elements if element.image_id in image_ids]
+        if len(elements) < MIN_TRACK:
+            continue
+        copy = pycolmap.Point3D(xyz=point.xyz, color=point.color, error=point.error, track=pycolmap.Track(elements))
+        target.add_point3D_with_id(point_id, copy)
+        for element in elements:
+            target.images[element.image_id].set_point3D_for_point2D(element.point2D_idx, point_id)
+
+
+def _unused_id(preferred: int, used: Iterable[int], next_id: int) -> tuple[int, int]:
+    return (preferred, next_id) if preferred not in set(used) else (next_id, next_id + 1)

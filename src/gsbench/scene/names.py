@@ -1,0 +1,102 @@
+"""Which image names mean which files, which images are kept, and which are held out."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import PurePosixPath
+
+from gsbench.errors import InputError
+from gsbench.scene.images import IMAGE_SUFFIXES
+
+MAX_IMAGES = 200  # the paper's limit per scene
+TEST_EVERY = 8  # Mip-NeRF 360 and 3DGS hold out every 8th image, from the first
+MIN_IMAGES = 3
+_MAX_NAMED = 3  # names that an error or warning lists before it only counts
+
+
+def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
+    """For each wanted image name the file that it means, for those that have one.
+
+    The same name wins; else the one file with the same path but for its extension (``images_4/a.png`` for ``a.JPG``). A
+    name that several files fit, or a file that several names claim, stays without a match.
+    """
+    files = set(files)
+    by_stem: dict[str, list[str]] = defaultdict(list)
+    for file in files:
+        by_stem[_stem(file)].append(file)
+    matches: dict[str, str] = {}
+    claims: dict[str, list[str]] = defaultdict(list)
+    for name in wanted:
+        if name in files:
+            matches[name] = name
+        elif len(by_stem[_stem(name)]) == 1:
+            claims[by_stem[_stem(name)][0]].append(name)
+    taken = set(matches.values())
+    matches.update({names[0]: file for file, names in claims.items() if len(names) == 1 and file not in taken})
+    return matches
+
+
+def select_images(names: Sequence[str], max_images: int) -> list[str]:
+    """At most ``max_images`` of the names, evenly spaced: the k-th of m is the one at index ``k * n // m``.
+
+    The first is always kept, and a closed ring of views stays evenly spaced. This comes before the split.
+
+    >>> select_images(["a", "b", "c", "d", "e"], 3)
+    ['a', 'b', 'd']
+    """
+    if max_images < MIN_IMAGES:
+        raise InputError(f"scene.max_images must be at least {MIN_IMAGES}, got {max_images}")
+    if len(names) <= max_images:
+        return list(names)
+    return [names[k * len(names) // max_images] for k in range(max_images)]
+
+
+def split_names(
+    names: Sequence[str],
+    test_every: int = TEST_EVERY,
+    train: Sequence[str] | None = None,
+    test: Sequence[str] | None = None,
+) -> tuple[list[str], list[str]]:
+    """Split sorted names into (training, test).
+
+    Every ``test_every``-th name from the first is a test view; ``test_every=0`` holds out none. Explicit lists win: with
+    one of them the other is the rest; with both, names in neither are left out.
+
+    Raises `InputError` if no training view is left, or no test view although ``test_every`` is not 0.
+    """
+    if test_every < 0:
+        raise InputError(f"scene.test_every must be 0 (no test views) or positive, got {test_every}")
+    if train is None and test is None:
+        chosen = set(names[::test_every]) if test_every else set()
+        training = [name for name in names if name not in chosen]
+    elif train is not None and test is not None:
+        chosen = set(test)
+        if both := sorted(chosen & set(train)):
+            raise InputError(f"the split lists hold {some_of(both)} for training and for testing: name each image once")
+        training = [name for name in names if name in set(train)]
+    elif test is not None:
+        chosen = set(test)
+        training = [name for name in names if name not in chosen]
+    else:
+        chosen = set(names) - set(train or ())
+        training = [name for name in names if name not in chosen]
+    testing = [name for name in names if name in chosen]
+    if not training:
+        raise InputError(f"the split leaves no training view of {len(names)}: raise scene.test_every or mend the lists")
+    if not testing and test_every:
+        raise InputError(
+            f"the split leaves no test view of {len(names)}: mend the lists, or scene.test_every=0 for none"
+        )
+    return training, testing
+
+
+def some_of(names: Sequence[str]) -> str:
+    """The first few names and the count of the others, for messages."""
+    more = len(names) - _MAX_NAMED
+    return ", ".join(names[:_MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _stem(name: str) -> str:
+    path = PurePosixPath(name)
+    return (path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path).as_posix()

@@ -1,0 +1,146 @@
+"""From a photograph on disk to an undistorted image at its final size, one file at a time.
+
+Undistortion is COLMAP's own with the defaults of its ``image_undistorter``, which INRIA's ``convert.py`` uses too: the
+largest pinhole image without blank pixels, at the focal length of the original. It runs on pixels in memory, so nothing
+passes through JPEG again.
+"""
+
+from __future__ import annotations
+
+import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherwise crashes Pillow's PNG code
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.isolate import CrashError, run_isolated
+from gsbench.scene.images import Resample, downscaled_size, read_image, resize_image
+
+PINHOLE_NAMES = ("SIMPLE_PINHOLE", "PINHOLE")
+_PNG_COMPRESSION = 1  # zlib level: lossless at any level, and this one writes about five times as fast as the default
+_CHUNK = 16  # images per isolated process: bounds what a crash loses, and lets progress be reported
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """A COLMAP camera as plain values: the model's name, the size in px, and the parameters in COLMAP's order."""
+
+    name: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    @property
+    def distorted(self) -> bool:
+        return self.name not in PINHOLE_NAMES
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without a pose: size, focal lengths and principal point in px."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def resized(self, width: int, height: int) -> Intrinsics:
+        sx, sy = width / self.width, height / self.height
+        return Intrinsics(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One image to prepare: where it is, its camera (of the file's size), and the PNG to write."""
+
+    source: Path
+    camera: CameraModel
+    target: Path
+    downscale: int = 1
+    max_size: int | None = None
+    resample: Resample = "lanczos"
+
+
+def intrinsics_of(camera: CameraModel) -> Intrinsics:
+    """The pinhole intrinsics of an undistorted COLMAP camera."""
+    fx, fy, cx, cy = camera.params if camera.name == "PINHOLE" else (camera.params[0], *camera.params)
+    return Intrinsics(camera.width, camera.height, fx, fy, cx, cy)
+
+
+def prepare_all(
+    jobs: Sequence[Job], threads: int = 2, progress: Callable[[int, int], None] | None = None
+) -> list[Intrinsics]:
+    """Prepare all images and return their final intrinsics, in the order of ``jobs``.
+
+    Distorted images go through child processes, because COLMAP's native code can abort the process it runs in; such an
+    abort, like an unreadable image, raises `InputError`. ``progress`` is called with (images done, all images).
+    """
+    results: list[Intrinsics] = []
+    for chunk in _chunks(jobs):
+        if any(job.camera.distorted for job in chunk):
+            try:
+                results += run_isolated(prepare_chunk, chunk, threads, what="undistortion")
+            except CrashError as error:
+                names = f"{chunk[0].source} to {chunk[-1].source.name}"
+                raise InputError(f"{error} ({names}): check these images and their cameras") from error
+        else:
+            results += prepare_chunk(chunk, threads)
+        if progress is not None:
+            progress(len(results), len(jobs))
+    return results
+
+
+def prepare_chunk(jobs: Sequence[Job], threads: int) -> list[Intrinsics]:
+    """Prepare some images in this process."""
+    with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
+        return list(pool.map(prepare_image, jobs))
+
+
+def prepare_image(job: Job) -> Intrinsics:
+    """Read, undistort if needed, downscale, and write one image as PNG; returns its final intrinsics."""
+    image = read_image(job.source)  # [H, W, 3]
+    if image.shape[:2] != (job.camera.height, job.camera.width):
+        raise InputError(f"{job.source}: the image changed its size while it was read: run again")
+    if job.camera.distorted:
+        image, intrinsics = undistort(image, job.camera)
+    else:
+        intrinsics = intrinsics_of(job.camera)
+    width, height = downscaled_size(intrinsics.width, intrinsics.height, job.downscale, job.max_size)
+    image = resize_image(image, width, height, job.resample)
+    job.target.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(image).save(job.target, format="PNG", compress_level=_PNG_COMPRESSION)
+    return intrinsics.resized(width, height)
+
+
+def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np.uint8], Intrinsics]:
+    """Undistort one image [H, W, 3] of any perspective COLMAP camera model; its size changes.
+
+    Raises `InputError` for a camera that has no pinhole image (a full panorama) or nonsensical parameters.
+    """
+    import pycolmap  # here, because pinhole images need none of it
+
+    source = pycolmap.Camera(
+        camera_id=1, model=camera.name, width=camera.width, height=camera.height, params=list(camera.params)
+    )
+    bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(image))
+    try:
+        flat, pinhole = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, source)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(
+            f"images of the camera model {camera.name} with parameters {camera.params} cannot be made pinhole images: "
+            "use another camera model"
+        ) from error
+    fx, fy, cx, cy = (float(value) for value in pinhole.params)
+    return np.array(flat.to_array()), Intrinsics(pinhole.width, pinhole.height, fx, fy, cx, cy)
+
+
+def _chunks(jobs: Sequence[Job]) -> Iterator[Sequence[Job]]:
+    for start in range(0, len(jobs), _CHUNK):
+        yield jobs[start : start + _CHUNK]

@@ -1,0 +1,202 @@
+"""Readers: a folder on disk becomes a `Capture`."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from gsbench.errors import InputError
+from gsbench.scene.colmap_files import model_files
+from gsbench.scene.images import IMAGE_SUFFIXES
+from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, TEST_EVERY, match_names, select_images, some_of, split_names
+from gsbench.scene.types import Capture
+
+log = logging.getLogger(__name__)
+
+SPARSE_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
+
+
+def read_colmap(
+    name: str,
+    path: Path | str,
+    images: str | None = None,
+    sparse: str | None = None,
+    max_images: int = MAX_IMAGES,
+    test_every: int = TEST_EVERY,
+    train_list: str | None = None,
+    test_list: str | None = None,
+    exact_poses: bool = False,
+) -> Capture:
+    """Read a COLMAP folder: ``path/<images>`` (default "images") and ``path/<sparse>`` (default "sparse/0", or "sparse").
+
+    The photos are those that the model has a pose for and that are in the folder; a file may have another extension than
+    the model says. See `select_images` for which are kept and `split_names` for which are held out.
+
+    Raises `InputError` if a folder is missing, the model is damaged, or fewer than three photos are usable.
+    """
+    from gsbench.scene.colmap import read_model, registered_names  # here, because photos alone need no pycolmap
+
+    root = _existing_folder(name, path)
+    folder = _subfolder(root, images or "images", "scene.images")
+    model_folder = _find_sparse(root, sparse)
+    wanted = registered_names(read_model(model_folder))
+    matches = match_names(wanted, list_images(folder))
+    missing = [image for image in wanted if image not in matches]
+    if missing:
+        log.warning(
+            "%s: %d of %d images of the model have no file: %s", folder, len(missing), len(wanted), some_of(missing)
+        )
+    _require_enough(len(matches), folder, f"that the model {model_folder} has a pose for")
+    return _capture(
+        name, folder, sorted(matches.values()), model_folder, exact_poses,
+        max_images=max_images, test_every=test_every, lists=_read_lists(root, train_list, test_list),
+    )  # fmt: skip
+
+
+def read_photos(
+    name: str,
+    path: Path | str,
+    images: str | None = None,
+    max_images: int = MAX_IMAGES,
+    test_every: int = TEST_EVERY,
+    train_list: str | None = None,
+    test_list: str | None = None,
+) -> Capture:
+    """Read bare photographs: all images in ``path/<images>``, or ``path/images`` if there is such a folder, or ``path``.
+
+    Sub-folders are read too. Any COLMAP model beside them is left alone.
+
+    Raises `InputError` if the folder is missing or holds fewer than three images.
+    """
+    root = _existing_folder(name, path)
+    if images is not None:
+        folder = _subfolder(root, images, "scene.images")
+    else:
+        folder = root / "images" if (root / "images").is_dir() else root
+    names = list_images(folder)
+    _require_enough(len(names), folder, f"({', '.join(sorted(s[1:] for s in IMAGE_SUFFIXES))})")
+    return _capture(
+        name, folder, names, None, False,
+        max_images=max_images, test_every=test_every, lists=_read_lists(root, train_list, test_list),
+    )  # fmt: skip
+
+
+def list_images(folder: Path) -> list[str]:
+    """The sorted image files in a folder and its sub-folders, relative, with "/" as separator; hidden ones left out."""
+    names = []
+    for parent, folders, files in os.walk(folder, followlinks=True):
+        folders[:] = sorted(entry for entry in folders if not entry.startswith("."))
+        for file in files:
+            if Path(file).suffix.lower() in IMAGE_SUFFIXES and not file.startswith("."):
+                names.append((Path(parent) / file).relative_to(folder).as_posix())
+    return sorted(names)
+
+
+def fingerprint(folder: Path, names: Iterable[str], model_files: Iterable[Path] = ()) -> str:
+    """sha256 over names and contents of the images, sorted, and of the model's files; independent of where they lie."""
+    digest = hashlib.sha256()
+    entries = [(f"image/{name}", folder / name) for name in sorted(names)]
+    entries += [(f"model/{file.name}", file) for file in sorted(model_files)]
+    for label, file in entries:
+        try:
+            with file.open("rb") as stream:
+                content = hashlib.file_digest(stream, "sha256").hexdigest()
+        except OSError as error:
+            raise InputError(f"{file}: cannot be read ({error.strerror})") from error
+        digest.update(f"{label}\0{content}\n".encode())
+    return digest.hexdigest()
+
+
+def _capture(
+    name: str,
+    folder: Path,
+    names: list[str],
+    model: Path | None,
+    exact_poses: bool,
+    max_images: int,
+    test_every: int,
+    lists: tuple[list[str] | None, list[str] | None],
+) -> Capture:
+    train, test = (None if wanted is None else _resolve(wanted, names, folder) for wanted in lists)
+    if train is not None and test is not None:
+        names = sorted({*train, *test})
+    selected = select_images(names, max_images)
+    training, testing = split_names(selected, test_every, train, test)
+    kept = tuple(sorted([*training, *testing]))
+    _require_enough(len(kept), folder, "in the split lists")
+    return Capture(
+        name=name,
+        images=folder,
+        image_names=kept,
+        test_names=tuple(testing),
+        model=model,
+        exact_poses=exact_poses,
+        fingerprint=fingerprint(folder, kept, model_files(model) if model is not None else ()),
+    )
+
+
+def _resolve(wanted: Sequence[str], names: Sequence[str], folder: Path) -> list[str]:
+    """The files that the names in a split list mean; their extension may be left out or differ."""
+    matches = match_names(wanted, names)
+    if unknown := [entry for entry in wanted if entry not in matches]:
+        raise InputError(
+            f"the split lists name {some_of(unknown)}, not among the usable images of {folder}: mend the lists"
+        )
+    return sorted(matches.values())
+
+
+def _read_lists(root: Path, train: str | None, test: str | None) -> tuple[list[str] | None, list[str] | None]:
+    return _read_list(root, train, "scene.train_list"), _read_list(root, test, "scene.test_list")
+
+
+def _read_list(root: Path, file: str | None, key: str) -> list[str] | None:
+    if file is None:
+        return None
+    path = root / file  # an absolute path stays as it is
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{key}: {path} cannot be read as text ({error})") from error
+    return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
+
+
+def _existing_folder(name: str, path: Path | str) -> Path:
+    if path is None or str(path) == "":
+        raise InputError(f"scene {name}: scene.path is not set: give the folder of the photos")
+    root = Path(path).expanduser()
+    if not root.is_dir():
+        what = "is a file" if root.exists() else "does not exist"
+        raise InputError(f"scene {name}: the folder {root} {what}: set scene.path, or GSBENCH_DATA for a known scene")
+    return root
+
+
+def _subfolder(root: Path, folder: str, key: str) -> Path:
+    found = root / folder
+    if not found.is_dir():
+        near = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
+        raise InputError(f"{found}: no such folder; set {key} to one of: {', '.join(near) or '(there is no folder)'}")
+    return found
+
+
+def _find_sparse(root: Path, sparse: str | None) -> Path:
+    if sparse is not None:
+        folder = root / sparse
+        model_files(folder)
+        return folder
+    for candidate in SPARSE_FOLDERS:
+        try:
+            model_files(root / candidate)
+        except InputError:
+            continue
+        return root / candidate
+    raise InputError(
+        f"{root}: no COLMAP model in {' or '.join(SPARSE_FOLDERS)}: set scene.sparse, or read bare photos with scene=photos"
+    )
+
+
+def _require_enough(count: int, folder: Path, which: str) -> None:
+    if count < MIN_IMAGES:
+        raise InputError(f"{folder}: {count} images {which}, but at least {MIN_IMAGES} are needed")

@@ -1,0 +1,68 @@
+"""What a scene is: photographs on disk before initialisation, views with cameras after it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbench.scene.camera import Camera
+
+EXTENT_MARGIN = 1.1  # 3DGS: cameras_extent = 1.1 x the largest distance of a training camera to their mean
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Photographs on disk, and the cameras that came with them, if any.
+
+    ``images`` is the folder; ``image_names`` are the selected files in it (relative, sorted) and ``test_names`` those of
+    them held out. ``model`` is a COLMAP sparse folder with reference cameras, or None for bare photographs;
+    ``exact_poses`` says that its poses are the truth (a procedural scene), not an estimate. ``fingerprint`` is a sha256
+    over names and contents of all that was selected.
+    """
+
+    name: str
+    images: Path
+    image_names: tuple[str, ...]
+    test_names: tuple[str, ...]
+    model: Path | None
+    exact_poses: bool
+    fingerprint: str
+
+    @property
+    def train_names(self) -> tuple[str, ...]:
+        held_out = set(self.test_names)
+        return tuple(name for name in self.image_names if name not in held_out)
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph with its camera; ``image`` is [H, W, 3] uint8, sRGB."""
+
+    name: str
+    camera: Camera
+    image: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The views that a trial trains on and is tested on, undistorted and at their final size."""
+
+    name: str
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+
+    @cached_property
+    def extent(self) -> float:
+        """3DGS's ``cameras_extent`` of the training cameras, in world units."""
+        return scene_extent([view.camera for view in self.train])
+
+
+def scene_extent(cameras: Sequence[Camera]) -> float:
+    """1.1 x the largest distance of a camera centre to the mean of the centres (3DGS's getNerfppNorm), world units."""
+    centers = np.stack([camera.center for camera in cameras])  # [V, 3]
+    return float(EXTENT_MARGIN * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())

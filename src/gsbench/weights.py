@@ -1,0 +1,180 @@
+"""Weights of networks: found in a folder, or downloaded, and in every case checked before they are read.
+
+A file is looked for in the folder given by the caller, then in ``$GSBENCH_WEIGHTS`` (both with their sub-folders), then in
+the torch hub cache; if it lies nowhere it is downloaded into that cache. Nothing is ever unpickled as code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+import urllib.request
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gsbench.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+WEIGHTS_VARIABLE = "GSBENCH_WEIGHTS"
+DOWNLOAD_TIMEOUT_SECONDS = 10.0  # of inactivity: without a network the answer must come at once
+SHA256_DIGITS = 64
+SAFETENSORS_SUFFIX = ".safetensors"
+
+
+class MissingWeights(InputError):
+    """A weights file lies nowhere and cannot be downloaded, or what lies there is not that file."""
+
+
+@dataclass(frozen=True)
+class WeightsFile:
+    """One file of weights.
+
+    ``names`` are the accepted file names, the first being the one that a download gets; ``sha256`` is the checksum in
+    hexadecimal, whole or its first digits, or None where none is published (then the shapes are the only check);
+    ``source`` says in a few words where the file comes from.
+    """
+
+    names: tuple[str, ...]
+    url: str | None
+    sha256: str | None
+    licence: str
+    source: str
+
+
+def find_weights(spec: WeightsFile, folder: Path | None = None, download: bool = True) -> Path:
+    """The path of a checked copy of ``spec``; downloads it into the torch hub cache where it is not at hand.
+
+    Raises ``InputError`` where ``folder`` does not exist, ``MissingWeights`` where no file has the right checksum or
+    nothing was found and nothing could be downloaded.
+    """
+    folders = _search_folders(folder)
+    refused: list[str] = []
+    for place, sub_folders in folders:
+        for path in _candidates(place, spec.names, sub_folders):
+            fault = _checksum_fault(path, spec)
+            if fault is None:
+                return path
+            refused.append(fault)
+    if refused:
+        raise MissingWeights(f"{refused[0]}; replace it with the file from {spec.url or spec.source}")
+    reason = "downloads are switched off"
+    if download and spec.url is not None:
+        try:
+            return _download(spec, hub_cache())
+        except OSError as error:
+            reason = f"the download failed: {error}"
+    elif spec.url is None:
+        reason = "it has no address to download from"
+    looked = ", ".join(str(place) for place, _ in folders)
+    raise MissingWeights(
+        f"weights file {spec.names[0]} not found in {looked} ({reason}); put it into a folder and set "
+        f"{WEIGHTS_VARIABLE} to that folder; it comes from {spec.url or spec.source}"
+    )
+
+
+def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
+    """The tensors in ``path`` (.safetensors, or a PyTorch file read with ``weights_only``), on the CPU, by name.
+
+    ``entry`` is the key under which a PyTorch file keeps them, where they are not all it holds. Raises ``MissingWeights`` where the file is truncated, is no weights file, or holds anything but tensors.
+    """
+    import pickle
+    import zipfile
+
+    import torch
+
+    try:
+        if path.suffix == SAFETENSORS_SUFFIX:
+            from safetensors.torch import load_file
+
+            return load_file(path, device="cpu")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except ModuleNotFoundError as error:
+        raise InputError(f"weights file {path} needs the package safetensors: pip install safetensors") from error
+    except (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
+        raise _unreadable(path, str(error).splitlines()[0] if str(error) else type(error).__name__) from error
+    except Exception as error:
+        # safetensors raises its own class, which exists only where it is installed
+        if type(error).__module__.startswith("safetensors"):
+            raise _unreadable(path, str(error)) from error
+        raise
+    if not isinstance(state, Mapping):
+        raise _unreadable(path, f"it holds a {type(state).__name__}, not tensors by name")
+    if entry is not None:
+        if not isinstance(state.get(entry), Mapping):
+            raise _unreadable(path, f"it has no entry {entry!r}")
+        state = state[entry]
+    if not all(isinstance(value, torch.Tensor) for value in state.values()):
+        raise _unreadable(path, "it holds something other than tensors")
+    return dict(state)
+
+
+def hub_cache() -> Path:
+    """The folder in which torch.hub keeps downloaded checkpoints (``$TORCH_HOME``, else ``$XDG_CACHE_HOME``)."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch"
+    return Path(os.environ.get("TORCH_HOME", cache)).expanduser() / "hub" / "checkpoints"
+
+
+def _search_folders(folder: Path | None) -> list[tuple[Path, bool]]:
+    """Where to look, in order, and whether sub-folders count."""
+    folders: list[tuple[Path, bool]] = []
+    if folder is not None:
+        if not folder.is_dir():
+            raise InputError(f"weights folder {folder} does not exist: give a folder, or leave it empty")
+        folders.append((folder, True))
+    configured = os.environ.get(WEIGHTS_VARIABLE)
+    if configured:
+        folders.append((Path(configured).expanduser(), True))
+    folders.append((hub_cache(), False))
+    return folders
+
+
+def _candidates(place: Path, names: tuple[str, ...], sub_folders: bool) -> list[Path]:
+    direct = [place / name for name in names]
+    below = [path for name in names for path in sorted(place.rglob(name))] if sub_folders and place.is_dir() else []
+    found = [path for path in direct + below if path.is_file()]
+    return list(dict.fromkeys(found))
+
+
+def _checksum_fault(path: Path, spec: WeightsFile) -> str | None:
+    if spec.sha256 is None:
+        return None
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    found = digest.hexdigest()
+    if found.startswith(spec.sha256.lower()):
+        return None
+    return f"weights file {path} has sha256 {found[:16]}…, expected {spec.sha256[:16]}…: wrong or truncated"
+
+
+def _download(spec: WeightsFile, folder: Path) -> Path:
+    """Fetch ``spec`` into ``folder``; the file appears under its name only when it is whole and checked."""
+    assert spec.url is not None
+    folder.mkdir(parents=True, exist_ok=True)
+    handle, temporary_name = tempfile.mkstemp(dir=folder, prefix=f".{spec.names[0]}.")
+    temporary = Path(temporary_name)
+    try:
+        with (
+            os.fdopen(handle, "wb") as file,
+            urllib.request.urlopen(spec.url, timeout=DOWNLOAD_TIMEOUT_SECONDS) as response,
+        ):
+            shutil.copyfileobj(response, file)
+        fault = _checksum_fault(temporary, spec)
+        if fault is not None:
+            raise MissingWeights(f"the download of {spec.names[0]} from {spec.url} is damaged: try again ({fault})")
+        target = folder / spec.names[0]
+        temporary.replace(target)
+        return target
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _unreadable(path: Path, why: str) -> MissingWeights:
+    return MissingWeights(f"weights file {path} cannot be read as plain tensors ({why}): replace it")

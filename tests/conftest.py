@@ -1,0 +1,30 @@
+"""Fixtures that all tests share."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch is imported, as the program itself does
+os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder with development data beside the checkout; the test is skipped where it is absent."""
+    folder = ROOT.parent / "shared"
+    if not (folder / "data").is_dir():
+        pytest.skip(f"needs the development data in {folder}")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def shared_weights(shared: Path) -> Path:
+    """The folder with small network weights; the test is skipped where it is absent."""
+    if not (shared / "weights").is_dir():
+        pytest.skip(f"needs the weights in {shared / 'weights'}")
+    return shared / "weights"

@@ -1,0 +1,154 @@
+"""A runs folder with made-up results: known effects, known noise, and nothing trained."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+METRICS = ("psnr", "ssim", "lpips_vgg_raw", "flip")
+BASE = {"psnr": 26.0, "ssim": 0.80, "lpips_vgg_raw": 0.25, "flip": 0.10}
+SPREAD = {"psnr": 1.0, "ssim": 0.03, "lpips_vgg_raw": 0.03, "flip": 0.01}  # a noise of 1 in units of the metric
+
+
+@dataclass
+class Plan:
+    """What to make up. ``effect`` is the true difference of "volumetric" from "adc" in each metric.
+
+    Noises are in units of ``SPREAD``: of a scene (shared by the arms), of the effect in a scene, of a trial, of a view
+    (shared by the arms) and of a view in a trial.
+    """
+
+    experiment: str = "exp"
+    scenes: Sequence[str] = ("courtyard", "garden")
+    inits: Sequence[str] = ("sfm",)
+    densifiers: Sequence[str] = ("adc", "volumetric")
+    seeds: Sequence[int] = (0, 1, 2)
+    views: int = 6
+    effect: dict[str, float] = field(default_factory=dict)
+    scene_noise: float = 2.0
+    effect_noise: float = 0.0
+    trial_noise: float = 0.1
+    view_noise: float = 1.0
+    residual_noise: float = 0.1
+    gaussians: dict[str, int] = field(default_factory=lambda: {"adc": 20_000, "volumetric": 26_000})
+    unavailable: dict[str, str] = field(default_factory=lambda: {"lpips_alex": "weights file alexnet.pth not found"})
+    random_seed: int = 0
+
+
+def write_runs(runs: Path, plan: Plan) -> list[Path]:
+    """Write every trial of the plan; returns their folders."""
+    rng = np.random.default_rng(plan.random_seed)
+    paths = []
+    for scene in plan.scenes:
+        scene_level = {m: rng.normal(0, plan.scene_noise) for m in METRICS}
+        scene_effect = {m: rng.normal(0, plan.effect_noise) for m in METRICS}
+        view_level = {m: rng.normal(0, plan.view_noise, plan.views) for m in METRICS}
+        for init in plan.inits:
+            for densify in plan.densifiers:
+                for seed in plan.seeds:
+                    views = {}
+                    for m in METRICS:
+                        treated = densify == "volumetric"
+                        noise = (
+                            scene_level[m] + treated * scene_effect[m] + view_level[m] + rng.normal(0, plan.trial_noise)
+                        )
+                        noise = noise + rng.normal(0, plan.residual_noise, plan.views)
+                        views[m] = BASE[m] + treated * plan.effect.get(m, 0.0) + SPREAD[m] * noise
+                    data = trial_data(plan, scene, init, densify, seed, views)
+                    paths.append(write_trial(runs, data, views))
+    return paths
+
+
+def trial_data(
+    plan: Plan, scene: str, init: str, densify: str, seed: int, views: dict[str, np.ndarray]
+) -> dict[str, Any]:
+    """A ``results.json`` as a finished trial writes it."""
+    gaussians = plan.gaussians.get(densify, 20_000)
+    return {
+        "status": "complete",
+        "experiment": plan.experiment,
+        "scene": scene,
+        "init": init,
+        "densify": densify,
+        "seed": seed,
+        "raster": "cpu",
+        "protocol": "paper-1",
+        "iterations": 2000,
+        "resolution": [400, 300],
+        "budget": {"max_gaussians": 50_000, "cap": "soft"},
+        "train_views": 42,
+        "test_views": len(next(iter(views.values()))),
+        "metrics": {m: float(values.mean()) for m, values in views.items()},
+        "unavailable": plan.unavailable,
+        "num_init_points": 3000,
+        "num_gaussians": gaussians + 10 * seed,
+        "scene_extent": 4.2,
+        "seconds": {"init": 5.0, "train": gaussians / 400 + seed, "evaluate": 2.0},
+        "peak_memory_mb": 900,
+        "events": {"cloned": 500, "split_gradient": 300, "split_volume": 100 if densify == "volumetric" else 0},
+        "init_report": {"registered": 48, "images": 48},
+        "hashes": {"config": "c0ffee00", "data": f"data-{scene}", "init": f"init-{scene}-{init}", "train": f"t{seed}"},
+        "versions": {"gsbench": "0.1.0", "torch": "2.13.0", "pycolmap": "4.2.1"},
+    }
+
+
+def trial_folder(runs: Path, data: dict[str, Any], config_hash: str = "c0ffee00") -> Path:
+    arm = f"{data['init']}-{data['densify']}"
+    return runs / data["experiment"] / data["scene"] / arm / f"{config_hash}-seed{data['seed']}"
+
+
+def write_trial(
+    runs: Path, data: dict[str, Any], views: dict[str, np.ndarray], config_hash: str = "c0ffee00", **settings: Any
+) -> Path:
+    """Write one trial folder: results, per-view metrics, events, curves and a configuration with ``settings``."""
+    path = trial_folder(runs, data, config_hash)
+    path.mkdir(parents=True)
+    names = [f"view{k:03d}" for k in range(len(next(iter(views.values()))))]
+    with (path / "per_view.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["view", *views])
+        writer.writerows([name, *(repr(float(values[k])) for values in views.values())] for k, name in enumerate(names))
+    config = {"name": data["experiment"], "seed": data["seed"], "scene": {"name": data["scene"]}}
+    config |= {
+        "densify": {"name": data["densify"], "volume_threshold": 0.03},
+        "train": {"iterations": data["iterations"]},
+    }
+    for key, value in settings.items():
+        group, _, name = key.partition("__")
+        config[group] = {**config.get(group, {}), name: value}
+    (path / "config.yaml").write_text(json.dumps(config))  # JSON is YAML
+    _write_lines(path / "events.jsonl", events(data))
+    _write_lines(path / "metrics.jsonl", curves(data))
+    (path / "results.json").write_text(json.dumps(data))
+    return path
+
+
+def events(data: dict[str, Any]) -> list[dict[str, int]]:
+    """Refinements every 100 iterations, with a volume split where the densifier has one."""
+    volume = 4 if data["densify"] == "volumetric" else 0
+    counts = {"cloned": 20, "split_gradient": 12, "split_volume": volume, "pruned_opacity": 7}
+    return [{"step": step, **counts} for step in range(600, data["iterations"] + 1, 100)]
+
+
+def curves(data: dict[str, Any]) -> list[dict[str, float]]:
+    """A growing scene and a rising PSNR."""
+    final, rows = data["num_gaussians"], []
+    for step in range(100, data["iterations"] + 1, 100):
+        part = step / data["iterations"]
+        row = {
+            "step": step,
+            "num_gaussians": int(3000 + (final - 3000) * part),
+            "seconds": data["seconds"]["train"] * part,
+        }
+        rows.append(row | {"psnr": data["metrics"]["psnr"] - 6 * (1 - part) ** 2, "loss": 0.3 * (1.2 - part)})
+    return rows
+
+
+def _write_lines(path: Path, rows: list[dict[str, Any]]) -> None:
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))

@@ -1,0 +1,162 @@
+"""LPIPS against the published reference value, and its networks against an independent statement of their layers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.eval.lpips import BACKBONES, Lpips, load_lpips
+from gsbench.weights import MissingWeights, load_state
+
+State = dict[str, Tensor]
+
+
+def random_weights(net: str, prefix: str = "features.") -> tuple[State, State]:
+    """Weights of the right shapes from a fixed seed: a backbone's, keyed with ``prefix``, and the heads'."""
+    generator = torch.Generator().manual_seed(0)
+    shapes = {key: value.shape for key, value in BACKBONES[net].build().state_dict().items()}
+    features = {}
+    for key, shape in shapes.items():
+        fan_in = shape[1:].numel() if len(shape) > 1 else 1
+        features[prefix + key] = torch.randn(shape, generator=generator) * (2 / fan_in) ** 0.5 * (len(shape) > 1)
+    heads = {
+        f"lin{k}.model.1.weight": torch.rand(1, channels, 1, 1, generator=generator)
+        for k, channels in enumerate(BACKBONES[net].channels)
+    }
+    return features, heads
+
+
+def vgg_taps(x: Tensor, w: State) -> list[Tensor]:
+    """VGG16 after relu1_2, relu2_2, relu3_3, relu4_3 and relu5_3, written by torchvision's layer numbers."""
+    taps = []
+    for block in ([0, 2], [5, 7], [10, 12, 14], [17, 19, 21], [24, 26, 28]):
+        if block[0] > 0:
+            x = F.max_pool2d(x, 2, 2)
+        for index in block:
+            x = F.relu(F.conv2d(x, w[f"features.{index}.weight"], w[f"features.{index}.bias"], padding=1))
+        taps.append(x)
+    return taps
+
+
+def alex_taps(x: Tensor, w: State) -> list[Tensor]:
+    """AlexNet (torchvision) after each of its five rectified convolutions."""
+    taps = []
+    for index, stride, padding, pool in (
+        (0, 4, 2, False),
+        (3, 1, 2, True),
+        (6, 1, 1, True),
+        (8, 1, 1, False),
+        (10, 1, 1, False),
+    ):
+        if pool:
+            x = F.max_pool2d(x, 3, 2)
+        x = F.relu(F.conv2d(x, w[f"features.{index}.weight"], w[f"features.{index}.bias"], stride, padding))
+        taps.append(x)
+    return taps
+
+
+def textbook_lpips(first: Tensor, second: Tensor, taps, features: State, heads: State) -> Tensor:
+    """The definition of LPIPS v0.1 on batches [B, 3, H, W] in [-1, 1], with 1x1 convolutions as heads."""
+    shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
+    scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
+    total = torch.zeros(len(first))
+    pairs = zip(taps((first - shift) / scale, features), taps((second - shift) / scale, features), strict=True)
+    for k, (a, b) in enumerate(pairs):
+        a = a / (a.pow(2).sum(1, keepdim=True).sqrt() + 1e-10)
+        b = b / (b.pow(2).sum(1, keepdim=True).sqrt() + 1e-10)
+        total = total + F.conv2d((a - b) ** 2, heads[f"lin{k}.model.1.weight"]).mean(dim=(1, 2, 3))
+    return total
+
+
+@pytest.mark.shared
+def test_squeeze_reproduces_the_published_value(shared: Path) -> None:
+    network = load_lpips("squeeze", shared / "weights", download=False)
+    torch.manual_seed(42)
+    first, second = torch.rand(10, 3, 100, 100) * 2 - 1, torch.rand(10, 3, 100, 100) * 2 - 1
+    assert round(float(network(first, second).mean()), 4) == 0.1005
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("net", ["vgg", "alex", "squeeze"])
+def test_the_published_heads_fit_the_taps(shared: Path, net: str) -> None:
+    features, _ = random_weights(net)
+    heads = load_state(shared / "weights" / "lpips" / f"lpips_v0.1_{net}.pth")
+    network = Lpips(net, features, heads)
+    assert float(network(torch.rand(1, 3, 40, 40), torch.rand(1, 3, 40, 40))) > 0
+
+
+@pytest.mark.parametrize(("net", "taps"), [("vgg", vgg_taps), ("alex", alex_taps)])
+def test_networks_match_an_independent_statement(net: str, taps) -> None:
+    features, heads = random_weights(net)
+    generator = torch.Generator().manual_seed(1)
+    first, second = (torch.rand(2, 3, 70, 66, generator=generator) * 2 - 1 for _ in range(2))
+    expected = textbook_lpips(first, second, taps, features, heads)
+    distances = Lpips(net, features, heads)(first, second)
+    assert distances.tolist() == pytest.approx(expected.tolist(), rel=1e-4)
+    assert float(distances.min()) > 0.01
+
+
+@pytest.mark.parametrize(
+    ("net", "channels"),
+    [
+        ("vgg", [64, 128, 256, 512, 512]),
+        ("alex", [64, 192, 384, 256, 256]),
+        ("squeeze", [64, 128, 256, 384, 384, 512, 512]),
+    ],
+)
+def test_taps_have_the_channels_of_the_published_heads(net: str, channels: list[int]) -> None:
+    backbone = BACKBONES[net]
+    x = torch.rand(1, 3, 64, 64)
+    seen = []
+    for index, layer in enumerate(backbone.build()):
+        x = layer(x)
+        if index in backbone.taps:
+            seen.append(x.shape[1])
+    assert seen == channels == list(backbone.channels)
+
+
+def test_identical_images_have_distance_zero_and_order_does_not_matter() -> None:
+    network = Lpips("alex", *random_weights("alex"))
+    first, second = torch.rand(1, 3, 48, 48), torch.rand(1, 3, 48, 48)
+    assert float(network(first, first)) == 0.0
+    assert float(network(first, second)) == pytest.approx(float(network(second, first)), rel=1e-6)
+
+
+def test_keys_without_the_features_prefix_and_with_a_classifier_load_alike() -> None:
+    plain, heads = random_weights("squeeze", prefix="")
+    prefixed, _ = random_weights("squeeze")
+    first, second = torch.rand(1, 3, 32, 32), torch.rand(1, 3, 32, 32)
+    with_classifier = prefixed | {"classifier.1.weight": torch.zeros(1)}
+    assert float(Lpips("squeeze", plain, heads)(first, second)) == float(
+        Lpips("squeeze", with_classifier, heads)(first, second)
+    )
+
+
+def test_weights_of_another_network_are_refused() -> None:
+    alex, alex_heads = random_weights("alex")
+    vgg, vgg_heads = random_weights("vgg")
+    with pytest.raises(InputError, match="not that network"):
+        Lpips("vgg", alex, vgg_heads)
+    with pytest.raises(InputError, match="heads"):
+        Lpips("vgg", vgg, alex_heads)
+
+
+def test_missing_weights_name_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    with pytest.raises(MissingWeights, match=r"vgg16-397923af\.pth"):
+        load_lpips("vgg", tmp_path, download=False)
+
+
+@pytest.mark.parametrize("net", ["vgg", "alex", "squeeze"])
+def test_the_smallest_size_is_the_smallest_that_works(net: str) -> None:
+    network = Lpips(net, *random_weights(net))
+    size = BACKBONES[net].min_size
+    assert torch.isfinite(network(torch.rand(1, 3, size, size), torch.rand(1, 3, size, size))).all()
+    with pytest.raises(ValueError, match="at least"):
+        network(torch.rand(1, 3, size - 1, size), torch.rand(1, 3, size - 1, size))

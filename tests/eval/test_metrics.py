@@ -1,0 +1,123 @@
+"""PSNR, SSIM and FLIP against scikit-image, brute force and values worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from gsbench.eval.metrics import flip, psnr, ssim
+
+
+def distorted_pair(height: int = 40, width: int = 53, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A smooth image and a noisy copy, [H, W, 3] float64 in [0, 1]."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[0:height, 0:width]
+    phases = rng.uniform(0, 6, 3)
+    image = 0.5 + 0.4 * np.sin(rows[..., None] / 5 + columns[..., None] / 7 + phases)
+    return image, np.clip(image + rng.normal(0, 0.08, image.shape), 0, 1)
+
+
+def brute_force_ssim(x: np.ndarray, y: np.ndarray) -> float:
+    """Zero-padded SSIM of [H, W, 3], pixel by pixel from the definition of a weighted window."""
+    offsets = np.arange(-5, 6)
+    window = np.exp(-(offsets[:, None] ** 2 + offsets[None, :] ** 2) / (2 * 1.5**2))
+    window /= window.sum()
+    height, width, channels = x.shape
+    x, y = (np.pad(image, ((5, 5), (5, 5), (0, 0))) for image in (x, y))
+    values = []
+    for row in range(height):
+        for column in range(width):
+            for channel in range(channels):
+                a = x[row : row + 11, column : column + 11, channel]
+                b = y[row : row + 11, column : column + 11, channel]
+                mean_a, mean_b = (window * a).sum(), (window * b).sum()
+                var_a, var_b = (window * (a - mean_a) ** 2).sum(), (window * (b - mean_b) ** 2).sum()
+                cov = (window * (a - mean_a) * (b - mean_b)).sum()
+                values.append(
+                    (2 * mean_a * mean_b + 1e-4)
+                    * (2 * cov + 9e-4)
+                    / ((mean_a**2 + mean_b**2 + 1e-4) * (var_a + var_b + 9e-4))
+                )
+    return float(np.mean(values))
+
+
+def test_psnr_matches_scikit_image() -> None:
+    x, y = distorted_pair()
+    expected = peak_signal_noise_ratio(x, y, data_range=1.0)
+    assert float(psnr(torch.tensor(y), torch.tensor(x))) == pytest.approx(expected, abs=1e-9)
+
+
+def test_psnr_is_one_value_per_image_over_all_channels() -> None:
+    # Channel errors of 0.1, 0.2 and 0 give mse (0.01 + 0.04) / 3; a mean of per-channel PSNRs would be infinite.
+    target = torch.zeros(2, 3, 4, 5, dtype=torch.float64)
+    image = target.clone()
+    image[0, 0], image[0, 1], image[1] = 0.1, 0.2, 1.0
+    assert psnr(image, target).tolist() == pytest.approx([-10 * math.log10(0.05 / 3), 0.0], abs=1e-9)
+
+
+def test_psnr_of_identical_images_is_infinite() -> None:
+    image = torch.rand(4, 5, 3)
+    assert float(psnr(image, image)) == math.inf
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_ssim_valid_matches_scikit_image(seed: int) -> None:
+    x, y = distorted_pair(seed=seed)
+    expected = structural_similarity(
+        x, y, channel_axis=2, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+    )
+    assert float(ssim(torch.tensor(y), torch.tensor(x), "valid")) == pytest.approx(expected, abs=1e-9)
+    assert float(ssim(torch.tensor(y).float(), torch.tensor(x).float(), "valid")) == pytest.approx(expected, abs=1e-5)
+
+
+def test_ssim_zero_padding_matches_brute_force() -> None:
+    x, y = distorted_pair(14, 17)
+    expected = brute_force_ssim(x, y)
+    assert float(ssim(torch.tensor(y), torch.tensor(x), "zero")) == pytest.approx(expected, abs=1e-10)
+    assert abs(expected - float(ssim(torch.tensor(y), torch.tensor(x), "valid"))) > 1e-3  # the two conventions differ
+
+
+def test_a_batch_gives_the_values_of_its_images() -> None:
+    pairs = [distorted_pair(20, 24, seed) for seed in range(3)]
+    first, second = (
+        torch.tensor(np.stack([pair[k] for pair in pairs])).permute(0, 3, 1, 2) for k in (0, 1)
+    )  # [3, 3, 20, 24]
+    for metric in (psnr, ssim, flip):
+        single = [float(metric(torch.tensor(y), torch.tensor(x))) for x, y in pairs]
+        assert metric(second, first).tolist() == pytest.approx(single, abs=1e-7)
+
+
+def test_flip_is_zero_for_identical_and_one_for_black_against_white() -> None:
+    image = torch.rand(24, 30, 3)
+    assert float(flip(image, image)) == 0.0
+    black, white = torch.zeros(24, 30, 3), torch.ones(24, 30, 3)
+    assert float(flip(white, black)) > 0.95
+
+
+def test_flip_depends_on_the_viewing_distance() -> None:
+    x, y = (torch.tensor(image) for image in distorted_pair())
+    # Seen from farther away (more pixels per degree) fine noise is less visible.
+    assert float(flip(y, x, ppd=200.0)) < float(flip(y, x, ppd=67.0)) < float(flip(y, x, ppd=20.0))
+
+
+@pytest.mark.parametrize(
+    ("shape", "other"), [((4, 5, 3), (4, 6, 3)), ((3, 4, 5), (3, 4, 5)), ((2, 1, 4, 5), (2, 1, 4, 5))]
+)
+def test_wrong_shapes_are_refused(shape: tuple[int, ...], other: tuple[int, ...]) -> None:
+    for metric in (psnr, ssim, flip):
+        with pytest.raises(ValueError, match="image"):
+            metric(torch.zeros(shape), torch.zeros(other))
+
+
+def test_integer_images_are_refused() -> None:
+    with pytest.raises(ValueError, match="floating point"):
+        psnr(torch.zeros(12, 12, 3, dtype=torch.uint8), torch.zeros(12, 12, 3, dtype=torch.uint8))
+
+
+def test_ssim_valid_refuses_images_below_the_window() -> None:
+    with pytest.raises(ValueError, match="11 px"):
+        ssim(torch.zeros(10, 30, 3), torch.zeros(10, 30, 3), "valid")

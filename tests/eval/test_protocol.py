@@ -1,0 +1,116 @@
+"""The conventions of the protocols, each pinned by a case small enough to work out by hand."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.errors import InputError, TrainingError
+from gsbench.eval import protocol as protocol_module
+from gsbench.eval.metrics import ssim
+from gsbench.eval.protocol import PAPER, STANDARD, Evaluator, get_protocol, quantize, summarize
+
+
+@pytest.fixture(autouse=True)
+def no_weights_at_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+
+
+def test_identifiers_are_named_and_versioned() -> None:
+    assert (PAPER.id, STANDARD.id) == ("paper-1", "standard-1")
+    assert get_protocol("paper") is PAPER
+    with pytest.raises(InputError, match="paper, standard"):
+        get_protocol("papre")
+
+
+def test_quantize_rounds_half_up_and_clamps() -> None:
+    image = torch.tensor([-0.1, 0.0, 0.499 / 255, 0.5 / 255, 1.49 / 255, 0.5, 254.6 / 255, 1.0, 1.7])
+    assert quantize(image).tolist() == [0, 0, 0, 1, 1, 128, 255, 255, 255]
+
+
+def test_the_paper_compares_eight_bit_images() -> None:
+    # 0.5 becomes 128/255 and 0.3 becomes 77/255 (76.5 + 0.5): the PSNR is that of the rounded pair.
+    render = torch.full((12, 12, 3), 0.5)
+    truth = np.full((12, 12, 3), 77, dtype=np.uint8)
+    value = Evaluator(PAPER, lpips=[], flip=False).evaluate_view(render, truth)["psnr"]
+    assert value == pytest.approx(-20 * math.log10((128 - 77) / 255), abs=1e-4)
+
+
+def test_protocols_differ_in_the_padding_of_ssim() -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.integers(0, 256, (24, 30, 3), dtype=np.uint8)
+    render = np.clip(truth + rng.integers(-20, 21, truth.shape), 0, 255).astype(np.uint8)
+    pair = [torch.tensor(image).double() / 255 for image in (render, truth)]
+    for protocol, padding in ((PAPER, "zero"), (STANDARD, "valid")):
+        value = Evaluator(protocol, lpips=[], flip=False).evaluate_view(render, truth)["ssim"]
+        assert value == pytest.approx(float(ssim(pair[0], pair[1], padding)), abs=1e-9)
+
+
+def test_identical_images_get_the_documented_cap() -> None:
+    image = np.full((16, 16, 3), 9, dtype=np.uint8)
+    values = Evaluator(PAPER, lpips=[]).evaluate_view(image, image)
+    assert values == {"psnr": 100.0, "ssim": pytest.approx(1.0), "flip": 0.0}
+
+
+def test_missing_weights_are_named_and_nothing_stands_in_for_them() -> None:
+    evaluator = Evaluator(PAPER, lpips=["vgg_raw", "vgg"], download=False)
+    image = np.zeros((32, 32, 3), dtype=np.uint8)
+    assert set(evaluator.evaluate_view(image, image)) == {"psnr", "ssim", "flip"}
+    assert set(evaluator.unavailable) == {"lpips_vgg_raw", "lpips_vgg", "lpips_alex", "lpips_squeeze"}
+    assert "vgg16-397923af.pth" in evaluator.unavailable["lpips_vgg_raw"]
+    assert "not asked for" in evaluator.unavailable["lpips_alex"]
+    assert not any("\n" in reason for reason in evaluator.unavailable.values())
+
+
+@pytest.mark.shared
+def test_lpips_variants_see_the_range_that_their_name_says(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(protocol_module.LPIPS_VARIANTS, "squeeze_raw", ("squeeze", True))
+    evaluator = Evaluator(PAPER, lpips=["squeeze", "squeeze_raw"], flip=False, weights=shared / "weights")
+    rng = np.random.default_rng(0)
+    render, truth = rng.integers(0, 256, (2, 40, 40, 3), dtype=np.uint8)
+    values = evaluator.evaluate_view(render, truth)
+    first, second = (torch.tensor(x).permute(2, 0, 1)[None].float() / 255 for x in (render, truth))
+    network = evaluator._networks["squeeze"]
+    assert values["lpips_squeeze"] == pytest.approx(float(network(first * 2 - 1, second * 2 - 1)))
+    assert values["lpips_squeeze_raw"] == pytest.approx(float(network(first, second)))
+    assert values["lpips_squeeze"] != pytest.approx(values["lpips_squeeze_raw"], rel=0.01)
+
+
+@pytest.mark.shared
+def test_a_view_too_small_for_a_network_is_said(shared: Path) -> None:
+    evaluator = Evaluator(PAPER, lpips=["squeeze"], flip=False, weights=shared / "weights", download=False)
+    image = np.zeros((16, 40, 3), dtype=np.uint8)
+    assert "lpips_squeeze" not in evaluator.evaluate_view(image, image)
+    assert evaluator.unavailable["lpips_squeeze"] == "a view is 40x16 px, below 17 px a side"
+
+
+def test_without_the_flip_package_the_metric_is_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    evaluator = Evaluator(PAPER, lpips=[])
+    image = np.zeros((16, 16, 3), dtype=np.uint8)
+    assert "flip" not in evaluator.evaluate_view(image, image)
+    assert "pip install" in evaluator.unavailable["flip"]
+
+
+def test_a_broken_render_is_an_error_not_a_number() -> None:
+    render = torch.full((16, 16, 3), float("nan"))
+    with pytest.raises(TrainingError, match="not finite"):
+        Evaluator(PAPER, lpips=[]).evaluate_view(render, np.zeros((16, 16, 3), dtype=np.uint8))
+
+
+def test_an_unknown_variant_is_refused() -> None:
+    with pytest.raises(InputError, match="vgg_raw, vgg, alex, squeeze"):
+        Evaluator(PAPER, lpips=["vgg16"])
+
+
+def test_means_leave_out_what_some_view_lacks() -> None:
+    per_view = {"a": {"psnr": 20.0, "flip": 0.1}, "b": {"psnr": 30.0}}
+    assert summarize(per_view, {}) == {"psnr": 25.0}
+    assert summarize(per_view, {"psnr": "broken"}) == {}
+    assert summarize({}, {}) == {}

@@ -1,0 +1,50 @@
+"""Small random sets of Gaussians and a camera that sees them."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gsbench.gaussians.model import NUM_SH_REST, Gaussians
+from gsbench.scene.camera import Camera
+
+
+def random_gaussians(
+    count: int,
+    seed: int = 0,
+    dtype: torch.dtype = torch.float64,
+    depth: tuple[float, float] = (2.0, 6.0),
+    log_scale: tuple[float, float] = (-3.0, -1.0),
+) -> Gaussians:
+    """Gaussians in front of ``front_camera``, of mixed sizes, shapes, opacities and colours."""
+    rng = torch.Generator().manual_seed(seed)
+
+    def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=rng, dtype=torch.float64)
+
+    z = uniform(*depth, count)
+    means = torch.stack([z * uniform(-0.6, 0.6, count), z * uniform(-0.5, 0.5, count), z], -1)
+    return Gaussians(
+        means=means,
+        log_scales=uniform(*log_scale, count, 3),
+        quaternions=torch.randn(count, 4, generator=rng, dtype=torch.float64),
+        opacity_logits=uniform(-2.5, 2.5, count),
+        sh_dc=torch.randn(count, 3, generator=rng, dtype=torch.float64),
+        sh_rest=0.3 * torch.randn(count, NUM_SH_REST, 3, generator=rng, dtype=torch.float64),
+    ).map(lambda tensor: tensor.to(dtype))
+
+
+def front_camera(width: int = 40, height: int = 30, shift: tuple[float, float] = (0.0, 0.0)) -> Camera:
+    """A camera at the origin, slightly turned, that looks along z; ``shift`` moves the principal point (px)."""
+    angle = 0.05
+    rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    return Camera(
+        width=width,
+        height=height,
+        fx=0.9 * width,
+        fy=0.95 * width,
+        cx=width / 2 + shift[0],
+        cy=height / 2 + shift[1],
+        rotation=rotation,
+        translation=np.array([0.1, -0.05, 0.2]),
+    )

@@ -1,0 +1,184 @@
+"""The reference rasterizer against finite differences, a pixel-by-pixel restatement, and gsplat's own torch code."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster.reference import ReferenceRasterizer, project
+from gsbench.scene.camera import Camera
+from tests.gaussians.helpers import front_camera, random_gaussians
+
+
+def brute_force(gaussians: Gaussians, camera: Camera, background: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Every pixel by itself, in plain Python from the published formulas; colours of degree 0 only."""
+    items = []
+    for i in range(len(gaussians)):
+        mean = gaussians.means[i].numpy()
+        view = camera.rotation @ mean + camera.translation
+        if view[2] <= 0.2:
+            continue
+        w, x, y, z = (gaussians.quaternions[i] / gaussians.quaternions[i].norm()).tolist()
+        matrix = np.array(
+            [
+                [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+            ]
+        )
+        sigma = matrix @ np.diag(np.exp(2 * gaussians.log_scales[i].numpy())) @ matrix.T
+        right = (camera.width - camera.cx) / camera.fx + 0.3 * camera.width / (2 * camera.fx)
+        left = camera.cx / camera.fx + 0.3 * camera.width / (2 * camera.fx)
+        bottom = (camera.height - camera.cy) / camera.fy + 0.3 * camera.height / (2 * camera.fy)
+        top = camera.cy / camera.fy + 0.3 * camera.height / (2 * camera.fy)
+        tx = min(max(view[0] / view[2], -left), right) * view[2]
+        ty = min(max(view[1] / view[2], -top), bottom) * view[2]
+        jacobian = np.array(
+            [
+                [camera.fx / view[2], 0, -camera.fx * tx / view[2] ** 2],
+                [0, camera.fy / view[2], -camera.fy * ty / view[2] ** 2],
+            ]
+        )
+        covariance = jacobian @ camera.rotation @ sigma @ camera.rotation.T @ jacobian.T + 0.3 * np.eye(2)
+        largest = np.linalg.eigvalsh(covariance)[1]
+        pixel = np.array(
+            [camera.fx * view[0] / view[2] + camera.cx - 0.5, camera.fy * view[1] / view[2] + camera.cy - 0.5]
+        )
+        rgb = np.maximum(0, gaussians.sh_dc[i].numpy() * 0.28209479177387814 + 0.5)
+        opacity = 1 / (1 + math.exp(-float(gaussians.opacity_logits[i])))
+        items.append((view[2], pixel, np.linalg.inv(covariance), math.ceil(3 * math.sqrt(largest)), opacity, rgb))
+    items.sort(key=lambda item: item[0])
+    image = np.zeros((camera.height, camera.width, 3))
+    alpha_image = np.zeros((camera.height, camera.width))
+    for row in range(camera.height):
+        for column in range(camera.width):
+            transmittance, color = 1.0, np.zeros(3)
+            tile_x, tile_y = column // 16 * 16, row // 16 * 16
+            for _, pixel, inverse, radius, opacity, rgb in items:
+                reaches = (
+                    math.floor((pixel[0] - radius) / 16) * 16 <= tile_x < math.floor((pixel[0] + radius + 15) / 16) * 16
+                    and math.floor((pixel[1] - radius) / 16) * 16
+                    <= tile_y
+                    < math.floor((pixel[1] + radius + 15) / 16) * 16
+                )
+                if not reaches:
+                    continue
+                offset = np.array([column, row]) - pixel
+                alpha = min(0.99, opacity * math.exp(-0.5 * offset @ inverse @ offset))
+                if alpha < 1 / 255:
+                    continue
+                if transmittance * (1 - alpha) < 1e-4:
+                    break
+                color += rgb * alpha * transmittance
+                transmittance *= 1 - alpha
+            image[row, column] = color + transmittance * background
+            alpha_image[row, column] = 1 - transmittance
+    return image, alpha_image
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (5.0, -4.0)])
+def test_matches_brute_force(shift: tuple[float, float]) -> None:
+    gaussians = random_gaussians(60, seed=3, log_scale=(-3.5, -0.5))
+    gaussians.opacity_logits[:8] = 6.0  # opaque ones reach both the clamp of alpha and the early stop
+    camera, background = front_camera(37, 21, shift), torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
+    out = ReferenceRasterizer().render(gaussians, camera, 0, background)
+    image, alpha = brute_force(gaussians, camera, background.numpy())
+    np.testing.assert_allclose(out.image.detach().numpy(), image, atol=1e-10)
+    np.testing.assert_allclose(out.alpha.detach().numpy(), alpha, atol=1e-10)
+    assert alpha.max() > 0.999
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_gradients_match_finite_differences(degree: int) -> None:
+    gaussians = random_gaussians(6, seed=11, log_scale=(-2.2, -1.2))
+    gaussians.opacity_logits.clamp_(max=1.5)  # below the clamp of alpha, whose gradient is passed on purpose
+    gaussians.sh_dc.clamp_(min=-0.5)  # above the clamp of colours
+    camera, background = front_camera(20, 18), torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    weights = torch.randn(18, 20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def loss(values: Gaussians) -> torch.Tensor:
+        out = ReferenceRasterizer().render(values, camera, degree, background)
+        return (out.image * weights).sum() + out.alpha.sum()
+
+    leaves = gaussians.map(lambda tensor: tensor.clone().requires_grad_(True))
+    loss(leaves).backward()
+    epsilon = 1e-6
+    for name, tensor in leaves.tensors().items():
+        numeric = torch.zeros_like(tensor)
+        with torch.no_grad():
+            for position in np.ndindex(*tensor.shape):
+                shifted = []
+                for sign in (1, -1):
+                    moved = gaussians.map(torch.clone)
+                    getattr(moved, name)[position] += sign * epsilon
+                    shifted.append(loss(moved))
+                numeric[position] = (shifted[0] - shifted[1]) / (2 * epsilon)
+        if name == "sh_rest" and degree == 0:
+            assert tensor.grad is None
+            assert not numeric.any()
+            continue
+        assert numeric.abs().max() > 0
+        torch.testing.assert_close(tensor.grad, numeric, atol=2e-6, rtol=2e-4, msg=lambda m, n=name: f"{n}: {m}")
+
+
+def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc() -> None:
+    """Moving the principal point moves every projected mean alike: the sum of the screen gradients says by how much."""
+    gaussians = random_gaussians(30, seed=5)
+    background = torch.zeros(3, dtype=torch.float64)
+
+    def loss(shift: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        leaves = gaussians.map(lambda tensor: tensor.clone().requires_grad_(True))
+        out = ReferenceRasterizer().render(leaves, front_camera(32, 32, (shift, 0.0)), 0, background, True)
+        value = (out.image**2).sum()
+        value.backward()
+        return value.detach(), out.screen_points.grad, out.screen_gradient_abs
+
+    _, gradient, absolute = loss(0.0)
+    epsilon = 1e-6  # px; the clamp of the Jacobian moves with the principal point too, but no mean is near it
+    numeric = (loss(epsilon)[0] - loss(-epsilon)[0]) / (2 * epsilon)
+    assert gradient[:, 0].sum() / (32 / 2) == pytest.approx(float(numeric), rel=1e-4)
+    assert (absolute >= gradient.abs() - 1e-12).all()
+    assert (absolute > 1.01 * gradient.abs()).any()
+
+
+def test_projection_matches_gsplat() -> None:
+    gsplat = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat (extra dev) is not installed")
+    gaussians, camera = random_gaussians(200, seed=7), front_camera(64, 48)
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3], matrix[:3, 3] = torch.from_numpy(camera.rotation), torch.from_numpy(camera.translation)
+    intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float64)
+    covariances, _ = gsplat._quat_scale_to_covar_preci(gaussians.quaternions, gaussians.scales, True, False)
+    _, means, depths, conics, _ = gsplat._fully_fused_projection(
+        gaussians.means, covariances, matrix[None], intrinsics[None], camera.width, camera.height, eps2d=0.3
+    )
+    projected = project(gaussians, camera)
+    torch.testing.assert_close(projected.means + 0.5, means[0, projected.index])  # gsplat's first pixel centre is 0.5
+    torch.testing.assert_close(projected.conics, conics[0, projected.index])
+    torch.testing.assert_close(projected.depths, depths[0, projected.index])
+    assert len(projected.index) > 150
+
+
+def test_spherical_harmonics_match_gsplat() -> None:
+    gsplat = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat (extra dev) is not installed")
+    from gsbench.gaussians.spherical_harmonics import colors
+
+    gaussians = random_gaussians(50, seed=9)
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
+    coefficients = torch.cat([gaussians.sh_dc[:, None], gaussians.sh_rest], 1)  # [N, 16, 3]
+    for degree in range(4):
+        theirs = gsplat._spherical_harmonics(degree, directions, coefficients)
+        ours = colors(gaussians.sh_dc, gaussians.sh_rest, directions, degree)
+        torch.testing.assert_close(ours, (theirs + 0.5).clamp_min(0))
+
+
+def test_nothing_visible_gives_the_background() -> None:
+    gaussians = random_gaussians(5)
+    gaussians.means[:, 2] = -5.0
+    out = ReferenceRasterizer().render(gaussians, front_camera(), 3, torch.tensor([0.5, 0.25, 1.0], dtype=torch.float64))
+    assert torch.equal(out.image[0, 0], torch.tensor([0.5, 0.25, 1.0], dtype=torch.float64))
+    assert not out.visible.any()
+    assert not out.alpha.any()
