@@ -11,7 +11,7 @@ import os
 import shutil
 import tempfile
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,29 +53,50 @@ def find_weights(spec: WeightsFile, folder: Path | None = None, download: bool =
     Raises ``InputError`` where ``folder`` does not exist, ``MissingWeights`` where no file has the right checksum or
     nothing was found and nothing could be downloaded.
     """
+    return find_all_weights([spec], folder, download)[0]
+
+
+def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, download: bool = True) -> list[Path]:
+    """As `find_weights` for several files; one error names all that are missing."""
     folders = _search_folders(folder)
-    refused: list[str] = []
+    found = {spec: _find_local(spec, folders) for spec in specs}
+    missing = [spec for spec, path in found.items() if path is None]
+    reasons = []
+    for spec in missing:
+        if not download:
+            reasons.append("downloads are switched off")
+        elif spec.url is None:
+            reasons.append("it has no address to download from")
+        else:
+            try:
+                found[spec] = _download(spec, hub_cache())
+            except OSError as error:
+                reasons.append(f"the download failed: {error}")
+                break  # without a network the others would only fail as slowly
+    still_missing = [spec for spec in missing if found[spec] is None]
+    if still_missing:
+        names = ", ".join(spec.names[0] for spec in still_missing)
+        sources = ", ".join(spec.url or spec.source for spec in still_missing)
+        places = ", ".join(str(place) for place, _ in folders)
+        raise MissingWeights(
+            f"weights not found: {names} (looked in {places}; {reasons[0]}): get them from {sources}, put them into a "
+            f"folder and set {WEIGHTS_VARIABLE} to it"
+        )
+    return [path for spec in specs if (path := found[spec]) is not None]
+
+
+def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path | None:
+    """The first file with the right checksum; raises ``MissingWeights`` where all that are there have a wrong one."""
+    faults = []
     for place, sub_folders in folders:
         for path in _candidates(place, spec.names, sub_folders):
             fault = _checksum_fault(path, spec)
             if fault is None:
                 return path
-            refused.append(fault)
-    if refused:
-        raise MissingWeights(f"{refused[0]}; replace it with the file from {spec.url or spec.source}")
-    reason = "downloads are switched off"
-    if download and spec.url is not None:
-        try:
-            return _download(spec, hub_cache())
-        except OSError as error:
-            reason = f"the download failed: {error}"
-    elif spec.url is None:
-        reason = "it has no address to download from"
-    looked = ", ".join(str(place) for place, _ in folders)
-    raise MissingWeights(
-        f"weights file {spec.names[0]} not found in {looked} ({reason}); put it into a folder and set "
-        f"{WEIGHTS_VARIABLE} to that folder; it comes from {spec.url or spec.source}"
-    )
+            faults.append(fault)
+    if faults:
+        raise MissingWeights(f"{faults[0]}; replace it with the file from {spec.url or spec.source}")
+    return None
 
 
 def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
@@ -114,6 +135,12 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
     return dict(state)
 
 
+def file_sha256(path: Path) -> str:
+    """The sha256 of a file's content, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def hub_cache() -> Path:
     """The folder in which torch.hub keeps downloaded checkpoints (``$TORCH_HOME``, else ``$XDG_CACHE_HOME``)."""
     cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch"
@@ -144,11 +171,7 @@ def _candidates(place: Path, names: tuple[str, ...], sub_folders: bool) -> list[
 def _checksum_fault(path: Path, spec: WeightsFile) -> str | None:
     if spec.sha256 is None:
         return None
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    found = digest.hexdigest()
+    found = file_sha256(path)
     if found.startswith(spec.sha256.lower()):
         return None
     return f"weights file {path} has sha256 {found[:16]}…, expected {spec.sha256[:16]}…: wrong or truncated"

@@ -115,7 +115,8 @@ def _differences(
     legend = (
         f"Δ is measured minus printed. Of {total} cells {tally[Agreement.ROUNDING]} are within rounding (=), "
         f"{tally[Agreement.INTERVAL]} within our {CONFIDENCE:.0%} t interval of the mean (≈), "
-        f"{tally[Agreement.DIFFERS]} differ (≠). The paper prints no deviation, so the spread of its own trials is not taken into account; a single trial "
+        f"{tally[Agreement.DIFFERS]} differ (≠). The paper "
+        "prints no deviation, so the spread of its own trials is not taken into account; a single trial "
         "has no interval."
     )
     left_out = [key for key in keys if key not in compared]

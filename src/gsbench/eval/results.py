@@ -32,7 +32,7 @@ COUNT_KEYS = ("seed", "iterations", "num_gaussians")
 
 @dataclass(frozen=True)
 class Trial:
-    """One complete trial. ``data`` is the whole of its ``results.json``, ``config_hash`` the hash in its folder's name."""
+    """One complete trial; ``data`` is the whole of its ``results.json``, ``config_hash`` that in its folder's name."""
 
     path: Path
     experiment: str
@@ -183,7 +183,7 @@ def read_views(trial: Trial) -> dict[str, dict[str, float]]:
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """The objects of a JSON-lines file up to the first damaged line (a killed writer leaves half a line); [] if absent."""
+    """The objects of a JSON-lines file up to the first damaged line, as a killed writer leaves it; [] if absent."""
     rows: list[dict[str, Any]] = []
     try:
         with path.open(encoding="utf-8") as file:

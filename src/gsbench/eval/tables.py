@@ -77,8 +77,9 @@ def build_table(
     """Cross the values of ``rows`` with those of ``columns``; each combination shows every metric.
 
     ``rows`` and ``columns`` are fields of a trial or dotted configuration keys; what stands in neither is averaged
-    over: seeds as trials, scenes as means of scenes. ``order`` gives the rows and the columns to show, also where nothing was
-    run; ``names`` replaces values in headings. Raises ``InputError`` where a cell would mix what may not be averaged.
+    over: seeds as trials, scenes as means of scenes. ``order`` gives the rows and the columns to show, also where
+    nothing was run; ``names`` replaces values in headings. Raises ``InputError`` where a cell would mix what may not be
+    averaged.
     """
     trials = list(experiment.trials if trials is None else trials)
     quantities = choose_quantities(trials, metrics)
@@ -244,7 +245,7 @@ def _cost_notes(trials: Sequence[Trial]) -> list[str]:
 def cost_change(
     baseline: Sequence[Trial], other: Sequence[Trial], read: Callable[[Trial], float | None]
 ) -> tuple[float, float, int] | None:
-    """Relative change of a cost as (ratio of totals, mean of scenes' ratios, scenes), over the scenes that both have."""
+    """Relative change of a cost over the scenes that both have: (ratio of totals, mean of ratios, scenes)."""
     means = []
     for group in (baseline, other):
         values: dict[str, list[float]] = {}

@@ -13,6 +13,7 @@ from gsbench.init.base import (
     read_cloud,
 )
 from gsbench.init.dataset import Dataset
+from gsbench.init.dim import Dim, SiftKornia
 from gsbench.init.random import Random
 from gsbench.init.sfm import Sfm, SfmDense
 
@@ -21,6 +22,7 @@ __all__ = [
     "OWN_GAUGE_FOLDER",
     "REPORT_FILE",
     "Dataset",
+    "Dim",
     "Gauge",
     "InitReport",
     "Initializer",
@@ -30,5 +32,6 @@ __all__ = [
     "Random",
     "Sfm",
     "SfmDense",
+    "SiftKornia",
     "read_cloud",
 ]

@@ -45,8 +45,8 @@ def align_poses(
 ) -> Similarity:
     """The similarity from one model's cameras to another's, little moved by cameras that are wrong.
 
-    Centres are [N, 3] and rotations (world to camera) [N, 3, 3], in the same order of cameras, N >= 3. The similarity is
-    fitted to the centres: the least median of squared residuals over seeded triples, then least squares over its
+    Centres are [N, 3] and rotations (world to camera) [N, 3, 3], in the same order of cameras, N >= 3. The similarity
+    is fitted to the centres: the least median of squared residuals over seeded triples, then least squares over its
     inliers. Centres on a line leave the rotation about it open, so there the rotation comes from the cameras' own
     orientations. Raises ``ValueError`` where the centres of one side coincide.
     """

@@ -78,7 +78,7 @@ class PoseErrors:
 class Gauge:
     """What a volume threshold in raw model units means in a model's unit of length.
 
-    COLMAP scales each model as it likes, so one threshold selects different Gaussians in another model of the same scene.
+    COLMAP scales each model as it likes, so one threshold selects different Gaussians in another model of a scene.
     """
 
     scene_extent: float  # 3DGS's cameras_extent of the training cameras, in the model's units
@@ -116,7 +116,7 @@ class InitReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
-        return json.loads(json.dumps(asdict(self)))
+        return json.loads(json.dumps(asdict(self), default=str))  # str: paths among the settings
 
     def write(self, path: Path) -> None:
         """Write the report as JSON."""

@@ -12,7 +12,11 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
+from gsbench.init.base import Progress
 from gsbench.scene.colmap import rescaled_camera
+
+VERIFY_CALLS = 20  # COLMAP reports no progress within a call, so it is called for a twentieth of the pairs
+MIN_PAIRS_PER_CALL = 50
 
 
 @dataclass(frozen=True)
@@ -115,8 +119,24 @@ def write_matches(path: Path, matches: dict[tuple[str, str], NDArray[np.uint32]]
             )
 
 
+def verify_pairs(
+    path: Path, pairs: Sequence[tuple[str, str]], options: pycolmap.TwoViewGeometryOptions, progress: Progress
+) -> None:
+    """COLMAP's geometric verification of the matches of ``pairs``, which are in the database."""
+    list_file = path.with_suffix(".pairs.txt")
+    size = max(len(pairs) // VERIFY_CALLS, MIN_PAIRS_PER_CALL)
+    progress("verify", 0, len(pairs))
+    with image_ids_as_names(path) as new_names:
+        for start in range(0, len(pairs), size):
+            part = pairs[start : start + size]
+            write_pairs(list_file, [(new_names[first], new_names[second]) for first, second in part])
+            pycolmap.verify_matches(path, list_file, options)
+            progress("verify", start + len(part), len(pairs))
+    list_file.unlink(missing_ok=True)
+
+
 def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
-    """COLMAP's list of image pairs, one pair of names on a line; names must be free of spaces (`image_ids_as_names`)."""
+    """COLMAP's list of image pairs, one pair of names on a line; they hold no spaces (`image_ids_as_names`)."""
     path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
 
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import logging
 import shutil
-import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from gsbench.errors import InputError
 from gsbench.init.base import (
@@ -29,6 +27,9 @@ from gsbench.init.timer import Timer
 from gsbench.scene.types import Capture
 
 if TYPE_CHECKING:
+    import pycolmap
+
+    from gsbench.init.alignment import Similarity
     from gsbench.init.colmap_database import CameraGroup
 
 logger = logging.getLogger(__name__)
@@ -38,6 +39,17 @@ CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV
 INTRINSICS = ("estimate", "reference")
 MIN_IMAGES = 3  # two views have no third that could contradict a wrong geometry
 LOG_FILE = "colmap.log"
+WORK_FOLDER = "work"
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What was done before COLMAP: its time, its counts and settings for the report, and what deserves a warning."""
+
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    counts: Mapping[str, int] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -49,16 +61,16 @@ class Job:
     output_dir: Path
     work_dir: Path
     reference: Path | None
-    seconds: Mapping[str, float]  # of what was done before
+    preparation: Preparation
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapInitializer(ABC):
     """Options shared by `Sfm`, `SfmDense` and `Dim`.
 
-    With ``poses=shared`` the points are triangulated under the reference cameras: those that came with the capture, else
-    those of the ``reference`` given to `run`. With ``poses=own`` cameras and points are estimated here and then, where a
-    reference exists, moved into its gauge by a similarity (``align``).
+    With ``poses=shared`` the points are triangulated under the reference cameras: those of the ``reference`` given to
+    `run`, else those that came with the capture. With ``poses=own`` cameras and points are estimated here and then,
+    where a reference exists, moved into its gauge by a similarity (``align``).
     """
 
     name: ClassVar[str]
@@ -109,10 +121,28 @@ class ColmapInitializer(ABC):
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """Write model and report (see `gsbench.init.base.Initializer`); ``work_dir`` keeps what a killed run had done.
+        """Write model and report (see `gsbench.init.base.Initializer`).
+
+        ``work_dir`` keeps features and matches for a later run; without it they are kept within ``output_dir`` until
+        the run succeeds, so that a killed run goes on there.
 
         Raises ``InputError`` where the photos or settings do not give a model.
         """
+        self.check(capture, reference)
+        output_dir.mkdir(parents=True, exist_ok=True)
+        work = output_dir / WORK_FOLDER if work_dir is None else work_dir
+        work.mkdir(parents=True, exist_ok=True)
+        preparation = self.prepare(capture, work, reference, progress)
+        job = Job(self, capture, output_dir, work, reference, preparation)
+        report = run_with_progress(build_model, job, progress, what=self.name, log=output_dir / LOG_FILE)
+        if work_dir is None:
+            shutil.rmtree(work)
+        for warning in report.warnings:
+            logger.warning("%s: %s", self.name, warning)
+        return report
+
+    def check(self, capture: Capture, reference: Path | None) -> None:
+        """Raise ``InputError``, before any work, where this capture cannot be initialised like this."""
         if len(capture.image_names) < MIN_IMAGES:
             raise InputError(
                 f"scene {capture.name} has {len(capture.image_names)} images: {self.name} needs at least {MIN_IMAGES}"
@@ -122,23 +152,10 @@ class ColmapInitializer(ABC):
                 f"init={self.name} takes its cameras from a reference, and scene {capture.name} came without: "
                 "make one with init=sfm first, or set init.poses=own and init.intrinsics=estimate"
             )
-        output_dir.mkdir(parents=True, exist_ok=True)
-        with ExitStack() as stack:
-            if work_dir is None:
-                work_dir = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gsbench-init-")))
-            work_dir.mkdir(parents=True, exist_ok=True)
-            timer = Timer()
-            self.prepare(capture, work_dir, reference, progress, timer)
-            job = Job(self, capture, output_dir, work_dir, reference, timer.seconds)
-            report = run_with_progress(build_model, job, progress, what=self.name, log=output_dir / LOG_FILE)
-        for warning in report.warnings:
-            logger.warning("%s: %s", self.name, warning)
-        return report
 
-    def prepare(
-        self, capture: Capture, work_dir: Path, reference: Path | None, progress: Progress, timer: Timer
-    ) -> None:
-        """What is done in the calling process, before the isolated one starts. Nothing, unless overridden."""
+    def prepare(self, capture: Capture, work_dir: Path, reference: Path | None, progress: Progress) -> Preparation:
+        """Work to be done before COLMAP starts; none, unless overridden."""
+        return Preparation()
 
     @abstractmethod
     def fill_database(
@@ -162,30 +179,27 @@ def build_model(job: Job, progress: Progress) -> InitReport:
     """Cameras, features, matches, model, report. Calls native code that can abort: run it isolated."""
     import pycolmap
 
-    from gsbench.init import colmap_database, reconstruct, report
+    from gsbench.init import colmap_database, reconstruct
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     options, capture = job.initializer, job.capture
-    timer = Timer(dict(job.seconds))
+    timer = Timer(dict(job.preparation.seconds))
     reference = reconstruct.load_reference(capture, job.reference)
-    shared = options.poses == "shared" and reference is not None
     database = job.work_dir / "database.db"
-    if reference is not None and (shared or options.intrinsics == "reference"):
-        camera_groups = colmap_database.reference_groups(reference)
+    if reference is not None and takes_reference_cameras(options):
+        cameras = colmap_database.reference_groups(reference)
     else:
-        camera_groups = colmap_database.guessed_groups(
+        cameras = colmap_database.guessed_groups(
             capture.images, capture.image_names, options.camera, options.camera_model, options.focal_length
         )
-    groups = colmap_database.create_database(database, camera_groups)
-    names = sorted(name for group in groups for name in group.names)
-    pairs = reconstruct.select_pairs(capture.images, names, options, reference)
+    groups = colmap_database.create_database(database, cameras)
+    pairs = reconstruct.select_pairs(capture.images, select_images(options, capture, reference), options, reference)
     options.fill_database(database, groups, pairs, capture, job.work_dir, progress, timer)
-    counts = colmap_database.database_counts(database)
+    counts = {**job.preparation.counts, **colmap_database.database_counts(database)}
     if counts["pairs_verified"] == 0:
         raise InputError(
             f"{options.name}: no pair of images shares enough matches: the photos need more overlap or texture"
         )
-
     settings = reconstruct.MappingSettings(
         options.seed,
         options.mapper_threads,
@@ -195,40 +209,68 @@ def build_model(job: Job, progress: Progress) -> InitReport:
     )
     scratch = job.work_dir / "mapping"
     shutil.rmtree(scratch, ignore_errors=True)
-    similarity, pose_errors, own_gauge, notes = None, None, None, ()
-    with timer.phase("triangulate" if shared else "map"):
-        if shared:
+    if options.poses == "shared" and reference is not None:
+        with timer.phase("triangulate"):
             model = reconstruct.triangulate(database, capture.images, scratch, reference, settings, progress)
-        else:
-            model = reconstruct.map_images(database, capture.images, scratch, settings, progress)
-    if not shared and reference is not None:
-        similarity = reconstruct.similarity_to(model, reference)
-        extent = report.training_extent(model, capture)
-        if similarity is None:
-            notes = ("too few common cameras with the reference: poses are neither aligned nor compared",)
-        else:
-            reference_extent = report.training_extent(reference, capture)
-            exact = capture.exact_poses and job.reference is None
-            pose_errors = report.compare_poses(model, reference, similarity, reference_extent, exact)
-            if options.align:
-                own_gauge = report.measure_gauge(extent, similarity.scale)
-                reconstruct.write_model(model, job.output_dir / OWN_GAUGE_FOLDER)
-                reconstruct.apply_similarity(model, similarity)
+        return _finish(job, "shared", model, reference, None, timer, counts)
+    with timer.phase("map"):
+        model = reconstruct.map_images(database, capture.images, scratch, settings, progress)
+    similarity = None if reference is None else reconstruct.similarity_to(model, reference)
+    return _finish(job, "own", model, reference, similarity, timer, counts)
+
+
+def takes_reference_cameras(options: ColmapInitializer) -> bool:
+    """Whether the cameras (intrinsics at least) are the reference's where there is one."""
+    return options.poses == "shared" or options.intrinsics == "reference"
+
+
+def select_images(options: ColmapInitializer, capture: Capture, reference: pycolmap.Reconstruction | None) -> list[str]:
+    """The sorted names of the images to be used: all, or those that the reference knows where its cameras are taken."""
+    if reference is None or not takes_reference_cameras(options):
+        return sorted(capture.image_names)
+    return sorted(image.name for image in reference.images.values() if image.has_pose)
+
+
+def _finish(
+    job: Job,
+    poses: str,
+    model: pycolmap.Reconstruction,
+    reference: pycolmap.Reconstruction | None,
+    similarity: Similarity | None,
+    timer: Timer,
+    counts: Mapping[str, int],
+) -> InitReport:
+    """Align the model where it has poses of its own, write it, and report."""
+    from gsbench.init import reconstruct, report
+
+    options, capture = job.initializer, job.capture
+    warnings = list(job.preparation.warnings)
+    pose_errors, own_gauge, scale = None, None, 1.0 if poses == "shared" else None
+    if poses == "own" and reference is not None and similarity is None:
+        warnings.append("too few common cameras with the reference: poses are neither aligned nor compared")
+    if reference is not None and similarity is not None:
+        exact = capture.exact_poses and job.reference is None
+        reference_extent = report.training_extent(reference, capture)
+        pose_errors = report.compare_poses(model, reference, similarity, reference_extent, exact)
+        scale = similarity.scale
+        if options.align:
+            own_gauge = report.measure_gauge(report.training_extent(model, capture), scale)
+            reconstruct.write_model(model, job.output_dir / OWN_GAUGE_FOLDER)
+            reconstruct.apply_similarity(model, similarity)
+            scale = 1.0
     reconstruct.write_model(model, job.output_dir / MODEL_FOLDER)
-    in_reference_gauge = shared or own_gauge is not None
-    scale = 1.0 if in_reference_gauge else None if similarity is None else similarity.scale
     result = InitReport(
         init=options.name,
-        poses="shared" if shared else "own",
+        poses=poses,
         **report.model_figures(model, capture),
         gauge=report.measure_gauge(report.training_extent(model, capture), scale),
         own_gauge=own_gauge,
         pose_errors=pose_errors,
         seconds=timer.rounded(),
-        settings=asdict(options),
+        settings={**asdict(options), **job.preparation.settings},
         versions=report.package_versions(*options.packages()),
         counts=counts,
     )
-    result = replace(result, warnings=notes + report.find_warnings(result, model))
+    result = replace(result, warnings=(*warnings, *report.find_warnings(result, model)))
     result.write(job.output_dir / REPORT_FILE)
     return result

@@ -31,7 +31,7 @@ class Dataset:
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """Write model and report; ``reference`` and ``work_dir`` are not used. ``InputError`` where there is no cloud."""
+        """Write model and report; the other arguments are not used. ``InputError`` where there is no cloud."""
         if capture.model is None:
             raise InputError(f"init=dataset: scene {capture.name} came without a COLMAP model: use init=sfm")
         output_dir.mkdir(parents=True, exist_ok=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import abstractmethod
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -12,16 +12,15 @@ from gsbench.errors import InputError
 from gsbench.init.base import Progress
 from gsbench.init.checks import check_choice, check_integer, check_number
 from gsbench.init.colmap_initializer import ColmapInitializer, Preparation
+from gsbench.init.feature_settings import FeatureSettings
 from gsbench.init.network_weights import ALIKED_WEIGHTS, EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS, SUPERPOINT_LICENCE
 from gsbench.init.relay import run_with_progress
 from gsbench.init.timer import Timer
 from gsbench.scene.types import Capture
-from gsbench.weights import find_weights
+from gsbench.weights import find_all_weights
 
 if TYPE_CHECKING:
     from gsbench.init.colmap_database import CameraGroup
-    from gsbench.init.extractors import ExtractorSettings
-    from gsbench.init.matching import MatcherSettings
 
 logger = logging.getLogger(__name__)
 
@@ -33,18 +32,150 @@ KEYPOINT_THRESHOLDS = {"superpoint": 0.0005, "aliked": 0.2, "disk": 0.0}
 NMS_RADII = {"superpoint": 3, "aliked": 2, "disk": 2}  # px
 
 
-@dataclass(frozen=True)
-class NetworkJob:
-    """What the isolated process needs to extract and match."""
+@dataclass(frozen=True, kw_only=True)
+class FeatureInitializer(ColmapInitializer):
+    """Features and matches from outside COLMAP, verified and mapped or triangulated by it.
 
-    capture: Capture
-    reference: Path | None
-    work_dir: Path
-    pairing: ColmapInitializer
-    extractor: ExtractorSettings
-    matcher: MatcherSettings
-    extractor_weights: Path | None
-    matcher_weights: Path | None
-    max_image_size: int
-    device: str
-    threads: int
+    Sizes are in px of the image files' longest side. Features and matches are kept in the ``work_dir`` given to `run`, by
+    image and by pair, so a killed run goes on there.
+    """
+
+    max_keypoints: int = 2048
+    max_image_size: int = 1600
+    max_ratio: float = 0.95
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_integer("max_keypoints", self.max_keypoints, 1)
+        check_integer("max_image_size", self.max_image_size, 32)
+        check_number("max_ratio", self.max_ratio, 0, 1, exclusive=True)
+
+    @abstractmethod
+    def feature_settings(self) -> FeatureSettings:
+        """What features and matches depend on."""
+
+    @abstractmethod
+    def find_weights(self) -> tuple[Path | None, Path | None]:
+        """Checked weights files of the extractor and of the matcher, None where they need none.
+
+        Raises ``MissingWeights``.
+        """
+
+    def check(self, capture: Capture, reference: Path | None) -> None:
+        super().check(capture, reference)
+        self.find_weights()
+
+    def prepare(self, capture: Capture, work_dir: Path, reference: Path | None, progress: Progress) -> Preparation:
+        from gsbench.init.extract_and_match import NetworkJob, extract_and_match
+
+        job = NetworkJob(self, capture, reference, work_dir, *self.find_weights())
+        return run_with_progress(extract_and_match, job, progress, what=f"{self.name}: features and matches")
+
+    def fill_database(
+        self,
+        database: Path,
+        groups: list[CameraGroup],
+        pairs: list[tuple[str, str]],
+        capture: Capture,
+        work_dir: Path,
+        progress: Progress,
+        timer: Timer,
+    ) -> None:
+        from gsbench.init.colmap_database import verify_pairs, write_features, write_matches
+        from gsbench.init.extract_and_match import open_store
+        from gsbench.init.reconstruct import verification_options
+
+        store = open_store(self, capture, work_dir, *self.find_weights())
+        names = [name for group in groups for name in group.names]
+        write_features(database, groups, {name: store.require_features(name).colmap_keypoints for name in names})
+        matches = {pair: store.require_matches(*pair) for pair in pairs}
+        matches = {pair: indices for pair, indices in matches.items() if len(indices) > 0}
+        write_matches(database, matches)
+        with timer.phase("verify"):
+            verify_pairs(database, sorted(matches), verification_options(self.seed, self.min_inliers), progress)
+
+    def packages(self) -> tuple[str, ...]:
+        return (*super().packages(), "torch", "kornia")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dim(FeatureInitializer):
+    """Deep image matching: SuperPoint, ALIKED or DISK features, matched by LightGlue or by mutual nearest descriptors."""
+
+    name: ClassVar[str] = "dim"
+
+    extractor: str = "superpoint"
+    matcher: str = "lightglue"
+    keypoint_threshold: float | None = None
+    nms_radius: int | None = None
+    aliked_model: str = "n16"
+    filter_threshold: float = 0.1
+    weights: str | Path | None = None
+    download: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("extractor", self.extractor, DEEP_EXTRACTORS)
+        check_choice("matcher", self.matcher, MATCHERS)
+        check_choice("aliked_model", self.aliked_model, ALIKED_MODELS)
+        check_number("filter_threshold", self.filter_threshold, 0, 1)
+        if self.keypoint_threshold is not None:
+            check_number("keypoint_threshold", self.keypoint_threshold, 0)
+        if self.nms_radius is not None:
+            check_integer("nms_radius", self.nms_radius, 1, 50)
+        if self.extractor == "aliked" and self.matcher == "lightglue" and self.aliked_model == "t16":
+            raise InputError(
+                "init.matcher=lightglue has no weights for init.aliked_model=t16: use n16 or mutual_nearest"
+            )
+
+    def feature_settings(self) -> FeatureSettings:
+        threshold, radius = self.keypoint_threshold, self.nms_radius
+        return FeatureSettings(
+            extractor=self.extractor,
+            matcher=self.matcher,
+            max_image_size=self.max_image_size,
+            max_keypoints=self.max_keypoints,
+            keypoint_threshold=KEYPOINT_THRESHOLDS[self.extractor] if threshold is None else threshold,
+            nms_radius=NMS_RADII[self.extractor] if radius is None else radius,
+            aliked_model=self.aliked_model,
+            filter_threshold=self.filter_threshold,
+            max_ratio=self.max_ratio,
+        )
+
+    def find_weights(self) -> tuple[Path | None, Path | None]:
+        folder = None if self.weights is None else Path(self.weights).expanduser()
+        specs = [ALIKED_WEIGHTS[self.aliked_model] if self.extractor == "aliked" else EXTRACTOR_WEIGHTS[self.extractor]]
+        if self.matcher == "lightglue":
+            specs.append(LIGHTGLUE_WEIGHTS[self.extractor])
+        paths = find_all_weights(specs, folder, self.download)
+        return paths[0], paths[1] if len(paths) > 1 else None
+
+    def check(self, capture: Capture, reference: Path | None) -> None:
+        super().check(capture, reference)
+        if self.extractor == "superpoint":
+            logger.warning("SuperPoint's weights are licensed by %s", SUPERPOINT_LICENCE)
+
+    def packages(self) -> tuple[str, ...]:
+        return (*super().packages(), *(["transformers"] if self.extractor == "superpoint" else []))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SiftKornia(FeatureInitializer):
+    """kornia's SIFT, which needs no weights, through the path of `Dim`: a stand-in beside it, never called DIM."""
+
+    name: ClassVar[str] = "sift_kornia"
+
+    max_keypoints: int = 8192
+
+    def feature_settings(self) -> FeatureSettings:
+        return FeatureSettings(
+            extractor="sift_kornia",
+            matcher="mutual_nearest",
+            max_image_size=self.max_image_size,
+            max_keypoints=self.max_keypoints,
+            max_ratio=self.max_ratio,
+        )
+
+    def find_weights(self) -> tuple[Path | None, Path | None]:
+        return None, None

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from gsbench.errors import InputError
+from gsbench.init.feature_settings import FeatureSettings
 from gsbench.init.features import Extractor
 from gsbench.weights import MissingWeights, load_state
 
@@ -16,18 +16,7 @@ SUPERPOINT_BORDER = 4  # px without keypoints, as in deep-image-matching; its ne
 LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."  # of SuperPoint within a LightGlue checkpoint of transformers
 
 
-@dataclass(frozen=True)
-class ExtractorSettings:
-    """What an extractor depends on; see the fields of `gsbench.init.Dim`."""
-
-    extractor: str
-    max_keypoints: int
-    keypoint_threshold: float
-    nms_radius: int
-    aliked_model: str
-
-
-def build_extractor(settings: ExtractorSettings, weights: Path | None, device: torch.device) -> Extractor:
+def build_extractor(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
     """The extractor with its network on ``device``; ``weights`` is the checked file, None for one without weights.
 
     Raises ``MissingWeights`` where the file does not fit the network.
@@ -51,7 +40,7 @@ def load_into(network: torch.nn.Module, state: Mapping[str, torch.Tensor], path:
         )
 
 
-def _superpoint(settings: ExtractorSettings, weights: Path | None, device: torch.device) -> Extractor:
+def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
     try:
         from transformers import SuperPointConfig, SuperPointForKeypointDetection
     except ImportError as error:
@@ -91,7 +80,7 @@ def _superpoint(settings: ExtractorSettings, weights: Path | None, device: torch
     return extract
 
 
-def _aliked(settings: ExtractorSettings, weights: Path | None, device: torch.device) -> Extractor:
+def _aliked(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
     from kornia.feature import ALIKED
 
     assert weights is not None
@@ -111,7 +100,7 @@ def _aliked(settings: ExtractorSettings, weights: Path | None, device: torch.dev
     return extract
 
 
-def _disk(settings: ExtractorSettings, weights: Path | None, device: torch.device) -> Extractor:
+def _disk(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
     from kornia.feature import DISK
 
     assert weights is not None
@@ -132,7 +121,7 @@ def _disk(settings: ExtractorSettings, weights: Path | None, device: torch.devic
     return extract
 
 
-def _sift_kornia(settings: ExtractorSettings, weights: Path | None, device: torch.device) -> Extractor:
+def _sift_kornia(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
     from kornia.feature import SIFTFeatureScaleSpace, laf_is_filled
 
     network = SIFTFeatureScaleSpace(settings.max_keypoints, device=device, descriptor_backend="pyramid").eval()
@@ -151,7 +140,7 @@ def _gray(image: torch.Tensor) -> torch.Tensor:
     return (image * weights).sum(dim=1, keepdim=True).expand(-1, 3, -1, -1)
 
 
-_BUILDERS: dict[str, Callable[[ExtractorSettings, Path | None, torch.device], Extractor]] = {
+_BUILDERS: dict[str, Callable[[FeatureSettings, Path | None, torch.device], Extractor]] = {
     "superpoint": _superpoint,
     "aliked": _aliked,
     "disk": _disk,

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbench.errors import GsbenchError
 from gsbench.init.features import Features
 
 KEY_DIGITS = 24
@@ -84,6 +85,20 @@ class FeatureStore:
         with temporary.open("wb") as file:
             np.save(file, matches)
         temporary.replace(path)
+
+    def require_features(self, name: str) -> Features:
+        """The stored features, which must be there."""
+        features = self.read_features(name)
+        if features is None:
+            raise GsbenchError(f"the stored features of {name} are gone from {self.folder}: run again")
+        return features
+
+    def require_matches(self, first: str, second: str) -> NDArray[np.uint32]:
+        """The stored matches [M, 2], which must be there."""
+        matches = self.read_matches(first, second)
+        if matches is None:
+            raise GsbenchError(f"the stored matches of {first} and {second} are gone from {self.folder}: run again")
+        return matches
 
     def _hash_image(self, name: str) -> str:
         content = hashlib.sha256((self.images / name).read_bytes()).hexdigest()

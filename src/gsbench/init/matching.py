@@ -12,19 +12,11 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.init.extractors import load_into
+from gsbench.init.feature_settings import FeatureSettings
 from gsbench.init.features import GPU_MEMORY_MEND, Features
 from gsbench.weights import load_state
 
 MIN_HALVED_KEYPOINTS = 128  # with fewer, a pair's geometry is a matter of luck
-
-
-@dataclass(frozen=True)
-class MatcherSettings:
-    """What a matcher depends on; see the fields of `gsbench.init.Dim`."""
-
-    matcher: str
-    filter_threshold: float
-    max_ratio: float
 
 
 class Matcher(Protocol):
@@ -33,15 +25,15 @@ class Matcher(Protocol):
     def __call__(self, first: Features, second: Features) -> NDArray[np.uint32]: ...
 
 
-def build_matcher(settings: MatcherSettings, extractor: str, weights: Path | None, device: torch.device) -> Matcher:
-    """The matcher named in ``settings`` for the features of ``extractor``; ``weights`` is LightGlue's checked file.
+def build_matcher(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Matcher:
+    """The matcher named in ``settings``; ``weights`` is LightGlue's checked file.
 
     Raises ``MissingWeights`` where the file does not fit the network.
     """
     if settings.matcher == "mutual_nearest":
         return MutualNearest(settings.max_ratio, device)
     assert weights is not None
-    return LightGlueMatcher(extractor, settings.filter_threshold, weights, device)
+    return LightGlueMatcher(settings.extractor, settings.filter_threshold, weights, device)
 
 
 @dataclass(frozen=True)
@@ -107,5 +99,7 @@ def match_within_memory(matcher: Matcher, first: Features, second: Features) -> 
             count //= 2
             halved = True
             if count < MIN_HALVED_KEYPOINTS:
-                raise InputError(f"matching ran out of memory even with {2 * count} keypoints: {GPU_MEMORY_MEND}") from error
+                raise InputError(
+                    f"matching ran out of memory even with {2 * count} keypoints: {GPU_MEMORY_MEND}"
+                ) from error
             torch.cuda.empty_cache()

@@ -54,8 +54,8 @@ def read_capture(store: Store, options: SceneConfig) -> Capture:
     selection: dict[str, Any] = {
         "max_images": options.max_images,
         "test_every": options.test_every,
-        "train_list": _path(options.train_list),
-        "test_list": _path(options.test_list),
+        "train_list": options.train_list,
+        "test_list": options.test_list,
     }
     if options.kind == "courtyard":
         inputs = {name: getattr(options, name) for name in ("views", "width", "height", "seed")}
@@ -65,11 +65,10 @@ def read_capture(store: Store, options: SceneConfig) -> Capture:
                 render_courtyard(folder, progress=lambda done, total: report("courtyard", done, total), **inputs)
 
         entry = store.get(CAPTURE, inputs, build)
-        capture = read_colmap(options.name, entry.path, **selection)
-        return dataclasses.replace(capture, exact_poses=True)
+        return read_colmap(options.name, entry.path, exact_poses=True, **selection)
     path = Path(str(options.path)).expanduser()
     if options.kind == "photos":
-        return read_photos(options.name, path, **selection)
+        return read_photos(options.name, path, images=options.images, **selection)
     return read_colmap(options.name, path, images=options.images, sparse=options.sparse, **selection)
 
 
@@ -87,9 +86,8 @@ def initialize(store: Store, capture: Capture, initializer: Initializer) -> Entr
 
     def build(folder: Path) -> None:
         with progress("init") as report:
-            initializer.run(
-                capture, folder, report, reference=None if reference is None else reference.path / MODEL_FOLDER
-            )
+            cameras = None if reference is None else reference.path / MODEL_FOLDER
+            initializer.run(capture, folder, report, reference=cameras)
 
     return store.get(INIT, inputs, build)
 
@@ -271,6 +269,3 @@ def versions() -> dict[str, str]:
             continue
     return found
 
-
-def _path(value: str | None) -> Path | None:
-    return None if value is None else Path(value).expanduser()

@@ -1,0 +1,170 @@
+"""The networks' part of deep image matching: features of every image and matches of every pair, into the store."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+
+from gsbench.errors import InputError
+from gsbench.init.base import Progress
+from gsbench.init.colmap_initializer import Preparation, select_images
+from gsbench.init.dim import FeatureInitializer
+from gsbench.init.extractors import build_extractor
+from gsbench.init.feature_store import FeatureStore
+from gsbench.init.features import Features, extract_features
+from gsbench.init.matching import build_matcher, match_within_memory
+from gsbench.init.reconstruct import load_reference, select_pairs
+from gsbench.init.timer import Timer
+from gsbench.scene.types import Capture
+from gsbench.weights import file_sha256
+
+CACHE_BYTES = 1 << 30  # of descriptors held in memory while pairs are matched
+NAMES_IN_WARNING = 5
+
+
+@dataclass(frozen=True)
+class NetworkJob:
+    """What the isolated process needs; the weights are checked files, None where none are needed."""
+
+    options: FeatureInitializer
+    capture: Capture
+    reference: Path | None
+    work_dir: Path
+    extractor_weights: Path | None
+    matcher_weights: Path | None
+
+
+def open_store(
+    options: FeatureInitializer,
+    capture: Capture,
+    work_dir: Path,
+    extractor_weights: Path | None,
+    matcher_weights: Path | None,
+) -> FeatureStore:
+    """The store of features and matches for these options and weights."""
+    settings = options.feature_settings()
+    extraction = {**settings.extraction(), "weights": _digest(extractor_weights)}
+    matching = {**settings.matching(), "weights": _digest(matcher_weights)}
+    return FeatureStore(work_dir, capture.images, extraction, matching)
+
+
+def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
+    """Fill the store with what is not there yet, and tell what it took.
+
+    Raises ``InputError`` where no image has a keypoint or no pair a match.
+    """
+    options, capture = job.options, job.capture
+    torch.set_num_threads(options.threads)
+    device = choose_device(options.device)
+    store = open_store(options, capture, job.work_dir, job.extractor_weights, job.matcher_weights)
+    reference = load_reference(capture, job.reference)
+    names = select_images(options, capture, reference)
+    pairs = select_pairs(capture.images, names, options, reference)
+    timer = Timer()
+    with timer.phase("extract"):
+        empty = _extract_all(job, store, names, device, progress)
+    if len(empty) == len(names):
+        raise InputError(
+            f"{options.name}: no keypoint in any image: lower init.keypoint_threshold, or check the photos"
+        )
+    with timer.phase("match"):
+        without, halved = _match_all(job, store, pairs, device, progress)
+    if len(without) == len(pairs):
+        raise InputError(f"{options.name}: no pair of images has a match: the photos need more overlap or texture")
+    warnings = []
+    if empty:
+        warnings.append(f"no keypoint in {_some(empty)}: these images are not used")
+    if halved:
+        warnings.append(f"out of GPU memory: {len(halved)} pairs were matched with fewer keypoints")
+    weights = [path for path in (job.extractor_weights, job.matcher_weights) if path is not None]
+    return Preparation(
+        seconds=timer.seconds,
+        counts={
+            "pairs_selected": len(pairs),
+            "pairs_without_matches": len(without),
+            "images_without_keypoints": len(empty),
+        },
+        settings={
+            **{key: value for key, value in options.feature_settings().extraction().items()},
+            "matcher": options.feature_settings().matcher,
+            "weights_sha256": {path.name: file_sha256(path) for path in weights},
+        },
+        warnings=tuple(warnings),
+    )
+
+
+def choose_device(name: str) -> torch.device:
+    """The torch device of that name; ``auto`` is the GPU where there is one. ``InputError`` where there is none such."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"init.device={name}: no such device here (use auto, cpu or cuda)") from error
+    return device
+
+
+def _extract_all(
+    job: NetworkJob, store: FeatureStore, names: Sequence[str], device: torch.device, progress: Progress
+) -> list[str]:
+    """Features of all images into the store; returns the names of those without any."""
+    settings, empty = job.options.feature_settings(), []
+    extractor = None
+    progress("extract", 0, len(names))
+    for done, name in enumerate(names, start=1):
+        features = store.read_features(name)
+        if features is None:
+            extractor = extractor or build_extractor(settings, job.extractor_weights, device)
+            path = job.capture.images / name
+            features = extract_features(path, extractor, settings.max_image_size, settings.max_keypoints, device)
+            store.write_features(name, features)
+        if len(features.keypoints) == 0:
+            empty.append(name)
+        progress("extract", done, len(names))
+    return empty
+
+
+def _match_all(
+    job: NetworkJob, store: FeatureStore, pairs: Sequence[tuple[str, str]], device: torch.device, progress: Progress
+) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
+    """Matches of all pairs into the store; returns the pairs without a match, and those matched in part."""
+    settings = job.options.feature_settings()
+    matcher, without, halved = None, [], []
+    read = _cached_reader(store, pairs)
+    progress("match", 0, len(pairs))
+    for done, (first, second) in enumerate(pairs, start=1):
+        matches = store.read_matches(first, second)
+        if matches is None:
+            matcher = matcher or build_matcher(settings, job.matcher_weights, device)
+            matches, in_part = match_within_memory(matcher, read(first), read(second))
+            if in_part:
+                halved.append((first, second))
+            else:
+                store.write_matches(first, second, matches)
+        if len(matches) == 0:
+            without.append((first, second))
+        progress("match", done, len(pairs))
+    return without, halved
+
+
+def _cached_reader(store: FeatureStore, pairs: Sequence[tuple[str, str]]) -> Callable[[str], Features]:
+    """`FeatureStore.require_features` that keeps as many images as `CACHE_BYTES` hold."""
+    if not pairs:
+        return store.require_features
+    example = store.require_features(pairs[0][0])
+    return lru_cache(maxsize=2 + CACHE_BYTES // max(example.descriptors.nbytes, 1))(store.require_features)
+
+
+def _digest(path: Path | None) -> str | None:
+    return None if path is None else file_sha256(path)
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:NAMES_IN_WARNING]) + (
+        f" and {len(names) - NAMES_IN_WARNING} more" if len(names) > NAMES_IN_WARNING else ""
+    )

@@ -1,0 +1,88 @@
+"""One refinement round, stated again from the formulas: plain numpy, one Gaussian at a time, no code shared with gsbench.
+
+A Gaussian is a dict of raw parameters with its two Adam moments. The normal draws come in as an iterator of rows, in the order
+in which the rules use them: all first children, then all second ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+Row = dict[str, Any]
+PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
+
+
+def rotation(q: np.ndarray) -> np.ndarray:
+    w, x, y, z = q / np.sqrt((q * q).sum())
+    return np.array(
+        [
+            [1 - 2 * y * y - 2 * z * z, 2 * x * y - 2 * w * z, 2 * x * z + 2 * w * y],
+            [2 * x * y + 2 * w * z, 1 - 2 * x * x - 2 * z * z, 2 * y * z - 2 * w * x],
+            [2 * x * z - 2 * w * y, 2 * y * z + 2 * w * x, 1 - 2 * x * x - 2 * y * y],
+        ]
+    )
+
+
+def newborn(parent: Row, mean: np.ndarray, log_scales: np.ndarray) -> Row:
+    child = {name: np.array(parent[name], copy=True) for name in PARAMETERS}
+    child["means"], child["log_scales"] = mean, log_scales
+    for name in PARAMETERS:
+        child["first " + name] = np.zeros_like(child[name])
+        child["second " + name] = np.zeros_like(child[name])
+    return child
+
+
+def split_all(rows: list[Row], chosen: list[int], scales: dict[int, np.ndarray], noise: Iterator[np.ndarray]) -> list[Row]:
+    """Two children for each chosen row, appended: every first child, then every second; the parents go."""
+    children = []
+    for _ in range(2):
+        for i in chosen:
+            s = np.exp(rows[i]["log_scales"])
+            offset = rotation(rows[i]["quaternions"]) @ (s * next(noise))
+            children.append(newborn(rows[i], rows[i]["means"] + offset, scales[i]))
+    return [row for i, row in enumerate(rows) if i not in chosen] + children
+
+
+def adc_growth(
+    rows: list[Row], mean_gradient: np.ndarray, extent: float, noise: Iterator[np.ndarray], events: dict[str, int]
+) -> list[Row]:
+    n = len(rows)
+    clones = []
+    for i in range(n):
+        if mean_gradient[i] >= 0.0002 and np.exp(rows[i]["log_scales"]).max() <= 0.01 * extent:
+            clones.append(newborn(rows[i], rows[i]["means"].copy(), rows[i]["log_scales"].copy()))
+    chosen = [
+        i for i in range(n) if mean_gradient[i] >= 0.0002 and np.exp(rows[i]["log_scales"]).max() > 0.01 * extent
+    ]
+    events["cloned"], events["split_gradient"] = len(clones), len(chosen)
+    scales = {i: np.log(np.exp(rows[i]["log_scales"]) / 1.6) for i in chosen}
+    return split_all(rows + clones, chosen, scales, noise)
+
+
+def volume_growth(rows: list[Row], threshold: float, noise: Iterator[np.ndarray], events: dict[str, int]) -> list[Row]:
+    chosen, scales, again = [], {}, 0
+    for i, row in enumerate(rows):
+        s = np.exp(row["log_scales"])
+        if 4 / 3 * math.pi * s[0] * s[1] * s[2] > threshold:
+            eigenvalues = s**2 / ((s.max() / s.min()) ** 2)  # eq. 7
+            chosen.append(i)
+            scales[i] = np.log(np.sqrt(eigenvalues))
+            again += 4 / 3 * math.pi * np.sqrt(eigenvalues).prod() > threshold
+    events["split_volume"], events["isotropic_resplit"] = len(chosen), int(again)
+    return split_all(rows, chosen, scales, noise)
+
+
+def prune(rows: list[Row], step: int, extent: float, events: dict[str, int]) -> list[Row]:
+    kept, events["pruned_opacity"], events["pruned_size"] = [], 0, 0
+    for row in rows:
+        if 1 / (1 + math.exp(-row["opacity_logits"])) < 0.005:
+            events["pruned_opacity"] += 1
+        elif step > 3000 and np.exp(row["log_scales"]).max() > 0.1 * extent:
+            events["pruned_size"] += 1
+        else:
+            kept.append(row)
+    return kept

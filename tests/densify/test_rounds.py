@@ -1,0 +1,154 @@
+"""Whole refinement rounds against the slow restatement: the same Gaussians, optimiser moments and events."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.densify import ADC, Densifier, DensifyContext, Volumetric
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.raster.base import RenderOutput
+from tests.densify import restatement
+from tests.gaussians.helpers import random_gaussians
+
+EXTENT = 4.0
+
+
+def prepared(densifier: Densifier, seed: int, count: int = 60) -> tuple[TrainableGaussians, np.ndarray]:
+    """Gaussians with uneven Adam moments, and three observed iterations; also the mean gradient of each."""
+    rng = np.random.default_rng(seed)
+    gaussians = random_gaussians(count, seed, log_scale=(-6.0, 0.3))
+    gaussians.opacity_logits.copy_(torch.from_numpy(rng.uniform(-8, 3, count)))
+    trainable = TrainableGaussians(gaussians, LearningRates(), EXTENT)
+    for _ in range(2):
+        for tensor in trainable.values.tensors().values():
+            tensor.grad = torch.from_numpy(rng.normal(size=tensor.shape) * 1e-3)
+        trainable.optimizer_step()
+    densifier.begin(trainable.values.detach(), DensifyContext(EXTENT))
+    total, seen = np.zeros(count), np.zeros(count)
+    for step in range(1, 4):
+        points = torch.zeros(count, 2, dtype=torch.float64, requires_grad=True)
+        points.grad = torch.from_numpy(rng.exponential(2e-4, (count, 2)))
+        radii = torch.from_numpy(rng.integers(0, 3, count).astype(np.int32))
+        densifier.observe(step, RenderOutput(torch.empty(0), torch.empty(0), radii, points))
+        for i in range(count):
+            if radii[i] > 0:
+                total[i] += np.hypot(*points.grad[i].numpy())
+                seen[i] += 1
+    return trainable, np.divide(total, seen, out=np.zeros(count), where=seen > 0)
+
+
+def to_rows(trainable: TrainableGaussians) -> list[restatement.Row]:
+    tensors = trainable.values.tensors()
+    moments = {name: trainable.optimizer.state[tensor] for name, tensor in tensors.items()}
+    rows = []
+    for i in range(len(trainable)):
+        row = {name: tensor[i].detach().numpy().copy() for name, tensor in tensors.items()}
+        row |= {"first " + name: state["exp_avg"][i].numpy().copy() for name, state in moments.items()}
+        row |= {"second " + name: state["exp_avg_sq"][i].numpy().copy() for name, state in moments.items()}
+        rows.append(row)
+    return rows
+
+
+def noise_of(seed: int, counts: list[int]) -> list[np.ndarray]:
+    """The normal draws of the real code: one batch of [2 S, 3] per rule that splits S parents."""
+    rng = torch.Generator().manual_seed(seed)
+    return [row for s in counts for row in torch.randn(2 * s, 3, generator=rng, dtype=torch.float64).numpy()]
+
+
+def assert_same(trainable: TrainableGaussians, rows: list[restatement.Row]) -> None:
+    found = to_rows(trainable)
+    assert len(found) == len(rows)
+    for real, expected in zip(found, rows, strict=True):
+        assert real.keys() == expected.keys()
+        for name in real:
+            np.testing.assert_allclose(real[name], expected[name], rtol=1e-5, atol=1e-7, err_msg=name)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("step", [600, 3100])
+def test_adc_round(seed: int, step: int) -> None:
+    densifier = ADC()
+    trainable, gradient = prepared(densifier, seed)
+    rows, expected = to_rows(trainable), {}
+    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
+    noise = iter(noise_of(seed, [event.split_gradient]))
+    rows = restatement.adc_growth(rows, gradient, EXTENT, noise, expected)
+    rows = restatement.prune(rows, step, EXTENT, expected)
+    assert_same(trainable, rows)
+    assert expected == {name: getattr(event, name) for name in expected}
+    assert event.cloned > 0
+    assert event.split_gradient > 0
+    assert event.after == len(rows) == len(densifier.lineage.ids)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("step", [600, 3100])
+def test_volumetric_round(seed: int, step: int) -> None:
+    densifier = Volumetric(volume_threshold=0.03)
+    trainable, gradient = prepared(densifier, seed)
+    rows, expected = to_rows(trainable), {}
+    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
+    noise = iter(noise_of(seed, [event.split_gradient, event.split_volume]))
+    rows = restatement.adc_growth(rows, gradient, EXTENT, noise, expected)
+    rows = restatement.volume_growth(rows, 0.03, noise, expected)
+    rows = restatement.prune(rows, step, EXTENT, expected)
+    assert_same(trainable, rows)
+    assert expected == {name: getattr(event, name) for name in expected}
+    assert event.split_volume > 0
+
+
+def test_every_event_balances() -> None:
+    for seed in range(20):
+        densifier = Volumetric(max_gaussians=80, cap="hard")
+        trainable, _ = prepared(densifier, seed)
+        event = densifier.refine(3100, trainable, torch.Generator().manual_seed(seed))
+        grown = event.cloned + event.split_gradient + event.split_volume
+        assert event.after == event.before + grown - event.pruned_opacity - event.pruned_size
+
+
+def test_optimizer_step_is_skipped_after_a_refinement_and_goes_on_after_it() -> None:
+    densifier = ADC()
+    trainable, _ = prepared(densifier, 0)
+    for tensor in trainable.values.tensors().values():
+        tensor.grad = torch.ones_like(tensor)
+    densifier.refine(600, trainable, torch.Generator().manual_seed(0))
+    before = trainable.values.detach().map(torch.clone)
+    trainable.optimizer_step()
+    assert torch.equal(before.means, trainable.values.means)
+    trainable.values.means.grad = torch.ones_like(trainable.values.means)
+    trainable.optimizer_step()
+    assert not torch.equal(before.means, trainable.values.means)
+    assert float(trainable.optimizer.state[trainable.values.means]["step"]) == 3
+
+
+def test_opacity_reset_zeroes_the_opacity_moments_only() -> None:
+    densifier = ADC(start=5000, stop=20_000)
+    trainable, _ = prepared(densifier, 1)
+    before = trainable.values.detach().map(torch.clone)
+    event = densifier.refine(3000, trainable, torch.Generator())
+    assert event.opacity_reset
+    torch.testing.assert_close(trainable.values.opacities, before.opacities.clamp_max(0.01))
+    assert torch.equal(trainable.values.means, before.means)
+    assert not trainable.optimizer.state[trainable.values.opacity_logits]["exp_avg"].any()
+    assert trainable.optimizer.state[trainable.values.means]["exp_avg"].all()
+
+
+def test_refinements_of_the_paper_schedule() -> None:
+    """144 refinements at 600, 700 ... 14,900 and resets at 3000, 6000, 9000, 12,000 (the baseline's own count)."""
+    densifier = ADC()
+    gaussians = random_gaussians(4)
+    gaussians = Gaussians(**gaussians.tensors())
+    trainable = TrainableGaussians(gaussians, LearningRates(), EXTENT)
+    densifier.begin(gaussians, DensifyContext(EXTENT))
+    due, resets = [], []
+    densifier._grow_and_prune = lambda step, *_: due.append(step)  # type: ignore[method-assign]
+    for step in range(1, 30_001):
+        event = densifier.refine(step, trainable, torch.Generator())
+        if event is not None and event.opacity_reset:
+            resets.append(step)
+    assert due == list(range(600, 15_000, 100))
+    assert len(due) == 144
+    assert resets == [3000, 6000, 9000, 12_000]

@@ -1,0 +1,151 @@
+"""The paper's formulas on cases computed by hand, and the thresholds and budgets around them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from gsbench.densify import DensifyContext, Volumetric
+from gsbench.densify.budget import admit, allowance
+from gsbench.densify.volume import child_log_scales, log_condition, log_volume
+from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from tests.gaussians.helpers import random_gaussians
+
+
+def scales(*rows: tuple[float, float, float]) -> torch.Tensor:
+    return torch.tensor(rows, dtype=torch.float64).log()
+
+
+def test_isotropic_keeps_its_size() -> None:
+    sphere = scales((0.2, 0.2, 0.2))
+    assert math.exp(log_volume(sphere)) == pytest.approx(4 / 3 * math.pi * 0.008)
+    assert math.exp(log_condition(sphere)) == pytest.approx(1)
+    torch.testing.assert_close(child_log_scales(sphere), sphere)
+
+
+def test_elongated_by_two() -> None:
+    """Axes 2, 1, 1: kappa = 4; eigenvalues 4, 1, 1 become 1, 1/4, 1/4; axes 1, 1/2, 1/2; volume divided by 8 = 4^1.5."""
+    parent = scales((2.0, 1.0, 1.0))
+    assert math.exp(log_condition(parent)) == pytest.approx(4)
+    child = child_log_scales(parent)
+    torch.testing.assert_close(child.exp(), torch.tensor([[1.0, 0.5, 0.5]], dtype=torch.float64))
+    assert math.exp(log_volume(parent) - log_volume(child)) == pytest.approx(8)
+    in_scales = child_log_scales(parent, "scales")  # s / kappa
+    torch.testing.assert_close(in_scales.exp(), torch.tensor([[0.5, 0.25, 0.25]], dtype=torch.float64))
+
+
+def test_needle_vanishes_and_the_limit_prevents_it() -> None:
+    needle = scales((1.0, 1e-3, 1e-3))  # kappa = 1e6
+    torch.testing.assert_close(child_log_scales(needle).exp(), torch.tensor([[1e-3, 1e-6, 1e-6]], dtype=torch.float64))
+    limited = child_log_scales(needle, max_condition=4.0)
+    torch.testing.assert_close(limited.exp(), torch.tensor([[0.5, 5e-4, 5e-4]], dtype=torch.float64))
+
+
+def test_volume_does_not_underflow() -> None:
+    tiny = torch.full((1, 3), -300.0)
+    assert float(log_volume(tiny)) == pytest.approx(-900 + math.log(4 * math.pi / 3))
+
+
+def run_volume_rule(log_scales: torch.Tensor, rounds: int = 1, **options: object):  # type: ignore[no-untyped-def]
+    gaussians = random_gaussians(len(log_scales))
+    gaussians.log_scales = log_scales.clone()
+    gaussians.opacity_logits.fill_(2.0)
+    densifier = Volumetric(**options)  # type: ignore[arg-type]
+    densifier.begin(gaussians, DensifyContext(extent=10.0))
+    trainable = TrainableGaussians(gaussians, LearningRates(), 10.0)
+    rng = torch.Generator().manual_seed(0)
+    events = [densifier.refine(600 + 100 * i, trainable, rng) for i in range(rounds)]
+    return trainable, events, densifier
+
+
+def radius_of(volume: float) -> float:
+    return (volume * 3 / (4 * math.pi)) ** (1 / 3)
+
+
+def test_threshold_is_exclusive() -> None:
+    """Exactly at the threshold is not above it."""
+    radius = radius_of(0.03)
+    at = torch.full((1, 3), math.log(radius), dtype=torch.float64)
+    exact = math.exp(float(log_volume(at)[0]))
+    _, (event,), _ = run_volume_rule(at, volume_threshold=exact * (1 + 1e-12))
+    assert event.split_volume == 0
+    _, (event,), _ = run_volume_rule(at, volume_threshold=exact * (1 - 1e-12))
+    assert event.split_volume == 1
+
+
+def test_isotropic_gaussians_are_split_again_and_again() -> None:
+    trainable, events, _ = run_volume_rule(scales((0.5, 0.5, 0.5)), rounds=5)
+    assert [event.isotropic_resplit for event in events] == [1, 2, 4, 8, 16]
+    assert len(trainable) == 32
+    trainable, events, _ = run_volume_rule(scales((0.5, 0.5, 0.5)), rounds=5, split_isotropic=False)
+    assert len(trainable) == 1
+    trainable, events, _ = run_volume_rule(scales((0.5, 0.5, 0.5)), rounds=8, max_gaussians=11, cap="hard")
+    assert len(trainable) == 11
+    assert events[-1].blocked_by_cap == 11
+    trainable, events, _ = run_volume_rule(scales((0.5, 0.5, 0.5)), rounds=8, max_gaussians=11, cap="soft")
+    assert len(trainable) == 16  # 8 is not over the cap, so one more round; 16 is
+
+
+def test_vanishing_needles_are_reported() -> None:
+    shapes = scales((30.0, 30.0, 1e-4), (0.6, 0.5, 0.4))  # children of the disc have axes of 1e-4 and less
+    _, (event,), _ = run_volume_rule(shapes)
+    assert event.split_volume == 2
+    assert event.vanished == 1  # below 1e-4 of the extent of 10
+    _, (event,), _ = run_volume_rule(shapes, max_condition=100.0)
+    assert event.vanished == 0
+
+
+def test_threshold_modes() -> None:
+    log_scales = random_gaussians(1000, log_scale=(-4, 0)).log_scales
+    volumes = log_volume(log_scales)
+
+    def selected(**options: object) -> int:
+        return run_volume_rule(log_scales, **options)[1][0].split_volume
+
+    assert selected(threshold_mode="absolute") == int((volumes.exp() > 0.03).sum())
+    assert selected(threshold_mode="extent_relative", volume_threshold=3e-5) == int((volumes.exp() > 0.03).sum())
+    assert selected(threshold_mode="quantile", volume_quantile=0.99) == 10
+    outlier = torch.cat([log_scales, torch.full((3, 3), 2.0, dtype=torch.float64) + torch.tensor([0.0, 0.1, 0.2])])
+    third, first = torch.quantile(log_volume(outlier), 0.75), torch.quantile(log_volume(outlier), 0.25)
+    expected = int((log_volume(outlier) > third + 1.5 * (third - first)).sum())
+    assert run_volume_rule(outlier, threshold_mode="auto")[1][0].split_volume == expected >= 3
+
+
+def test_auto_threshold_does_not_depend_on_the_gauge() -> None:
+    log_scales = random_gaussians(500, log_scale=(-5, 0.5)).log_scales
+    log_scales[:5] += 2.5
+    counts = {run_volume_rule(log_scales + math.log(k), threshold_mode="auto")[1][0].split_volume for k in (0.01, 1, 50)}
+    assert len(counts) == 1
+    assert counts.pop() > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "key"),
+    [
+        ({"volume_threshold": -1.0}, "densify.volume_threshold"),
+        ({"max_condition": 0.5}, "densify.max_condition"),
+        ({"interval": 0}, "densify.interval"),
+        ({"volume_interval": 150}, "densify.volume_interval"),
+        ({"gradient_threshold": 0.0}, "densify.gradient_threshold"),
+        ({"max_gaussians": 0}, "densify.max_gaussians"),
+        ({"stop": 10}, "densify.stop"),
+        ({"threshold_mode": "banana"}, "densify.threshold_mode"),
+    ],
+)
+def test_bad_values_name_their_key(options: dict[str, object], key: str) -> None:
+    with pytest.raises(ValueError, match=key):
+        Volumetric(**options)  # type: ignore[arg-type]
+
+
+def test_admit_takes_the_best_and_says_how_many_it_refused() -> None:
+    candidates = torch.tensor([True, True, False, True])
+    score = torch.tensor([1.0, 3.0, 9.0, 3.0])
+    admitted, refused = admit(candidates, score, 1, 2)
+    assert admitted.tolist() == [False, True, False, True]
+    assert refused == 1
+    assert allowance(5, 10, "hard") == 5
+    assert allowance(10, 10, "soft") is None
+    assert allowance(11, 10, "soft") == 0
+    assert allowance(11, None, "hard") is None
