@@ -62,6 +62,7 @@ class TrainConfig:
     densify_stop: int = 15_000
     densify_interval: int = 100
     opacity_reset_interval: int = 3000
+    mcmc_stop: int = 25_000  # 3DGS-MCMC refines for longer
     step_after_refine: bool = False  # True: gsplat's order, the optimiser steps before a refinement and loses no step
     visible_adam: bool = False  # update visible Gaussians only; a departure from the baseline
     max_seconds: float | None = None  # a budget of training time; the run ends at the first iteration past it

@@ -5,7 +5,7 @@ class GsbenchError(Exception):
     """Base of every error that gsbench raises on purpose; its text is one line: the cause, then the mend."""
 
 
-class InputError(GsbenchError):
+class InputError(GsbenchError, ValueError):
     """The user's files or settings cannot be used (exit code 2)."""
 
 

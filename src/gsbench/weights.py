@@ -1,7 +1,7 @@
 """Weights of networks: found in a folder, or downloaded, and in every case checked before they are read.
 
-A file is looked for in the folder given by the caller, then in ``$GSBENCH_WEIGHTS`` (both with their sub-folders), then in
-the torch hub cache; if it lies nowhere it is downloaded into that cache. Nothing is ever unpickled as code.
+A file is looked for in the folder given by the caller, then in ``$GSBENCH_WEIGHTS`` (both with their sub-folders), then
+in the torch hub cache; if it lies nowhere it is downloaded into that cache. Nothing is ever unpickled as code.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SHA256_DIGITS = 64
 SAFETENSORS_SUFFIX = ".safetensors"
 
 
-class MissingWeights(InputError):
+class MissingWeights(InputError):  # noqa: N818  it says what is the matter
     """A weights file lies nowhere and cannot be downloaded, or what lies there is not that file."""
 
 
@@ -102,7 +102,8 @@ def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path
 def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
     """The tensors in ``path`` (.safetensors, or a PyTorch file read with ``weights_only``), on the CPU, by name.
 
-    ``entry`` is the key under which a PyTorch file keeps them, where they are not all it holds. Raises ``MissingWeights`` where the file is truncated, is no weights file, or holds anything but tensors.
+    ``entry`` is the key under which a PyTorch file keeps them, where they are not all it holds. Raises
+    ``MissingWeights`` where the file is truncated, is no weights file, or holds anything but tensors.
     """
     import pickle
     import zipfile

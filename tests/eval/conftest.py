@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tests.eval.synthetic import Plan, write_runs
 
 from gsbench.eval.results import Experiment, load_experiment
+from tests.eval.synthetic import Plan, write_runs
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tests.eval.synthetic import Plan, write_runs
 
 from gsbench.errors import InputError
 from gsbench.eval.cells import Cell
@@ -16,6 +15,7 @@ from gsbench.eval.paper_tables import Agreement, agreement, paper_tables, t_half
 from gsbench.eval.results import Experiment, load_experiment
 from gsbench.eval.tables import build_table
 from gsbench.eval.tables_cli import main_tables
+from tests.eval.synthetic import Plan, write_runs
 
 
 def cell(mean: float, std: float | None = None, count: int = 3) -> Cell:

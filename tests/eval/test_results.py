@@ -9,10 +9,10 @@ import time
 from pathlib import Path
 
 import pytest
-from tests.eval.synthetic import Plan, write_runs
 
 from gsbench.errors import InputError
 from gsbench.eval.results import list_experiments, load_experiment, read_json_lines, read_views
+from tests.eval.synthetic import Plan, write_runs
 
 
 def rewrite(path: Path, **changes: object) -> None:

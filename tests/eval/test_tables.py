@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.eval.synthetic import Plan, trial_data, write_runs, write_trial
 
 from gsbench.errors import InputError
 from gsbench.eval.results import Experiment, load_experiment
 from gsbench.eval.table_formats import escape_latex, to_csv, to_html, to_html_page, to_latex, to_markdown
 from gsbench.eval.tables import Table, build_table, cost_change
+from tests.eval.synthetic import Plan, trial_data, write_runs, write_trial
 
 Make = Callable[..., Experiment]
 

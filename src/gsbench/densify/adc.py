@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsbench.densify.base import Densifier, DensifyContext, require
-from gsbench.densify.budget import CapKind, admit, allowance
+from gsbench.densify.budget import CapKind, admit, allowance, limit_at
 from gsbench.densify.events import Cause, RefineEvent
 from gsbench.densify.operations import revised_logits, split
 from gsbench.gaussians.model import Gaussians
@@ -60,14 +60,23 @@ class ADC(Densifier):
         require(self.opacity_reset_interval >= 1, "opacity_reset_interval", self.opacity_reset_interval, "at least 1")
         require(0 < self.opacity_reset_value < 1, "opacity_reset_value", self.opacity_reset_value, "in (0, 1)")
         require(self.max_gaussians is None or self.max_gaussians >= 1, "max_gaussians", self.max_gaussians, "at least 1")
-        require(self.cap in ("soft", "hard"), "cap", self.cap, "soft or hard")
+        require(self.cap in ("soft", "hard", "curve"), "cap", self.cap, "soft, hard or curve")
+        require(self.cap != "curve" or self.max_gaussians is not None, "max_gaussians", None, "set for densify.cap=curve")
 
     @property
     def needs_absolute_gradient(self) -> bool:  # type: ignore[override]
         return self.gradient == "absolute"
 
     def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
+        limit = self.max_gaussians
+        require(
+            limit is None or limit >= len(gaussians),
+            "max_gaussians",
+            limit,
+            f"at least the size of the initial cloud ({len(gaussians)})",
+        )
         super().begin(gaussians, context)
+        self.initial_count = len(gaussians)
         self._forget_statistics(len(gaussians), gaussians.means.device)
 
     def observe(self, step: int, render: RenderOutput) -> None:
@@ -110,7 +119,7 @@ class ADC(Densifier):
         over = mean >= self.gradient_threshold if self.threshold_inclusive else mean > self.gradient_threshold
         large = gaussians.values.log_scales.amax(-1) > math.log(self.split_size * self.context.extent)  # [N]
         gain = self.split_children - 1
-        allowed = allowance(len(gaussians), self.max_gaussians, self.cap)
+        allowed = self._allowance(step, len(gaussians))
         selected, blocked = admit(over, mean, max(1, gain), allowed)
         event.blocked_by_cap += blocked
         self._clone(step, gaussians, selected & ~large, event)
@@ -125,6 +134,10 @@ class ADC(Densifier):
             Cause.SPLIT_GRADIENT,
             self.revised_opacity,
         )
+
+    def _allowance(self, step: int, num_gaussians: int) -> int | None:
+        limit = limit_at(step, self.start, self.stop, self.initial_count, self.max_gaussians, self.cap)
+        return allowance(num_gaussians, limit, self.cap)
 
     def _clone(self, step: int, gaussians: TrainableGaussians, selected: Tensor, event: RefineEvent) -> None:
         parents = selected.nonzero().squeeze(-1)  # [C]
@@ -189,6 +202,7 @@ class ADC(Densifier):
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {
+            "initial_count": self.initial_count,
             "gradient_sum": self.gradient_sum.clone(),
             "visible_count": self.visible_count.clone(),
             "max_radii": self.max_radii.clone(),
@@ -196,6 +210,7 @@ class ADC(Densifier):
 
     def load_state_dict(self, state: dict[str, Any], context: DensifyContext) -> None:
         super().load_state_dict(state, context)
+        self.initial_count = state["initial_count"]
         self.gradient_sum = state["gradient_sum"].clone()
         self.visible_count = state["visible_count"].clone()
         self.max_radii = state["max_radii"].clone()

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsbench.errors import InputError
 from gsbench.densify.events import Cause, Lineage, RefineEvent
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
@@ -33,6 +34,10 @@ class Densifier:
     context: DensifyContext
     lineage: Lineage
     needs_absolute_gradient: bool = False
+
+    def prepare(self, gaussians: Gaussians) -> Gaussians:
+        """The Gaussians that the training starts with, from those of the initial cloud."""
+        return gaussians
 
     def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
         """Start a training of ``gaussians``: forget all earlier state."""
@@ -80,6 +85,6 @@ class NoDensifier(Densifier):
 
 
 def require(condition: bool, key: str, value: object, rule: str) -> None:
-    """Raise ValueError naming the hyper-parameter ``key`` unless ``condition`` holds."""
+    """Raise InputError naming the hyper-parameter ``key`` unless ``condition`` holds."""
     if not condition:
-        raise ValueError(f"densify.{key} must be {rule}, got {value!r}")
+        raise InputError(f"densify.{key} must be {rule}, got {value!r}")

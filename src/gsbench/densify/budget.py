@@ -7,14 +7,26 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-CapKind = Literal["soft", "hard"]
+CapKind = Literal["soft", "hard", "curve"]
+
+
+def limit_at(step: int, start: int, stop: int, initial: int, max_gaussians: int | None, cap: CapKind) -> int | None:
+    """The cap that holds at iteration ``step``.
+
+    ``curve`` rises from the ``initial`` count at ``start`` to ``max_gaussians`` at ``stop`` along n0 + (n - n0) (2x - x^2), so
+    that arms grow alike and the last refinements are small (the idea of Taming 3DGS, arXiv 2406.15643).
+    """
+    if max_gaussians is None or cap != "curve":
+        return max_gaussians
+    x = min(max((step - start) / (stop - start), 0.0), 1.0)
+    return round(initial + (max_gaussians - initial) * (2 * x - x * x))
 
 
 def allowance(num_gaussians: int, max_gaussians: int | None, cap: CapKind) -> int | None:
     """How many Gaussians a growth step may add; None for no limit.
 
     ``soft``: no limit up to ``max_gaussians``, nothing beyond it, so one step may overshoot (the paper's cap, whose counts
-    end at 3.41 to 3.57 M for 3.4 M). ``hard``: never beyond ``max_gaussians``.
+    end at 3.41 to 3.57 M for 3.4 M). ``hard`` and ``curve``: never beyond it.
     """
     if max_gaussians is None:
         return None

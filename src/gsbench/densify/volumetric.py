@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsbench.densify.adc import ADC
 from gsbench.densify.base import require
-from gsbench.densify.budget import admit, allowance
+from gsbench.densify.budget import admit
 from gsbench.densify.events import Cause, RefineEvent
 from gsbench.densify.volume import ConditionOf, child_log_scales, log_volume
 from gsbench.gaussians.trainable import TrainableGaussians
@@ -101,7 +101,7 @@ class Volumetric(ADC):
         if not self.split_isotropic:
             selected &= ~again
         gain = self.volume_children - (0 if self.keep_parent else 1)
-        selected, blocked = admit(selected, volumes, gain, allowance(len(gaussians), self.max_gaussians, self.cap))
+        selected, blocked = admit(selected, volumes, gain, self._allowance(step, len(gaussians)))
         event.volume_threshold = math.exp(threshold)
         event.blocked_by_cap += blocked
         event.isotropic_resplit += int((selected & again).sum())

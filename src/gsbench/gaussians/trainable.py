@@ -66,6 +66,11 @@ class TrainableGaussians:
     def device(self) -> torch.device:
         return self.values.means.device
 
+    @property
+    def position_rate(self) -> float:
+        """The present learning rate of the means, world units."""
+        return float(self._group("means")["lr"])
+
     def set_step(self, step: int) -> None:
         """Set the learning rate of the means for iteration ``step`` (1, 2, …)."""
         self._group("means")["lr"] = self.rates.position(step) * self.spatial_scale

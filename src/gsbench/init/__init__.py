@@ -3,6 +3,7 @@
 from gsbench.init.base import (
     MODEL_FOLDER,
     OWN_GAUGE_FOLDER,
+    PICTURE_FILE,
     REPORT_FILE,
     Gauge,
     Initializer,
@@ -20,6 +21,7 @@ from gsbench.init.sfm import Sfm, SfmDense
 __all__ = [
     "MODEL_FOLDER",
     "OWN_GAUGE_FOLDER",
+    "PICTURE_FILE",
     "REPORT_FILE",
     "Dataset",
     "Dim",

@@ -16,6 +16,7 @@ from gsbench.scene.types import Capture
 MODEL_FOLDER = Path("sparse", "0")  # below the output folder: where COLMAP users and 3DGS trainers look
 OWN_GAUGE_FOLDER = Path("sparse_own_gauge", "0")  # the same model as its own mapper scaled it, before alignment
 REPORT_FILE = "report.json"
+PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
 POSES = ("shared", "own")
 
 
@@ -133,9 +134,9 @@ class Initializer(Protocol):
     def run(
         self, capture: Capture, output_dir: Path, progress: Progress = no_progress, reference: Path | None = None
     ) -> InitReport:
-        """Write the model to ``output_dir / MODEL_FOLDER`` and the report to ``output_dir / REPORT_FILE``.
+        """Write the model to `MODEL_FOLDER`, the report to `REPORT_FILE` and a picture to `PICTURE_FILE`.
 
-        The cameras have the sizes of the files in ``capture.images``. ``reference`` is a COLMAP model of the same files
-        whose cameras stand in for those that the capture came with.
+        All are below ``output_dir``. The cameras have the sizes of the files in ``capture.images``. ``reference`` is a
+        COLMAP model of the same files whose cameras stand in for those that the capture came with.
         """
         ...

@@ -6,16 +6,14 @@ import logging
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from gsbench.errors import InputError
 from gsbench.init.base import (
-    MODEL_FOLDER,
     OWN_GAUGE_FOLDER,
     POSES,
-    REPORT_FILE,
     InitReport,
     Progress,
     no_progress,
@@ -258,19 +256,19 @@ def _finish(
             reconstruct.write_model(model, job.output_dir / OWN_GAUGE_FOLDER)
             reconstruct.apply_similarity(model, similarity)
             scale = 1.0
-    reconstruct.write_model(model, job.output_dir / MODEL_FOLDER)
-    result = InitReport(
-        init=options.name,
-        poses=poses,
-        **report.model_figures(model, capture),
-        gauge=report.measure_gauge(report.training_extent(model, capture), scale),
+    result = report.make_report(
+        options.name,
+        poses,
+        capture,
+        model,
+        scale,
+        settings={**asdict(options), **job.preparation.settings},
+        seconds=timer.rounded(),
+        packages=options.packages(),
         own_gauge=own_gauge,
         pose_errors=pose_errors,
-        seconds=timer.rounded(),
-        settings={**asdict(options), **job.preparation.settings},
-        versions=report.package_versions(*options.packages()),
         counts=counts,
+        warnings=warnings,
     )
-    result = replace(result, warnings=(*warnings, *report.find_warnings(result, model)))
-    result.write(job.output_dir / REPORT_FILE)
+    report.write_result(model, result, job.output_dir)
     return result

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from gsbench.errors import InputError
-from gsbench.init.base import MODEL_FOLDER, REPORT_FILE, InitReport, Progress, no_progress
+from gsbench.init.base import InitReport, Progress, no_progress
 from gsbench.init.relay import run_with_progress
 from gsbench.init.timer import Timer
 from gsbench.scene.types import Capture
@@ -39,7 +39,7 @@ class Dataset:
 
 
 def _copy_model(job: tuple[Dataset, Capture, Path], progress: Progress) -> InitReport:
-    from gsbench.init import reconstruct, report
+    from gsbench.init import report
     from gsbench.scene.colmap import read_reference
 
     options, capture, output_dir = job
@@ -48,16 +48,15 @@ def _copy_model(job: tuple[Dataset, Capture, Path], progress: Progress) -> InitR
         model = read_reference(capture)
     if model.num_points3D() == 0:
         raise InputError(f"init=dataset: the model of scene {capture.name} has no points: use init=sfm or init=random")
-    reconstruct.write_model(model, output_dir / MODEL_FOLDER)
-    result = InitReport(
-        init=options.name,
-        poses="shared",
-        **report.model_figures(model, capture),
-        gauge=report.measure_gauge(report.training_extent(model, capture), 1.0),
-        seconds=timer.rounded(),
+    result = report.make_report(
+        options.name,
+        "shared",
+        capture,
+        model,
+        1.0,
         settings=asdict(options),
-        versions=report.package_versions("pycolmap"),
+        seconds=timer.rounded(),
+        packages=("pycolmap",),
     )
-    result = replace(result, warnings=report.find_warnings(result, model))
-    result.write(output_dir / REPORT_FILE)
+    report.write_result(model, result, output_dir)
     return result

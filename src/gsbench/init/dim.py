@@ -36,7 +36,7 @@ NMS_RADII = {"superpoint": 3, "aliked": 2, "disk": 2}  # px
 class FeatureInitializer(ColmapInitializer):
     """Features and matches from outside COLMAP, verified and mapped or triangulated by it.
 
-    Sizes are in px of the image files' longest side. Features and matches are kept in the ``work_dir`` given to `run`, by
+    Sizes are in px of the image files' longest side. Features and matches are kept in the ``work_dir`` of `run`, by
     image and by pair, so a killed run goes on there.
     """
 
@@ -101,9 +101,10 @@ class FeatureInitializer(ColmapInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class Dim(FeatureInitializer):
-    """Deep image matching: SuperPoint, ALIKED or DISK features, matched by LightGlue or by mutual nearest descriptors."""
+    """Deep image matching: SuperPoint, ALIKED or DISK features, matched by LightGlue or as mutual nearest ones."""
 
     name: ClassVar[str] = "dim"
+    key_ignores: ClassVar[tuple[str, ...]] = ("weights", "download")  # where the files come from, not what they hold
 
     extractor: str = "superpoint"
     matcher: str = "lightglue"
@@ -125,9 +126,7 @@ class Dim(FeatureInitializer):
         if self.nms_radius is not None:
             check_integer("nms_radius", self.nms_radius, 1, 50)
         if self.extractor == "aliked" and self.matcher == "lightglue" and self.aliked_model == "t16":
-            raise InputError(
-                "init.matcher=lightglue has no weights for init.aliked_model=t16: use n16 or mutual_nearest"
-            )
+            raise InputError("init.matcher=lightglue has no weights for init.aliked_model=t16: use mutual_nearest")
 
     def feature_settings(self) -> FeatureSettings:
         threshold, radius = self.keypoint_threshold, self.nms_radius

@@ -89,8 +89,8 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
             "images_without_keypoints": len(empty),
         },
         settings={
-            **{key: value for key, value in options.feature_settings().extraction().items()},
-            "matcher": options.feature_settings().matcher,
+            **options.feature_settings().extraction(),
+            **options.feature_settings().matching(),
             "weights_sha256": {path.name: file_sha256(path) for path in weights},
         },
         warnings=tuple(warnings),
@@ -98,7 +98,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
 
 
 def choose_device(name: str) -> torch.device:
-    """The torch device of that name; ``auto`` is the GPU where there is one. ``InputError`` where there is none such."""
+    """The torch device of that name, ``auto`` being the GPU if there is one; ``InputError`` if there is none such."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -165,6 +165,5 @@ def _digest(path: Path | None) -> str | None:
 
 
 def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:NAMES_IN_WARNING]) + (
-        f" and {len(names) - NAMES_IN_WARNING} more" if len(names) > NAMES_IN_WARNING else ""
-    )
+    more = len(names) - NAMES_IN_WARNING
+    return ", ".join(names[:NAMES_IN_WARNING]) + (f" and {more} more" if more > 0 else "")

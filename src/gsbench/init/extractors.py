@@ -63,7 +63,7 @@ def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.d
     if any(name.startswith(prefix) for name in state):
         state = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
     load_into(network, state, weights)
-    network.to(device).eval()
+    torch.nn.Module.to(network.eval(), device)
 
     def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         height, width = image.shape[-2:]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -46,9 +46,10 @@ class MutualNearest:
     def __call__(self, first: Features, second: Features) -> NDArray[np.uint32]:
         from kornia.feature import match_smnn
 
-        descriptors = (torch.from_numpy(side.descriptors).to(self.device) for side in (first, second))
+        first_descriptors = torch.from_numpy(first.descriptors).to(self.device)  # [K, D]
+        second_descriptors = torch.from_numpy(second.descriptors).to(self.device)
         with torch.inference_mode():
-            _, indices = match_smnn(*descriptors, th=self.max_ratio)
+            _, indices = match_smnn(first_descriptors, second_descriptors, self.max_ratio)
         return indices.cpu().numpy().astype(np.uint32).reshape(-1, 2)
 
 
@@ -58,9 +59,9 @@ class LightGlueMatcher:
     def __init__(self, extractor: str, filter_threshold: float, weights: Path, device: torch.device) -> None:
         from kornia.feature import LightGlue
 
-        # built without a name, as a named one would download its weights
+        unnamed: Any = None  # a named one would download its weights
         layout = {key: value for key, value in LightGlue.features[extractor].items() if key != "weights"}
-        self.network = LightGlue(features=None, filter_threshold=filter_threshold, **layout)
+        self.network = LightGlue(unnamed, filter_threshold=filter_threshold, **layout)
         state = load_state(weights)
         for layer in range(self.network.conf.n_layers):  # the published files name the layers by their kind first
             for kind in ("self_attn", "cross_attn"):
@@ -99,7 +100,5 @@ def match_within_memory(matcher: Matcher, first: Features, second: Features) -> 
             count //= 2
             halved = True
             if count < MIN_HALVED_KEYPOINTS:
-                raise InputError(
-                    f"matching ran out of memory even with {2 * count} keypoints: {GPU_MEMORY_MEND}"
-                ) from error
+                raise InputError(f"matching of {2 * count} keypoints ran out of memory: {GPU_MEMORY_MEND}") from error
             torch.cuda.empty_cache()

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
 from gsbench.errors import InputError
-from gsbench.init.base import MODEL_FOLDER, REPORT_FILE, InitReport, PointCloud, Progress, no_progress
+from gsbench.init.base import InitReport, PointCloud, Progress, no_progress
 from gsbench.init.checks import check_integer, check_number
 from gsbench.init.relay import run_with_progress
 from gsbench.init.timer import Timer
@@ -81,16 +81,15 @@ def _scatter(job: tuple[Random, Capture, Path, Path | None], progress: Progress)
         cloud = random_cloud(np.mean(centers, axis=0), options.size * extent, options.count, options.seed)
         for point, color in zip(cloud.points, cloud.colors, strict=True):
             model.add_point3D(point, pycolmap.Track(), color)
-    reconstruct.write_model(model, output_dir / MODEL_FOLDER)
-    result = InitReport(
-        init=options.name,
-        poses="shared",
-        **report.model_figures(model, capture),
-        gauge=report.measure_gauge(extent, 1.0),
-        seconds=timer.rounded(),
+    result = report.make_report(
+        options.name,
+        "shared",
+        capture,
+        model,
+        1.0,
         settings=asdict(options),
-        versions=report.package_versions("pycolmap", "numpy"),
+        seconds=timer.rounded(),
+        packages=("pycolmap", "numpy"),
     )
-    result = replace(result, warnings=report.find_warnings(result, model))
-    result.write(output_dir / REPORT_FILE)
+    report.write_result(model, result, output_dir)
     return result

@@ -25,9 +25,12 @@ from gsbench.scene.types import Capture
 class Pairing(Protocol):
     """The options that choose pairs."""
 
-    pairs: str
-    overlap: int
-    neighbors: int
+    @property
+    def pairs(self) -> str: ...
+    @property
+    def overlap(self) -> int: ...
+    @property
+    def neighbors(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ def select_pairs(
     else:
         poses = {} if reference is None else poses_by_name(reference)
         if all(name in poses for name in names):
-            positions = np.array([poses[name][0] for name in names], dtype=np.float64)
+            positions: Array | None = np.array([poses[name][0] for name in names], dtype=np.float64)
         else:
             positions = gps_positions([images / name for name in names])
         if positions is None:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib import metadata
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 
 from gsbench.init.alignment import Similarity, rotation_angles, transformed_rotations
-from gsbench.init.base import Gauge, InitReport, PoseErrors
-from gsbench.init.reconstruct import common_poses, poses_by_name
+from gsbench.init.base import MODEL_FOLDER, PICTURE_FILE, REPORT_FILE, Gauge, InitReport, PoseErrors
+from gsbench.init.plot import draw_cloud
+from gsbench.init.reconstruct import common_poses, poses_by_name, write_model
 from gsbench.scene.types import EXTENT_MARGIN, Capture
 
 PAPER_VOLUME_THRESHOLD = 0.03  # V_th of the paper, in raw units of its COLMAP models
@@ -70,24 +75,51 @@ def compare_poses(
     )
 
 
-def package_versions(*packages: str) -> dict[str, str]:
-    """Installed versions by name of the package."""
-    return {package: metadata.version(package) for package in packages}
-
-
-def model_figures(model: pycolmap.Reconstruction, capture: Capture) -> dict[str, object]:
-    """The fields of `InitReport` that are counts and means over the model."""
+def make_report(
+    init: str,
+    poses: str,
+    capture: Capture,
+    model: pycolmap.Reconstruction,
+    scale_to_reference: float | None,
+    *,
+    settings: Mapping[str, Any],
+    seconds: Mapping[str, float],
+    packages: Sequence[str],
+    own_gauge: Gauge | None = None,
+    pose_errors: PoseErrors | None = None,
+    counts: Mapping[str, int] | None = None,
+    warnings: Sequence[str] = (),
+) -> InitReport:
+    """The report on ``model`` as it is written; ``packages`` are those whose installed versions it states."""
     placed = set(poses_by_name(model))
     observed = any(point.track.length() > 0 for point in model.points3D.values())
-    return {
-        "num_images": len(capture.image_names),
-        "num_registered": len(placed),
-        "unregistered": tuple(name for name in capture.image_names if name not in placed),
-        "num_points": model.num_points3D(),
-        "mean_reprojection_error": model.compute_mean_reprojection_error() if observed else None,
-        "mean_track_length": model.compute_mean_track_length() if observed else None,
-        "focal_lengths": tuple(camera.mean_focal_length() for _, camera in sorted(model.cameras.items())),
-    }
+    report = InitReport(
+        init=init,
+        poses=poses,
+        num_images=len(capture.image_names),
+        num_registered=len(placed),
+        unregistered=tuple(name for name in capture.image_names if name not in placed),
+        num_points=model.num_points3D(),
+        mean_reprojection_error=model.compute_mean_reprojection_error() if observed else None,
+        mean_track_length=model.compute_mean_track_length() if observed else None,
+        focal_lengths=tuple(camera.mean_focal_length() for _, camera in sorted(model.cameras.items())),
+        gauge=measure_gauge(training_extent(model, capture), scale_to_reference),
+        seconds=seconds,
+        settings=settings,
+        versions={package: metadata.version(package) for package in packages},
+        own_gauge=own_gauge,
+        pose_errors=pose_errors,
+        counts=counts or {},
+    )
+    return replace(report, warnings=(*warnings, *find_warnings(report, model)))
+
+
+def write_result(model: pycolmap.Reconstruction, report: InitReport, output_dir: Path) -> None:
+    """Write the model, the report and the picture where `gsbench.init.base.Initializer` promises them."""
+    write_model(model, output_dir / MODEL_FOLDER)
+    title = f"{report.init}, {report.poses} poses: {report.num_points:,} points, {report.num_registered} cameras"
+    draw_cloud(model, output_dir / PICTURE_FILE, f"{title}, from above")
+    report.write(output_dir / REPORT_FILE)
 
 
 def find_warnings(report: InitReport, model: pycolmap.Reconstruction) -> tuple[str, ...]:

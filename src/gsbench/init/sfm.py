@@ -76,7 +76,7 @@ class Sfm(ColmapInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class SfmDense(Sfm):
-    """`Sfm` with loose detection thresholds: many more points. An offline stand-in beside deep image matching, not it."""
+    """`Sfm` with loose detection thresholds, for many more points: an offline stand-in beside deep image matching."""
 
     name: ClassVar[str] = "sfm_dense"
     is_own_reference: ClassVar[bool] = False

@@ -77,6 +77,7 @@ class Trainer:
     ) -> None:
         self.scene, self.densifier, self.rasterizer, self.options = scene, densifier, rasterizer, options
         self.device = initial.means.device
+        initial = densifier.prepare(initial)
         self.background = torch.tensor(list(options.background), dtype=torch.float32, device=self.device)  # [3]
         self.context = DensifyContext(scene.extent, white_background=bool((self.background == 1).all()))
         self.gaussians = TrainableGaussians(initial, learning_rates(options), scene.extent)
@@ -129,10 +130,10 @@ class Trainer:
         loss, l1, ssim = photometric_loss(render.image, self._target(view), options.ssim_weight)
         regularizer = self.densifier.regularizer(self.gaussians.values)
         total = loss if regularizer is None else loss + regularizer
-        value = float(loss)
-        if not math.isfinite(float(total)):
+        value = loss.item()
+        if not math.isfinite(total.item()):
             raise TrainingError(
-                f"the loss became {float(total)} at iteration {step}; the last good state is the newest checkpoint in {folder}"
+                f"the loss became {total.item()} at iteration {step}; the last good state is the newest checkpoint in {folder}"
             )
         self.smoothed_loss = (
             value
@@ -143,8 +144,8 @@ class Trainer:
         record = {
             "step": step,
             "loss": value,
-            "l1": float(l1),
-            "ssim": float(ssim),
+            "l1": l1.item(),
+            "ssim": ssim.item(),
             "num_gaussians": len(self.gaussians),
             "sh_degree": self.sh_degree,
         }

@@ -233,7 +233,7 @@ def _backward(
             g_quaternions,
             g_logits,
             g_sh_dc,
-            g_sh_rest.reshape(count, -1),
+            g_sh_rest.reshape(count, 45),
             g_screen.numpy(),
             g_absolute,
             absolute is not None,

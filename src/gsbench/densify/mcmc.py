@@ -1,0 +1,157 @@
+"""3DGS as Markov chain Monte Carlo (Kheradmand et al., arXiv 2404.09591): relocation and noise instead of heuristics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from gsbench.densify.base import Densifier, DensifyContext, require
+from gsbench.densify.events import Cause, RefineEvent
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.trainable import TrainableGaussians
+
+MAX_COPIES = 51  # of one Gaussian in a relocation (the authors' table of binomials ends there)
+GATE_STEEPNESS = 100.0  # of the sigmoid that keeps noise off opaque Gaussians
+
+
+@dataclass
+class MCMC(Densifier):
+    """Dead Gaussians move to where opaque ones are, a few are added until ``max_gaussians``, and means get noise.
+
+    Copies share opacity and size so that the picture stays the same (eq. 9 of the paper). The cap is always exact.
+    """
+
+    start: int = 500
+    stop: int = 25_000
+    interval: int = 100
+    max_gaussians: int = 1_000_000
+    cap: Literal["hard"] = "hard"
+    growth: float = 0.05  # of the present count, at each refinement
+    min_opacity: float = 0.005  # dead at and below it
+    noise_rate: float = 5e5  # times the learning rate of the means
+    opacity_weight: float = 0.01  # of the mean opacity, in the loss
+    scale_weight: float = 0.01  # of the mean scale, in the loss
+    initial_opacity: float = 0.5
+    initial_scale: float = 0.1  # of the distance to the neighbours
+
+    def __post_init__(self) -> None:
+        require(self.start >= 0, "start", self.start, "at least 0")
+        require(self.stop > self.start, "stop", self.stop, f"above densify.start ({self.start})")
+        require(self.interval >= 1, "interval", self.interval, "at least 1")
+        require(self.max_gaussians >= 1, "max_gaussians", self.max_gaussians, "at least 1")
+        require(self.growth >= 0, "growth", self.growth, "at least 0")
+        require(0 < self.min_opacity < 1, "min_opacity", self.min_opacity, "in (0, 1)")
+        require(self.noise_rate >= 0, "noise_rate", self.noise_rate, "at least 0")
+        require(self.opacity_weight >= 0, "opacity_weight", self.opacity_weight, "at least 0")
+        require(self.scale_weight >= 0, "scale_weight", self.scale_weight, "at least 0")
+        require(0 < self.initial_opacity < 1, "initial_opacity", self.initial_opacity, "in (0, 1)")
+        require(self.initial_scale > 0, "initial_scale", self.initial_scale, "above 0")
+
+    def prepare(self, gaussians: Gaussians) -> Gaussians:
+        changed = {
+            "opacity_logits": torch.full_like(gaussians.opacity_logits, _logit(self.initial_opacity)),
+            "log_scales": gaussians.log_scales + math.log(self.initial_scale),
+        }
+        return Gaussians(**(gaussians.tensors() | changed))
+
+    def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
+        require(
+            len(gaussians) <= self.max_gaussians,
+            "max_gaussians",
+            self.max_gaussians,
+            f"at least the size of the initial cloud ({len(gaussians)})",
+        )
+        super().begin(gaussians, context)
+
+    def regularizer(self, gaussians: Gaussians) -> Tensor:
+        return self.opacity_weight * gaussians.opacities.mean() + self.scale_weight * gaussians.scales.mean()
+
+    @torch.no_grad()
+    def refine(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> RefineEvent | None:
+        if not (self.start < step < self.stop and step % self.interval == 0):
+            return None
+        event = RefineEvent(step=step, before=len(gaussians))
+        dead = gaussians.values.opacities <= self.min_opacity  # [N]
+        if dead.all():
+            event.after = len(gaussians)
+            return event
+        event.relocated = self._relocate(step, gaussians, dead, rng)
+        wanted = int((1 + self.growth) * len(gaussians)) - len(gaussians)
+        event.added = min(wanted, max(0, self.max_gaussians - len(gaussians)))
+        event.blocked_by_cap = wanted - event.added
+        self._add(step, gaussians, event.added, rng)
+        event.after = len(gaussians)
+        return event
+
+    @torch.no_grad()
+    def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
+        values = gaussians.values
+        gate = torch.sigmoid(-GATE_STEEPNESS * (values.opacities - self.min_opacity))  # [N]
+        noise = torch.randn(len(gaussians), 3, generator=rng, dtype=values.means.dtype).to(values.means.device)
+        axes = values.rotations * values.scales.unsqueeze(-2)  # [N, 3, 3]
+        covariance = axes @ axes.mT
+        offsets = (covariance @ noise.unsqueeze(-1)).squeeze(-1)  # [N, 3]
+        values.means += offsets * gate.unsqueeze(-1) * (self.noise_rate * gaussians.position_rate)
+
+    def _relocate(self, step: int, gaussians: TrainableGaussians, dead: Tensor, rng: torch.Generator) -> int:
+        """Turn every dead Gaussian into a copy of a living one, drawn by opacity."""
+        gone = dead.nonzero().squeeze(-1)  # [D]
+        if len(gone) == 0:
+            return 0
+        opacities = gaussians.values.opacities.detach().masked_fill(dead, 0)
+        sources = _draw(opacities, len(gone), rng)  # [D]
+        self._share(gaussians, sources)
+        copies = gaussians.values.detach().select(sources)
+        self._edit(gaussians, step, keep=~dead, append=copies, parents=sources, cause=Cause.RELOCATED)
+        return len(gone)
+
+    def _add(self, step: int, gaussians: TrainableGaussians, count: int, rng: torch.Generator) -> None:
+        if count == 0:
+            return
+        sources = _draw(gaussians.values.opacities.detach(), count, rng)  # [A]
+        self._share(gaussians, sources)
+        copies = gaussians.values.detach().select(sources)
+        self._edit(gaussians, step, append=copies, parents=sources, cause=Cause.ADDED)
+
+    def _share(self, gaussians: TrainableGaussians, sources: Tensor) -> None:
+        """Give the ``sources`` [D] the opacity and scale that they and their copies will have."""
+        copies = torch.bincount(sources, minlength=len(gaussians)) + 1  # [N] each and its copies
+        touched = copies > 1
+        opacity, shrink = shared_opacity(gaussians.values.opacities.detach()[touched], copies[touched])
+        opacity = opacity.clamp(self.min_opacity, 1 - 1e-6)
+        logits = gaussians.values.opacity_logits.detach().clone()
+        logits[touched] = torch.logit(opacity)
+        log_scales = gaussians.values.log_scales.detach().clone()
+        log_scales[touched] += shrink.log().unsqueeze(-1)
+        gaussians.overwrite("opacity_logits", logits, where=touched)
+        gaussians.overwrite("log_scales", log_scales, where=touched)
+
+def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+    """Opacity of each of n coincident copies that look like one of opacity o, and the factor for their scales.
+
+    o' = 1 - (1 - o)^(1/n) and s'/s = o / sum_{i=1..n} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1) (eq. 9); [M] each.
+    """
+    copies = copies.clamp_max(MAX_COPIES)
+    new = 1 - (1 - opacities.double()).pow(1 / copies)  # [M]
+    total = torch.zeros_like(new)
+    for i in range(1, int(copies.max()) + 1 if len(copies) else 1):
+        inner = torch.zeros_like(new)
+        for k in range(i):
+            inner += math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
+        total += torch.where(copies >= i, inner, 0.0)
+    return new.to(opacities.dtype), (opacities / total).to(opacities.dtype)
+
+
+def _draw(weights: Tensor, count: int, rng: torch.Generator) -> Tensor:
+    """``count`` indices drawn with replacement in proportion to ``weights`` [N]; on the CPU, so a seed means the same anywhere."""
+    cumulative = weights.double().cpu().cumsum(0)
+    draws = torch.rand(count, generator=rng, dtype=torch.float64) * cumulative[-1]
+    return torch.searchsorted(cumulative, draws, right=True).clamp_max(len(weights) - 1).to(weights.device)
+
+
+def _logit(p: float) -> float:
+    return math.log(p / (1 - p))

@@ -1,0 +1,143 @@
+"""The densifiers around ADC: what each changes, checked by what it must preserve."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.densify import ADC, MCMC, DensifyContext, NoDensifier
+from gsbench.densify.budget import limit_at
+from gsbench.densify.mcmc import shared_opacity
+from gsbench.densify.operations import revised_logits
+from gsbench.errors import InputError
+from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.raster.base import RenderOutput
+from tests.gaussians.helpers import random_gaussians
+
+
+@pytest.mark.parametrize("copies", [1, 2, 3, 8])
+@pytest.mark.parametrize("opacity", [0.1, 0.6, 0.95])
+def test_shared_opacity_preserves_centre_and_integral(copies: int, opacity: float) -> None:
+    """n coincident copies: the same opacity at the centre, and the same integral along a line (numerically)."""
+    o = torch.tensor([opacity], dtype=torch.float64)
+    new, factor = shared_opacity(o, torch.tensor([copies]))
+    assert 1 - (1 - float(new)) ** copies == pytest.approx(opacity)
+    x = np.linspace(-12, 12, 48_001)
+    before = opacity * np.exp(-(x**2) / 2)
+    after = 1 - (1 - float(new) * np.exp(-(x**2) / (2 * float(factor) ** 2))) ** copies
+    assert np.trapezoid(after, x) == pytest.approx(np.trapezoid(before, x), rel=1e-6)
+
+
+def test_revised_opacity_of_two_children_equals_the_parent() -> None:
+    logits = torch.tensor([-4.0, 0.0, 3.0], dtype=torch.float64)
+    child = torch.sigmoid(revised_logits(logits))
+    torch.testing.assert_close(1 - (1 - child) ** 2, torch.sigmoid(logits))
+
+
+def mcmc_state(count: int = 40, **options: object) -> tuple[MCMC, TrainableGaussians]:
+    gaussians = random_gaussians(count)
+    gaussians.opacity_logits[: count // 4] = -9.0  # dead
+    densifier = MCMC(**options)  # type: ignore[arg-type]
+    densifier.begin(gaussians, DensifyContext(4.0))
+    return densifier, TrainableGaussians(gaussians, LearningRates(), 4.0)
+
+
+def test_mcmc_moves_the_dead_and_grows_to_an_exact_cap() -> None:
+    densifier, trainable = mcmc_state(max_gaussians=50, growth=0.2)
+    rng = torch.Generator().manual_seed(0)
+    event = densifier.refine(600, trainable, rng)
+    assert (event.before, event.relocated, event.added, event.after) == (40, 10, 8, 48)
+    assert (trainable.values.opacities > densifier.min_opacity * 0.999).all()
+    event = densifier.refine(700, trainable, rng)
+    assert (event.added, event.blocked_by_cap, event.after) == (2, 7, 50)
+    assert len(densifier.lineage.ids) == 50
+    assert densifier.lineage.causes_of_living()["relocated"] > 0
+
+
+def test_mcmc_noise_moves_faint_gaussians_only() -> None:
+    densifier, trainable = mcmc_state()
+    trainable.values.opacity_logits.data[20:] = 4.0
+    before = trainable.values.means.detach().clone()
+    densifier.after_step(1, trainable, torch.Generator().manual_seed(1))
+    moved = (trainable.values.means - before).norm(dim=-1)
+    assert (moved[:10] > 0).all()
+    assert float(moved[20:].max()) < 1e-12
+
+
+def test_mcmc_refuses_a_cap_below_the_initial_cloud() -> None:
+    with pytest.raises(InputError, match=r"densify.max_gaussians .* initial cloud \(40\)"):
+        mcmc_state(max_gaussians=39)
+    with pytest.raises(InputError, match=r"densify.max_gaussians .* initial cloud"):
+        ADC(max_gaussians=3).begin(random_gaussians(4), DensifyContext(1.0))
+
+
+def test_absolute_gradient_is_what_absgrad_reads() -> None:
+    gaussians = random_gaussians(3)
+    points = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
+    points.grad = torch.zeros(3, 2, dtype=torch.float64)
+    absolute = torch.tensor([[3.0, 4.0], [0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
+    render = RenderOutput(torch.empty(0), torch.empty(0), torch.ones(3, dtype=torch.int32), points, absolute)
+    densifier = ADC(gradient="absolute")
+    assert densifier.needs_absolute_gradient
+    densifier.begin(gaussians, DensifyContext(1.0))
+    densifier.observe(1, render)
+    assert densifier.gradient_sum.tolist() == [5.0, 0.0, 1.0]
+    signed = ADC()
+    assert not signed.needs_absolute_gradient
+    signed.begin(gaussians, DensifyContext(1.0))
+    signed.observe(1, render)
+    assert not signed.gradient_sum.any()
+
+
+def test_curve_rises_from_the_cloud_to_the_cap() -> None:
+    counts = [limit_at(step, 500, 1500, 100, 1100, "curve") for step in (0, 500, 1000, 1500, 9000)]
+    assert counts == [100, 100, 850, 1100, 1100]
+    assert limit_at(600, 500, 1500, 100, 1100, "hard") == 1100
+
+
+def test_none_never_changes_anything() -> None:
+    gaussians = random_gaussians(4)
+    densifier = NoDensifier()
+    densifier.begin(gaussians, DensifyContext(1.0))
+    trainable = TrainableGaussians(gaussians, LearningRates(), 1.0)
+    assert all(densifier.refine(step, trainable, torch.Generator()) is None for step in range(1, 3001))
+    assert len(trainable) == 4
+
+
+def test_state_survives_saving() -> None:
+    """A densifier that is saved and loaded half-way gives the same events as one that is not."""
+    events = []
+    for interrupted in (False, True):
+        densifier = ADC(max_gaussians=500, cap="curve", start=500, stop=3000)
+        trainable = TrainableGaussians(random_gaussians(50, log_scale=(-5, -1)), LearningRates(), 4.0)
+        densifier.begin(trainable.values.detach(), DensifyContext(4.0))
+        rng, draws = torch.Generator().manual_seed(5), np.random.default_rng(0)
+        for step in range(599, 701):
+            points = torch.zeros(len(trainable), 2, dtype=torch.float64, requires_grad=True)
+            points.grad = torch.from_numpy(draws.exponential(3e-4, (len(trainable), 2)))
+            radii = torch.ones(len(trainable), dtype=torch.int32)
+            densifier.observe(step, RenderOutput(torch.empty(0), torch.empty(0), radii, points))
+            event = densifier.refine(step, trainable, rng)
+            events.append((interrupted, step, event))
+            if interrupted and step == 650:
+                saved = densifier.state_dict()
+                densifier = ADC(max_gaussians=500, cap="curve", start=500, stop=3000)
+                densifier.load_state_dict(saved, DensifyContext(4.0))
+    plain = [(step, event) for interrupted, step, event in events if not interrupted]
+    assert plain == [(step, event) for interrupted, step, event in events if interrupted]
+    assert sum(event is not None for _, event in plain) == 2
+
+
+def test_threshold_strictness() -> None:
+    counts = {}
+    for inclusive in (True, False):
+        densifier = ADC(threshold_inclusive=inclusive, gradient_threshold=2.5e-4)
+        trainable = TrainableGaussians(random_gaussians(1, log_scale=(-9, -8)), LearningRates(), 4.0)
+        trainable.values.opacity_logits.data.fill_(2.0)
+        densifier.begin(trainable.values.detach(), DensifyContext(4.0))
+        densifier.gradient_sum[:] = torch.tensor(2.5e-4)
+        densifier.visible_count[:] = 1
+        densifier.gradient_threshold = float(densifier.gradient_sum[0])  # as float32 holds it
+        counts[inclusive] = densifier.refine(600, trainable, torch.Generator()).cloned
+    assert counts == {True: 1, False: 0}

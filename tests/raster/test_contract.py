@@ -1,0 +1,163 @@
+"""Every executor that runs here against the float64 reference: the contract of ``gsbench.raster.base``."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster import create_rasterizer
+from gsbench.raster.base import Rasterizer
+from gsbench.raster.reference import ReferenceRasterizer
+from gsbench.scene.camera import Camera
+from tests.raster.strategies import Case, extreme_gaussians, render_with_gradients
+
+VALUE_TOLERANCE = 1e-4
+GRADIENT_TOLERANCE = 1e-3  # of the largest entry of each gradient
+
+CASES = [
+    Case(33, 49, 50, sh_degree=3),  # the last tiles are one pixel wide and one pixel high
+    Case(97, 65, 250, sh_degree=3, principal=(7.3, -5.1)),
+    Case(64, 48, 150, sh_degree=2, log_scale=-3.0),
+    Case(50, 37, 120, sh_degree=1, log_scale=-1.0),
+    Case(81, 50, 150, sh_degree=0, log_scale=-2.5, principal=(-20.0, 11.0)),
+    Case(40, 40, 300, sh_degree=3, log_scale=-1.5, logit=3.0),  # opaque: pixels stop early, alphas are clamped
+    Case(7, 5, 20, sh_degree=3),  # smaller than a tile
+]
+
+
+def _available() -> list[str]:
+    names = ["reference", "cpu"]
+    if torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None:
+        names.append("cuda")
+    return names
+
+
+@pytest.fixture(params=_available())
+def device(request: pytest.FixtureRequest) -> str:
+    return "cuda" if request.param == "cuda" else "cpu"
+
+
+@pytest.fixture
+def rasterizer(request: pytest.FixtureRequest, device: str) -> Rasterizer:
+    return create_rasterizer(request.node.callspec.params["device"], torch.device(device), threads=2)
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_values_and_gradients_match_the_reference(rasterizer: Rasterizer, device: str, case: Case) -> None:
+    expected, expected_gradients = render_with_gradients(ReferenceRasterizer(), case, torch.float64)
+    output, gradients = render_with_gradients(rasterizer, case, torch.float32, device)
+
+    assert expected.visible.sum() > case.count / 4
+    assert output.image.shape == (case.height, case.width, 3)
+    assert (output.image.cpu().double() - expected.image).abs().max() < VALUE_TOLERANCE
+    assert (output.alpha.cpu().double() - expected.alpha).abs().max() < VALUE_TOLERANCE
+    assert output.radii.dtype == torch.int32
+    assert torch.equal(output.radii.cpu(), expected.radii)
+    for name, reference in expected_gradients.items():
+        error = (gradients[name] - reference).abs().max() / reference.abs().max().clamp_min(1e-30)
+        assert error < GRADIENT_TOLERANCE, f"{name}: relative error {error:.2e}"
+        if not (name == "sh_rest" and case.sh_degree == 0):
+            assert reference.abs().max() > 0, name
+
+
+def test_unused_coefficients_get_a_zero_gradient(rasterizer: Rasterizer, device: str) -> None:
+    _, gradients = render_with_gradients(rasterizer, Case(50, 37, 120, sh_degree=1), torch.float32, device)
+    assert gradients["sh_rest"][:, :3].abs().max() > 0
+    assert gradients["sh_rest"][:, 3:].abs().max() == 0
+
+
+def test_the_gradient_of_the_colour_clamp_passes_at_zero(rasterizer: Rasterizer, device: str) -> None:
+    """max(0, SH + 0.5): no gradient below 0, all of it at exactly 0."""
+    gaussians = _one_gaussian(device)
+    c0 = math.sqrt(1 / (4 * math.pi))
+    at_zero = np.float32(-0.5) / np.float32(c0)
+    candidates = [at_zero, np.nextafter(at_zero, np.float32(0)), np.nextafter(at_zero, np.float32(-9))]
+    exact = next(float(v) for v in candidates if np.float32(c0) * v + np.float32(0.5) == 0)
+    gaussians.sh_dc = torch.tensor([[exact, exact - 1e-3, exact + 1e-3]], device=device, requires_grad=True)
+    output = rasterizer.render(gaussians, _camera(32, 32), 0, torch.zeros(3, device=device))
+    output.image.sum().backward()
+    gradient = gaussians.sh_dc.grad[0]
+    assert gradient[1] == 0
+    assert gradient[2] > 0
+    assert gradient[0] == pytest.approx(gradient[2].item(), rel=1e-5)
+
+
+def test_nothing_to_see_is_the_background(rasterizer: Rasterizer, device: str) -> None:
+    background = torch.tensor([0.1, 0.2, 0.3], device=device)
+    for gaussians in (_one_gaussian(device, z=-5.0), _one_gaussian(device).select(torch.zeros(0, dtype=torch.long))):
+        leaves = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
+        output = rasterizer.render(leaves, _camera(20, 17), 3, background)
+        assert torch.equal(output.image, background.expand(17, 20, 3))
+        assert output.alpha.abs().max() == 0
+        assert not output.visible.any()
+        output.image.sum().backward()
+        for name, tensor in leaves.tensors().items():
+            assert tensor.grad is None or tensor.grad.abs().sum() == 0, name
+
+
+@settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(gaussians=extreme_gaussians())
+def test_extreme_gaussians_give_finite_results(rasterizer: Rasterizer, device: str, gaussians: Gaussians) -> None:
+    leaves = gaussians.map(lambda tensor: tensor.to(device).requires_grad_())
+    output = rasterizer.render(leaves, _camera(37, 21), 3, torch.zeros(3, device=device), absolute_gradient=True)
+    assert output.image.isfinite().all()
+    assert ((output.alpha >= 0) & (output.alpha <= 1)).all()
+    assert (output.radii >= 0).all()
+    (output.image.sum() + output.alpha.sum()).backward()
+    for name, tensor in leaves.tensors().items():
+        assert tensor.grad is None or tensor.grad.isfinite().all(), name
+    assert output.screen_points.grad is None or output.screen_points.grad.isfinite().all()
+    assert output.screen_gradient_abs.isfinite().all()
+
+
+@pytest.mark.parametrize("name", ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_values_that_are_not_finite_are_named(rasterizer: Rasterizer, device: str, name: str, value: float) -> None:
+    gaussians = _one_gaussian(device)
+    getattr(gaussians, name).flatten()[0] = value
+    with pytest.raises(ValueError, match=name):
+        rasterizer.render(gaussians, _camera(16, 16), 3, torch.zeros(3, device=device))
+
+
+def test_inputs_that_cannot_be_used_are_named(rasterizer: Rasterizer, device: str) -> None:
+    gaussians, black = _one_gaussian(device), torch.zeros(3, device=device)
+    with pytest.raises(ValueError, match="sh_degree"):
+        rasterizer.render(gaussians, _camera(16, 16), 4, black)
+    with pytest.raises(ValueError, match="background"):
+        rasterizer.render(gaussians, _camera(16, 16), 0, torch.zeros(4, device=device))
+    with pytest.raises(ValueError, match="background"):
+        rasterizer.render(gaussians, _camera(16, 16), 0, black.double())
+    with pytest.raises(ValueError, match="width"):
+        rasterizer.render(gaussians, _camera(20_000, 16), 0, black)
+    with pytest.raises(ValueError, match="fx"):
+        rasterizer.render(gaussians, _camera(16, 16, focal=1e-6), 0, black)
+    gaussians.quaternions[:] = 0
+    with pytest.raises(ValueError, match="quaternions"):
+        rasterizer.render(gaussians, _camera(16, 16), 0, black)
+
+
+def _camera(width: int, height: int, focal: float | None = None) -> Camera:
+    return Camera(width, height, focal or width, focal or width, width / 2, height / 2, np.eye(3), np.zeros(3))
+
+
+def _one_gaussian(device: str, z: float = 3.0) -> Gaussians:
+    gaussians = Gaussians(
+        torch.tensor([[0.0, 0.0, z]]),
+        torch.full((1, 3), -1.0),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        torch.ones(1),
+        torch.zeros(1, 3),
+        torch.zeros(1, 15, 3),
+    )
+    return gaussians.map(lambda tensor: tensor.to(device))

@@ -1,0 +1,237 @@
+"""What the compiled CPU rasterizer promises beyond the contract: the same bits, memory that is safe to keep, any host."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster.base import RenderOutput
+from gsbench.raster.cpu import CpuRasterizer, simd
+from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
+from gsbench.raster.reference import ReferenceRasterizer
+from tests.raster.strategies import Case, render_with_gradients
+
+BLACK = torch.zeros(3)
+CASE = Case(97, 65, 250, sh_degree=3, principal=(7.3, -5.1))
+MANY = Case(150, 110, 4000, sh_degree=3, log_scale=-3.0)
+
+
+def _bits(output: RenderOutput, gradients: dict[str, torch.Tensor]) -> list[bytes]:
+    tensors = [output.image, output.alpha, output.radii, *gradients.values()]
+    return [tensor.detach().numpy().tobytes() for tensor in tensors]
+
+
+def test_the_same_bits_on_every_run_and_for_any_number_of_threads() -> None:
+    one = CpuRasterizer(threads=1)
+    expected = _bits(*render_with_gradients(one, MANY, torch.float32))
+    assert _bits(*render_with_gradients(one, MANY, torch.float32)) == expected  # memory that was used before
+    for threads in (2, 4):
+        rasterizer = CpuRasterizer(threads=threads)
+        for _ in range(3):
+            assert _bits(*render_with_gradients(rasterizer, MANY, torch.float32)) == expected
+
+
+def test_equal_depths_are_blended_in_the_order_of_the_index() -> None:
+    gaussians = Gaussians(
+        torch.tensor([[0.3, 0.2, 3.0]] * 5),
+        torch.full((5, 3), -1.0),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 5),
+        torch.ones(5),
+        torch.eye(5)[:, :3] * 3,
+        torch.zeros(5, 15, 3),
+    )
+    camera = CASE.camera()
+    image = CpuRasterizer(threads=2).render(gaussians, camera, 0, BLACK).image
+    reference = ReferenceRasterizer().render(gaussians.map(torch.Tensor.double), camera, 0, BLACK.double()).image
+    assert (image - reference).abs().max() < 1e-5
+    assert reference.max() > 0.5
+
+
+def test_needles_keep_their_gradients() -> None:
+    """Long thin Gaussians: the determinant of their 2D covariance loses its digits when computed in float32 as ac - b^2."""
+    gaussians = Case(90, 70, 40, sh_degree=0).gaussians()
+    gaussians.log_scales[:, 0] = 0.5
+    gaussians.log_scales[:, 1:] = -9.0
+    errors = []
+    for rasterizer, dtype in ((CpuRasterizer(threads=1), torch.float32), (ReferenceRasterizer(), torch.float64)):
+        leaves = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
+        rasterizer.render(leaves, CASE.camera(), 0, BLACK.to(dtype)).image.square().sum().backward()
+        errors.append(leaves.log_scales.grad.double())
+    assert errors[1].abs().max() > 0
+    assert (errors[0] - errors[1]).abs().max() < 2e-5 * errors[1].abs().max()
+
+
+def test_renders_may_be_differentiated_late_and_twice() -> None:
+    """Two graphs at once, in the opposite order, and one of them twice: none may use the memory of another."""
+    rasterizer = CpuRasterizer(threads=1)
+    cases = (CASE, MANY)
+    alone = [render_with_gradients(rasterizer, case, torch.float32)[1]["means"] for case in cases]
+    leaves = [case.gaussians().map(lambda tensor: tensor.float().requires_grad_()) for case in cases]
+    background = torch.tensor([0.2, 0.5, 0.9])
+    outputs = [
+        rasterizer.render(g, case.camera(), 3, background) for g, case in zip(leaves, cases, strict=True)
+    ]
+    for k in (1, 0, 0):
+        case = cases[k]
+        weights = torch.randn(
+            case.height, case.width, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64
+        ).float()
+        leaves[k].means.grad = None
+        loss = (outputs[k].image * weights[..., :3]).sum() + (outputs[k].alpha * weights[..., 3]).sum()
+        loss.backward(retain_graph=True)
+        assert torch.equal(leaves[k].means.grad.double(), alone[k])
+
+
+def test_results_that_are_kept_are_not_overwritten() -> None:
+    rasterizer = CpuRasterizer(threads=1)
+    output, gradients = render_with_gradients(rasterizer, CASE, torch.float32)
+    image = output.image.detach()
+    kept = image.clone()
+    del output
+    for _ in range(3):
+        render_with_gradients(rasterizer, CASE, torch.float32)
+        rasterizer.render(Case(60, 60, 90, 0).gaussians().map(torch.Tensor.float), CASE.camera(), 0, BLACK)
+    assert torch.equal(image, kept)
+    assert gradients["means"].isfinite().all()
+
+
+def test_gradients_accumulate() -> None:
+    leaves = CASE.gaussians().map(lambda tensor: tensor.float().requires_grad_())
+    rasterizer = CpuRasterizer(threads=1)
+    rasterizer.render(leaves, CASE.camera(), 3, BLACK).image.sum().backward()
+    once = leaves.sh_rest.grad.clone()
+    rasterizer.render(leaves, CASE.camera(), 3, BLACK).image.sum().backward()
+    assert torch.equal(leaves.sh_rest.grad, 2 * once)
+
+
+def test_strided_parameters_and_the_gradient_of_the_background() -> None:
+    gaussians = CASE.gaussians().map(torch.Tensor.float)
+    strided = gaussians.map(lambda tensor: torch.stack([tensor, tensor], -1)[..., 0])
+    assert not strided.means.is_contiguous()
+    rasterizer = CpuRasterizer(threads=1)
+    background = torch.tensor([0.1, 0.5, 0.7], requires_grad=True)
+    output = rasterizer.render(strided, CASE.camera(), 3, background)
+    assert torch.equal(output.image, rasterizer.render(gaussians, CASE.camera(), 3, background).image)
+    output.image.sum().backward()
+    assert background.grad[0].item() == pytest.approx((1 - output.alpha).sum().item(), rel=1e-5)
+
+
+def test_float64_is_refused() -> None:
+    with pytest.raises(ValueError, match="float32"):
+        CpuRasterizer(threads=1).render(CASE.gaussians(), CASE.camera(), 0, BLACK.double())
+    with pytest.raises(ValueError, match="threads"):
+        CpuRasterizer(threads=0)
+
+
+@pytest.mark.parametrize("cpu", ["generic"])
+def test_hosts_without_wide_vectors(cpu: str, tmp_path: Path) -> None:
+    """Compiled for the plainest CPU of this architecture (SSE2 on x86), in a process of its own."""
+    script = """
+import sys, torch
+from gsbench.raster.cpu import CpuRasterizer
+from gsbench.raster.reference import ReferenceRasterizer
+from tests.raster.strategies import Case, render_with_gradients
+case = Case(33, 49, 50, sh_degree=3)
+output, gradients = render_with_gradients(CpuRasterizer(threads=2), case, torch.float32)
+expected, references = render_with_gradients(ReferenceRasterizer(), case, torch.float64)
+worst = max(float((gradients[n] - r).abs().max() / r.abs().max()) for n, r in references.items())
+print(float((output.image.double() - expected.image).abs().max()), worst)
+"""
+    environment = os.environ | {
+        "NUMBA_CPU_NAME": cpu,
+        "NUMBA_CPU_FEATURES": "",
+        "NUMBA_CACHE_DIR": str(tmp_path),
+        "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+    }
+    root = Path(__file__).resolve().parents[2]
+    command = [sys.executable, "-c", script]
+    run = subprocess.run(command, env=environment, cwd=root, capture_output=True, text=True, timeout=300, check=False)
+    assert run.returncode == 0, run.stderr
+    value_error, gradient_error = map(float, run.stdout.split())
+    assert value_error < 1e-4
+    assert gradient_error < 1e-3
+    assert "compiling the CPU rasterizer" in run.stderr
+    assert any(tmp_path.rglob("*.nbc"))
+
+
+@numba.njit
+def _vector_functions(a, b, out):  # type: ignore[no-untyped-def]
+    x, y = simd.load(a, 0), simd.load(b, 0)
+    simd.store(out, 0, simd.fma(x, y, 2) - x / y)
+    simd.store(out, 16, simd.exp2(x * 8))
+    mask = (x < y) & ~(x > 0)
+    simd.store(out, 32, simd.select(mask, x, 7))
+    simd.store(out, 48, simd.minimum(x, y) + simd.maximum(x, 0) * simd.absolute(y))
+    simd.store(out, 64, simd.lane_sums((x, y, x * y, x - y, -x)))
+    simd.store(out, 80, simd.select(simd.mask_from_bits(np.uint64(0b1010)), x, y))
+    return simd.mask_bits(mask), simd.lowest_bit(np.uint64(0b101000))
+
+
+def test_vector_functions() -> None:
+    generator = np.random.default_rng(0)
+    a, b = generator.normal(size=(2, 16)).astype(np.float32)
+    out = np.full(96, np.nan, np.float32)
+    bits, lowest = _vector_functions(a, b, out)
+    mask = (a < b) & ~(a > 0)
+    assert bits == sum(1 << k for k in range(16) if mask[k])
+    assert 0 < mask.sum() < 16
+    assert lowest == 3
+    np.testing.assert_allclose(out[:16], a * b + 2 - a / b, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(out[16:32], np.exp2(8 * a.astype(np.float64)), rtol=1e-6)
+    np.testing.assert_array_equal(out[32:48], np.where(mask, a, np.float32(7)))
+    np.testing.assert_allclose(out[48:64], np.minimum(a, b) + np.maximum(a, 0) * np.abs(b), rtol=1e-6)
+    for k, values in enumerate((a, b, a * b, a - b, -a)):
+        assert out[64 + simd.SUM_LANES[k]] == pytest.approx(values.sum(), abs=1e-5)
+    assert np.count_nonzero(out[64:80]) == 5
+    np.testing.assert_array_equal(out[80:96], np.where(0b1010 >> np.arange(16) & 1, a, b))
+
+
+def test_exp2_over_its_range() -> None:
+    x = np.linspace(-126, 127, 16 * 4096).astype(np.float32)
+    out = np.empty_like(x)
+
+    @numba.njit
+    def fill(x, out):  # type: ignore[no-untyped-def]
+        for i in range(0, len(x), 16):
+            simd.store(out, i, simd.exp2(simd.load(x, i)))
+
+    fill(x, out)
+    np.testing.assert_allclose(out, np.exp2(x.astype(np.float64)), rtol=2.5e-7)
+
+
+def test_memory_is_used_again() -> None:
+    pool = TensorPool()
+    first = pool.empty((100, 3))
+    address = first.data_ptr()
+    assert address % 64 == 0
+    view = first[1:]
+    del first
+    second = pool.empty((100, 3))
+    assert second.data_ptr() != address  # a view still holds the memory
+    del view
+    assert pool.empty((110, 3)).data_ptr() == address
+
+    arena = Arena()
+    block = arena.take("a", (10,), np.float32, zero=True)
+    assert not block.any()
+    block[:] = 1
+    assert arena.take("a", (4,), np.float32).all()
+    assert not arena.take("a", (1000,), np.float32, zero=True).any()
+
+
+def test_an_error_in_a_shard_is_raised() -> None:
+    def fail(shard: int) -> None:
+        if shard == 3:
+            raise ZeroDivisionError
+
+    for threads in (1, 2):
+        with pytest.raises(ZeroDivisionError):
+            ShardRunner(threads).run(8, fail)
