@@ -64,8 +64,7 @@ class Comparison:
 
     ``scope`` is what the verdict speaks of ("scenes like these", "these scenes" or "this scene"), ``test`` the test
     behind ``p``. ``effect_size`` is the mean difference in deviations of the units tested (Cohen's d for pairs), None
-    with fewer than two. ``interval`` is the hierarchical bootstrap interval. ``verdict`` is better, worse or
-    "no evidence".
+    with fewer than two. ``interval`` is the bootstrap interval. ``verdict`` is better, worse or "no evidence".
     """
 
     metric: str
@@ -180,41 +179,43 @@ def pooled_deviation(per_trial: Sequence[Array]) -> float | None:
 def bootstrap_interval(
     differences: Sequence[Array], resample_scenes: bool, samples: int, rng: np.random.Generator
 ) -> Interval | None:
-    """95 % interval of the mean of scenes of ``differences`` ([K, V] each), resampling scenes, trials and views.
+    """95 % percentile interval of the mean of scenes of ``differences`` ([K, V] each); None where nothing is repeated.
 
-    Views are drawn once for all trials of a scene, since the same view is seen by every trial. Scenes are resampled only
-    if asked for. A percentile interval from few units is too short: its ends are moved away from the mean by
-    ``sqrt(n / (n - 1)) t / z`` for the n outermost units (Hesterberg 2015, "What teachers should know about the
-    bootstrap", the expansion for small samples). None where the outermost units are not repeated.
+    With ``resample_scenes``, scenes are drawn anew and keep their trials and views, since the spread of the scenes' means
+    already contains that of what is below (Davison and Hinkley 1997, section 3.8). Otherwise the trials and the views of
+    each scene are drawn anew, a view together for all trials, since every trial sees the same ones; the deviations of
+    the two are added. Percentile intervals from n units are too short: deviations are stretched by
+    ``sqrt(n / (n - 1)) t / z`` (Hesterberg 2015, "What teachers should know about the bootstrap").
     """
     scenes = len(differences)
-    trials = [matrix.shape[0] for matrix in differences]
-    degrees = scenes - 1 if resample_scenes else sum(count - 1 for count in trials)
-    if degrees == 0:
-        return None
-    width = scenes if resample_scenes else 1
-    inner = np.stack([_resampled_means(matrix, samples * width, rng) for matrix in differences])  # [S, samples * width]
-    if resample_scenes:
-        chosen = rng.integers(scenes, size=(samples, scenes))  # [samples, S]
-        inner = inner.reshape(scenes, samples, scenes)
-        means = inner[chosen, np.arange(samples)[:, None], np.arange(scenes)].mean(axis=1)  # [samples]
-        smallest = scenes
-    else:
-        means = inner.mean(axis=0)  # [samples]
-        smallest = min(count for count in trials if count > 1)
     center = float(np.mean([matrix.mean() for matrix in differences]))
-    low, high = np.quantile(means, [ALPHA / 2, 1 - ALPHA / 2])
-    t, z = special.stdtrit(degrees, 1 - ALPHA / 2), special.ndtri(1 - ALPHA / 2)
-    factor = float(math.sqrt(smallest / (smallest - 1)) * t / z)
-    return Interval(center + factor * (float(low) - center), center + factor * (float(high) - center))
+    if resample_scenes:
+        means = np.array([matrix.mean() for matrix in differences])  # [S]
+        deviations = _stretch(scenes, scenes - 1) * (_resampled_means(means, samples, rng) - center)
+    elif min(len(matrix) for matrix in differences) > 1:
+        deviations = np.zeros(samples)
+        for axis in (0, 1):
+            degrees = sum(matrix.shape[axis] - 1 for matrix in differences)
+            for matrix in differences:
+                if matrix.shape[axis] > 1:  # a single view cannot be drawn anew
+                    drawn = _resampled_means(matrix.mean(axis=1 - axis), samples, rng) - matrix.mean()
+                    deviations += _stretch(matrix.shape[axis], degrees) * drawn / scenes
+    else:
+        return None
+    low, high = np.quantile(deviations, [ALPHA / 2, 1 - ALPHA / 2])
+    return Interval(center + float(low), center + float(high))
 
 
-def _resampled_means(matrix: Array, samples: int, rng: np.random.Generator) -> Array:
-    """Means [samples] of a matrix [K, V] with rows and columns drawn anew."""
-    trials, views = matrix.shape
-    rows = rng.multinomial(trials, np.full(trials, 1 / trials), size=samples) / trials  # [samples, K]
-    columns = rng.multinomial(views, np.full(views, 1 / views), size=samples) / views  # [samples, V]
-    return np.einsum("nk,kv,nv->n", rows, matrix, columns, optimize=True)
+def _resampled_means(values: Array, samples: int, rng: np.random.Generator) -> Array:
+    """Means [samples] of as many values drawn with replacement from ``values`` [n]."""
+    n = len(values)
+    return rng.multinomial(n, np.full(n, 1 / n), size=samples) @ values / n
+
+
+def _stretch(units: int, degrees: int) -> float:
+    """How much wider Student's interval of ``units`` values is than the percentile interval of their bootstrap."""
+    normal = special.ndtri(1 - ALPHA / 2)
+    return float(math.sqrt(units / (units - 1)) * special.stdtrit(degrees, 1 - ALPHA / 2) / normal)
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 
@@ -158,16 +159,17 @@ class TrainableGaussians:
         return next(group for group in self.optimizer.param_groups if group["name"] == name)
 
     def state_dict(self) -> dict[str, object]:
-        """Everything that a resumed training needs; ``load`` is the inverse."""
+        """Everything that a resumed training needs, sharing memory with this object: save it before the next step."""
         return {
-            "gaussians": {name: tensor.detach().clone() for name, tensor in self.values.tensors().items()},
+            "gaussians": {name: tensor.detach() for name, tensor in self.values.tensors().items()},
             "optimizer": self.optimizer.state_dict(),
         }
 
     @classmethod
     def load(cls, state: dict, rates: LearningRates, spatial_scale: float) -> TrainableGaussians:  # type: ignore[type-arg]
+        """The inverse of ``state_dict``; copies."""
         trainable = cls(Gaussians(**state["gaussians"]), rates, spatial_scale)
-        trainable.optimizer.load_state_dict(state["optimizer"])
+        trainable.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))  # torch itself would share the moments
         return trainable
 
 

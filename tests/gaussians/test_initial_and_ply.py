@@ -1,0 +1,68 @@
+"""From cloud to Gaussians, and the PLY layout that viewers read."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+
+from gsbench.errors import InputError
+from gsbench.gaussians.initial import gaussians_from_cloud
+from gsbench.gaussians.ply import read_ply, write_ply
+from tests.gaussians.helpers import random_gaussians
+
+
+def test_first_scales_are_the_root_mean_square_of_three_neighbours() -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [50, 50, 50]])
+    colors = np.array([[255, 0, 127]] * 5, dtype=np.uint8)
+    gaussians = gaussians_from_cloud(points, colors)
+    assert float(gaussians.scales[0, 0]) == pytest.approx(math.sqrt((1 + 4 + 9) / 3), rel=1e-6)
+    assert torch.equal(gaussians.scales[:, 0], gaussians.scales[:, 2])
+    assert float(gaussians.opacities[0]) == pytest.approx(0.1)
+    shown = gaussians.sh_dc[0] * 0.28209479177387814 + 0.5
+    assert shown.tolist() == pytest.approx([1.0, 0.0, 127 / 255], abs=1e-6)
+
+
+def test_coincident_points_keep_a_floor() -> None:
+    gaussians = gaussians_from_cloud(np.zeros((6, 3)), np.zeros((6, 3), dtype=np.uint8))
+    assert float(gaussians.scales[0, 0]) == pytest.approx(math.sqrt(1e-7), rel=1e-5)
+
+
+def test_too_few_or_broken_points_are_refused() -> None:
+    with pytest.raises(InputError, match="3 points"):
+        gaussians_from_cloud(np.zeros((3, 3)), np.zeros((3, 3), dtype=np.uint8))
+    with pytest.raises(InputError, match="not finite"):
+        gaussians_from_cloud(np.full((5, 3), np.nan), np.zeros((5, 3), dtype=np.uint8))
+
+
+def test_ply_round_trip_is_exact(tmp_path: Path) -> None:
+    gaussians = random_gaussians(20, dtype=torch.float32)
+    write_ply(gaussians, tmp_path / "a.ply")
+    back = read_ply(tmp_path / "a.ply")
+    for a, b in zip(gaussians.tensors().values(), back.tensors().values(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_ply_layout_is_the_standard_one(tmp_path: Path) -> None:
+    """Read with plyfile alone: names, order, and harmonics stored channel by channel."""
+    gaussians = random_gaussians(4, dtype=torch.float32)
+    write_ply(gaussians, tmp_path / "a.ply")
+    vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    names = [p.name for p in vertex.properties]
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert names[9:54] == [f"f_rest_{i}" for i in range(45)]
+    assert names[54:] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert vertex["f_rest_15"][2] == gaussians.sh_rest[2, 0, 1].item()  # first coefficient of green
+    assert vertex["f_rest_1"][2] == gaussians.sh_rest[2, 1, 0].item()  # second coefficient of red
+    assert vertex["rot_0"][1] == gaussians.quaternions[1, 0].item()  # w first
+
+
+def test_a_file_that_is_no_ply_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "b.ply"
+    path.write_text("not a ply")
+    with pytest.raises(InputError, match=r"b\.ply"):
+        read_ply(path)

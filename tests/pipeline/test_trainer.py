@@ -1,0 +1,176 @@
+"""The training loop: it learns, it follows the schedule, it is repeatable, and it goes on where it was stopped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsbench.config import TrainConfig
+from gsbench.densify import ADC, MCMC, Densifier, NoDensifier, Volumetric
+from gsbench.errors import TrainingError
+from gsbench.gaussians.initial import gaussians_from_cloud
+from gsbench.gaussians.model import Gaussians
+from gsbench.pipeline.trainer import CameraOrder, Status, Trainer, generator, learning_rates
+from gsbench.raster import create_rasterizer
+from gsbench.raster.base import Rasterizer
+from gsbench.scene.types import Scene
+
+CPU = torch.device("cpu")
+
+
+def cloud(truth: Gaussians) -> Gaussians:
+    colors = torch.full((len(truth), 3), 127, dtype=torch.uint8)
+    return gaussians_from_cloud(truth.means.double().numpy(), colors.numpy())
+
+
+def options(**changes: object) -> TrainConfig:
+    values = {
+        "name": "test",
+        "iterations": 120,
+        "sh_interval": 40,
+        "position_steps": 120,
+        "checkpoint_every": 50,
+        "volume_histogram": [60],
+    }
+    return TrainConfig(**(values | changes))  # type: ignore[arg-type]
+
+
+def small(kind: type[ADC] = ADC, **changes: object) -> ADC:
+    return kind(start=20, stop=110, interval=20, opacity_reset_interval=60, **changes)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def rasterizer() -> Rasterizer:
+    return create_rasterizer("cpu", CPU, threads=1)
+
+
+def train(
+    scene: Scene, truth: Gaussians, rasterizer: Rasterizer, folder: Path, densifier: Densifier, seed: int = 0, **changes: object
+) -> Gaussians:
+    folder.mkdir(parents=True, exist_ok=True)
+    return Trainer(scene, cloud(truth), densifier, rasterizer, options(**changes), seed).run(folder)
+
+
+def same(a: Gaussians, b: Gaussians) -> bool:
+    return len(a) == len(b) and all(torch.equal(x, y) for x, y in zip(a.tensors().values(), b.tensors().values(), strict=True))
+
+
+def records(path: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_training_learns_the_scene(tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path) -> None:
+    train(tiny_scene, truth, rasterizer, tmp_path, NoDensifier(), iterations=500, position_steps=500)
+    metrics = records(tmp_path / "metrics.jsonl")
+    first = sum(r["l1"] for r in metrics[:3]) / 3
+    last = sum(r["l1"] for r in metrics[-3:]) / 3
+    assert last < 0.5 * first
+    assert metrics[-1]["step"] == 500
+    assert [r["sh_degree"] for r in metrics if r["step"] in (30, 40, 80, 120, 500)] == [0, 1, 2, 3, 3]
+
+
+def test_same_seed_same_bits_other_seed_not(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    runs = [train(tiny_scene, truth, rasterizer, tmp_path / str(i), small(), seed=i // 2) for i in range(3)]
+    assert same(runs[0], runs[1])
+    assert not same(runs[0], runs[2])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [small, lambda: small(Volumetric, volume_threshold=0.01), lambda: MCMC(start=20, stop=110, interval=20)],
+    ids=["adc", "volumetric", "mcmc"],
+)
+def test_interrupted_training_ends_in_the_same_bits(
+    make, tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:  # type: ignore[no-untyped-def]
+    whole = train(tiny_scene, truth, rasterizer, tmp_path / "whole", make())
+    broken = tmp_path / "broken"
+
+    class Stop(Exception):
+        pass
+
+    def stop_at_70(status: Status) -> None:
+        if status.step == 70:
+            raise Stop
+
+    broken.mkdir()
+    with pytest.raises(Stop):
+        Trainer(tiny_scene, cloud(truth), make(), rasterizer, options(), 0).run(broken, stop_at_70)
+    assert sorted(path.name for path in broken.glob("*.pt")) == ["checkpoint-00000050.pt"]
+    assert same(whole, train(tiny_scene, truth, rasterizer, broken, make()))
+    for name in ("events.jsonl", "volume_histograms.jsonl"):
+        assert (broken / name).read_text() == (tmp_path / "whole" / name).read_text()
+    steps = [r["step"] for r in records(broken / "metrics.jsonl")]
+    assert steps == list(range(10, 121, 10))
+    assert not list(broken.glob("*.pt"))
+
+
+def test_events_add_up_to_the_gaussians(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    densifier = small(Volumetric, volume_threshold=0.01)
+    trained = train(tiny_scene, truth, rasterizer, tmp_path, densifier)
+    events = records(tmp_path / "events.jsonl")
+    assert [event["step"] for event in events] == [40, 60, 80, 100]
+    count = len(truth)
+    for event in events:
+        assert event["before"] == count
+        count = event["after"]
+    assert count == len(trained) > len(truth)
+    living = densifier.lineage.causes_of_living()
+    assert sum(living.values()) == count
+    assert living["split_volume"] > 0
+
+
+def test_nothing_is_refined_in_the_last_iteration(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    """3DGS saves its model before it would refine or step."""
+    train(tiny_scene, truth, rasterizer, tmp_path, small(), iterations=100)
+    assert [event["step"] for event in records(tmp_path / "events.jsonl")] == [40, 60, 80]
+
+
+def test_time_budget_ends_a_training(tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path) -> None:
+    train(tiny_scene, truth, rasterizer, tmp_path, NoDensifier(), iterations=10**6, max_seconds=0.3)
+    last = records(tmp_path / "metrics.jsonl")[-1]
+    assert last["seconds"] >= 0.3
+    assert last["step"] < 10**6
+
+
+def test_visible_adam_trains_too(tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path) -> None:
+    train(tiny_scene, truth, rasterizer, tmp_path, small(), visible_adam=True)
+    metrics = records(tmp_path / "metrics.jsonl")
+    assert metrics[-1]["l1"] < metrics[0]["l1"]
+
+
+def test_non_finite_loss_names_the_iteration(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    class Explode(NoDensifier):
+        def regularizer(self, gaussians: Gaussians) -> torch.Tensor | None:
+            self.calls = getattr(self, "calls", 0) + 1
+            return torch.tensor(float("inf")) if self.calls == 57 else None
+
+    with pytest.raises(TrainingError, match=r"iteration 57.*last good state"):
+        train(tiny_scene, truth, rasterizer, tmp_path, Explode())
+    assert (tmp_path / "checkpoint-00000050.pt").exists()
+
+
+def test_every_view_is_used_once_before_any_is_used_again() -> None:
+    order = CameraOrder(7, generator(0, 0))
+    drawn = [order.next() for _ in range(21)]
+    assert [sorted(drawn[i : i + 7]) for i in (0, 7, 14)] == [list(range(7))] * 3
+    assert drawn[:7] != drawn[7:14]
+
+
+def test_learning_rate_of_the_means_is_log_linear() -> None:
+    rates = learning_rates(TrainConfig(name="x"))
+    assert rates.position(0) == pytest.approx(1.6e-4)
+    assert rates.position(15_000) == pytest.approx(1.6e-5)  # the geometric middle
+    assert rates.position(30_000) == pytest.approx(1.6e-6)
+    assert rates.position(99_000) == pytest.approx(1.6e-6)
