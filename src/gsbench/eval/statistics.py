@@ -141,7 +141,9 @@ def sign_flip_p(values: Array, weights: Array) -> float:
     terms = values * weights  # [n]
     observed = abs(terms.sum())
     if len(terms) <= MAX_ENUMERATED:
-        half = _sign_patterns(len(terms) - 1)  # a pattern and its negative give the same absolute sum: fix the first sign
+        half = _sign_patterns(
+            len(terms) - 1
+        )  # a pattern and its negative give the same absolute sum: fix the first sign
         sums = terms[0] + half @ terms[1:]  # [2^(n-1)]
         return float(np.mean(np.abs(sums) >= observed * (1 - 1e-12)))
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(RANDOM_FLIPS, len(terms)))
@@ -280,7 +282,9 @@ def _standardised(units: Array) -> float | None:
     return float(units.mean() / units.std(ddof=1))
 
 
-def all_arms_pairs(arms: Sequence[tuple[str, str]], baseline: str = "adc") -> list[tuple[tuple[str, str], tuple[str, str]]]:
+def all_arms_pairs(
+    arms: Sequence[tuple[str, str]], baseline: str = "adc"
+) -> list[tuple[tuple[str, str], tuple[str, str]]]:
     """The comparisons worth making: every densifier against the baseline with the same initialiser, else all pairs."""
     pairs = [((init, baseline), (init, name)) for init, name in arms if name != baseline and (init, baseline) in arms]
     return pairs or list(itertools.combinations(arms, 2))

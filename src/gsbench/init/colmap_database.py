@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +18,7 @@ VERIFY_CALLS = 20  # COLMAP reports no progress within a call, so it is called f
 MIN_PAIRS_PER_CALL = 50
 
 
-@dataclass(frozen=True)
-class CameraGroup:
-    """Images taken with one camera; ``camera_id`` is the one in the database."""
-
-    camera_id: int
-    rig_id: int
-    names: tuple[str, ...]
+Groups = Sequence[tuple[pycolmap.Camera, Sequence[str]]]  # each camera with the names of its images
 
 
 def reference_groups(reference: pycolmap.Reconstruction) -> list[tuple[pycolmap.Camera, list[str]]]:
@@ -71,45 +64,49 @@ def guessed_groups(
     return result
 
 
-def create_database(path: Path, groups: Sequence[tuple[pycolmap.Camera, Sequence[str]]]) -> list[CameraGroup]:
-    """A new database with the cameras of ``groups``, each in a rig of its own, and no images yet."""
+def create_database(path: Path, groups: Groups) -> dict[str, int]:
+    """A new database with cameras and images but no features; returns the image ids, which follow the sorted names.
+
+    With the ids fixed here, extraction and matching give the same database on any number of threads. Each camera is in
+    a rig of its own.
+    """
     path.unlink(missing_ok=True)
-    created = []
+    camera_ids: dict[str, int] = {}
+    rig_ids: dict[str, int] = {}
+    image_ids: dict[str, int] = {}
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for camera, names in groups:
             camera.camera_id = database.write_camera(camera)
             rig = pycolmap.Rig()
             rig.add_ref_sensor(camera.sensor_id)
-            created.append(CameraGroup(camera.camera_id, database.write_rig(rig), tuple(names)))
-    return created
-
-
-def write_features(
-    path: Path, groups: Sequence[CameraGroup], keypoints: dict[str, NDArray[np.float32]]
-) -> dict[str, int]:
-    """Add the images of ``groups`` with their ``keypoints`` [K, 2], and return the image ids by name.
-
-    Keypoints are in pixels of the image file in COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
-    """
-    group_of = {name: group for group in groups for name in group.names}
-    image_ids = {}
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        for name in sorted(group_of):
-            points = np.ascontiguousarray(keypoints[name], dtype=np.float32)
-            if points.ndim != 2 or points.shape[1] != 2:
-                raise ValueError(f"keypoints of {name} must be [K, 2], got {points.shape}")
-            image = pycolmap.Image(name=name, camera_id=group_of[name].camera_id)
+            rig_id = database.write_rig(rig)
+            camera_ids |= dict.fromkeys(names, camera.camera_id)
+            rig_ids |= dict.fromkeys(names, rig_id)
+        for name in sorted(camera_ids):
+            image = pycolmap.Image(name=name, camera_id=camera_ids[name])
             image.image_id = database.write_image(image)
             frame = pycolmap.Frame()
-            frame.rig_id = group_of[name].rig_id
+            frame.rig_id = rig_ids[name]
             frame.add_data_id(image.data_id)
             database.write_frame(frame)
-            database.write_keypoints(image.image_id, points)
             image_ids[name] = image.image_id
     return image_ids
 
 
-def write_matches(path: Path, matches: dict[tuple[str, str], NDArray[np.uint32]]) -> None:
+def write_keypoints(path: Path, keypoints: Mapping[str, NDArray[np.float32]]) -> None:
+    """Add ``keypoints`` [K, 2] by image name.
+
+    They are in pixels of the image file in COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
+    """
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        image_ids = {image.name: image.image_id for image in database.read_all_images()}
+        for name, points in keypoints.items():
+            if points.ndim != 2 or points.shape[1] != 2:
+                raise ValueError(f"keypoints of {name} must be [K, 2], got {points.shape}")
+            database.write_keypoints(image_ids[name], np.ascontiguousarray(points, dtype=np.float32))
+
+
+def write_matches(path: Path, matches: Mapping[tuple[str, str], NDArray[np.uint32]]) -> None:
     """Add ``matches`` [M, 2], indices of keypoints of the first and second image, by pairs of image names."""
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         image_ids = {image.name: image.image_id for image in database.read_all_images()}
@@ -165,9 +162,10 @@ def _rename_images(path: Path, names: Mapping[int, str]) -> None:
 def database_counts(path: Path) -> dict[str, int]:
     """How many features, matched and verified pairs and inlier matches the database holds."""
     with pycolmap.Database.open(path) as database:
+        _, inliers = database.read_two_view_geometry_num_inliers()  # pairs that failed are there too, with 0
         return {
             "features": database.num_keypoints(),
             "pairs_matched": database.num_matched_image_pairs(),
-            "pairs_verified": database.num_verified_image_pairs(),
-            "inlier_matches": database.num_inlier_matches(),
+            "pairs_verified": sum(count > 0 for count in inliers),
+            "inlier_matches": sum(inliers),
         }

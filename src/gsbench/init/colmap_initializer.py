@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from gsbench.errors import InputError
 from gsbench.init.base import (
@@ -18,7 +18,7 @@ from gsbench.init.base import (
     Progress,
     no_progress,
 )
-from gsbench.init.checks import check_choice, check_integer, check_number
+from gsbench.init.checks import available_cores, check_choice, check_integer, check_number
 from gsbench.init.pairs import PAIRINGS
 from gsbench.init.relay import run_with_progress
 from gsbench.init.timer import Timer
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     import pycolmap
 
     from gsbench.init.alignment import Similarity
-    from gsbench.init.colmap_database import CameraGroup
 
 logger = logging.getLogger(__name__)
 
@@ -87,7 +86,7 @@ class ColmapInitializer(ABC):
     min_model_size: int = 3
     two_view_tracks: bool = False
     seed: int = 0
-    threads: int = 1
+    threads: int | Literal["auto"] = "auto"
     mapper_threads: int = 1
 
     def __post_init__(self) -> None:
@@ -103,7 +102,8 @@ class ColmapInitializer(ABC):
         check_integer("min_inliers", self.min_inliers, 7)  # a fundamental matrix takes seven
         check_integer("min_model_size", self.min_model_size, 2)
         check_integer("seed", self.seed, 0, 2**31 - 1)
-        check_integer("threads", self.threads, 1)
+        if self.threads != "auto":
+            check_integer("threads", self.threads, 1)
         check_integer("mapper_threads", self.mapper_threads, 1)
 
     def needs_reference(self, capture: Capture) -> bool:
@@ -159,14 +159,19 @@ class ColmapInitializer(ABC):
     def fill_database(
         self,
         database: Path,
-        groups: list[CameraGroup],
+        names: list[str],
         pairs: list[tuple[str, str]],
         capture: Capture,
         work_dir: Path,
         progress: Progress,
         timer: Timer,
     ) -> None:
-        """Write features, matches and verified geometries; runs in the isolated process."""
+        """Write features, matches and verified geometries of the images ``names``; runs in the isolated process."""
+
+    @property
+    def num_threads(self) -> int:
+        """``threads`` as a number; ``auto`` is the cores that this process may use."""
+        return available_cores() if self.threads == "auto" else self.threads
 
     def packages(self) -> tuple[str, ...]:
         """The packages whose versions the report states."""
@@ -190,9 +195,9 @@ def build_model(job: Job, progress: Progress) -> InitReport:
         cameras = colmap_database.guessed_groups(
             capture.images, capture.image_names, options.camera, options.camera_model, options.focal_length
         )
-    groups = colmap_database.create_database(database, cameras)
-    pairs = reconstruct.select_pairs(capture.images, select_images(options, capture, reference), options, reference)
-    options.fill_database(database, groups, pairs, capture, job.work_dir, progress, timer)
+    names = list(colmap_database.create_database(database, cameras))
+    pairs = reconstruct.select_pairs(capture.images, names, options, reference)
+    options.fill_database(database, names, pairs, capture, job.work_dir, progress, timer)
     counts = {**job.preparation.counts, **colmap_database.database_counts(database)}
     if counts["pairs_verified"] == 0:
         raise InputError(

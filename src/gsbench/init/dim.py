@@ -6,7 +6,7 @@ import logging
 from abc import abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from gsbench.errors import InputError
 from gsbench.init.base import Progress
@@ -18,9 +18,6 @@ from gsbench.init.relay import run_with_progress
 from gsbench.init.timer import Timer
 from gsbench.scene.types import Capture
 from gsbench.weights import find_all_weights
-
-if TYPE_CHECKING:
-    from gsbench.init.colmap_database import CameraGroup
 
 logger = logging.getLogger(__name__)
 
@@ -75,20 +72,19 @@ class FeatureInitializer(ColmapInitializer):
     def fill_database(
         self,
         database: Path,
-        groups: list[CameraGroup],
+        names: list[str],
         pairs: list[tuple[str, str]],
         capture: Capture,
         work_dir: Path,
         progress: Progress,
         timer: Timer,
     ) -> None:
-        from gsbench.init.colmap_database import verify_pairs, write_features, write_matches
+        from gsbench.init.colmap_database import verify_pairs, write_keypoints, write_matches
         from gsbench.init.extract_and_match import open_store
         from gsbench.init.reconstruct import verification_options
 
         store = open_store(self, capture, work_dir, *self.find_weights())
-        names = [name for group in groups for name in group.names]
-        write_features(database, groups, {name: store.require_features(name).colmap_keypoints for name in names})
+        write_keypoints(database, {name: store.require_features(name).colmap_keypoints for name in names})
         matches = {pair: store.require_matches(*pair) for pair in pairs}
         matches = {pair: indices for pair, indices in matches.items() if len(indices) > 0}
         write_matches(database, matches)

@@ -58,7 +58,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     Raises ``InputError`` where no image has a keypoint or no pair a match.
     """
     options, capture = job.options, job.capture
-    torch.set_num_threads(options.threads)
+    torch.set_num_threads(options.num_threads)
     device = choose_device(options.device)
     store = open_store(options, capture, job.work_dir, job.extractor_weights, job.matcher_weights)
     reference = load_reference(capture, job.reference)

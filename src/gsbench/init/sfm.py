@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from gsbench.errors import InputError
 from gsbench.init.base import Progress
@@ -12,9 +12,6 @@ from gsbench.init.checks import check_integer, check_number
 from gsbench.init.colmap_initializer import ColmapInitializer
 from gsbench.init.timer import Timer
 from gsbench.scene.types import Capture
-
-if TYPE_CHECKING:
-    from gsbench.init.colmap_database import CameraGroup
 
 DEFAULT_PEAK_THRESHOLD = 0.02 / 3  # COLMAP's defaults
 DEFAULT_EDGE_THRESHOLD = 10.0
@@ -27,11 +24,12 @@ class Sfm(ColmapInitializer):
     """SIFT, matching and incremental mapping by COLMAP.
 
     Sizes are in px of the image files' longest side: larger images are shrunk for detection, and keypoints come back at
-    the files' size. With one seed and ``threads = mapper_threads = 1`` two runs give the same model bit for bit.
+    the files' size. With one seed and ``mapper_threads=1`` two runs give the same model bit for bit.
     """
 
     name: ClassVar[str] = "sfm"
     is_own_reference: ClassVar[bool] = True
+    key_ignores: ClassVar[tuple[str, ...]] = ("threads",)  # the database is the same for any number
 
     max_image_size: int = 1600
     max_num_features: int = 8192
@@ -54,7 +52,7 @@ class Sfm(ColmapInitializer):
     def fill_database(
         self,
         database: Path,
-        groups: list[CameraGroup],
+        names: list[str],
         pairs: list[tuple[str, str]],
         capture: Capture,
         work_dir: Path,
@@ -66,12 +64,12 @@ class Sfm(ColmapInitializer):
         from gsbench.init.sift import extract_sift, match_sift
 
         with timer.phase("extract"):
-            extract_sift(database, capture.images, groups, self, self.threads, progress)
+            extract_sift(database, capture.images, names, self, self.num_threads, progress)
         if database_counts(database)["features"] == 0:
             raise InputError(f"{self.name}: no keypoint in any image: lower init.peak_threshold, or check the photos")
         with timer.phase("match"):
             verification = verification_options(self.seed, self.min_inliers)
-            match_sift(database, pairs, self, verification, self.threads, progress)
+            match_sift(database, pairs, self, verification, self.num_threads, progress)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,9 +9,9 @@ from typing import Protocol
 import pycolmap
 
 from gsbench.init.base import Progress
-from gsbench.init.colmap_database import CameraGroup, image_ids_as_names, write_pairs
+from gsbench.init.colmap_database import image_ids_as_names, write_pairs
 
-IMAGES_PER_CALL = 4  # COLMAP reports no progress within a call, so it is called for a few images at a time
+IMAGES_PER_CALL = 8  # COLMAP reports no progress within a call, so it is called for a few images at a time
 MATCH_CALLS = 20  # … and for about a twentieth of the pairs, of which
 MIN_PAIRS_PER_CALL = 50  # fewer would pay more for the start of the matcher than for the matching
 MAX_PAIRS_PER_CALL = 2000
@@ -39,9 +39,9 @@ class SiftSettings(Protocol):
 
 
 def extract_sift(
-    database: Path, images: Path, groups: Sequence[CameraGroup], sift: SiftSettings, threads: int, progress: Progress
+    database: Path, images: Path, names: Sequence[str], sift: SiftSettings, threads: int, progress: Progress
 ) -> None:
-    """Detect and describe keypoints in all images of ``groups``, whose cameras are in the database."""
+    """Detect and describe keypoints in the images ``names``, which are in the database."""
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = threads
@@ -50,24 +50,13 @@ def extract_sift(
     options.sift.peak_threshold = sift.peak_threshold
     options.sift.edge_threshold = sift.edge_threshold
     options.sift.first_octave = sift.first_octave
-    done, total = 0, sum(len(group.names) for group in groups)
-    progress("extract", done, total)
-    for group in groups:
-        reader = pycolmap.ImageReaderOptions()
-        reader.existing_camera_id = group.camera_id
-        for start in range(0, len(group.names), IMAGES_PER_CALL):
-            names = list(group.names[start : start + IMAGES_PER_CALL])
-            pycolmap.extract_features(
-                database,
-                images,
-                image_names=names,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader,
-                extraction_options=options,
-                device=pycolmap.Device.cpu,
-            )
-            done += len(names)
-            progress("extract", done, total)
+    progress("extract", 0, len(names))
+    for start in range(0, len(names), IMAGES_PER_CALL):
+        part = list(names[start : start + IMAGES_PER_CALL])
+        pycolmap.extract_features(
+            database, images, image_names=part, extraction_options=options, device=pycolmap.Device.cpu
+        )
+        progress("extract", start + len(part), len(names))
 
 
 def match_sift(

@@ -124,9 +124,12 @@ class Trainer:
         step, options = self.step, self.options
         self.gaussians.set_step(step)
         view = self.scene.train[self.order.next()]
-        render = self.rasterizer.render(
-            self.gaussians.values, view.camera, self.sh_degree, self.background, self.densifier.needs_absolute_gradient
-        )
+        try:
+            render = self.rasterizer.render(
+                self.gaussians.values, view.camera, self.sh_degree, self.background, self.densifier.needs_absolute_gradient
+            )
+        except ValueError as error:  # the optimiser has driven a parameter out of range
+            raise TrainingError(f"iteration {step}: {error}; the last good state is the newest checkpoint in {folder}") from error
         loss, l1, ssim = photometric_loss(render.image, self._target(view), options.ssim_weight)
         regularizer = self.densifier.regularizer(self.gaussians.values)
         total = loss if regularizer is None else loss + regularizer

@@ -34,21 +34,18 @@ def to_local(rotation, x, y, z):
 
 
 @_inline
-def slab(low, high, origin, direction):
-    """Entry and exit of a ray through a slab of one axis."""
-    if abs(direction) < 1e-12:
-        return (-inf, inf) if low <= origin <= high else (inf, -inf)
-    a, b = (low - origin) / direction, (high - origin) / direction
-    return (a, b) if a < b else (b, a)
+def inverse(value):
+    """1 / value, large but finite at 0, so that a ray along a face of a box gives no NaN."""
+    return 1.0 / value if abs(value) > 1e-12 else 1e12
 
 
 @_inline
-def enter_box(hx, hy, hz, ox, oy, oz, dx, dy, dz):
-    """(entry, exit) of a ray through the box of half extents h around the origin; entry > exit where it misses."""
-    ax, bx = slab(-hx, hx, ox, dx)
-    ay, by = slab(-hy, hy, oy, dy)
-    az, bz = slab(-hz, hz, oz, dz)
-    return max(ax, ay, az), min(bx, by, bz)
+def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
+    """(entry, exit) of a ray with inverse direction i through the box from l to h; entry > exit where it misses."""
+    ax, bx = (lx - ox) * ix, (hx - ox) * ix
+    ay, by = (ly - oy) * iy, (hy - oy) * iy
+    az, bz = (lz - oz) * iz, (hz - oz) * iz
+    return max(min(ax, bx), min(ay, by), min(az, bz)), min(max(ax, bx), max(ay, by), max(az, bz))
 
 
 @_inline
@@ -79,7 +76,9 @@ def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
 def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
     """The first distance > 0 along a local ray to the primitive, inf where it misses."""
     if kind == BOX:
-        entry, exit_ = enter_box(size[0], size[1], size[2], ox, oy, oz, dx, dy, dz)
+        entry, exit_ = enter_box(
+            -size[0], -size[1], -size[2], size[0], size[1], size[2], ox, oy, oz, inverse(dx), inverse(dy), inverse(dz)
+        )
         return entry if 0.0 < entry <= exit_ else inf
     if kind == SPHERE:
         b, c = ox * dx + oy * dy + oz * dz, ox * ox + oy * oy + oz * oz - size[0] * size[0]
@@ -95,13 +94,13 @@ def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
 def cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz, anything):
     """(distance, primitive) of the first hit, GROUND or SKY included; with ``anything`` the first one found will do."""
     best, index = inf, SKY
+    ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
     if dz < -1e-9 and not anything:
         best, index = -oz / dz, GROUND
     for g in range(len(start) - 1):
-        ax, bx = slab(low[g, 0], high[g, 0], ox, dx)
-        ay, by = slab(low[g, 1], high[g, 1], oy, dy)
-        az, bz = slab(low[g, 2], high[g, 2], oz, dz)
-        entry, exit_ = max(ax, ay, az), min(bx, by, bz)
+        entry, exit_ = enter_box(
+            low[g, 0], low[g, 1], low[g, 2], high[g, 0], high[g, 1], high[g, 2], ox, oy, oz, ix, iy, iz
+        )
         if entry > exit_ or exit_ < 0.0 or entry > best:
             continue
         for i in range(start[g], start[g + 1]):

@@ -97,16 +97,17 @@ def build_layout(seed: int) -> Layout:
     """The courtyard of a seed: one plan; the seed varies the turn and shade of the small things and the shrubs."""
     rng = np.random.default_rng(seed)
     build = _Builder()
-    _house(build)
-    _walls(build)
-    _pergola(build, rng)
-    _shrubs(build, rng)
+    # near things first: a ray that has hit one skips the groups behind it
     _well(build)
     _crates(build, rng)
     _bench(build, rng)
     _pots(build, rng)
     _logs(build, rng)
     _sundial(build, rng)
+    _shrubs(build, rng)
+    _pergola(build, rng)
+    _walls(build)
+    _house(build)
     return build.layout()
 
 
