@@ -16,7 +16,7 @@ from gsbench.errors import GsbenchError, InputError
 
 DONE, TRIAL_FAILED, BAD_INPUT = 0, 1, 2
 VERBS = {
-    "tables": ("gsbench.eval.tables_cli", "Markdown, CSV, LaTeX or HTML tables of an experiment"),
+    "tables": ("gsbench.verbs.tables", "Markdown, CSV, LaTeX or HTML tables of an experiment"),
     "bench": ("gsbench.bench", "time rasterizers and the training step"),
     "sync": ("gsbench.verbs.sync", "mirror to MLflow what it missed"),
     "ui": ("gsbench.verbs.ui", "open the MLflow dashboard on this machine"),

@@ -1,8 +1,8 @@
 """Run a function in a process of its own, so that a crash in native code becomes an error with a reason.
 
-The child is a fresh interpreter (never a fork, so no threads or locks are inherited) that imports only what the function
-needs: the parent's ``__main__`` is not imported again, so it works alike from a console script, a notebook, pytest and
-Hydra. The child ends when the parent does, even when the parent is killed.
+The child is a fresh interpreter (never a fork, so no threads or locks are inherited) that imports only what the
+function needs: the parent's ``__main__`` is not imported again, so it works alike from a console script, a notebook,
+pytest and Hydra. The child ends when the parent does, even when the parent is killed.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ def run_isolated(
 ) -> R:
     """Return ``function(*args, **kwargs)``, computed in a fresh child process.
 
-    ``function`` must be importable by name (a top-level function of a module, not of ``__main__``); it, the arguments and
-    the result travel by pickle. ``what`` names the work in errors ("undistortion"). The child's whole output, native
-    libraries' included, is appended to the file ``log`` if one is given, else dropped on success.
+    ``function`` must be importable by name (a top-level function of a module, not of ``__main__``); it, the arguments
+    and the result travel by pickle. ``what`` names the work in errors ("undistortion"). The child's whole output, that
+    of native libraries included, is appended to the file ``log`` if one is given, else dropped on success.
 
     An exception that the function raises is raised here again, with the child's traceback as a note. A crash of the
     process raises `CrashError`, one line that ends with the last telling lines of its output.
@@ -75,7 +75,7 @@ def run_isolated(
 def _run_child(call: Path, result: Path, output: BinaryIO) -> int:
     """Start the child, wait for it and return its exit code; end it on any exception here (Ctrl-C included)."""
     command = [sys.executable, "-c", _BOOTSTRAP, json.dumps(sys.path), str(call), str(result)]
-    # A session of its own: Ctrl-C reaches the parent only, which then ends the child; no two tracebacks on the terminal.
+    # A session of its own: Ctrl-C reaches the parent only, which then ends the child: one traceback, not two.
     # stdin is a pipe that is never written: its end of file tells the child that the parent is gone.
     child = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True

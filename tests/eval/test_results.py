@@ -70,7 +70,9 @@ def test_a_trial_that_cannot_be_used_is_named_and_left_out(tmp_path: Path, damag
 def test_a_failed_trial_says_why(tmp_path: Path) -> None:
     path = write_runs(tmp_path, Plan())[0]
     (path / "results.json").unlink()
-    (path / "failed.json").write_text(json.dumps({"error": "Traceback …\nthe loss is not finite at 812"}))
+    (path / "failed.json").write_text(
+        json.dumps({"error": "TrainingError", "message": "the loss is not finite at 812"})
+    )
     assert load_experiment(tmp_path, "exp").warnings == (
         "exp/courtyard/sfm-adc/c0ffee00-seed0: failed, the loss is not finite at 812",
     )

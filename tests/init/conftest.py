@@ -57,7 +57,7 @@ def untrained_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 block.ffn[-1].weight.zero_()
                 block.ffn[-1].bias.zero_()
         for assignment in lightglue.log_assignment:
-            assignment.final_proj.weight.copy_(30.0 * torch.eye(256))
+            assignment.final_proj.weight.copy_(200.0 * torch.eye(256))
             assignment.final_proj.bias.zero_()
             assignment.matchability.weight.zero_()
             assignment.matchability.bias.fill_(10.0)

@@ -1,7 +1,8 @@
 """Where an arm helps: the errors of two arms' renders, binned by what the ground truth or the scene is like there.
 
-Every pixel gets a property, such as the texture energy of the ground truth; pixels are sorted into equally filled bins
-of it, and the mean error of each arm is taken in each bin, view and trial. Differences are then tested as any metric is.
+Every pixel gets a property, such as the texture energy of the ground truth; pixels are sorted into equally filled
+bins of it, and the mean error of each arm is taken in each bin, view and trial. Differences are then tested as those of
+any metric are.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ MAP_PROPERTIES = {
 
 @dataclass(frozen=True)
 class RegionErrors:
-    """Mean absolute errors (8-bit levels) of two arms in bins of a property, from the lowest to the highest.
+    """Mean absolute errors (8-bit levels) of two arms in bins of a property, from its lowest values to its highest.
 
     ``edges`` are the inner edges of each scene's bins; ``comparisons`` are second arm minus first, one for each bin.
     """
@@ -50,7 +51,7 @@ class RegionErrors:
 
 
 def texture_energy(image: NDArray[np.uint8]) -> Array:
-    """Local mean of the squared luminance gradient, [H, W], of an image [H, W, 3] uint8; units: 8-bit levels squared."""
+    """Local mean of the squared luminance gradient (8-bit levels squared), [H, W], of an image [H, W, 3] uint8."""
     from scipy.ndimage import gaussian_filter  # here, since it is slow to import
 
     luminance = image.astype(np.float64) @ np.array(LUMINANCE)  # [H, W]
@@ -75,23 +76,30 @@ def errors_by_region(
     if not pairs:
         raise InputError("no trials of the two arms share a scene and a seed")
     read_property = _property_reader(property_name)
-    scenes, before, after, edges = [], [], [], {}
+    scenes: list[str] = []
+    errors: list[Array] = []
+    edges: dict[str, tuple[float, ...]] = {}
     for scene, group in by_key([one for one, _ in pairs], lambda trial: trial.scene).items():
         own = [(one, other) for one, other in pairs if one in group]
         scene_edges = _edges(group[0], read_property, bins)
-        means = np.array([list(_pair_means(one, other, read_property, scene_edges)) for one, other in own])
+        errors.append(
+            np.array([list(_pair_means(*pair, read_property, scene_edges)) for pair in own])
+        )  # [K, V, 2, bins]
         scenes.append(scene)
         edges[scene] = tuple(float(edge) for edge in scene_edges)
-        before.append(means[:, :, 0])  # [K, V, bins]
-        after.append(means[:, :, 1])
-    comparisons = []
+    means, comparisons = [], []
     for index in range(bins):
-        differences = tuple(b[:, :, index] - a[:, :, index] for a, b in zip(before, after, strict=True))
-        baseline = float(np.mean([a[:, :, index].mean() for a in before]))
+        inside = [array[:, np.isfinite(array[:, :, 0, index]).all(axis=0), :, index] for array in errors]  # [K, V', 2]
+        kept = [(scene, array) for scene, array in zip(scenes, inside, strict=True) if array.size]
+        if not kept:
+            raise InputError(f"{property_name}: bin {index + 1} of {bins} is empty in every scene; ask for fewer bins")
+        means.append(np.mean([array.mean(axis=(0, 1)) for _, array in kept], axis=0))  # [2]
+        differences = tuple(array[:, :, 1] - array[:, :, 0] for _, array in kept)
         name = f"error in {property_name} bin {index + 1}"
-        comparisons.append(compare(Paired(name, tuple(scenes), differences, baseline, ()), direction=-1))
-    means_of_scenes = [tuple(np.mean([m.mean(axis=(0, 1)) for m in arm], axis=0).tolist()) for arm in (before, after)]
-    return RegionErrors(property_name, means_of_scenes[0], means_of_scenes[1], tuple(comparisons), edges)
+        paired = Paired(name, tuple(scene for scene, _ in kept), differences, float(means[-1][0]), ())
+        comparisons.append(compare(paired, direction=-1))
+    first_means, second_means = (tuple(float(mean[place]) for mean in means) for place in (0, 1))
+    return RegionErrors(property_name, first_means, second_means, tuple(comparisons), edges)
 
 
 def view_names(trial: Trial) -> list[str]:
@@ -136,7 +144,7 @@ def _read_map(trial: Trial, view: str, name: str, shape: tuple[int, int]) -> Arr
 
 
 def _edges(trial: Trial, read_property: Reader, bins: int) -> Array:
-    """The inner edges [bins - 1] that divide the property's finite values over a scene's test views into equal parts."""
+    """The inner edges [bins - 1] that cut the finite values over a scene's test views into equal parts."""
     names = view_names(trial)
     samples = []
     for name in names:
@@ -147,7 +155,7 @@ def _edges(trial: Trial, read_property: Reader, bins: int) -> Array:
 
 
 def _pair_means(one: Trial, other: Trial, read_property: Reader, edges: Array) -> Iterator[tuple[Array, Array]]:
-    """For each view: the mean error of both trials in every bin, [bins] each; 0 pixels give 0 in both."""
+    """For each view: the mean error of both trials in every bin, [bins] each; a bin without pixels is not a number."""
     if view_names(one) != view_names(other):
         raise InputError(f"{one.label} and {other.label} have different renders")
     for name in view_names(one):
@@ -159,5 +167,5 @@ def _pair_means(one: Trial, other: Trial, read_property: Reader, edges: Array) -
         for trial in (one, other):
             errors = absolute_error(read_image(trial.path / RENDERS / f"{name}.png"), truth).ravel()
             sums = np.bincount(index, weights=errors, minlength=len(edges) + 2)[:-1]
-            means.append(sums / np.maximum(counts, 1))
+            means.append(np.where(counts > 0, sums / np.maximum(counts, 1), np.nan))
         yield means[0], means[1]

@@ -44,15 +44,16 @@ METRICS: dict[str, tuple[str, int, int]] = {  # key -> name, direction, decimals
     "flip": ("FLIP", -1, 3),
 }
 COSTS = ("gaussians", "train_time", "init_points", "total_time", "peak_memory_mb")
-ALIASES = {"lpips": "lpips_vgg_raw", "num_gaussians": "gaussians", "seconds": "train_time", "train": "train_time"}
-PROTOCOL_LPIPS = {"paper": "lpips_vgg_raw", "standard": "lpips_vgg"}  # what a protocol means by LPIPS
+ALIASES = {"num_gaussians": "gaussians", "seconds": "train_time", "train": "train_time"}
+PAPER_LPIPS = "lpips_vgg_raw"
+PROTOCOL_LPIPS = {"paper": PAPER_LPIPS, "standard": "lpips_vgg"}  # what a protocol means by LPIPS
 
 
 def choose_quantities(trials: Iterable[Trial], names: Iterable[str] | None = None) -> list[Quantity]:
     """The quantities by name; by default all metrics that some trial has, the protocol's LPIPS, and the main costs."""
     trials = list(trials)
     if names is None:
-        protocols = {str(trial.data["protocol"]).rsplit("-", 1)[0] for trial in trials}
+        protocols = {_protocol(trial) for trial in trials}
         wanted = {PROTOCOL_LPIPS.get(protocol) for protocol in protocols}
         present = {key for trial in trials for key in trial.metrics}
         names = [key for key in METRICS if key in present or key in wanted]
@@ -67,6 +68,8 @@ def quantity(name: str, trials: Iterable[Trial]) -> Quantity:
     """
     trials = list(trials)
     key = ALIASES.get(name, name)
+    if key == "lpips":
+        key = PROTOCOL_LPIPS.get(_protocol(trials[0]) if trials else "", PAPER_LPIPS)
     if key in METRICS:
         label, direction, decimals = METRICS[key]
         return Quantity(key, label, direction, decimals, lambda trial: trial.metrics.get(key))
@@ -87,6 +90,11 @@ def quantity(name: str, trials: Iterable[Trial]) -> Quantity:
     if any(name in trial.metrics for trial in trials):  # a metric of the user's own
         return Quantity(name, name, 0, 3, lambda trial: trial.metrics.get(name))
     raise InputError(f"unknown metric {name!r}; choose among {', '.join([*METRICS, *COSTS])}")
+
+
+def _protocol(trial: Trial) -> str:
+    """The protocol's name without its version."""
+    return str(trial.data["protocol"]).rsplit("-", 1)[0]
 
 
 def _count(

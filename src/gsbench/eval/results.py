@@ -230,7 +230,7 @@ def _folders(place: str | Path) -> list[str]:
 def _why_unfinished(path: Path) -> str:
     try:
         failure = json.loads((path / FAILED).read_text(encoding="utf-8"))
-        reason = str(failure.get("error") or failure.get("message") or "see failed.json").strip().splitlines()[-1]
+        reason = str(failure.get("message") or failure.get("error") or "see failed.json").strip().splitlines()[-1]
         return f"failed, {reason}"
     except FileNotFoundError:
         return "unfinished, no results.json yet" if (path / CONFIG).is_file() else "foreign, not a trial"

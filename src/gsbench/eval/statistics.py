@@ -28,6 +28,8 @@ BOOTSTRAP_SAMPLES = 4000
 POWER = 0.8
 MAX_SEEDS = 1000
 
+SCENES_LIKE_THESE, THESE_SCENES, THIS_SCENE = "scenes like these", "these scenes", "this scene"
+
 Array = NDArray[np.float64]
 
 
@@ -112,11 +114,8 @@ def compare(paired: Paired, direction: int, samples: int = BOOTSTRAP_SAMPLES, se
     )
 
 
-SCENES_LIKE_THESE, THESE_SCENES, THIS_SCENE = "scenes like these", "these scenes", "this scene"
-
-
 def _overall_test(per_trial: Sequence[Array], per_scene: Array) -> tuple[float | None, str, str, Array]:
-    """(p, test, scope, units tested): scenes where there are enough, else trials, by sign flips where they can decide."""
+    """(p, test, scope, units tested): over scenes where there are enough, else over trials."""
     if len(per_scene) >= MIN_SCENES:
         p = sign_flip_p(per_scene, np.full(len(per_scene), 1.0))
         return p, f"exact sign flips of {len(per_scene)} scenes", SCENES_LIKE_THESE, per_scene
@@ -183,10 +182,10 @@ def bootstrap_interval(
 ) -> Interval | None:
     """95 % percentile interval of the mean of scenes of ``differences`` ([K, V] each); None where nothing is repeated.
 
-    With ``resample_scenes``, scenes are drawn anew and keep their trials and views, since the spread of the scenes' means
-    already contains that of what is below (Davison and Hinkley 1997, section 3.8). Otherwise the trials and the views of
-    each scene are drawn anew, a view together for all trials, since every trial sees the same ones; the deviations of
-    the two are added. Percentile intervals from n units are too short: deviations are stretched by
+    With ``resample_scenes``, scenes are drawn anew and keep their trials and views, since the spread of the scenes'
+    means already contains that of what is below (Davison and Hinkley 1997, section 3.8). Otherwise the trials and the
+    views of each scene are drawn anew, a view together for all trials, since every trial sees the same ones; the
+    deviations of the two are added. Percentile intervals from n units are too short: deviations are stretched by
     ``sqrt(n / (n - 1)) t / z`` (Hesterberg 2015, "What teachers should know about the bootstrap").
     """
     scenes = len(differences)

@@ -57,7 +57,7 @@ def arm_curve(trials: Sequence[Trial], arm: Arm, quality: Quantity, cost: str, l
 
 
 def training_curve(trials: Sequence[Trial], cost: str, quality: str) -> Curve:
-    """Quality during training against Gaussians or seconds, averaged over trials step by step, from ``metrics.jsonl``."""
+    """Quality during training against Gaussians or seconds, averaged over trials step by step (``metrics.jsonl``)."""
     key = {"gaussians": "num_gaussians", "seconds": "seconds"}[cost]
     by_step: dict[int, list[tuple[float, float]]] = {}
     for trial in trials:

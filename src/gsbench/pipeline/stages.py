@@ -8,6 +8,7 @@ import logging
 import re
 import resource
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -24,12 +25,13 @@ from gsbench.gaussians.model import MAX_SH_DEGREE
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Sfm, read_cloud
 from gsbench.init.base import MODEL_FOLDER, REPORT_FILE, Initializer
-from gsbench.pipeline.components import options_of
-from gsbench.pipeline.progress import progress
+from gsbench.pipeline.components import available_threads, options_of
+from gsbench.pipeline.progress import Report, progress
 from gsbench.pipeline.store import Entry, Stage, Store, write_json
 from gsbench.pipeline.trainer import Status, Trainer
 from gsbench.raster import Rasterizer
 from gsbench.scene.courtyard import render_courtyard
+from gsbench.scene.images import read_image
 from gsbench.scene.load import load_scene
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Capture, Scene
@@ -86,10 +88,18 @@ def initialize(store: Store, capture: Capture, initializer: Initializer) -> Entr
 
     def build(folder: Path) -> None:
         with progress("init") as report:
+            check_readable(capture, report)
             cameras = None if reference is None else reference.path / MODEL_FOLDER
             initializer.run(capture, folder, report, reference=cameras)
 
     return store.get(INIT, inputs, build)
+
+
+def check_readable(capture: Capture, report: Report) -> None:
+    """Decode every photograph once, so that a damaged file is named before hours of work. Raises InputError."""
+    with ThreadPoolExecutor(max_workers=available_threads()) as pool:
+        for done, _ in enumerate(pool.map(lambda name: read_image(capture.images / name).shape, capture.image_names)):
+            report("photographs", done + 1, len(capture.image_names))
 
 
 def prepare_scene(store: Store, capture: Capture, init: Entry, options: SceneConfig) -> Scene:

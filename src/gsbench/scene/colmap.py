@@ -73,10 +73,10 @@ def fit_model(
     sizes: Mapping[str, tuple[int, int]],
     folder: Path,
 ) -> pycolmap.Reconstruction:
-    """A new model of the images ``names`` (old name -> new name), for files of ``sizes`` (new name -> width, height in px).
+    """A new model of the images ``names`` (old -> new name), for files of ``sizes`` (new name -> (width, height) px).
 
-    Camera, image and point ids are kept; where files of one camera have different sizes, each further size gets a camera
-    of its own. ``folder`` is only for error messages.
+    Camera, image and point ids are kept; where files of one camera have different sizes, each further size gets a
+    camera of its own. ``folder`` is only for error messages.
     """
     fitted = pycolmap.Reconstruction()
     next_camera_id = max(model.cameras, default=0) + 1

@@ -61,7 +61,7 @@ def render_courtyard(
 
 
 def courtyard_cameras(views: int, width: int, height: int) -> dict[str, Camera]:
-    """The cameras by file name: a ring that rises and falls, in steps of 7.5 degrees or, for more than 48 views, less."""
+    """The cameras by file name: a wavy ring in steps of 7.5 degrees or, for more than 48 views, less."""
     if views < MIN_VIEWS:
         raise InputError(f"scene.views must be at least {MIN_VIEWS}, got {views}")
     if min(width, height) < 16:

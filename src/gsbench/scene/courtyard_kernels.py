@@ -15,7 +15,7 @@ SUN = (-0.5130, -0.4305, 0.7426)  # unit vector towards the sun: from the south-
 SUN_LIGHT = (2.55, 2.30, 1.90)
 SKY_LIGHT = (0.42, 0.50, 0.64)  # from above
 BOUNCE_LIGHT = (0.19, 0.18, 0.13)  # from below
-OCCLUSION_STEPS = (0.06, 0.18, 0.45)  # m along the normal
+OCCLUSION_STEPS = (0.1, 0.35)  # m along the normal
 EXPOSURE = 1.12
 SUBSAMPLES = 2  # per side of a pixel
 _EPSILON = 1e-4  # m, how far a shadow ray starts above the surface
@@ -104,7 +104,11 @@ def cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz,
         if entry > exit_ or exit_ < 0.0 or entry > best:
             continue
         for i in range(start[g], start[g + 1]):
-            lx, ly, lz = to_local(rotation[i], ox - center[i, 0], oy - center[i, 1], oz - center[i, 2])
+            x, y, z = ox - center[i, 0], oy - center[i, 1], oz - center[i, 2]
+            along = x * dx + y * dy + z * dz
+            if along * along < x * x + y * y + z * z - size[i, 3] * size[i, 3]:
+                continue  # passes the bounding sphere
+            lx, ly, lz = to_local(rotation[i], x, y, z)
             ux, uy, uz = to_local(rotation[i], dx, dy, dz)
             t = hit_primitive(kind[i], size[i], lx, ly, lz, ux, uy, uz)
             if t < best:
@@ -139,7 +143,10 @@ def nearest_surface(kind, center, rotation, size, start, low, high, x, y, z, lim
         if qx * qx + qy * qy + qz * qz >= best * best:
             continue
         for i in range(start[g], start[g + 1]):
-            lx, ly, lz = to_local(rotation[i], x - center[i, 0], y - center[i, 1], z - center[i, 2])
+            rx, ry, rz = x - center[i, 0], y - center[i, 1], z - center[i, 2]
+            if rx * rx + ry * ry + rz * rz >= (best + size[i, 3]) ** 2:
+                continue
+            lx, ly, lz = to_local(rotation[i], rx, ry, rz)
             best = min(best, abs(signed_distance(kind[i], size[i], lx, ly, lz)))
     return best
 
@@ -215,13 +222,11 @@ def shade(kind, center, rotation, size, material, tint, start, low, high, ox, oy
         free = nearest_surface(
             kind, center, rotation, size, start, low, high, x + step * nx, y + step * ny, z + step * nz, step
         )
-        occlusion -= 0.27 * (1.0 - free / step)
+        occlusion -= 0.38 * (1.0 - free / step)
     sun = nx * SUN[0] + ny * SUN[1] + nz * SUN[2]
     if sun > 0.0:
         sx, sy, sz = x + _EPSILON * nx, y + _EPSILON * ny, z + _EPSILON * nz
-        _, blocker = cast(
-            kind, center, rotation, size, start, low, high, sx, sy, sz, SUN[0], SUN[1], SUN[2], True
-        )
+        _, blocker = cast(kind, center, rotation, size, start, low, high, sx, sy, sz, SUN[0], SUN[1], SUN[2], True)
         sun = sun if blocker == SKY else 0.0
     sun = max(sun, 0.0)
     up = 0.5 + 0.5 * nz
@@ -239,7 +244,7 @@ def encode(value):
     if value > 0.6:
         value = 0.6 + 0.4 * (1.0 - exp(-(value - 0.6) / 0.4))
     srgb = 12.92 * value if value <= 0.0031308 else 1.055 * value ** (1 / 2.4) - 0.055
-    return int(floor(255.0 * clamp(srgb, 0.0, 1.0) + 0.5))
+    return floor(255.0 * clamp(srgb, 0.0, 1.0) + 0.5)
 
 
 @numba.njit(nogil=True, error_model="numpy")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from math import cos, pi, radians, sin
 
 import numpy as np
@@ -29,14 +30,14 @@ _LEAF, _DEEP_LEAF, _PALE_LEAF = (0.10, 0.20, 0.045), (0.055, 0.13, 0.04), (0.17,
 class Layout:
     """The primitives as arrays, sorted by group; a group is a box in space that rays test first.
 
-    ``size``: BOX half extents; SPHERE (radius, -, -); TUBE (outer radius, half height, inner radius or 0), its axis
-    along local z. ``rotation`` [S, 3, 3] takes local to world directions.
+    ``size``: BOX half extents; SPHERE (radius, -, -); TUBE (outer radius, half height, inner radius or 0), axis
+    along local z; and, fourth, the radius of the bounding sphere. ``rotation`` [S, 3, 3] takes local to world directions.
     """
 
     kind: NDArray[np.int64]  # [S]
     center: NDArray[np.float64]  # [S, 3] m
     rotation: NDArray[np.float64]  # [S, 3, 3]
-    size: NDArray[np.float64]  # [S, 3] m
+    size: NDArray[np.float64]  # [S, 4] m
     material: NDArray[np.int64]  # [S]
     tint: NDArray[np.float64]  # [S, 3] linear RGB
     group_start: NDArray[np.int64]  # [G + 1] first primitive of each group
@@ -83,10 +84,11 @@ class _Builder:
 
     def layout(self) -> Layout:
         kind, center, rotation, size, material, tint = zip(*self.rows, strict=True)
+        size = [(*sides, _bounding_radius(shape, sides)) for shape, sides in zip(kind, size, strict=True)]
         starts = np.array([*self.starts, len(self.rows)])
         boxes = [_bounds(*row[:4]) for row in self.rows]
-        low = [np.min([boxes[i][0] for i in range(a, b)], axis=0) for a, b in zip(starts, starts[1:], strict=False)]
-        high = [np.max([boxes[i][1] for i in range(a, b)], axis=0) for a, b in zip(starts, starts[1:], strict=False)]
+        low = [np.min([boxes[i][0] for i in range(a, b)], axis=0) for a, b in pairwise(starts)]
+        high = [np.max([boxes[i][1] for i in range(a, b)], axis=0) for a, b in pairwise(starts)]
         return Layout(
             np.array(kind), np.array(center), np.array(rotation), np.array(size), np.array(material), np.array(tint),
             starts, np.array(low), np.array(high),
@@ -162,7 +164,7 @@ def _pergola(build: _Builder, rng: np.random.Generator) -> None:
     for y in (-4.2, -1.4, 1.4, 4.2):
         build.group(-5.9, y)
         build.box((0, 0, 0.14), (0.56, 0.56, 0.28), STONE, _GREY_STONE)
-        build.tube((0, 0, 1.27), 0.19, 1.98, STONE, _SANDSTONE)
+        build.tube((0, 0, 1.27), 0.19, 1.98, STONE, _WHITEWASH)
         build.box((0, 0, 2.32), (0.5, 0.5, 0.14), STONE, _GREY_STONE)
         angle = rng.uniform(0, 2 * pi)
         build.sphere((0.24 * cos(angle), 0.24 * sin(angle), 0.32), 0.25, LEAVES, _DEEP_LEAF)
@@ -226,7 +228,7 @@ def _crate(build: _Builder, at: tuple[float, float, float], side: float, yaw: fl
 def _bench(build: _Builder, rng: np.random.Generator) -> None:
     build.group(-1.95, 1.45, 55.0 + rng.uniform(-6, 6))
     for y in (-0.16, 0.0, 0.16):
-        build.box((0, y, 0.46), (1.6, 0.14, 0.045), WOOD, _PALE_WOOD)
+        build.box((0, y, 0.46), (1.6, 0.16, 0.045), WOOD, _PALE_WOOD)
     for z in (0.66, 0.84):
         build.box((0, 0.27, z), (1.6, 0.04, 0.13), WOOD, _PALE_WOOD, roll=-8)
     for x in (-0.68, 0.68):
@@ -278,3 +280,9 @@ def _bounds(kind: int, center: NDArray, rotation: NDArray, size: tuple) -> tuple
     half = {BOX: size, SPHERE: size, TUBE: (size[0], size[0], size[1])}[kind]
     reach = np.full(3, size[0]) if kind == SPHERE else np.abs(rotation) @ np.array(half)
     return center - reach - 1e-6, center + reach + 1e-6
+
+
+def _bounding_radius(kind: int, size: tuple) -> float:
+    if kind == SPHERE:
+        return size[0]
+    return float(np.linalg.norm(size if kind == BOX else size[:2]))

@@ -1,7 +1,7 @@
 """Procedural solid textures of the courtyard, compiled with numba.
 
-Every pattern is a sum of noise octaves that fade out as their cells approach the footprint of a pixel on the surface, so a
-picture from afar shows no aliasing. All functions are scalar, pure and deterministic. Colours are linear RGB.
+Every pattern is a sum of noise octaves that fade out as their cells approach the footprint of a pixel on the surface,
+so a picture from afar shows no aliasing. All functions are scalar, pure and deterministic. Colours are linear RGB.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ def octaves3(x, y, z, cell, count, gain, footprint, seed):
 
 @_inline
 def pebbles(x, y, cell, seed):
-    """Cellular noise: (distance to the nearest feature point, distance to the border between cells, shade of the cell)."""
-    gx, gy = int(floor(x / cell)), int(floor(y / cell))
+    """Cellular noise: (distance to the nearest feature point, that to the cell's border, shade of the cell)."""
+    gx, gy = floor(x / cell), floor(y / cell)
     first, second, shade = 9.0, 9.0, 0.0
     for i in range(gx - 1, gx + 2):
         for j in range(gy - 1, gy + 2):
@@ -118,7 +118,7 @@ def ground(x, y, footprint, seed):
     radius = sqrt(x * x + y * y)
     to_door = max(abs(x + 0.12 * y * (y - 7.2) / 7.2) - 0.55, -y)
     to_gate = max(abs(x - 0.6 * (y / 7.2) ** 2 + 0.9 * y * (y + 7.2) / 14.0 * 0.5) - 0.5, y)
-    path = min(min(to_door, to_gate), abs(radius - 1.25) - 0.42) + wobble
+    path = min(min(to_door, to_gate), abs(radius - 1.15) - 0.32) + wobble
     soil = min(7.2 - abs(x), 7.2 - abs(y)) - 1.05 + 1.3 * wobble
     edge = max(0.03, footprint)
 
@@ -128,13 +128,13 @@ def ground(x, y, footprint, seed):
     tuft = noise2(x / 0.33, y / 0.33, seed + 41)
     light = 1.0 + 0.10 * patch + 0.13 * blades + 0.06 * tuft
     dry = clamp(0.35 + 0.30 * patch + 0.12 * tuft, 0.0, 1.0)
-    red, green, blue = light * (0.085 + 0.060 * dry), light * (0.150 + 0.018 * dry), light * (0.030 + 0.012 * dry)
+    red, green, blue = light * (0.092 + 0.062 * dry), light * (0.135 + 0.020 * dry), light * (0.036 + 0.014 * dry)
 
     inside = clamp(0.5 - path / edge, 0.0, 1.0)
     if inside > 0.0:
         _, border, shade = pebbles(x, y, 0.055, seed + 51)
         sharp = visible(0.055, footprint)
-        stone = 0.36 + sharp * (0.30 * (shade - 0.5) - 0.17 * clamp(1.0 - 4.0 * border, 0.0, 1.0) + 0.05)
+        stone = 0.27 + sharp * (0.26 * (shade - 0.5) - 0.15 * clamp(1.0 - 4.0 * border, 0.0, 1.0) + 0.05)
         stone *= 1.0 + 0.10 * octaves2(x, y, 0.9, 4, 0.7, footprint, seed + 61)
         warm = 0.06 * sharp * (2.0 * random_cell(int(shade * 4096.0), 5, 0, seed) - 1.0)
         red += inside * (stone * (1.06 + warm) - red)
@@ -168,36 +168,35 @@ def shade_factors(material, px, py, pz, u, v, footprint, seed):
         damp = clamp(1.0 - (v + 1.95) / 0.9, 0.0, 1.0)
         light = 1.0 + 0.07 * stain + 0.07 * grain - 0.22 * damp * (0.6 + 0.5 * stain)
         warmth = 0.10 * stain
-    elif material == WOOD or material == PAINT:
-        along, across = max(abs(px), 0.0) * 0.0 + u, v
-        plank = floor(across / 0.16)
+    elif material in (WOOD, PAINT):
+        plank = floor(v / 0.16 + 0.5)
         tone = random_cell(int(plank), 4, 0, seed) - 0.5
-        fibre = octaves3(along * 0.12, across, px + py + pz, 0.035, 3, 0.8, 0.7 * footprint, seed + 131)
-        knots = octaves3(along, across * 2.5, pz, 0.3, 3, 0.6, footprint, seed + 141)
+        fibre = octaves3(u * 0.12, v, px + py + pz, 0.035, 3, 0.8, 0.7 * footprint, seed + 131)
+        knots = octaves3(u, v * 2.5, pz, 0.3, 3, 0.6, footprint, seed + 141)
         strength = 1.0 if material == WOOD else 0.25
         light = 1.0 + strength * (0.30 * tone + 0.24 * fibre + 0.20 * knots)
-        light *= 1.0 - 0.55 * groove(across, 0.16, 0.008, footprint) * (1.0 if material == WOOD else 0.0)
+        light *= 1.0 - 0.55 * groove(v + 0.08, 0.16, 0.008, footprint) * (1.0 if material == WOOD else 0.0)
         warmth = 0.2 * strength * (tone + knots)
     elif material == TILES:
         row = floor(v / 0.2)
         shift = u + 0.09 * (row - 2.0 * floor(row / 2.0))
-        tile = random_cell(int(floor(shift / 0.18)), int(row), 6, seed) - 0.5
+        tile = random_cell(floor(shift / 0.18), int(row), 6, seed) - 0.5
         ridge = (v / 0.2 - row) if footprint < 0.2 else 0.5
         moss = clamp(octaves3(px, py, pz, 0.5, 4, 0.7, footprint, seed + 151) - 0.25, 0.0, 1.0)
         light = (1.0 + 0.55 * tile * visible(0.18, footprint)) * (0.72 + 0.5 * ridge)
         light *= 1.0 - 0.5 * groove(shift, 0.18, 0.012, footprint)
         warmth = 0.4 * tile - 1.1 * moss
     elif material == LEAVES:
-        _, border, leaf = pebbles(u + 0.31 * pz, v + 0.23 * px, 0.05, seed + 161)
-        sharp = visible(0.05, footprint)
+        _, border, leaf = pebbles(u + 0.31 * pz, v + 0.23 * px, 0.032, seed + 161)
+        sharp = visible(0.032, footprint)
         clump = octaves3(px, py, pz, 0.22, 3, 0.7, footprint, seed + 171)
-        light = 0.9 + sharp * (0.9 * (leaf - 0.5) - 0.55 * clamp(1.0 - 5.0 * border, 0.0, 1.0)) + 0.40 * clump
+        light = 0.9 + sharp * (0.9 * (leaf - 0.5) - 0.40 * clamp(1.0 - 5.0 * border, 0.0, 1.0)) + 0.40 * clump
         warmth = 0.5 * sharp * (leaf - 0.5) + 0.2 * clump
     elif material == CLAY:
         light = 1.0 + 0.22 * octaves3(px, py, pz, 0.12, 4, 0.75, footprint, seed + 181)
         light *= 1.0 - 0.2 * groove(v, 0.1, 0.008, footprint)
         warmth = 0.3 * noise3(px / 0.15, py / 0.15, pz / 0.15, seed + 182)
-    elif material == WATER or material == GLASS:
+    elif material in (WATER, GLASS):
         light = 1.0 + 0.35 * octaves3(px, py, pz, 0.4, 2, 0.5, footprint, seed + 191) + 0.5 * clamp(v, -0.3, 0.3)
     elif material == METAL:
         rust = octaves3(px, py, pz, 0.1, 4, 0.8, footprint, seed + 201)

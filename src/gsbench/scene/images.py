@@ -1,6 +1,6 @@
 """Reading photographs and making them smaller.
 
-Every image becomes uint8 RGB. EXIF orientation is ignored, as COLMAP ignores it: the camera belongs to the stored pixels.
+Every image becomes uint8 RGB. EXIF orientation is ignored, as COLMAP ignores it: a camera belongs to stored pixels.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 
 def downscaled_size(width: int, height: int, downscale: int = 1, max_size: int | None = None) -> tuple[int, int]:
-    """The size after dividing by ``downscale`` and then, if still longer, shrinking the longest side to ``max_size`` px.
+    """The size after dividing by ``downscale`` and then, if need be, shrinking the longest side to ``max_size``.
 
     Sides are rounded half up, and never below 1; the size never grows.
 

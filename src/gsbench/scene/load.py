@@ -10,8 +10,8 @@ import hashlib
 import json
 import logging
 import os
+import secrets
 import shutil
-import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
@@ -52,7 +52,7 @@ def load_scene(
     ``max_size`` px (see `downscaled_size`). ``centred`` moves principal points to the image centre, as 3DGS assumes.
     Views without a pose in the model are left out with a warning. ``progress`` gets (images done, all images).
 
-    Raises `InputError` if fewer than three views, or no training view, have a pose, or an image does not fit its camera.
+    Raises `InputError` if fewer than three views or no training view have a pose, or an image does not fit its camera.
     """
     if principal_point not in ("used", "centred"):
         raise InputError(f"scene.principal_point must be used or centred, got {principal_point!r}")
@@ -96,7 +96,8 @@ def _build(
     """Prepare all registered images of the capture and publish them as ``folder``."""
     cameras = _model_cameras(capture, model_dir)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    work = folder.parent / f".{folder.name}-{secrets.token_hex(4)}"
+    work.mkdir()  # not mkdtemp, whose folders nobody else may read: a cache may be shared
     try:
         entries: dict[str, dict[str, object]] = {}
         jobs: dict[str, Job] = {}
@@ -150,7 +151,9 @@ def _model_cameras(capture: Capture, model_dir: Path) -> dict[str, tuple[CameraM
             f"{MIN_IMAGES} are needed: take more overlapping photos, or another init"
         )
     if not set(cameras) & set(capture.train_names):
-        raise InputError(f"scene {capture.name}: no training view has a pose in {model_dir}: change the split or the init")
+        raise InputError(
+            f"scene {capture.name}: no training view has a pose in {model_dir}: change the split or the init"
+        )
     return dict(sorted(cameras.items()))
 
 

@@ -60,8 +60,8 @@ def split_names(
 ) -> tuple[list[str], list[str]]:
     """Split sorted names into (training, test).
 
-    Every ``test_every``-th name from the first is a test view; ``test_every=0`` holds out none. Explicit lists win: with
-    one of them the other is the rest; with both, names in neither are left out.
+    Every ``test_every``-th name from the first is a test view; ``test_every=0`` holds out none. Explicit lists win:
+    with one of them the other is the rest; with both, names in neither are left out.
 
     Raises `InputError` if no training view is left, or no test view although ``test_every`` is not 0.
     """

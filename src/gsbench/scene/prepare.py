@@ -129,14 +129,17 @@ def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np
     source = pycolmap.Camera(
         camera_id=1, model=camera.name, width=camera.width, height=camera.height, params=list(camera.params)
     )
+    refusal = (
+        f"images of the camera model {camera.name} with parameters {camera.params} cannot be made pinhole images: "
+        "use another camera model"
+    )
+    if source.is_spherical():
+        raise InputError(refusal)
     bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(image))
     try:
         flat, pinhole = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, source)
     except (ValueError, RuntimeError) as error:
-        raise InputError(
-            f"images of the camera model {camera.name} with parameters {camera.params} cannot be made pinhole images: "
-            "use another camera model"
-        ) from error
+        raise InputError(refusal) from error
     fx, fy, cx, cy = (float(value) for value in pinhole.params)
     return np.array(flat.to_array()), Intrinsics(pinhole.width, pinhole.height, fx, fy, cx, cy)
 

@@ -30,10 +30,10 @@ def read_colmap(
     test_list: str | None = None,
     exact_poses: bool = False,
 ) -> Capture:
-    """Read a COLMAP folder: ``path/<images>`` (default "images") and ``path/<sparse>`` (default "sparse/0", or "sparse").
+    """Read a COLMAP folder: ``path/<images>`` (else "images") and ``path/<sparse>`` (else "sparse/0" or "sparse").
 
-    The photos are those that the model has a pose for and that are in the folder; a file may have another extension than
-    the model says. See `select_images` for which are kept and `split_names` for which are held out.
+    The photos are those that the model has a pose for and that are in the folder; a file may have another extension
+    than the model says. See `select_images` for which are kept and `split_names` for which are held out.
 
     Raises `InputError` if a folder is missing, the model is damaged, or fewer than three photos are usable.
     """
@@ -65,7 +65,7 @@ def read_photos(
     train_list: str | None = None,
     test_list: str | None = None,
 ) -> Capture:
-    """Read bare photographs: all images in ``path/<images>``, or ``path/images`` if there is such a folder, or ``path``.
+    """Read bare photographs: all images in ``path/<images>``, or ``path/images`` if there is one, or ``path``.
 
     Sub-folders are read too. Any COLMAP model beside them is left alone.
 
@@ -192,9 +192,7 @@ def _find_sparse(root: Path, sparse: str | None) -> Path:
         except InputError:
             continue
         return root / candidate
-    raise InputError(
-        f"{root}: no COLMAP model in {' or '.join(SPARSE_FOLDERS)}: set scene.sparse, or read bare photos with scene=photos"
-    )
+    raise InputError(f"{root}: no COLMAP model in {' or '.join(SPARSE_FOLDERS)}: set scene.sparse, or use scene=photos")
 
 
 def _require_enough(count: int, folder: Path, which: str) -> None:

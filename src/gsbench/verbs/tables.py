@@ -1,0 +1,10 @@
+"""``gsbench tables``: tables of an experiment from its result files."""
+
+from __future__ import annotations
+
+
+def main(argv: list[str]) -> int:
+    from gsbench.cli import runs_dir
+    from gsbench.eval.tables_cli import main_tables
+
+    return main_tables(argv, runs_dir())

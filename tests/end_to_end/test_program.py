@@ -1,0 +1,140 @@
+"""The program from outside: a sweep, its files and its table; bad input; and the installed wheel."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.conftest import ROOT
+from tests.end_to_end.conftest import SMALL, Run
+
+pytestmark = pytest.mark.end_to_end
+
+
+def test_sweep_leaves_complete_trials_and_a_table(gsbench: Run, tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    done = gsbench("-m", *SMALL, "name=small", "densify=adc,volumetric", "seed=0,1", GSBENCH_RUNS=str(runs))
+    assert done.returncode == 0, done.stderr
+    results = [json.loads(path.read_text()) for path in sorted(runs.glob("small/courtyard/*/*/results.json"))]
+    assert {(r["densify"], r["seed"]) for r in results} == {("adc", 0), ("adc", 1), ("volumetric", 0), ("volumetric", 1)}
+    for result in results:
+        assert result["status"] == "complete"
+        assert result["protocol"] == "paper-1"
+        assert 13 < result["metrics"]["psnr"] < 40
+        assert "lpips_vgg_raw" not in result["metrics"]
+        assert "lpips_vgg_raw" in result["unavailable"]
+    trial = next(runs.glob("small/courtyard/random-volumetric/*-seed0"))
+    names = {path.name for path in trial.iterdir()}
+    wanted = "config.yaml results.json per_view.csv metrics.jsonl events.jsonl renders ground_truth point_cloud.ply log.txt"
+    assert set(wanted.split()) <= names
+    with (trial / "per_view.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["view"] for row in rows] == ["0000.png", "0008.png"]
+    picture = np.asarray(Image.open(trial / "renders" / "0000.png")).astype(float)
+    truth = np.asarray(Image.open(trial / "ground_truth" / "0000.png")).astype(float)
+    assert picture.shape == truth.shape == (72, 96, 3)
+    assert 10 * np.log10(255**2 / ((picture - truth) ** 2).mean()) == pytest.approx(float(rows[0]["psnr"]), abs=1e-6)
+    flipped = ((picture[::-1] - truth) ** 2).mean()
+    assert ((picture - truth) ** 2).mean() < 0.6 * flipped  # a PSNR alone would not show a flipped picture
+
+    table = gsbench("tables", "small", GSBENCH_RUNS=str(runs))
+    assert table.returncode == 0, table.stderr
+    assert "volumetric" in table.stdout
+    assert "±" in table.stdout
+
+    again = gsbench("-m", *SMALL, "name=small", "densify=adc,volumetric", "seed=0,1", GSBENCH_RUNS=str(runs))
+    assert again.returncode == 0
+    assert [json.loads(p.read_text()) for p in sorted(runs.glob("small/courtyard/*/*/results.json"))] == results
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["densify.grad_threshold=1"], ["densify.grad_threshold", "gradient_threshold"]),
+        (["densify=volumetrik"], ["volumetrik", "volumetric", "adc"]),
+        (["densify.volume_threshold=abc"], ["densify.volume_threshold"]),
+        (["densify.volume_threshold=-1"], ["densify.volume_threshold", "above 0"]),
+        (["scene=photos"], ["scene.path"]),
+        (["scene=photos", "scene.path=/nowhere/at/all"], ["/nowhere/at/all"]),
+        (["scene=colmap", "scene.path=."], ["sparse"]),
+        (["train.iterations=many"], ["iterations"]),
+        (["raster=cuda", "device=cpu"], ["raster=cuda"]),
+        (["tabels"], ["tabels", "tables"]),
+        (["densify._target_=os.system"], ["os.system", "allow_targets"]),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_bad_input_is_one_line_and_exit_code_2(gsbench: Run, tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+    (tmp_path / "images").mkdir()
+    for i in range(3):
+        Image.new("RGB", (32, 24), (i, 0, 0)).save(tmp_path / "images" / f"{i}.png")
+    done = gsbench(*arguments, GSBENCH_RUNS=str(tmp_path / "runs"))
+    assert done.returncode == 2, done.stderr
+    lines = done.stderr.strip().splitlines()
+    assert len([line for line in lines if line.startswith("gsbench:")]) == 1
+    assert "Traceback" not in done.stderr
+    assert not list((tmp_path / "runs").rglob("results.json"))
+    for word in words:
+        assert word in lines[-1]
+
+
+def test_truncated_photo_is_named(gsbench: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for i in range(4):
+        noise = np.random.default_rng(i).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(folder / f"{i}.jpg")
+    data = (folder / "2.jpg").read_bytes()
+    (folder / "2.jpg").write_bytes(data[: len(data) // 2])
+    done = gsbench("scene=photos", f"scene.path={folder}", GSBENCH_RUNS=str(tmp_path / "runs"))
+    assert done.returncode == 2, done.stderr
+    assert "2.jpg" in done.stderr.strip().splitlines()[-1]
+
+
+def test_help_is_quick_to_load(gsbench: Run) -> None:
+    """No torch, no MLflow: the modules say so, whatever the machine's speed."""
+    code = "import sys, gsbench.cli as c; c.run(['--help']); sys.exit(any(m in sys.modules for m in ('torch', 'mlflow', 'numba')))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "volumetric" in done.stdout
+
+
+def test_wheel_runs_a_trial_outside_the_checkout(environment: dict[str, str], tmp_path: Path) -> None:
+    pytest.importorskip("hatchling", reason="building the wheel offline needs hatchling (extra dev)")
+    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path / "dist"), str(ROOT)]
+    subprocess.run(build, check=True, capture_output=True, timeout=300)
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    home = tmp_path / "clean"
+    venv.create(home, with_pip=False)
+    python = home / "bin" / "python"
+    packages = next((home / "lib").glob("python*/site-packages"))
+    # The dependencies come from this environment, after the wheel's own files; gsbench itself from the wheel alone.
+    dependencies = Path(pytest.__file__).resolve().parents[1]
+    (packages / "zz_dependencies.pth").write_text(f"{dependencies}\n")
+    subprocess.run(
+        [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(packages), str(wheel)], check=True
+    )
+    where = "import gsbench, gsbench.config as c; print(gsbench.__file__); print(c.conf_dir())"
+    found = subprocess.run([python, "-c", where], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert all(line.startswith(str(packages)) for line in found.stdout.split())
+    arguments = [*SMALL, "train.iterations=10", "tracking=none"]
+    runs = tmp_path / "runs"
+    done = subprocess.run(
+        [python, "-m", "gsbench.cli", *arguments],
+        cwd=tmp_path,
+        env=environment | {"GSBENCH_RUNS": str(runs)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(list(runs.rglob("results.json"))) == 1

@@ -1,0 +1,81 @@
+"""The clouds that need no matching."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from gsbench.errors import InputError
+from gsbench.init import MODEL_FOLDER, Dataset, Random, read_cloud
+from gsbench.scene.types import Capture
+
+
+def add_points(model_dir: Path, target: Path, count: int) -> np.ndarray:
+    """A copy of the model with points that the first three images see."""
+    model = pycolmap.Reconstruction(model_dir)
+    points = np.random.default_rng(0).uniform(-1, 1, (count, 3))
+    copy = pycolmap.Reconstruction()
+    for camera in model.cameras.values():
+        copy.add_camera_with_trivial_rig(camera)
+    for image in model.images.values():
+        projected = np.array([image.project_point(point) for point in points])
+        new = pycolmap.Image(name=image.name, keypoints=projected, camera_id=image.camera_id, image_id=image.image_id)
+        copy.add_image_with_trivial_frame(new, image.cam_from_world())
+    for index, point in enumerate(points):
+        elements = [pycolmap.TrackElement(image_id, index) for image_id in (1, 2, 3)]
+        copy.add_point3D(point, pycolmap.Track(elements), np.array([index, 2 * index, 255 - index], dtype=np.uint8))
+    target.mkdir(parents=True)
+    copy.write_binary(target)
+    return points
+
+
+def test_dataset_takes_over_the_cloud(courtyard: Capture, tmp_path: Path):
+    points = add_points(courtyard.model, tmp_path / "model", 20)
+    report = Dataset().run(replace(courtyard, model=tmp_path / "model"), tmp_path / "out")
+    cloud = read_cloud(tmp_path / "out" / MODEL_FOLDER)
+    np.testing.assert_allclose(cloud.points, points)
+    np.testing.assert_array_equal(cloud.colors[:, 1], 2 * np.arange(20))
+    assert report.num_points == 20
+    assert report.mean_track_length == 3.0
+    assert any("only 20 points" in warning for warning in report.warnings)
+
+
+def test_dataset_without_points_or_model(courtyard: Capture, bare_photos: Capture, tmp_path: Path):
+    with pytest.raises(InputError, match="has no points: use init=sfm"):
+        Dataset().run(courtyard, tmp_path)
+    with pytest.raises(InputError, match="came without a COLMAP model"):
+        Dataset().run(bare_photos, tmp_path)
+
+
+def test_random_fills_the_box_around_the_training_cameras(courtyard: Capture, tmp_path: Path):
+    report = Random(count=5000, size=2.0, seed=3).run(courtyard, tmp_path / "a")
+    cloud = read_cloud(tmp_path / "a" / MODEL_FOLDER)
+    images = pycolmap.Reconstruction(courtyard.model).images.values()
+    centers = np.array([image.projection_center() for image in images if image.name in courtyard.train_names])
+    offset = np.abs(cloud.points - centers.mean(axis=0)) / report.gauge.scene_extent
+    assert offset.max() <= 2.0
+    assert offset.max() > 1.99
+    assert offset.mean() == pytest.approx(1.0, abs=0.03)  # of uniform values in [0, 2]
+    assert cloud.colors.mean() == pytest.approx(127.5, abs=2)
+    assert report.mean_reprojection_error is None
+    assert "NaN" not in (tmp_path / "a" / "report.json").read_text()
+    Random(count=5000, size=2.0, seed=3).run(courtyard, tmp_path / "b")
+    np.testing.assert_array_equal(read_cloud(tmp_path / "b" / MODEL_FOLDER).points, cloud.points)
+    Random(count=5000, size=2.0, seed=4).run(courtyard, tmp_path / "c")
+    assert not np.allclose(read_cloud(tmp_path / "c" / MODEL_FOLDER).points, cloud.points)
+
+
+def test_random_needs_cameras(bare_photos: Capture, courtyard: Capture, tmp_path: Path):
+    assert Random().needs_reference(bare_photos)
+    with pytest.raises(InputError, match="init=random needs cameras"):
+        Random().run(bare_photos, tmp_path)
+    assert Random(count=10).run(bare_photos, tmp_path, reference=courtyard.model).num_points == 10
+
+
+def test_no_model_to_read(tmp_path: Path):
+    with pytest.raises(InputError, match="no COLMAP model here"):
+        read_cloud(tmp_path)

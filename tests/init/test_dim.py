@@ -1,0 +1,306 @@
+"""Deep image matching without training: shapes, coordinates, store, errors; and the parts of the libraries it rests on."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.init import MODEL_FOLDER, Dim, SiftKornia, read_cloud
+from gsbench.init.extractors import SUPERPOINT_BORDER, build_extractor
+from gsbench.init.features import Features, extract_features
+from gsbench.init.matching import MutualNearest, build_matcher, match_within_memory
+from gsbench.scene.courtyard import surface_distance
+from gsbench.scene.types import Capture
+from gsbench.weights import MissingWeights
+
+CPU = torch.device("cpu")
+
+
+def digest(model: Path) -> str:
+    return hashlib.sha256(b"".join(file.read_bytes() for file in sorted(model.glob("*.bin")))).hexdigest()
+
+
+@pytest.fixture(autouse=True)
+def no_weights_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+
+
+@pytest.fixture(scope="module")
+def few(courtyard: Capture) -> Capture:
+    return replace(courtyard, image_names=courtyard.image_names[:4])
+
+
+def superpoint(weights: Path, **options: object) -> Dim:
+    return Dim(weights=weights, download=False, **{"max_keypoints": 400, "threads": 1, **options})
+
+
+class TestUntrained:
+    """The whole path with networks that were never trained."""
+
+    @pytest.fixture(scope="class")
+    def run(self, courtyard: Capture, untrained_weights: Path, tmp_path_factory: pytest.TempPathFactory):
+        output = tmp_path_factory.mktemp("dim")
+        init = superpoint(untrained_weights, matcher="mutual_nearest")
+        return init, init.run(courtyard, output / "out", work_dir=output / "work"), output
+
+    def test_cloud_lies_on_the_surfaces(self, run):
+        _, report, output = run
+        assert (report.init, report.poses, report.num_registered) == ("dim", "shared", 8)
+        assert report.counts["features"] == 8 * 400
+        assert report.settings["extractor"] == "superpoint"
+        assert report.settings["keypoint_threshold"] == 0.0005
+        assert len(report.settings["weights_sha256"]["superpoint.safetensors"]) == 64
+        assert "transformers" in report.versions
+        assert np.median(surface_distance(read_cloud(output / "out" / MODEL_FOLDER).points)) < 0.15
+
+    def test_stored_features_and_matches_are_used_again(self, run, courtyard: Capture):
+        """A killed run goes on: only what is missing or damaged is computed, and the result is the same to the bit."""
+        init, _, output = run
+        features = sorted((output / "work" / "features").iterdir())
+        matches = sorted((output / "work" / "matches").iterdir())
+        assert (len(features), len(matches)) == (8, 28)
+        features[0].unlink()
+        features[1].write_bytes(b"half a file")
+        matches[5].unlink()
+        times = {path: path.stat().st_mtime_ns for path in features[2:] + matches[:5] + matches[6:]}
+        init.run(courtyard, output / "again", work_dir=output / "work")
+        assert {path: path.stat().st_mtime_ns for path in times} == times
+        assert digest(output / "again" / MODEL_FOLDER) == digest(output / "out" / MODEL_FOLDER)
+
+    def test_two_runs_are_equal_to_the_bit(self, run, courtyard: Capture, tmp_path: Path):
+        init, _, output = run
+        init.run(courtyard, tmp_path)
+        assert digest(tmp_path / MODEL_FOLDER) == digest(output / "out" / MODEL_FOLDER)
+
+    def test_other_settings_do_not_read_the_store(self, run, courtyard: Capture, untrained_weights: Path):
+        _, _, output = run
+        changed = superpoint(untrained_weights, matcher="mutual_nearest", nms_radius=5, pairs="sequential", overlap=1)
+        changed.run(courtyard, output / "changed", work_dir=output / "work")
+        assert len(list((output / "work" / "features").iterdir())) == 16
+
+    def test_lightglue_on_the_same_path(self, few: Capture, untrained_weights: Path, tmp_path: Path, caplog):
+        init = superpoint(untrained_weights, max_keypoints=256, filter_threshold=0.0, pairs="sequential", overlap=1)
+        report = init.run(few, tmp_path)
+        assert report.counts["pairs_selected"] == 3
+        assert report.counts["inlier_matches"] > 30
+        assert len(report.settings["weights_sha256"]) == 2
+        assert sum("noncommercial" in message for message in caplog.messages) == 1
+
+
+class TestContracts:
+    """What the code relies on in transformers and kornia beyond their documented calls."""
+
+    @pytest.mark.parametrize(("width", "height"), [(128, 96), (1237, 40), (131, 101)])
+    def test_superpoint_keypoints_are_the_maxima_of_its_score_map(
+        self, untrained_weights: Path, width: int, height: int
+    ):
+        settings = superpoint(untrained_weights, max_keypoints=10**6).feature_settings()
+        extract = build_extractor(settings, untrained_weights / "superpoint.safetensors", CPU)
+        network = extract.__closure__[-1].cell_contents if extract.__closure__ else None
+        image = torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(0))
+        with torch.inference_mode():
+            keypoints, descriptors, scores = extract(image)
+            gray = (image * torch.tensor([0.299, 0.587, 0.114])[None, :, None, None]).sum(1, keepdim=True)
+            encoded = network.encoder(gray).last_hidden_state
+            score_map = network.keypoint_decoder._get_pixel_scores(encoded)[0]
+        expected = {
+            (x, y)
+            for y, x in torch.nonzero(score_map > 0.0005).tolist()
+            if SUPERPOINT_BORDER <= x < width - SUPERPOINT_BORDER
+            and SUPERPOINT_BORDER <= y < height - SUPERPOINT_BORDER
+        }
+        assert {(int(x), int(y)) for x, y in keypoints} == expected
+        assert len(keypoints) > 10
+        assert torch.equal(keypoints, keypoints.round())
+        for (x, y), score in zip(keypoints[:20].int().tolist(), scores[:20], strict=True):
+            assert score_map[y, x] == score
+        torch.testing.assert_close(descriptors.norm(dim=1), torch.ones(len(keypoints)))
+
+    def test_lightglue_finds_a_permutation_with_images_of_different_sizes(self, untrained_weights: Path):
+        rng = np.random.default_rng(0)
+        descriptors = rng.normal(size=(100, 256)).astype(np.float32)
+        descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+        order = rng.permutation(100)[:80]
+        keypoints = rng.uniform(0, 60, (100, 2)).astype(np.float32)
+        first = Features(keypoints, descriptors, np.ones(100, np.float32), (100, 80), (100, 80))
+        second = Features(keypoints[order], descriptors[order], np.ones(80, np.float32), (64, 200), (640, 2000))
+        settings = superpoint(untrained_weights).feature_settings()
+        matcher = build_matcher(settings, untrained_weights / "superpoint_lightglue.pth", CPU)
+        matches = matcher(first, second)
+        assert matches.dtype == np.uint32
+        assert len(matches) > 60  # width pruning may drop some
+        np.testing.assert_array_equal(order[matches[:, 1]], matches[:, 0])
+
+    def test_lightglue_reads_the_published_names(self, untrained_weights: Path, tmp_path: Path):
+        """cvg/LightGlue's files say self_attn.0.… where the network says transformers.0.self_attn.…"""
+        state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
+        published = {}
+        for name, value in state.items():
+            parts = name.split(".")
+            if parts[0] == "transformers":
+                name = ".".join([parts[2], parts[1], *parts[3:]])
+            published[name] = value
+        published.pop("confidence_thresholds")
+        torch.save(published, tmp_path / "published.pth")
+        settings = superpoint(untrained_weights).feature_settings()
+        matcher = build_matcher(settings, tmp_path / "published.pth", CPU)
+        loaded = matcher.network.state_dict()
+        assert all(torch.equal(loaded[name], value) for name, value in state.items())
+
+    def test_no_network_is_downloaded_by_the_libraries(self, untrained_weights: Path, monkeypatch: pytest.MonkeyPatch):
+        def refuse(*_: object, **__: object) -> None:
+            raise AssertionError("a library tried to download")
+
+        monkeypatch.setattr(torch.hub, "load_state_dict_from_url", refuse)
+        monkeypatch.setattr("kornia.feature.lightglue.load_state_dict_from_url", refuse)
+        settings = superpoint(untrained_weights).feature_settings()
+        build_matcher(settings, untrained_weights / "superpoint_lightglue.pth", CPU)
+        build_extractor(settings, untrained_weights / "superpoint.safetensors", CPU)
+
+    def test_disk_through_its_checkpoint_layout(self, tmp_path: Path):
+        from kornia.feature import DISK
+
+        torch.manual_seed(0)
+        torch.save({"extractor": DISK().state_dict(), "optimizer": {"lr": 1.0}}, tmp_path / "depth-save.pth")
+        settings = Dim(extractor="disk", matcher="mutual_nearest", max_keypoints=50).feature_settings()
+        extract = build_extractor(settings, tmp_path / "depth-save.pth", CPU)
+        with torch.inference_mode():
+            keypoints, descriptors, scores = extract(torch.rand(1, 3, 75, 101))
+        assert len(keypoints) == len(scores) <= 50
+        assert descriptors.shape == (len(keypoints), 128)
+        assert (keypoints >= 0).all()
+        assert (keypoints < torch.tensor([101, 75])).all()
+
+
+class TestErrors:
+    def test_missing_weights_are_named_before_any_work(self, courtyard: Capture, tmp_path: Path):
+        with pytest.raises(MissingWeights, match=r"superpoint.safetensors, superpoint_lightglue_v0-1_arxiv-pth"):
+            Dim(download=False).run(courtyard, tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+
+    def test_wrong_checksum(self, courtyard: Capture, tmp_path: Path):
+        (tmp_path / "aliked-n16.pth").write_bytes(b"not ALIKED")
+        with pytest.raises(MissingWeights, match=r"aliked-n16.pth has sha256 .* expected 5be8704840ed662d"):
+            Dim(extractor="aliked", weights=tmp_path, download=False).run(courtyard, tmp_path / "out")
+
+    def test_weights_of_another_network(self, few: Capture, untrained_weights: Path, tmp_path: Path):
+        torch.save({"conv.weight": torch.zeros(3)}, tmp_path / "superpoint_lightglue.pth")
+        shutil.copy(untrained_weights / "superpoint.safetensors", tmp_path)
+        with pytest.raises(MissingWeights, match="is for another network"):
+            superpoint(tmp_path, max_keypoints=64).run(few, tmp_path / "out")
+
+    def test_weights_of_another_shape(self, untrained_weights: Path, tmp_path: Path):
+        state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
+        state["log_assignment.0.final_proj.weight"] = torch.zeros(3, 3)
+        torch.save(state, tmp_path / "bad.pth")
+        with pytest.raises(MissingWeights, match="other shapes"):
+            build_matcher(superpoint(tmp_path).feature_settings(), tmp_path / "bad.pth", CPU)
+
+    def test_images_without_keypoints(self, courtyard: Capture, tmp_path: Path):
+        """A blank photograph is named and left out; only blank ones are an error."""
+        images = tmp_path / "images"
+        images.mkdir()
+        for name in courtyard.image_names:
+            shutil.copy(courtyard.images / name, images)
+        Image.new("RGB", (320, 240)).save(images / courtyard.image_names[2])
+        capture = replace(courtyard, images=images)
+        report = SiftKornia(max_keypoints=1000, max_ratio=0.9).run(capture, tmp_path / "out")
+        assert report.counts["images_without_keypoints"] == 1
+        assert any(f"no keypoint in {courtyard.image_names[2]}" in warning for warning in report.warnings)
+        assert report.num_points > 100
+        for name in courtyard.image_names:
+            Image.new("RGB", (320, 240)).save(images / name)
+        with pytest.raises(InputError, match="no keypoint in any image"):
+            SiftKornia().run(capture, tmp_path / "blank")
+
+    def test_out_of_gpu_memory_halves_the_keypoints(self):
+        features = Features(
+            np.zeros((1000, 2), np.float32), np.zeros((1000, 8), np.float32), np.ones(1000, np.float32), (9, 9), (9, 9)
+        )
+        seen = []
+
+        def small_gpu(first: Features, second: Features) -> np.ndarray:
+            seen.append(len(first.keypoints))
+            if len(first.keypoints) > 300:
+                raise torch.OutOfMemoryError("CUDA out of memory")
+            return np.zeros((5, 2), np.uint32)
+
+        matches, halved = match_within_memory(small_gpu, features, features)
+        assert (len(matches), halved, seen) == (5, True, [1000, 500, 250])
+
+        def no_gpu(first: Features, second: Features) -> np.ndarray:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+
+        with pytest.raises(InputError, match=r"ran out of memory: lower init.max_image_size"):
+            match_within_memory(no_gpu, features, features)
+
+    def test_out_of_gpu_memory_in_extraction_says_so(self, courtyard: Capture):
+        def no_gpu(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+
+        with pytest.raises(InputError, match=r"0000.png: cpu ran out of memory at 320x240 px"):
+            extract_features(courtyard.images / "0000.png", no_gpu, 1600, 10, CPU)
+
+    def test_an_empty_image_has_no_matches(self):
+        some = Features(
+            np.zeros((3, 2), np.float32), np.eye(3, 8, dtype=np.float32), np.ones(3, np.float32), (9, 9), (9, 9)
+        )
+        matches, halved = match_within_memory(MutualNearest(0.9, CPU), some, some.strongest(0))
+        assert matches.shape == (0, 2)
+        assert not halved
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"extractor": "sift_kornia"}, "init.extractor=sift_kornia: allowed are superpoint, aliked, disk"),
+            ({"matcher": "superglue"}, "init.matcher=superglue"),
+            ({"extractor": "aliked", "aliked_model": "t16"}, "init.matcher=lightglue does not fit"),
+            ({"filter_threshold": -1}, "init.filter_threshold=-1"),
+            ({"max_keypoints": 0}, "init.max_keypoints=0"),
+        ],
+    )
+    def test_settings_are_checked_by_name(self, options: dict[str, object], message: str):
+        with pytest.raises(InputError, match=message):
+            Dim(**options)
+
+    def test_unknown_device(self, courtyard: Capture, tmp_path: Path):
+        with pytest.raises(InputError, match="init.device=tpu: no such device"):
+            SiftKornia(device="tpu").run(courtyard, tmp_path)
+
+
+def test_mutual_nearest_by_brute_force():
+    rng = np.random.default_rng(2)
+    sides = []
+    for _ in range(2):
+        descriptors = rng.normal(size=(60, 6)).astype(np.float32)
+        sides.append(Features(np.zeros((60, 2), np.float32), descriptors, np.ones(60, np.float32), (9, 9), (9, 9)))
+    distance = np.linalg.norm(sides[0].descriptors[:, None] - sides[1].descriptors[None], axis=2)
+    expected = []
+    for i in range(60):
+        j = int(distance[i].argmin())
+        row, column = np.sort(distance[i]), np.sort(distance[:, j])
+        if distance[:, j].argmin() == i and row[0] <= 0.9 * row[1] and column[0] <= 0.9 * column[1]:
+            expected.append((i, j))
+    matches = MutualNearest(0.9, CPU)(*sides)
+    assert sorted(map(tuple, matches.tolist())) == expected
+    assert len(expected) > 3
+
+
+@pytest.mark.shared
+def test_aliked_with_real_weights(courtyard: Capture, shared_weights: Path, tmp_path: Path):
+    init = Dim(extractor="aliked", matcher="mutual_nearest", weights=shared_weights, download=False)
+    report = init.run(courtyard, tmp_path)
+    assert report.num_points > 200
+    assert np.median(surface_distance(read_cloud(tmp_path / MODEL_FOLDER).points)) < 0.05  # m
+    assert report.versions["kornia"]
+    assert os.listdir(tmp_path / MODEL_FOLDER)

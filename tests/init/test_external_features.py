@@ -1,0 +1,113 @@
+"""Features from outside COLMAP: the same model as COLMAP's own path, and coordinates that are right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from PIL import Image
+
+from gsbench.init import Sfm
+from gsbench.init.base import no_progress
+from gsbench.init.colmap_database import (
+    create_database,
+    database_counts,
+    guessed_groups,
+    verify_pairs,
+    write_keypoints,
+    write_matches,
+)
+from gsbench.init.extractors import build_extractor
+from gsbench.init.feature_settings import FeatureSettings
+from gsbench.init.features import Features, extract_features
+from gsbench.init.reconstruct import MappingSettings, map_images, verification_options
+from gsbench.init.sift import extract_sift, match_sift
+from gsbench.scene.types import Capture
+
+MAPPING = MappingSettings(seed=0, threads=1, min_model_size=3, two_view_tracks=False, fixed_intrinsics=False)
+SIFT = FeatureSettings(extractor="sift_kornia", matcher="mutual_nearest", max_image_size=1600, max_keypoints=2000)
+
+
+def new_database(path: Path, capture: Capture) -> list[str]:
+    return list(create_database(path, guessed_groups(capture.images, capture.image_names, "single", "PINHOLE", 300.0)))
+
+
+@pytest.fixture(scope="module")
+def own_path(bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[str, str]]]:
+    """A database that COLMAP filled by itself, and its pairs."""
+    path = tmp_path_factory.mktemp("own") / "database.db"
+    names = new_database(path, bare_photos)
+    pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
+    extract_sift(path, bare_photos.images, names, Sfm(), 1, no_progress)
+    match_sift(path, pairs, Sfm(), verification_options(0, 15), 1, no_progress)
+    return path, pairs
+
+
+def test_sift_through_the_external_path_gives_the_same_model(
+    own_path: tuple[Path, list[tuple[str, str]]], bare_photos: Capture, tmp_path: Path
+):
+    own, pairs = own_path
+    with pycolmap.Database.open(own) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        keypoints = {name: database.read_keypoints(image_id)[:, :2] for name, image_id in ids.items()}
+        matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in pairs}
+    external = tmp_path / "external.db"
+    new_database(external, bare_photos)
+    write_keypoints(external, keypoints)
+    write_matches(external, matches)
+    verify_pairs(external, pairs, verification_options(0, 15), no_progress)
+    assert database_counts(external) == database_counts(own)
+
+    first = map_images(own, bare_photos.images, tmp_path / "first", MAPPING, no_progress)
+    second = map_images(external, bare_photos.images, tmp_path / "second", MAPPING, no_progress)
+    assert first.num_points3D() == second.num_points3D() > 100
+    for point_id, point in first.points3D.items():
+        np.testing.assert_array_equal(point.xyz, second.points3D[point_id].xyz)
+    for image_id, image in first.images.items():
+        np.testing.assert_array_equal(
+            image.cam_from_world().matrix(), second.images[image_id].cam_from_world().matrix()
+        )
+
+
+@pytest.mark.parametrize("max_image_size", [320, 213])
+def test_kornia_keypoints_coincide_with_colmaps(
+    own_path: tuple[Path, list[tuple[str, str]]], bare_photos: Capture, max_image_size: int
+):
+    """Two implementations of SIFT find the same points; a half-pixel or scale error would shift all of them."""
+    name = bare_photos.image_names[0]
+    with pycolmap.Database.open(own_path[0]) as database:
+        colmap = database.read_keypoints(database.read_image_with_name(name).image_id)[:, :2]
+    extractor = build_extractor(SIFT, None, torch.device("cpu"))
+    features = extract_features(bare_photos.images / name, extractor, max_image_size, 2000, torch.device("cpu"))
+    assert features.network_size == (max_image_size, round(max_image_size * 0.75))
+    ours = features.colmap_keypoints
+    distances = np.linalg.norm(ours[:, None] - colmap[None], axis=2)  # [K, L]
+    near = distances.min(axis=1) < 0.6
+    offsets = (ours - colmap[distances.argmin(axis=1)])[near]
+    assert near.sum() > 100
+    assert np.abs(np.median(offsets, axis=0)).max() < 0.04  # px
+
+
+@pytest.mark.parametrize("center", [(50.0, 40.0), (50.3, 39.8)])
+def test_a_blob_is_found_at_its_centre(tmp_path: Path, center: tuple[float, float]):
+    """Coordinates in which the first pixel covers 0 to 1: the blob is drawn, and found, in them."""
+    x, y = np.meshgrid(np.arange(100) + 0.5, np.arange(80) + 0.5)
+    blob = 40 + 200 * np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * 4.0**2))
+    Image.fromarray(np.repeat(blob[..., None], 3, axis=2).round().astype(np.uint8)).save(tmp_path / "blob.png")
+    extractor = build_extractor(SIFT, None, torch.device("cpu"))
+    features = extract_features(tmp_path / "blob.png", extractor, 1600, 10, torch.device("cpu"))
+    np.testing.assert_allclose(features.colmap_keypoints[0], center, atol=0.05)
+
+
+def test_keypoints_scale_with_each_side():
+    features = Features(
+        np.array([[0, 0], [99, 49]], dtype=np.float32),
+        np.zeros((2, 8), dtype=np.float32),
+        np.ones(2, dtype=np.float32),
+        network_size=(100, 50),
+        file_size=(400, 201),
+    )
+    np.testing.assert_allclose(features.colmap_keypoints, [[2.0, 2.01], [398.0, 198.99]], rtol=1e-6)

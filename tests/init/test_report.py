@@ -1,0 +1,140 @@
+"""The gauge report on models whose numbers are known beforehand."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from gsbench.init.plot import draw_cloud, view_from_above
+from gsbench.init.reconstruct import similarity_to
+from gsbench.init.report import compare_poses, make_report, measure_gauge, training_extent
+from gsbench.scene.types import Capture
+
+NAMES = ("a.png", "b.png", "c.png", "d.png")
+CENTERS = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, 5.0, 0]])  # d is held out
+
+
+def model_of(centers: np.ndarray, turn: Rotation | None = None, shift_px: float = 0.0) -> pycolmap.Reconstruction:
+    """Cameras that look along +z, and two points, observed with an error of ``shift_px`` in x by the first two."""
+    points = np.array([[0.0, 0.0, 5.0], [0.5, 0.5, 6.0]])
+    rotation = (turn or Rotation.identity()).as_matrix()
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80))
+    for index, (name, center) in enumerate(zip(NAMES, centers, strict=True), start=1):
+        pose = pycolmap.Rigid3d(np.column_stack([rotation, -rotation @ center]))
+        camera_points = points @ rotation.T - rotation @ center
+        keypoints = 100 * camera_points[:, :2] / camera_points[:, 2:] + [50, 40] + [shift_px, 0]
+        image = pycolmap.Image(name=name, keypoints=keypoints, camera_id=1, image_id=index)
+        model.add_image_with_trivial_frame(image, pose)
+    for index, point in enumerate(points):
+        elements = [pycolmap.TrackElement(image_id, index) for image_id in (1, 2)]
+        model.add_point3D(point, pycolmap.Track(elements), np.array([10, 20, 30], dtype=np.uint8))
+    model.update_point_3d_errors()
+    return model
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Capture:
+    return Capture("hand", tmp_path, NAMES, ("d.png",), None, False, "0")
+
+
+def test_extent_is_that_of_the_training_cameras(capture: Capture):
+    mean = CENTERS[:3].mean(axis=0)  # (0, 1/3, 0): a and b are sqrt(1 + 1/9) away
+    assert training_extent(model_of(CENTERS), capture) == pytest.approx(1.1 * math.sqrt(1 + 1 / 9))
+    assert mean[1] == pytest.approx(1 / 3)
+
+
+def test_gauge_of_the_papers_threshold():
+    gauge = measure_gauge(2.0, 0.5)
+    assert 4 / 3 * math.pi * gauge.threshold_radius**3 == pytest.approx(0.03)
+    assert gauge.threshold_over_extent_cubed == pytest.approx(0.03 / 8)
+    assert gauge.threshold_radius_over_extent == pytest.approx(gauge.threshold_radius / 2)
+    assert gauge.threshold_in_reference == pytest.approx(0.03 / 8)
+    assert measure_gauge(0.0, None).threshold_over_extent_cubed is None
+
+
+def test_figures_of_a_model(capture: Capture):
+    model = model_of(CENTERS, shift_px=0.75)
+    report = make_report("x", "shared", capture, model, 1.0, settings={}, seconds={}, packages=("pycolmap",))
+    assert (report.num_images, report.num_registered, report.num_points) == (4, 4, 2)
+    assert report.mean_reprojection_error == pytest.approx(0.75)
+    assert report.mean_track_length == 2.0
+    assert report.focal_lengths == (100.0,)
+    assert report.versions["pycolmap"] == pycolmap.__version__
+
+
+def test_missing_images_and_doubtful_numbers_are_warnings(tmp_path: Path):
+    capture = Capture("hand", tmp_path, (*NAMES, "e.png"), (), None, False, "0")
+    model = model_of(CENTERS, shift_px=3.0)
+    model.cameras[1].params = [4000.0, 4000.0, 50.0, 40.0]
+    report = make_report("x", "own", capture, model, None, settings={}, seconds={}, packages=())
+    assert report.unregistered == ("e.png",)
+    text = "\n".join(report.warnings)
+    for part in ("only 4 of 5 images have a pose (missing: e.png)", "only 2 points", "3.00 px is large", "implausible"):
+        assert part in text
+
+
+def test_pose_errors_after_a_similarity():
+    """A model moved by a similarity has no error; one camera displaced by 0.3 shows it, and only it."""
+    turn = Rotation.from_rotvec([0.2, 0.1, -0.4])
+    reference = model_of(CENTERS)
+    model = model_of(CENTERS)
+    model.transform(pycolmap.Sim3d(3.0, pycolmap.Rotation3d(turn.as_matrix()), np.array([1.0, 2.0, 3.0])))
+    similarity = similarity_to(model, reference)
+    errors = compare_poses(model, reference, similarity, 2.0, exact=True)
+    assert similarity.scale == pytest.approx(1 / 3)
+    assert errors.num_images == 4
+    assert errors.center_max < 1e-9
+    assert errors.rotation_max_deg < 1e-5
+
+    tilted = model_of(CENTERS, Rotation.from_rotvec([0, np.radians(4.0), 0]))
+    errors = compare_poses(tilted, reference, similarity_to(tilted, reference), 2.0, exact=False)
+    assert errors.rotation_mean_deg == pytest.approx(4.0)
+    assert errors.center_max < 1e-9
+
+
+def test_center_errors_are_in_reference_units_and_relative():
+    moved = CENTERS.copy()
+    moved[3, 2] += 0.3
+    model, reference = model_of(moved), model_of(CENTERS)
+    identity = similarity_to(reference, reference)
+    errors = compare_poses(model, reference, identity, 2.0, exact=True)
+    assert errors.center_max == pytest.approx(0.3)
+    assert errors.center_mean == pytest.approx(0.3 / 4)
+    assert errors.center_rmse == pytest.approx(0.3 / 2)
+    assert errors.center_rmse_relative == pytest.approx(0.3 / 4)
+
+
+def test_above_is_along_the_normal_of_a_ring_of_cameras():
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    ring = np.stack([np.cos(angles), np.sin(angles), 0.3 + 0 * angles], axis=1) * 4
+    up = np.array([0.0, 0.0, 1.0])
+    rotations = []
+    for center in ring:
+        forward = -center / np.linalg.norm(center)
+        right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
+        rotations.append([right, np.cross(forward, right), forward])
+    axes = view_from_above(ring, np.array(rotations), np.zeros((1, 3)))
+    np.testing.assert_allclose(axes[2], up, atol=1e-9)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+
+
+def test_above_for_cameras_that_look_down():
+    centers = np.array([[x, y, 10.0] for x in range(4) for y in range(4)])
+    down = np.diag([1.0, -1.0, -1.0])  # world to camera: looks along -z, the image's top is +y
+    axes = view_from_above(centers, np.tile(down, (16, 1, 1)), np.zeros((5, 3)))
+    np.testing.assert_allclose(axes[2], [0, 0, 1], atol=1e-9)
+
+
+def test_picture_shows_points_in_their_colours(tmp_path: Path):
+    draw_cloud(model_of(CENTERS), tmp_path / "cloud.png", "hand-made")
+    pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB")).reshape(-1, 3)
+    assert (np.abs(pixels - [10, 20, 30]).max(axis=1) < 8).any()
+    assert (np.abs(pixels.astype(int) - [214, 39, 40]).max(axis=1) < 8).any()  # the cameras' red

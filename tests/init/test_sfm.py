@@ -1,0 +1,220 @@
+"""Structure from motion on a scene whose cameras and surfaces are known exactly."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.init import MODEL_FOLDER, OWN_GAUGE_FOLDER, PICTURE_FILE, REPORT_FILE, Sfm, SfmDense, read_cloud
+from gsbench.init.base import InitReport
+from gsbench.init.colmap_initializer import WORK_FOLDER
+from gsbench.scene.courtyard import surface_distance
+from gsbench.scene.types import Capture
+
+
+def digest(model: Path) -> str:
+    return hashlib.sha256(b"".join(file.read_bytes() for file in sorted(model.glob("*.bin")))).hexdigest()
+
+
+def picture(path: Path, pixels: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels.astype(np.uint8)).save(path)
+
+
+def capture_of(folder: Path) -> Capture:
+    names = tuple(sorted(path.name for path in folder.iterdir()))
+    return Capture("photos", folder, names, (), None, False, "0")
+
+
+@pytest.fixture(scope="module")
+def own(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[InitReport, Path]:
+    output = tmp_path_factory.mktemp("own")
+    return Sfm(poses="own").run(courtyard, output), output
+
+
+@pytest.fixture(scope="module")
+def shared(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[InitReport, Path]:
+    output = tmp_path_factory.mktemp("shared")
+    return Sfm().run(courtyard, output), output
+
+
+def test_own_poses_agree_with_the_exact_ones(own: tuple[InitReport, Path]):
+    report, _ = own
+    assert report.num_registered == report.num_images == 8
+    assert report.pose_errors is not None
+    assert report.pose_errors.exact
+    assert report.pose_errors.center_max < 0.02  # m, on a ring of 4.5 m radius
+    assert report.pose_errors.rotation_max_deg < 1.5  # an arc of 52 degrees fixes the turn about itself weakly
+    assert report.focal_lengths[0] == pytest.approx(300.9, rel=0.01)  # 320 / (2 tan 28 degrees)
+    assert report.mean_reprojection_error < 0.5
+    assert report.warnings == ()
+
+
+def test_own_model_is_written_in_both_gauges(own: tuple[InitReport, Path], courtyard: Capture):
+    report, output = own
+    aligned, raw = pycolmap.Reconstruction(output / MODEL_FOLDER), pycolmap.Reconstruction(output / OWN_GAUGE_FOLDER)
+    scale = report.own_gauge.scale_to_reference
+    assert report.gauge.scale_to_reference == 1.0
+    first, second = (
+        {image.name: image.projection_center() for image in model.images.values()} for model in (aligned, raw)
+    )
+    ratio = np.linalg.norm(first["0000.png"] - first["0007.png"]) / np.linalg.norm(
+        second["0000.png"] - second["0007.png"]
+    )
+    assert ratio == pytest.approx(scale, rel=1e-9)
+    assert report.gauge.scene_extent == pytest.approx(report.own_gauge.scene_extent * scale, rel=1e-9)
+    assert report.own_gauge.threshold_in_reference == pytest.approx(0.03 * scale**3, rel=1e-12)
+    exact = pycolmap.Reconstruction(courtyard.model)
+    for image in exact.images.values():
+        np.testing.assert_allclose(first[image.name], image.projection_center(), atol=0.02)
+
+
+def test_known_poses_give_points_on_the_true_surfaces(shared: tuple[InitReport, Path], courtyard: Capture):
+    report, output = shared
+    assert report.poses == "shared"
+    assert report.pose_errors is None
+    assert np.median(surface_distance(read_cloud(output / MODEL_FOLDER).points)) < 0.02  # m; a pixel covers 0.015 m
+    model, exact = pycolmap.Reconstruction(output / MODEL_FOLDER), pycolmap.Reconstruction(courtyard.model)
+    for image in exact.images.values():  # the cameras are the reference's, to the bit
+        np.testing.assert_array_equal(
+            model.find_image_with_name(image.name).cam_from_world().matrix(), image.cam_from_world().matrix()
+        )
+
+
+def test_colours_are_the_photographs(shared: tuple[InitReport, Path], courtyard: Capture):
+    _, output = shared
+    model = pycolmap.Reconstruction(output / MODEL_FOLDER)
+    pixels = {name: np.asarray(Image.open(courtyard.images / name)) for name in courtyard.image_names}
+    differences = []
+    for point in model.points3D.values():
+        seen = []
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            x, y = image.points2D[element.point2D_idx].xy
+            seen.append(pixels[image.name][int(y), int(x)])
+        differences.append(np.abs(np.mean(seen, axis=0) - point.color).max())
+    assert np.median(differences) < 12
+
+
+def test_output_is_complete_and_the_work_folder_is_gone(shared: tuple[InitReport, Path]):
+    report, output = shared
+    assert json.loads((output / REPORT_FILE).read_text()) == report.to_dict()
+    assert report.to_dict()["settings"]["peak_threshold"] == pytest.approx(0.02 / 3)
+    assert {"extract", "match", "triangulate"} == set(report.seconds)
+    assert Image.open(output / PICTURE_FILE).size[0] > 500
+    assert not (output / WORK_FOLDER).exists()
+
+
+def test_two_runs_are_equal_to_the_bit_on_any_number_of_threads(
+    own: tuple[InitReport, Path], courtyard: Capture, tmp_path: Path
+):
+    _, first = own
+    Sfm(poses="own", threads=3).run(courtyard, tmp_path)
+    assert digest(tmp_path / MODEL_FOLDER) == digest(first / MODEL_FOLDER)
+
+
+def test_bare_photos_get_poses_of_their_own_and_serve_as_reference(bare_photos: Capture, tmp_path: Path):
+    assert not Sfm().needs_reference(bare_photos)
+    report = Sfm().run(bare_photos, tmp_path / "sfm")
+    assert report.poses == "own"
+    assert report.pose_errors is None
+    assert report.gauge.scale_to_reference is None
+    assert SfmDense().needs_reference(bare_photos)
+    dense = SfmDense().run(bare_photos, tmp_path / "dense", reference=tmp_path / "sfm" / MODEL_FOLDER)
+    assert dense.poses == "shared"
+    assert dense.gauge.scene_extent == pytest.approx(report.gauge.scene_extent, rel=1e-12)
+    assert dense.num_points > report.num_points
+    with pytest.raises(InputError, match="init=sfm_dense takes its cameras from a reference"):
+        SfmDense().run(bare_photos, tmp_path / "without")
+
+
+def test_names_with_spaces_and_photos_of_two_sizes(courtyard: Capture, tmp_path: Path):
+    images = tmp_path / "my photos"
+    images.mkdir()
+    for index, name in enumerate(courtyard.image_names):
+        with Image.open(courtyard.images / name) as image:
+            size = (320, 240) if index % 2 else (480, 360)
+            image.resize(size).save(images / f"IMG {index} (1).png")
+    report = Sfm().run(capture_of(images), tmp_path / "out")
+    assert report.num_registered >= 7
+    model = pycolmap.Reconstruction(tmp_path / "out" / MODEL_FOLDER)
+    for image in model.images.values():  # one camera for each size, the size of the file
+        with Image.open(images / image.name) as file:
+            assert (model.cameras[image.camera_id].width, model.cameras[image.camera_id].height) == file.size
+    assert len(model.cameras) == 2
+
+
+def test_detection_at_a_smaller_size_comes_back_at_the_files_size(courtyard: Capture, tmp_path: Path):
+    Sfm(max_image_size=200).run(courtyard, tmp_path)
+    assert np.median(surface_distance(read_cloud(tmp_path / MODEL_FOLDER).points)) < 0.06
+
+
+def test_wrong_reference_is_noticed(courtyard: Capture, tmp_path: Path):
+    """Poses that are placed but wrong must not pass silently."""
+    model = pycolmap.Reconstruction(courtyard.model)
+    names = sorted(image.name for image in model.images.values())
+    poses = {name: model.find_image_with_name(name).cam_from_world() for name in names}
+    for name, other in zip(names, reversed(names), strict=True):
+        image = model.find_image_with_name(name)
+        image.frame.set_cam_from_world(image.camera_id, poses[other])
+    (tmp_path / "wrong").mkdir()
+    model.write_binary(tmp_path / "wrong")
+    wrong = replace(courtyard, model=tmp_path / "wrong")
+    report = Sfm(poses="own").run(wrong, tmp_path / "out")
+    assert report.num_registered == 8
+    assert any("degrees against the true ones" in warning for warning in report.warnings)
+
+
+def test_photos_without_texture(tmp_path: Path):
+    for index in range(4):
+        picture(tmp_path / f"{index}.png", np.full((60, 80, 3), 40 * index))
+    with pytest.raises(InputError, match="no keypoint in any image"):
+        Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
+
+
+def test_photos_without_overlap(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    for index in range(4):
+        picture(tmp_path / f"{index}.png", rng.integers(0, 255, (120, 160, 3)))
+    with pytest.raises(InputError, match="no pair of images shares enough matches"):
+        Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
+
+
+def test_photos_from_one_place(courtyard: Capture, tmp_path: Path):
+    """Copies of one photograph match perfectly and have no depth."""
+    for index in range(4):
+        shutil.copy(courtyard.images / "0000.png", tmp_path / f"{index}.png")
+    with pytest.raises(InputError, match=r"structure from motion found no pair|no pair of images"):
+        Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
+
+
+def test_too_few_photos(courtyard: Capture, tmp_path: Path):
+    with pytest.raises(InputError, match="has 2 images: sfm needs at least 3"):
+        Sfm().run(replace(courtyard, image_names=courtyard.image_names[:2]), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"poses": "both"}, "init.poses=both: allowed are shared, own"),
+        ({"camera_model": "THIN_PRISM"}, "init.camera_model=THIN_PRISM: allowed are"),
+        ({"pairs": "all"}, "init.pairs=all"),
+        ({"max_ratio": 1.5}, "init.max_ratio=1.5: must be a number above 0 and at most 1"),
+        ({"max_image_size": 0}, "init.max_image_size=0: must be a number at least 32"),
+        ({"threads": 0}, "init.threads=0"),
+        ({"seed": 0.5}, "init.seed=0.5: must be a whole number"),
+        ({"focal_length": float("nan")}, "init.focal_length=nan"),
+    ],
+)
+def test_settings_are_checked_by_name(options: dict[str, object], message: str):
+    with pytest.raises(InputError, match=message.replace("(", r"\(")):
+        Sfm(**options)

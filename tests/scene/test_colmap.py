@@ -1,0 +1,122 @@
+"""COLMAP models fitted to files: sizes, subsets, names, poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.scene.camera import Camera
+from gsbench.scene.colmap import cameras_of, points_of, read_model, read_reference, write_model
+from gsbench.scene.readers import read_colmap, read_photos
+
+from .conftest import smooth_image
+
+
+def reprojection_errors(model: pycolmap.Reconstruction) -> list[float]:
+    """|projected 3D point - stored 2D point| in px, by pycolmap's own camera model, over all observations."""
+    errors = []
+    for point in model.points3D.values():
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            seen = image.points2D[element.point2D_idx]
+            assert seen.has_point3D()
+            errors.append(np.linalg.norm(image.project_point(point.xyz) - seen.xy))
+    return errors
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_PINHOLE", [160, 80, 60]),
+        ("PINHOLE", [160, 150, 79, 61]),
+        ("OPENCV", [160, 150, 79, 61, 0.05, 0, 0.001, 0]),
+    ],
+)
+def test_cameras_follow_smaller_files(make_scene, model, params):
+    root = make_scene(size=(41, 30), camera_size=(162, 121), model=model, params=params)  # 162/4 = 40.5, 121/4 = 30.25
+    fitted = read_reference(read_colmap("toy", root))
+    camera = next(iter(fitted.cameras.values()))
+    assert (camera.width, camera.height) == (41, 30)
+    assert camera.focal_length_x == pytest.approx(160 * 41 / 162)
+    assert camera.focal_length_y == pytest.approx(params[-3 if model == "SIMPLE_PINHOLE" else 1] * 30 / 121)
+    assert fitted.num_points3D() == 9
+    assert max(reprojection_errors(fitted)) < 1e-9
+    assert fitted.points3D[1].color.tolist() == read_model(root / "sparse/0").points3D[1].color.tolist()
+
+
+def test_subset_drops_images_and_their_observations(make_scene, tmp_path: Path):
+    fitted = read_reference(read_colmap("toy", make_scene(), max_images=3, test_every=0))
+    assert sorted(image.name for image in fitted.images.values()) == ["00.png", "02.png", "04.png"]
+    assert {point.track.length() for point in fitted.points3D.values()} == {3}
+    assert max(reprojection_errors(fitted)) < 1e-9
+    (tmp_path / "out").mkdir()
+    fitted.write_binary(tmp_path / "out")
+    again = read_model(tmp_path / "out")
+    assert again.num_reg_images() == 3
+    np.testing.assert_array_equal(points_of(again)[0], points_of(fitted)[0])
+
+
+def test_points_of_fewer_than_two_kept_images_go(make_scene):
+    root = make_scene()
+    model = read_model(root / "sparse/0")
+    for image_id in (3, 4, 5, 6):  # point 1, the first 2D point of every image, stays in 00.png and 01.png only
+        model.delete_observation(image_id, 0)
+    model.write_binary(root / "sparse/0")
+    fitted = read_reference(read_colmap("toy", root, max_images=3))
+    assert sorted(fitted.points3D) == list(range(2, 10))
+
+
+def test_files_of_one_camera_with_two_sizes(make_scene):
+    root = make_scene(size=(40, 30))
+    Image.fromarray(smooth_image(80, 60)).save(root / "images/02.png")
+    cameras = cameras_of(read_reference(read_colmap("toy", root)))
+    assert (cameras["02.png"].width, cameras["02.png"].fx) == (80, 100.0)
+    assert (cameras["03.png"].width, cameras["03.png"].fx) == (40, 50.0)
+
+
+def test_size_that_disagrees(make_scene):
+    root = make_scene(size=(40, 30))
+    Image.fromarray(smooth_image(40, 26)).save(root / "images/01.png")
+    with pytest.raises(InputError, match=r"01\.png: the image is 40x26 px but its camera in the COLMAP model 40x30"):
+        read_reference(read_colmap("toy", root))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(smooth_image(30, 40)).save(root / "images/01.png", exif=exif)
+    with pytest.raises(InputError, match=r"01\.png.*on its side \(EXIF orientation 6"):
+        read_reference(read_colmap("toy", root))
+
+
+def test_bare_photos_have_no_reference(make_scene):
+    with pytest.raises(InputError, match="no COLMAP model came with"):
+        read_reference(read_photos("toy", make_scene()))
+
+
+def test_distorted_cameras_are_not_pinholes(make_scene):
+    root = make_scene(model="SIMPLE_RADIAL", params=[50, 20, 15, 0.1])
+    with pytest.raises(InputError, match="SIMPLE_RADIAL is distorted"):
+        cameras_of(read_model(root / "sparse/0"))
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_written_cameras_project_alike(tmp_path: Path, text: bool):
+    rng = np.random.default_rng(5)
+    cameras = {}
+    for k in range(4):
+        rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        rotation *= np.sign(np.linalg.det(rotation))
+        cameras[f"{k}.png"] = Camera(64, 48, 60.0 + (k > 1), 61.0, 31.0, 25.0, rotation, rng.normal(size=3))
+    write_model(tmp_path / "model", cameras, text=text)
+    model = pycolmap.Reconstruction(tmp_path / "model")
+    assert model.num_cameras() == 2
+    for name, camera in cameras.items():
+        point = camera.rotation.T @ (np.array([0.3, -0.2, 2.0]) - camera.translation)
+        expected = [camera.fx * 0.15 + camera.cx, camera.fy * -0.1 + camera.cy]
+        np.testing.assert_allclose(model.find_image_with_name(name).project_point(point), expected, atol=1e-9)
+        back = cameras_of(model)[name]
+        np.testing.assert_allclose(back.rotation, camera.rotation, atol=1e-12)
+        np.testing.assert_allclose(back.center, model.find_image_with_name(name).projection_center(), atol=1e-12)

@@ -1,0 +1,94 @@
+"""Reading and shrinking images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.scene.images import downscaled_size, image_size, read_image, resize_image, same_up_to_rounding
+
+from .conftest import smooth_image
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "tif"])
+def test_lossless_formats_come_back_exactly(tmp_path: Path, suffix: str):
+    image = smooth_image(20, 14)
+    path = tmp_path / f"a.{suffix}"
+    Image.fromarray(image).save(path)
+    np.testing.assert_array_equal(read_image(path), image)
+    assert image_size(path) == (20, 14)
+
+
+def test_modes_become_rgb(tmp_path: Path):
+    path = tmp_path / "a.png"
+    Image.fromarray(np.array([[[200, 100, 50, 255], [200, 100, 50, 0]]], dtype=np.uint8)).save(path)
+    assert read_image(path).tolist() == [[[200, 100, 50], [0, 0, 0]]]  # transparency lies over black
+    Image.fromarray(np.array([[7, 250]], dtype=np.uint8)).save(path)
+    assert read_image(path).tolist() == [[[7, 7, 7], [250, 250, 250]]]
+    Image.fromarray(np.array([[0x1234, 0xFFFF]], dtype=np.uint16)).save(path)
+    assert read_image(path).tolist() == [[[0x12] * 3, [0xFF] * 3]]
+    Image.fromarray(np.zeros((2, 2), dtype=np.float32)).save(tmp_path / "f.tif")
+    with pytest.raises(InputError, match="convert it to 8-bit"):
+        read_image(tmp_path / "f.tif")
+
+
+def test_exif_orientation_is_ignored(tmp_path: Path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(smooth_image(20, 14)).save(tmp_path / "a.jpg", exif=exif)
+    assert read_image(tmp_path / "a.jpg").shape == (14, 20, 3)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+def test_damaged_files_are_named(tmp_path: Path, suffix: str):
+    path = tmp_path / f"broken.{suffix}"
+    Image.fromarray(smooth_image(200, 150)).save(path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(InputError, match=rf"broken\.{suffix}: the image is damaged"):
+        read_image(path)
+    path.write_text("no image at all")
+    with pytest.raises(InputError, match=rf"broken\.{suffix}: not a readable image"):
+        read_image(path)
+    with pytest.raises(InputError, match="no such image"):
+        read_image(tmp_path / "absent.png")
+
+
+# the sizes of Mip-NeRF 360's own images_4 and images_2
+@pytest.mark.parametrize(
+    ("native", "factor", "expected"),
+    [
+        ((4946, 3286), 4, (1237, 822)),
+        ((5187, 3361), 4, (1297, 840)),
+        ((3114, 2075), 2, (1557, 1038)),
+        ((3118, 2078), 2, (1559, 1039)),
+    ],
+)
+def test_sizes_of_the_benchmark(native, factor, expected):
+    assert downscaled_size(*native, downscale=factor) == expected
+    assert same_up_to_rounding(expected, native)
+
+
+def test_sizes_never_grow_and_the_longest_side_is_exact():
+    assert downscaled_size(900, 600, max_size=1600) == (900, 600)
+    assert downscaled_size(900, 600, downscale=2, max_size=500) == (450, 300)
+    assert downscaled_size(900, 600, downscale=2, max_size=300) == (300, 200)
+    assert all(max(downscaled_size(side, 777, max_size=640)) == 640 for side in range(800, 1500))
+    for bad in ({"downscale": 0}, {"max_size": 0}):
+        with pytest.raises(InputError):
+            downscaled_size(9, 9, **bad)
+    assert not same_up_to_rounding((40, 26), (40, 30))
+
+
+def test_area_is_the_block_mean_and_lanczos_keeps_a_ramp():
+    image = smooth_image(40, 30)
+    blocks = image.reshape(15, 2, 20, 2, 3).mean(axis=(1, 3))
+    assert np.abs(resize_image(image, 20, 15, "area") - blocks).max() <= 1.0  # Pillow rounds after each of two passes
+    ramp = np.repeat(np.arange(0, 200, 2, dtype=np.uint8)[None, :, None], 30, 0).repeat(3, 2)
+    small = resize_image(ramp, 50, 15, "lanczos")
+    np.testing.assert_allclose(small[7, 5:-5, 0], np.arange(1, 200, 4)[5:-5], atol=1.01)
+    with pytest.raises(InputError, match="resample"):
+        resize_image(image, 20, 15, "cubic")  # type: ignore[arg-type]

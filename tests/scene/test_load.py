@@ -1,0 +1,162 @@
+"""From capture and model to a scene: undistortion of every camera model, sizes, cache, missing poses."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.scene.load import load_scene
+from gsbench.scene.prepare import CameraModel, Job, prepare_all, undistort
+from gsbench.scene.readers import read_colmap
+
+WIDTH, HEIGHT = 200, 150
+MODELS = {
+    "SIMPLE_RADIAL": [150, 100, 75, 0.08],
+    "RADIAL": [150, 100, 75, -0.1, 0.02],
+    "OPENCV": [150, 152, 99, 76, -0.1, 0.02, 0.001, -0.001],
+    "FULL_OPENCV": [150, 152, 99, 76, -0.1, 0.02, 0.001, -0.001, 0.01, 0.01, 0.01, 0.001],
+    "SIMPLE_RADIAL_FISHEYE": [150, 100, 75, 0.02],
+    "RADIAL_FISHEYE": [150, 100, 75, 0.02, 0.001],
+    "OPENCV_FISHEYE": [150, 152, 100, 75, 0.01, 0.001, 0, 0],
+    "FOV": [150, 150, 100, 75, 0.3],
+    "THIN_PRISM_FISHEYE": [150, 150, 100, 75, 0.01, 0.001, 0.0005, 0.0005, 0.001, 0.001, 0.0001, 0.0001],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [150, 150, 100, 75, 0.01, 0, 0, 0, 0, 0, 0.001, 0, 0, 0, 0, 0],
+    "SIMPLE_DIVISION": [150, 100, 75, -0.1],
+    "DIVISION": [150, 152, 100, 75, -0.1],
+    "SIMPLE_FISHEYE": [150, 100, 75],
+    "FISHEYE": [150, 150, 100, 75],
+    "EUCM": [150, 150, 100, 75, 0.5, 1.1],
+}
+SPOTS = np.array([[x, y, 1.0] for x in (-0.3, 0.0, 0.35) for y in (-0.25, 0.05, 0.2)])  # camera space
+
+
+def test_every_model_of_this_pycolmap_is_tested():
+    known = set(pycolmap.CameraModelId.__members__) - {"INVALID", "PINHOLE", "SIMPLE_PINHOLE", "EQUIRECTANGULAR"}
+    assert known == set(MODELS)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_spots_land_where_a_pinhole_sees_them(name: str):
+    source = pycolmap.Camera(camera_id=1, model=name, width=WIDTH, height=HEIGHT, params=MODELS[name])
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    image = np.zeros((HEIGHT, WIDTH))
+    for spot in SPOTS:  # one soft spot where COLMAP's own distortion puts each point
+        x, y = source.img_from_cam(spot)
+        image += np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 1.5**2))
+    pixels = np.repeat((255 * image.clip(0, 1)).astype(np.uint8)[..., None], 3, axis=2)
+    flat, pinhole = undistort(pixels, CameraModel(name, WIDTH, HEIGHT, tuple(map(float, MODELS[name]))))
+    assert flat.shape == (pinhole.height, pinhole.width, 3)
+    found = 0
+    for spot in SPOTS:
+        x, y = pinhole.fx * spot[0] + pinhole.cx, pinhole.fy * spot[1] + pinhole.cy
+        assert 6 < x < pinhole.width - 6
+        assert 6 < y < pinhole.height - 6
+        left, top = int(x) - 5, int(y) - 5
+        window = flat[top : top + 11, left : left + 11, 0].astype(float)
+        ys, xs = np.mgrid[:11, :11] + 0.5
+        center = np.array([(window * xs).sum() + left * window.sum(), (window * ys).sum() + top * window.sum()])
+        np.testing.assert_allclose(center / window.sum(), [x, y], atol=0.12)
+        found += 1
+    assert found == len(SPOTS)
+
+
+def test_panoramas_are_refused(tmp_path: Path):
+    camera = CameraModel("EQUIRECTANGULAR", WIDTH, HEIGHT, (float(WIDTH), float(HEIGHT)))
+    with pytest.raises(InputError, match="EQUIRECTANGULAR"):
+        undistort(np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8), camera)
+    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match="EQUIRECTANGULAR"):  # and so from the isolated process
+        prepare_all([Job(tmp_path / "a.png", camera, tmp_path / "b.png")])
+
+
+def test_untouched_views_are_the_files(make_scene, tmp_path: Path):
+    root = make_scene()
+    capture = read_colmap("toy", root)
+    scene = load_scene(capture, capture.model, tmp_path / "cache")
+    assert [view.name for view in scene.test] == ["00.png"]
+    assert len(scene.train) == 5
+    for view in (*scene.train, *scene.test):
+        np.testing.assert_array_equal(view.image, np.asarray(Image.open(root / "images" / view.name)))
+        assert (view.camera.fx, view.camera.cx, view.camera.cy) == (50.0, 20.0, 15.0)
+    assert not list((tmp_path / "cache").rglob("*.png"))
+    # camera k stands at x = -0.1 k; training views 1..5: mean -0.3, farthest 0.2 away
+    assert scene.extent == pytest.approx(1.1 * 0.2)
+
+
+def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp_path: Path):
+    root = make_scene(size=(81, 60), model="SIMPLE_RADIAL", params=[70, 40, 30, 0.05])
+    capture = read_colmap("toy", root)
+    done = []
+    options = {"downscale": 2, "progress": lambda *step: done.append(step)}
+    first = load_scene(capture, capture.model, tmp_path / "cache", **options)
+    assert done == [(6, 6)]
+    second = load_scene(capture, capture.model, tmp_path / "cache", **options)
+    assert done == [(6, 6)]  # nothing was prepared again
+    third = load_scene(capture, capture.model, tmp_path / "other", threads=1, **options)
+    for scene in (second, third):
+        for a, b in zip(first.train, scene.train, strict=True):
+            np.testing.assert_array_equal(a.image, b.image)
+            np.testing.assert_array_equal(a.camera.rotation, b.camera.rotation)
+            assert (a.camera.width, a.camera.fx, a.camera.cy) == (b.camera.width, b.camera.fx, b.camera.cy)
+    camera = first.train[0].camera
+    assert first.train[0].image.shape == (camera.height, camera.width, 3)
+    assert camera.width < 41
+    assert not list((tmp_path / "cache").glob(".*"))  # no work folder is left behind
+    load_scene(capture, capture.model, tmp_path / "cache", downscale=4)
+    assert len(list((tmp_path / "cache").iterdir())) == 2
+
+
+def test_centred_moves_the_principal_point_only(make_scene, tmp_path: Path):
+    capture = read_colmap("toy", make_scene(params=[50, 51, 18, 16]))
+    used = load_scene(capture, capture.model, tmp_path)
+    centred = load_scene(capture, capture.model, tmp_path, principal_point="centred")
+    assert (used.train[0].camera.cx, used.train[0].camera.cy) == (18, 16)
+    assert (centred.train[0].camera.cx, centred.train[0].camera.cy) == (20, 15)
+    assert centred.train[0].camera.fy == 51
+    np.testing.assert_array_equal(used.train[0].image, centred.train[0].image)
+    with pytest.raises(InputError, match="principal_point"):
+        load_scene(capture, capture.model, tmp_path, principal_point="center")  # type: ignore[arg-type]
+
+
+def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path: Path, caplog):
+    capture = read_colmap("toy", make_scene(), test_every=3)
+    small = make_scene(names=("00.png", "01.png", "02.png", "04.png"), root="partial")
+    with caplog.at_level(logging.WARNING):
+        scene = load_scene(capture, small / "sparse/0", tmp_path / "cache")
+    assert [view.name for view in scene.train] == ["01.png", "02.png", "04.png"]
+    assert [view.name for view in scene.test] == ["00.png"]
+    assert "1 of 4 training views" in caplog.text
+    assert "1 of 2 test views have no pose and are left out: 03.png" in caplog.text
+    two = make_scene(names=("00.png", "01.png"), root="two")
+    with pytest.raises(InputError, match="2 of 6 images have a pose"):
+        load_scene(capture, two / "sparse/0", tmp_path / "cache")
+    only_test = replace(capture, test_names=("00.png", "01.png", "02.png", "04.png"))
+    with pytest.raises(InputError, match="no training view"):
+        load_scene(only_test, small / "sparse/0", tmp_path / "cache2")
+
+
+def test_truncated_photo_is_named_and_leaves_nothing(make_scene, tmp_path: Path):
+    root = make_scene(size=(80, 60))
+    path = root / "images/03.png"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    capture = read_colmap("toy", root)
+    with pytest.raises(InputError, match=r"03\.png: the image is damaged"):
+        load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
+    assert not list((tmp_path / "cache").iterdir())
+
+
+@pytest.mark.shared
+def test_real_photos_of_a_distorted_camera(shared: Path, tmp_path: Path):
+    capture = read_colmap("herz", shared / "data/herz_jesus_p25", max_images=4)
+    scene = load_scene(capture, capture.model, tmp_path, max_size=300)
+    assert {max(view.camera.width, view.camera.height) for view in scene.train} == {300}
+    model = pycolmap.Reconstruction(capture.model)
+    view = scene.train[0]
+    np.testing.assert_allclose(view.camera.center, model.find_image_with_name(view.name).projection_center(), atol=1e-9)

@@ -1,0 +1,147 @@
+"""Readers: which files are found, kept and held out, and what is said about bad folders."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.scene.names import match_names, select_images, split_names
+from gsbench.scene.readers import list_images, read_colmap, read_photos
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("sparse", ["sparse/0", "sparse"])
+def test_colmap_folder(make_scene, text: bool, sparse: str):
+    root = make_scene(text=text, sparse=sparse)
+    capture = read_colmap("toy", root, test_every=3)
+    assert capture.image_names == tuple(f"{k:02d}.png" for k in range(6))
+    assert capture.test_names == ("00.png", "03.png")
+    assert capture.train_names == ("01.png", "02.png", "04.png", "05.png")
+    assert capture.model == root / sparse
+    assert not capture.exact_poses
+
+
+def test_the_older_three_file_layout(make_scene):
+    root = make_scene()
+    for file in ("rigs.bin", "frames.bin"):
+        (root / "sparse/0" / file).unlink()
+    assert len(read_colmap("toy", root).image_names) == 6
+
+
+def test_photos_in_images_or_directly_or_nested(make_scene):
+    root = make_scene(names=("cam1/01.PNG", "cam1/02.png", "cam2/01.JPEG", "z.tif", "y.webp", "x.bmp"))
+    (root / "images" / ".hidden.png").write_bytes(b"no image")
+    (root / "images" / "notes.txt").write_text("no image")
+    for path in (root, root / "images"):
+        capture = read_photos("toy", path)
+        assert capture.image_names == ("cam1/01.PNG", "cam1/02.png", "cam2/01.JPEG", "x.bmp", "y.webp", "z.tif")
+        assert capture.model is None
+
+
+def test_files_with_another_extension_and_missing_ones(make_scene, caplog):
+    root = make_scene(names=tuple(f"cam/{k}.JPG" for k in range(6)))
+    half = root / "images_2" / "cam"
+    half.mkdir(parents=True)
+    for k in range(5):
+        Image.open(root / "images" / f"cam/{k}.JPG").resize((20, 15)).save(half / f"{k}.png")
+    with caplog.at_level(logging.WARNING):
+        capture = read_colmap("toy", root, images="images_2")
+    assert capture.image_names == tuple(f"cam/{k}.png" for k in range(5))
+    assert "1 of 6 images of the model have no file: cam/5.JPG" in caplog.text
+
+
+def test_match_names_refuses_what_is_ambiguous():
+    assert match_names(["a.JPG", "b.JPG"], ["a.png", "a.tif", "b.png"]) == {"b.JPG": "b.png"}
+    assert match_names(["a.JPG", "a.jpeg"], ["a.png"]) == {}
+    assert match_names(["a.png", "a.JPG"], ["a.png"]) == {"a.png": "a.png"}
+    assert match_names(["frame.001"], ["frame.001.png"]) == {"frame.001": "frame.001.png"}
+
+
+def test_selection_is_even_and_comes_before_the_split(make_scene):
+    assert select_images(list("abcdefghij"), 4) == ["a", "c", "f", "h"]
+    for count, most in ((292, 98), (7, 3), (200, 200), (201, 200)):
+        chosen = [int(name) for name in select_images([str(k) for k in range(count)], most)]
+        gaps = {b - a for a, b in zip(chosen, [*chosen[1:], count], strict=True)}  # closed ring: back to the first
+        assert len(chosen) == most
+        assert max(gaps) - min(gaps) <= 1
+    capture = read_colmap("toy", make_scene(), max_images=3, test_every=2)
+    assert capture.image_names == ("00.png", "02.png", "04.png")
+    assert capture.test_names == ("00.png", "04.png")
+
+
+def test_split_lists(make_scene):
+    root = make_scene()
+    (root / "test.txt").write_text("01.JPG\n\n# a comment\n03\n")
+    (root / "train.txt").write_text("00.png\n02.png\n")
+    capture = read_colmap("toy", root, test_list="test.txt")
+    assert capture.test_names == ("01.png", "03.png")
+    assert len(capture.train_names) == 4
+    both = read_colmap("toy", root, test_list="test.txt", train_list="train.txt")
+    assert both.image_names == ("00.png", "01.png", "02.png", "03.png")
+    assert read_colmap("toy", root, train_list="train.txt").test_names == ("01.png", "03.png", "04.png", "05.png")
+    (root / "bad.txt").write_text("00.png\n99.png\n")
+    with pytest.raises(InputError, match=r"split lists name 99\.png"):
+        read_colmap("toy", root, test_list="bad.txt")
+    (root / "both.txt").write_text("00.png\n")
+    with pytest.raises(InputError, match=r"00\.png for training and for testing"):
+        read_photos("toy", root, train_list="train.txt", test_list="both.txt")
+
+
+def test_splits_without_views():
+    names = [str(k) for k in range(5)]
+    assert split_names(names, test_every=0) == (names, [])
+    with pytest.raises(InputError, match="no training view"):
+        split_names(names, test_every=1)
+    with pytest.raises(InputError, match="no test view"):
+        split_names(names, test=[])
+    with pytest.raises(InputError, match="test_every"):
+        split_names(names, test_every=-1)
+
+
+def test_fingerprint_follows_content_not_place(make_scene, tmp_path: Path):
+    root = make_scene()
+    copy = Path(shutil.copytree(root, tmp_path / "elsewhere"))
+    first = read_colmap("toy", root)
+    assert read_colmap("other", copy).fingerprint == first.fingerprint
+    assert read_photos("toy", root).fingerprint != first.fingerprint
+    assert read_colmap("toy", root, max_images=5).fingerprint != first.fingerprint
+    with (copy / "images" / "03.png").open("ab") as stream:
+        stream.write(b"x")
+    assert read_colmap("toy", copy).fingerprint != first.fingerprint
+
+
+def test_bad_folders(make_scene, tmp_path: Path):
+    with pytest.raises(InputError, match="does not exist"):
+        read_photos("toy", tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"scene\.path is not set"):
+        read_photos("toy", "")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(InputError, match="0 images"):
+        read_photos("toy", empty)
+    root = make_scene()
+    with pytest.raises(InputError, match=r"images_8: no such folder; set scene\.images to one of: images, sparse"):
+        read_colmap("toy", root, images="images_8")
+    for name in list_images(root / "images")[2:]:
+        (root / "images" / name).unlink()
+    with pytest.raises(InputError, match="2 images that the model"):
+        read_colmap("toy", root)
+    shutil.rmtree(root / "sparse")
+    with pytest.raises(InputError, match="no COLMAP model in sparse/0 or sparse"):
+        read_colmap("toy", root)
+
+
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D", "frames"])
+@pytest.mark.parametrize("keep", [0.0, 0.6])
+def test_truncated_model_is_one_clear_line(make_scene, file: str, keep: float):
+    root = make_scene()
+    path = root / "sparse/0" / f"{file}.bin"
+    path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
+    with pytest.raises(InputError, match=rf"{file}\.bin: .*(truncated|too few)") as caught:
+        read_colmap("toy", root)
+    assert "\n" not in str(caught.value)
