@@ -1,14 +1,15 @@
 """What one training step costs with each rasterizer: times, their split, and peak memory.
 
-A step is what training does: render, photometric loss, backward, Adam on all parameters, spherical harmonics of degree 3.
-The synthetic scene has the statistics of a trained model (many small flat Gaussians, few large ones, opacities of all
-kinds) and is the same for one count on every machine. torch is imported inside functions, as everywhere near the command
-line.
+A step is what training does: render, photometric loss, backward, Adam on all parameters, spherical harmonics of degree
+3. The synthetic scene has the statistics of a trained model (many small flat Gaussians, few large ones, opacities of
+all kinds) and is the same for one count on every machine. torch is imported inside functions, as everywhere near the
+command line.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import statistics
@@ -52,10 +53,10 @@ def run_bench(
     """Time one training step of each of ``rasters`` for each image size (width, height) and count of Gaussians.
 
     The rasters take turns, step by step; all times are medians over ``repeats``, in ms. ``forward_ms`` is the render,
-    ``backward_ms`` the backward pass of loss and render, ``step_ms`` everything; ``loss_ms`` and ``adam_ms`` are the rest, and
-    ``cpu_ms`` is the processor time of the step on all threads. ``peak_memory_mb`` is that of a fresh process that makes the same steps (on a
-    GPU: of torch's allocations there), None if ``memory`` is false. With ``ply`` that model is timed instead of
-    ``counts``. Raises InputError for a raster that cannot run here.
+    ``backward_ms`` the backward pass of loss and render, ``step_ms`` everything; ``loss_ms`` and ``adam_ms`` are the
+    rest, and ``cpu_ms`` is the processor time of the step on all threads. ``peak_memory_mb`` is that of a fresh process
+    that makes the same steps (on a GPU: of torch's allocations there), None if ``memory`` is false. With ``ply`` that
+    model is timed instead of ``counts``. Raises InputError for a raster that cannot run here.
     """
     results = []
     for width, height in sizes:
@@ -73,9 +74,7 @@ def run_bench(
                     key: round(statistics.median(sample[key] for sample in samples[raster]), 3)
                     for key in samples[raster][0]
                 }
-                row["peak_memory_mb"] = (
-                    _measure_memory(raster, width, height, count, ply, threads) if memory else None
-                )
+                row["peak_memory_mb"] = _measure_memory(raster, width, height, count, ply, threads) if memory else None
                 row["threads"] = stepper.threads
                 row["device"] = stepper.device.type
                 if raster == PEER:
@@ -87,9 +86,7 @@ def run_bench(
 class _Stepper:
     """One rasterizer with its own copy of the scene and an optimiser."""
 
-    def __init__(
-        self, raster: str, width: int, height: int, count: int, ply: Path | None, threads: int | None
-    ) -> None:
+    def __init__(self, raster: str, width: int, height: int, count: int, ply: Path | None, threads: int | None) -> None:
         import torch
 
         from gsbench.gaussians.ply import read_ply
@@ -125,7 +122,7 @@ class _Stepper:
         marks.append(self._now())
         self.optimizer.step()
         marks.append(self._now())
-        forward, loss_time, backward, adam = (1e3 * (b - a) for a, b in zip(marks, marks[1:], strict=False))
+        forward, loss_time, backward, adam = (1e3 * (b - a) for a, b in itertools.pairwise(marks))
         return {
             "forward_ms": forward,
             "backward_ms": backward,
@@ -229,11 +226,18 @@ def camera_before(scene: Gaussians, width: int, height: int) -> Camera:
     return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(3), translation)
 
 
-def _measure_memory(
-    raster: str, width: int, height: int, count: int, ply: Path | None, threads: int | None
-) -> float:
+def _measure_memory(raster: str, width: int, height: int, count: int, ply: Path | None, threads: int | None) -> float:
     """Peak memory in MB of a fresh process that makes the warm-up steps and one more."""
-    command = [sys.executable, "-m", "gsbench.bench", "--peak-memory", "--raster", raster, "--size", f"{width}x{height}"]
+    command = [
+        sys.executable,
+        "-m",
+        "gsbench.bench",
+        "--peak-memory",
+        "--raster",
+        raster,
+        "--size",
+        f"{width}x{height}",
+    ]
     command += ["--ply", str(ply)] if ply is not None else ["--count", str(count)]
     command += ["--threads", str(threads)] if threads else []
     run = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -77,6 +77,7 @@ class EvalConfig:
     protocol: str = MISSING  # paper | standard
     lpips: list[str] = field(default_factory=lambda: ["vgg_raw", "vgg", "alex", "squeeze"])
     flip: bool = True
+    maps: bool = False  # keep maps of depth, volume and distance to the initial cloud: where an arm helps
     weights: str | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
     download: bool = True  # fetch missing weights, checked by checksum
 
@@ -124,6 +125,7 @@ GROUP_SCHEMAS = {
     "tracking": TrackingConfig,
     "launch": LaunchConfig,
 }
+WITHOUT_EFFECT = ("threads", "weights", "download")  # options of a group that cannot change its result
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
 
 
@@ -199,6 +201,9 @@ def plain(config: DictConfig) -> dict[str, Any]:
 def config_hash(values: dict[str, Any]) -> str:
     """sha256 of what determines a result apart from the seed: not names, devices, folders, tracking or launchers."""
     kept = {key: value for key, value in values.items() if key not in NOT_HASHED}
+    for key, group in kept.items():
+        if isinstance(group, dict):
+            kept[key] = {name: value for name, value in group.items() if name not in WITHOUT_EFFECT}
     return sha256_of(kept)
 
 

@@ -9,13 +9,12 @@ import pytest
 import scipy.stats
 
 from gsbench.errors import InputError
-from gsbench.eval.pairing import Paired, ViewCache, pair_arms
+from gsbench.eval.pairing import Paired, ViewCache, choose_pairs, pair_arms
 from gsbench.eval.results import Experiment
 from gsbench.eval.statistics import (
     SCENES_LIKE_THESE,
     THESE_SCENES,
     THIS_SCENE,
-    all_arms_pairs,
     bootstrap_interval,
     compare,
     holm,
@@ -235,5 +234,14 @@ def test_arms_under_different_conditions_are_not_compared(make_experiment: Calla
 
 def test_comparisons_worth_making() -> None:
     arms = [("dim", "adc"), ("dim", "volumetric"), ("sfm", "adc"), ("sfm", "volumetric")]
-    assert all_arms_pairs(arms) == [(arms[0], arms[1]), (arms[2], arms[3])]
-    assert all_arms_pairs([("a", "x"), ("b", "x")]) == [(("a", "x"), ("b", "x"))]
+    assert choose_pairs(arms) == [(arms[0], arms[1]), (arms[2], arms[3])]
+    assert choose_pairs([("a", "x"), ("b", "x"), ("c", "x")]) == [(("a", "x"), ("b", "x")), (("a", "x"), ("c", "x"))]
+    assert choose_pairs(arms[2:], baseline="volumetric") == [(arms[3], arms[2])]
+    assert choose_pairs([("sfm", "adc")]) == []
+
+
+def test_variants_are_held_against_the_baselines_own() -> None:
+    arms = [("sfm", f"{name} cap={cap}") for name in ("adc", "volumetric") for cap in (1, 2)]
+    assert choose_pairs(arms) == [(arms[0], arms[2]), (arms[1], arms[3])]
+    arms = [("sfm", "adc"), ("sfm", "volumetric threshold=1"), ("sfm", "volumetric threshold=2")]
+    assert choose_pairs(arms) == [(arms[0], arms[1]), (arms[0], arms[2])]

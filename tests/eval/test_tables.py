@@ -115,7 +115,8 @@ def test_a_cell_never_mixes_settings(tmp_path: Path) -> None:
     one_trial(tmp_path, 1, "bbbbbbbb", {"densify__volume_threshold": 0.1}, psnr=28.0)
     experiment = load_experiment(tmp_path, "exp")
     with pytest.raises(InputError, match=r"differ in densify\.volume_threshold: 0\.03 \| 0\.1"):
-        build_table(experiment)
+        build_table(experiment, rows=["scene", "densify"])
+    assert build_table(experiment).row_headings[-1] == "densify.volume_threshold"  # by default it becomes a row
     table = build_table(experiment, rows=["scene", "densify.volume_threshold"], metrics=["psnr"])
     assert [row.labels for row in table.rows] == [("garden", "0.03"), ("garden", "0.1")]
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from gsbench.eval.quantities import quantity
 from gsbench.eval.results import Experiment
-from gsbench.eval.tradeoffs import Curve, arm_curve, curve_gap, training_curve
+from gsbench.eval.tradeoffs import Curve, curve_gap, family_curve, training_curve
 
 
 def curve(cost: list[float], quality: list[float]) -> Curve:
@@ -39,12 +40,13 @@ def test_crossing_curves_cancel() -> None:
     assert gap.gap == pytest.approx(0.0, abs=1e-12)
 
 
-def test_an_arm_has_a_point_for_each_level(make_experiment: Callable[..., Experiment]) -> None:
+def test_a_densifier_has_a_point_for_each_variant(make_experiment: Callable[..., Experiment]) -> None:
     experiment = make_experiment()
-    for trial in experiment.trials:
+    trials = [replace(trial, variant=f"seed={trial.seed}") for trial in experiment.trials]
+    for trial in trials:
         trial.data["num_gaussians"] = 1000 * (1 + trial.seed)
-    psnr = quantity("psnr", experiment.trials)
-    found = arm_curve(experiment.trials, ("sfm", "adc"), psnr, "gaussians", level="seed")
+    psnr = quantity("psnr", trials)
+    found = family_curve(trials, ("sfm", "adc"), psnr, "gaussians")
     assert found.cost.tolist() == [1000, 2000, 3000]
     expected = [
         np.mean([t.metrics["psnr"] for t in experiment.trials if t.seed == seed and t.densify == "adc"])

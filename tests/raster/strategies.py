@@ -1,4 +1,4 @@
-"""Random scenes for the rasterizer tests: seeded ones of ordinary Gaussians, and hypothesis strategies of extreme ones."""
+"""Scenes for the rasterizer tests: seeded ones of ordinary Gaussians, and hypothesis strategies of extreme ones."""
 
 from __future__ import annotations
 

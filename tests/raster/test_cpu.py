@@ -1,4 +1,4 @@
-"""What the compiled CPU rasterizer promises beyond the contract: the same bits, memory that is safe to keep, any host."""
+"""What the compiled CPU rasterizer promises beyond the contract: the same bits, memory safe to keep, any host."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_equal_depths_are_blended_in_the_order_of_the_index() -> None:
 
 
 def test_needles_keep_their_gradients() -> None:
-    """Long thin Gaussians: the determinant of their 2D covariance loses its digits when computed in float32 as ac - b^2."""
+    """Long thin Gaussians: the determinant of their 2D covariance loses its digits in float32 as ac - b^2."""
     gaussians = Case(90, 70, 40, sh_degree=0).gaussians()
     gaussians.log_scales[:, 0] = 0.5
     gaussians.log_scales[:, 1:] = -9.0
@@ -76,9 +76,7 @@ def test_renders_may_be_differentiated_late_and_twice() -> None:
     alone = [render_with_gradients(rasterizer, case, torch.float32)[1]["means"] for case in cases]
     leaves = [case.gaussians().map(lambda tensor: tensor.float().requires_grad_()) for case in cases]
     background = torch.tensor([0.2, 0.5, 0.9])
-    outputs = [
-        rasterizer.render(g, case.camera(), 3, background) for g, case in zip(leaves, cases, strict=True)
-    ]
+    outputs = [rasterizer.render(g, case.camera(), 3, background) for g, case in zip(leaves, cases, strict=True)]
     for k in (1, 0, 0):
         case = cases[k]
         weights = torch.randn(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from gsbench.errors import InputError
@@ -95,6 +95,23 @@ def differing_settings(trials: Sequence[Trial]) -> dict[str, list[str]]:
     keys = {key for trial in trials for key in trial.config if not key.startswith(IGNORED_SETTINGS)}
     values = {key: sorted({canonical(trial.config.get(key)) for trial in trials}) for key in sorted(keys)}
     return {key: found for key, found in values.items() if len(found) > 1}
+
+
+def swept_settings(trials: Iterable[Trial]) -> list[str]:
+    """The settings in which trials of one scene, initialiser and densifier differ, apart from what may differ."""
+    groups = by_key(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values()
+    return sorted({key for group in groups for key in differing_settings(group)})
+
+
+def with_variants(trials: Sequence[Trial]) -> list[Trial]:
+    """The trials, each with its values of the swept settings as its variant, so that they are arms of their own."""
+    swept = swept_settings(trials)
+    if not swept:
+        return list(trials)
+    return [
+        replace(trial, variant=" ".join(f"{key.rpartition('.')[2]}={trial.config.get(key)}" for key in swept))
+        for trial in trials
+    ]
 
 
 def make_cell(trials: Sequence[Trial], quantity: Quantity, scenes: Sequence[str], expected: int) -> Cell:

@@ -17,8 +17,8 @@ from PIL import Image, UnidentifiedImageError
 
 from gsbench.errors import InputError
 from gsbench.eval.cells import by_key
-from gsbench.eval.pairing import Arm, Paired, pair_trials
-from gsbench.eval.results import Trial
+from gsbench.eval.pairing import Paired, pair_trials
+from gsbench.eval.results import Arm, Trial
 from gsbench.eval.statistics import Comparison, compare
 
 BINS = 5

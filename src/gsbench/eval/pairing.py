@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.eval.cells import by_key, check_averageable, differing_conditions
-from gsbench.eval.results import Trial, read_views
+from gsbench.eval.results import Arm, Trial, read_views
 
-Arm = tuple[str, str]  # init, densify
 Views = Mapping[str, Mapping[str, float]]
 
 
@@ -29,6 +28,9 @@ class Paired:
     differences: tuple[NDArray[np.float64], ...]
     baseline_mean: float
     left_out: tuple[str, ...]
+
+
+BASELINE = "adc"
 
 
 class ViewCache:
@@ -48,6 +50,21 @@ class ViewCache:
         if isinstance(found, InputError):
             raise found
         return found
+
+
+def choose_pairs(arms: Sequence[Arm], baseline: str = BASELINE) -> list[tuple[Arm, Arm]]:
+    """(baseline arm, other arm) for every densifier whose initialiser also has the baseline.
+
+    A variant such as ``volumetric max_gaussians=30000`` is held against the baseline's own variant where there is one.
+    Without the baseline, the other arms are held against the first of ``arms``.
+    """
+    pairs = []
+    for init, name in arms:
+        densifier, _, variant = name.partition(" ")
+        partners = [arm for arm in ((init, f"{baseline} {variant}".strip()), (init, baseline)) if arm in arms]
+        if partners and baseline not in (densifier, name):
+            pairs.append((partners[0], (init, name)))
+    return pairs or [(arms[0], arm) for arm in arms[1:]]
 
 
 def arm_name(arm: Arm) -> str:
@@ -88,7 +105,7 @@ def pair_trials(trials: Sequence[Trial], first: Arm, second: Arm) -> list[tuple[
 
 
 def _by_seed(group: Sequence[Trial], arm: Arm, scene: str) -> dict[int, Trial]:
-    own = [trial for trial in group if (trial.init, trial.densify) == arm]
+    own = [trial for trial in group if trial.arm == arm]
     if own:
         check_averageable(own, f"scene={scene} {arm_name(arm)}")
     return {trial.seed: trial for trial in own}

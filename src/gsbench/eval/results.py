@@ -26,6 +26,8 @@ NOT_EXPERIMENTS = {"store", "mlartifacts"}  # what else lies in the runs folder
 TRIAL_FOLDER = re.compile(r"(?P<hash>[0-9a-f]{8})-seed(?P<seed>\d+)")
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
 
+Arm = tuple[str, str]  # initialiser, densifier
+
 TEXT_KEYS = ("experiment", "scene", "init", "densify", "raster", "protocol")
 COUNT_KEYS = ("seed", "iterations", "num_gaussians")
 
@@ -44,6 +46,12 @@ class Trial:
     metrics: Mapping[str, float]
     unavailable: Mapping[str, str]
     data: Mapping[str, Any] = field(repr=False)
+    variant: str = ""  # the swept settings that tell this trial from others of its initialiser and densifier
+
+    @property
+    def arm(self) -> Arm:
+        """What is compared: the initialiser, and the densifier with its variant."""
+        return self.init, f"{self.densify} {self.variant}".strip()
 
     @property
     def label(self) -> str:

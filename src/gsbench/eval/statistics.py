@@ -8,7 +8,6 @@ scenes different from zero when scenes are the units (asked from ``MIN_SCENES`` 
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -279,11 +278,3 @@ def _standardised(units: Array) -> float | None:
     if len(units) < 2 or units.std(ddof=1) == 0:
         return None
     return float(units.mean() / units.std(ddof=1))
-
-
-def all_arms_pairs(
-    arms: Sequence[tuple[str, str]], baseline: str = "adc"
-) -> list[tuple[tuple[str, str], tuple[str, str]]]:
-    """The comparisons worth making: every densifier against the baseline with the same initialiser, else all pairs."""
-    pairs = [((init, baseline), (init, name)) for init, name in arms if name != baseline and (init, baseline) in arms]
-    return pairs or list(itertools.combinations(arms, 2))

@@ -81,10 +81,9 @@ def to_html(table: Table) -> str:
         heads = "".join(f'<th scope="colgroup" colspan="{size}">{html.escape(name)}</th>' for name, size in groups)
         span = f'<td colspan="{len(table.row_headings)}"></td>'
         parts.append(f"<tr>{span}{heads}</tr>\n")
-    names = [*table.row_headings, *(column.heading for column in table.columns)]
-    parts.append(
-        "<tr>" + "".join(f'<th scope="col">{html.escape(name)}</th>' for name in names) + "</tr>\n</thead>\n<tbody>\n"
-    )
+    labels = "".join(f'<th class="name" scope="col">{html.escape(name)}</th>' for name in table.row_headings)
+    heads = "".join(f'<th scope="col">{html.escape(column.heading)}</th>' for column in table.columns)
+    parts.append(f"<tr>{labels}{heads}</tr>\n</thead>\n<tbody>\n")
     for row in table.rows:
         labels = "".join(f'<th scope="row">{html.escape(label)}</th>' for label in row.labels)
         cells = "".join(f"<td>{_html_text(entry)}</td>" for entry in row.entries)
@@ -118,7 +117,7 @@ body { font: 16px/1.5 system-ui, sans-serif; margin: 1rem; color: #1c1e21; backg
 figure.table { margin: 0; overflow-x: auto }
 table { border-collapse: collapse } caption { text-align: left; font-weight: 600; padding-bottom: .5rem }
 th, td { padding: .3rem .7rem; text-align: right; white-space: nowrap }
-th[scope=row], thead tr:last-child th:first-child { text-align: left; font-weight: normal }
+th[scope=row], th.name { text-align: left } th[scope=row] { font-weight: normal }
 thead tr:last-child th { border-bottom: 1px solid #888 } tr.rule > * { border-top: 1px solid #888 }
 th[scope=colgroup] { text-align: center } figcaption { font-size: .85rem; color: #555 }
 """

@@ -19,12 +19,13 @@ from gsbench.eval.cells import (
     differing_conditions,
     field_value,
     make_cell,
+    swept_settings,
 )
+from gsbench.eval.pairing import BASELINE
 from gsbench.eval.quantities import Quantity, choose_quantities
 from gsbench.eval.results import Experiment, Trial
 
 DEFAULT_ROWS = ("scene", "init", "densify")
-BASELINE = "adc"
 MEAN_OF_SCENES = "mean of {} scenes"
 
 
@@ -67,7 +68,7 @@ class Table:
 def build_table(
     experiment: Experiment,
     trials: Sequence[Trial] | None = None,
-    rows: Sequence[str] = DEFAULT_ROWS,
+    rows: Sequence[str] | None = None,
     columns: Sequence[str] = (),
     metrics: Sequence[str] | None = None,
     title: str | None = None,
@@ -77,11 +78,13 @@ def build_table(
     """Cross the values of ``rows`` with those of ``columns``; each combination shows every metric.
 
     ``rows`` and ``columns`` are fields of a trial or dotted configuration keys; what stands in neither is averaged
-    over: seeds as trials, scenes as means of scenes. ``order`` gives the rows and the columns to show, also where
-    nothing was run; ``names`` replaces values in headings. Raises ``InputError`` where a cell would mix what may not be
-    averaged.
+    over: seeds as trials, scenes as means of scenes. By default, rows are scene, initialiser, densifier and every
+    setting that was swept within those. ``order`` gives the rows and the columns to show, also where nothing was run;
+    ``names`` replaces values in headings. Raises ``InputError`` where a cell would mix what may not be averaged.
     """
     trials = list(experiment.trials if trials is None else trials)
+    if rows is None:
+        rows = (*DEFAULT_ROWS, *(key for key in swept_settings(trials) if key not in columns))
     quantities = choose_quantities(trials, metrics)
     fields = (*rows, *columns)
     groups = by_key(trials, lambda trial: tuple(field_value(trial, name) for name in fields))

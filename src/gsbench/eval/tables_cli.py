@@ -31,10 +31,10 @@ def main_tables(argv: Sequence[str], runs_dir: Path) -> int:
     layout = options.layout or (experiment.name if _is_plain(options) and experiment.name in PAPER_TABLES else "plain")
     metrics = _words(options.metrics)
     if layout == "plain":
-        rows, columns = _words(options.rows) or DEFAULT_ROWS, _words(options.columns) or ()
-        if set(rows) & set(columns):
+        rows, columns = _words(options.rows), _words(options.columns) or ()
+        if set(rows or ()) & set(columns):
             raise InputError(
-                f"{', '.join(sorted(set(rows) & set(columns)))} stands in --rows and --columns: choose one"
+                f"{', '.join(sorted(set(rows or ()) & set(columns)))} stands in --rows and --columns: choose one"
             )
         tables = [build_table(experiment, trials, rows, columns, metrics)]
     else:

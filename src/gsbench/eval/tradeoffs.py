@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.eval.cells import by_key, field_value
-from gsbench.eval.pairing import Arm
+from gsbench.eval.cells import by_key
 from gsbench.eval.quantities import Quantity
-from gsbench.eval.results import Trial, read_json_lines
+from gsbench.eval.results import Arm, Trial, read_json_lines
 
 GRID = 200  # points at which two curves are compared
 METRICS_FILE = "metrics.jsonl"
@@ -43,16 +42,16 @@ class CurveGap:
     high: float
 
 
-def arm_curve(trials: Sequence[Trial], arm: Arm, quality: Quantity, cost: str, level: str) -> Curve:
-    """One point for each value of the field or setting ``level``: means over seeds, then over scenes."""
+def family_curve(trials: Sequence[Trial], family: Arm, quality: Quantity, cost: str) -> Curve:
+    """One point for each variant of a densifier (init, densify): means over seeds, then over scenes."""
     read = COST_READERS[cost]
-    own = [trial for trial in trials if (trial.init, trial.densify) == arm]
+    own = [trial for trial in trials if (trial.init, trial.densify) == family]
     points = []
-    for label, group in by_key(own, lambda trial: field_value(trial, level)).items():
+    for variant, group in by_key(own, lambda trial: trial.variant).items():
         cost_mean = _mean_of_scenes(group, read)
         quality_mean = _mean_of_scenes(group, quality.read)
         if cost_mean and quality_mean is not None:
-            points.append((cost_mean, quality_mean, label))
+            points.append((cost_mean, quality_mean, variant))
     return _curve(points)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from pydantic import TypeAdapter, ValidationError
 
-from gsbench.config import check_target, closest
+from gsbench.config import WITHOUT_EFFECT, check_target, closest
 from gsbench.errors import InputError
 
 RESERVED = ("_target_", "name")  # keys of a group that are not options of its class
@@ -54,11 +54,10 @@ def locate(target: str, group: str) -> Any:
 
 
 def options_of(component: Any) -> dict[str, Any]:
-    """Class and options of a component, as they enter a stage's key; ``key_ignores`` of the class names what has no effect."""
+    """Class and options of a component, as they enter a stage's key; those that cannot change a result are left out."""
     values = {"class": f"{type(component).__module__}.{type(component).__qualname__}"}
-    ignored = getattr(type(component), "key_ignores", ())
     if dataclasses.is_dataclass(component):
-        fields = [field.name for field in dataclasses.fields(component) if field.init and field.name not in ignored]
+        fields = [field.name for field in dataclasses.fields(component) if field.init and field.name not in WITHOUT_EFFECT]
         values |= {name: _plain(getattr(component, name)) for name in fields}
     return values
 

@@ -16,13 +16,11 @@ C1 = 0.01**2
 C2 = 0.03**2
 
 
-def photometric_loss(
-    image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT
-) -> tuple[Tensor, Tensor, Tensor]:
+def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT) -> tuple[Tensor, Tensor, Tensor]:
     """The loss, L1 and SSIM of ``image`` [H, W, 3] against ``target`` [H, W, 3] (uint8, taken as /255, or floating).
 
-    Three scalars; only the loss carries a gradient, to ``image``. On the CPU in float32 this is a compiled kernel; a caller
-    with many images keeps a ``PhotometricLoss`` instead, which has threads and keeps its memory.
+    Three scalars; only the loss carries a gradient, to ``image``. On the CPU in float32 this is a compiled kernel; a
+    caller with many images keeps a ``PhotometricLoss`` instead, which has threads and keeps its memory.
     """
     return PhotometricLoss(ssim_weight, threads=1)(image, target)
 
@@ -42,7 +40,9 @@ class PhotometricLoss:
 
     def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         if image.dim() != 3 or image.shape[-1] != 3 or image.shape != target.shape:
-            raise ValueError(f"image {tuple(image.shape)} and target {tuple(target.shape)} must be of one shape [H, W, 3]")
+            raise ValueError(
+                f"image {tuple(image.shape)} and target {tuple(target.shape)} must be of one shape [H, W, 3]"
+            )
         if image.device.type != "cpu" or image.dtype != torch.float32:
             return torch_photometric_loss(image, target, self.ssim_weight)
         if self._compiled is None:

@@ -1,8 +1,8 @@
 """The photometric loss compiled for the CPU: one fused forward pass over rows, and a hand-written gradient.
 
-Images stay interleaved [H, W, 3]: a row is 3 W numbers and a horizontal neighbour is 3 numbers away, so one vector covers 16
-numbers of any channel. Rows are filtered horizontally once into a ring of 11 and combined vertically from there. The
-statistics of the target are computed again at each step: that costs less than fetching them from memory.
+Images stay interleaved [H, W, 3]: a row is 3 W numbers and a horizontal neighbour is 3 numbers away, so one vector
+covers 16 numbers of any channel. Rows are filtered horizontally once into a ring of 11 and combined vertically from
+there. The statistics of the target are computed again at each step: that costs less than fetching them from memory.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -19,7 +18,7 @@ from gsbench.pipeline.loss import C1, C2, WINDOW_RADIUS, window
 from gsbench.raster.cpu.executor import available_threads
 from gsbench.raster.cpu.jit import inlined, kernel
 from gsbench.raster.cpu.simd import LANES, absolute, fma, lane_sums, load, select, splat, store
-from gsbench.raster.cpu.workspace import Arena, ArenaPool, ShardRunner, TensorPool
+from gsbench.raster.cpu.workspace import ArenaPool, ShardRunner, TensorPool
 
 SHARDS = 8  # fixed, so that the bits are the same for any number of threads
 CHANNELS = 3
@@ -49,7 +48,9 @@ def _blur_column(ring: Any, first: int, i: int, row: int, stride: int) -> Any:
     """Filter vertically around ``row`` at number ``i``: rows of the ring starting at ``first``, ``stride`` apart."""
     total = load(ring, first + row % TAPS * stride + i) * WEIGHTS[0]
     for k in range(1, WINDOW_RADIUS + 1):
-        pair = load(ring, first + (row - k + TAPS) % TAPS * stride + i) + load(ring, first + (row + k) % TAPS * stride + i)
+        pair = load(ring, first + (row - k + TAPS) % TAPS * stride + i) + load(
+            ring, first + (row + k) % TAPS * stride + i
+        )
         total = fma(pair, WEIGHTS[k], total)
     return total
 
@@ -78,21 +79,31 @@ def _scale_row(out: Any, numbers: int, divisor: Any) -> None:
 
 @kernel
 def similarity_rows(
-    begin: int, end: int, height: int, width: int, image: Any, target: Any, divisor: Any, derivatives: Any, sums: Any
+    memory: Any,
+    begin: int,
+    end: int,
+    height: int,
+    width: int,
+    image: Any,
+    target: Any,
+    divisor: Any,
+    derivatives: Any,
+    sums: Any,
 ) -> None:
-    """Rows ``begin`` to ``end``: ``sums`` [2] gets the sum of SSIM and of |image - target|.
+    """Rows ``begin`` to ``end``, with scratch ``memory``: ``sums`` [2] gets the sum of SSIM and of |image - target|.
 
-    ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if not empty, gets the derivative of SSIM's sum with respect to the
-    blurred image, its blurred square and its blurred product with the target, between zeros.
+    ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if not empty, gets the derivative of SSIM's sum with respect to
+    the blurred image, its blurred square and its blurred product with the target, between zeros.
     """
     numbers = width * CHANNELS
     length = (numbers + LANES - 1) // LANES * LANES
     padded = length + 2 * PAD
-    x, y = np.zeros(padded, np.float32), np.zeros(padded, np.float32)
-    xx, yy, xy = np.zeros(padded, np.float32), np.zeros(padded, np.float32), np.zeros(padded, np.float32)
-    ring = np.empty(5 * TAPS * length, np.float32)
-    scratch = np.empty(LANES, np.float32)
     part = TAPS * length
+    x, y, xx = memory[:padded], memory[padded:], memory[2 * padded :]
+    yy, xy, ring = memory[3 * padded :], memory[4 * padded :], memory[5 * padded :]
+    scratch = ring[5 * part :]
+    for i in range(0, 5 * padded, LANES):
+        store(memory, i, splat(ZERO))
     total_similarity, total_l1 = 0.0, 0.0
     lane = load(LANE, 0)
     for row in range(begin - WINDOW_RADIUS, end + WINDOW_RADIUS):
@@ -155,6 +166,7 @@ def similarity_rows(
 
 @kernel
 def gradient_rows(
+    memory: Any,
     begin: int,
     end: int,
     height: int,
@@ -167,14 +179,14 @@ def gradient_rows(
     ssim_factor: Any,
     gradient: Any,
 ) -> None:
-    """Rows ``begin`` to ``end`` of ``gradient`` [H * W * 3]: the blur is symmetric, so it pulls the derivatives back."""
+    """Rows ``begin`` to ``end`` of ``gradient`` [H * W * 3]; the blur is symmetric, so it pulls derivatives back."""
     numbers = width * CHANNELS
     length = (numbers + LANES - 1) // LANES * LANES
     padded = length + 2 * PAD
-    x, y = np.zeros(padded, np.float32), np.zeros(padded, np.float32)
-    line = np.empty(length, np.float32)
-    ring = np.empty(3 * TAPS * length, np.float32)
     part = TAPS * length
+    x, y, line, ring = memory[:padded], memory[padded:], memory[2 * padded :], memory[3 * padded :]
+    for i in range(0, 2 * padded, LANES):
+        store(memory, i, splat(ZERO))
     for row in range(begin - WINDOW_RADIUS, end + WINDOW_RADIUS):
         slot = (row + TAPS) % TAPS * length
         for m in range(3):
@@ -227,12 +239,14 @@ class CompiledLoss:
         sums = np.zeros((SHARDS, 2))
         holder = _Holder()
         arena = self._arenas.lease(holder)
-        derivatives = self._derivatives(arena, height, width, differentiate)
+        padded = -(-width * CHANNELS // LANES) * LANES + 2 * PAD
+        derivatives = arena.take("derivatives", (3 * height * padded if differentiate else 0,), np.float32)
+        memory = arena.take("memory", (SHARDS, 5 * (TAPS + 1) * padded + LANES), np.float32)
+        common = (height, width, pixels, wanted, divisor, derivatives)
 
         def similarity(shard: int) -> None:
             if edges[shard] < edges[shard + 1]:
-                common = (height, width, pixels, wanted, divisor, derivatives)
-                similarity_rows(edges[shard], edges[shard + 1], *common, sums[shard])
+                similarity_rows(memory[shard], edges[shard], edges[shard + 1], *common, sums[shard])
 
         self._runner.run(SHARDS, similarity)
         total_similarity, total_l1 = (float(value) / numbers for value in sums.sum(0))
@@ -245,16 +259,10 @@ class CompiledLoss:
 
         def differentiate_rows(shard: int) -> None:
             if edges[shard] < edges[shard + 1]:
-                common = (height, width, pixels, wanted, divisor, derivatives)
-                gradient_rows(edges[shard], edges[shard + 1], *common, *factors, flat)
+                gradient_rows(memory[shard], edges[shard], edges[shard + 1], *common, *factors, flat)
 
         self._runner.run(SHARDS, differentiate_rows)
         return total_similarity, total_l1, gradient
-
-    @staticmethod
-    def _derivatives(arena: Arena, height: int, width: int, wanted: bool) -> NDArray[np.float32]:
-        padded = -(-width * CHANNELS // LANES) * LANES + 2 * PAD
-        return arena.take("derivatives", (3 * height * padded if wanted else 0,), np.float32)
 
 
 class _Holder:

@@ -16,16 +16,18 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
+from scipy.spatial import cKDTree
 
 from gsbench.config import EvalConfig, SceneConfig, TrainConfig, sha256_of
 from gsbench.densify import Densifier
 from gsbench.eval.protocol import Evaluator, get_protocol, quantize, summarize
 from gsbench.gaussians.initial import gaussians_from_cloud
-from gsbench.gaussians.model import MAX_SH_DEGREE
+from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Sfm, read_cloud
 from gsbench.init.base import MODEL_FOLDER, REPORT_FILE, Initializer
 from gsbench.pipeline.components import available_threads, options_of
+from gsbench.pipeline.maps import view_maps
 from gsbench.pipeline.progress import Report, progress
 from gsbench.pipeline.store import Entry, Stage, Store, write_json
 from gsbench.pipeline.trainer import Status, Trainer
@@ -181,6 +183,7 @@ def keep_ground_truth(store: Store, scene: Scene, scene_inputs: dict[str, Any], 
 def evaluate(
     store: Store,
     scene: Scene,
+    init: Entry,
     trained: Entry,
     rasterizer: Rasterizer,
     train_options: TrainConfig,
@@ -196,6 +199,7 @@ def evaluate(
         "train": trained.key,
         "protocol": evaluator.protocol.id,
         "unavailable": sorted(evaluator.unavailable),  # so that weights that arrive later are used
+        "maps": options.maps,
     }
 
     def build(folder: Path) -> None:
@@ -211,11 +215,22 @@ def evaluate(
                 image = quantize(rendered).cpu().numpy()  # [H, W, 3] uint8
                 Image.fromarray(image).save(folder / "renders" / png_name(view.name))
                 per_view[view.name] = evaluator.evaluate_view(image, view.image)
+        if options.maps:
+            write_maps(folder / "maps", scene, init, gaussians, rasterizer)
         write_per_view(folder / PER_VIEW_FILE, per_view)
         metrics = {"metrics": summarize(per_view, evaluator.unavailable), "unavailable": evaluator.unavailable}
         write_json(folder / METRICS_FILE, metrics)
 
     return store.get(EVALUATE, inputs, build)
+
+
+def write_maps(folder: Path, scene: Scene, init: Entry, gaussians: Gaussians, rasterizer: Rasterizer) -> None:
+    """One ``<view>.npz`` for each test view (see ``view_maps``)."""
+    folder.mkdir(exist_ok=True)
+    points = cKDTree(read_cloud(init.path / MODEL_FOLDER).points)
+    for view in scene.test:
+        maps = view_maps(rasterizer, gaussians, view.camera, points)
+        np.savez_compressed(folder / Path(png_name(view.name)).with_suffix(".npz"), **maps)
 
 
 def png_name(view_name: str) -> str:

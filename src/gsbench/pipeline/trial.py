@@ -96,7 +96,9 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
             store, scene, inputs, init, densifier, rasterizer, train_options, values["seed"], device
         )
         ground_truth = stages.keep_ground_truth(store, scene, inputs, init)
-        evaluated = stages.evaluate(store, scene, trained, rasterizer, train_options, eval_options, device)
+        evaluated = stages.evaluate(
+            store, scene, init, trained, rasterizer, train_options, eval_options, device
+        )
         _publish(paths.folder, trained, evaluated, ground_truth)
         results = _results(values, capture.fingerprint, scene, init, trained, evaluated, rasterizer.name)
         done = paths.folder / RESULTS
@@ -170,10 +172,15 @@ def _publish(folder: Path, trained: Entry, evaluated: Entry, ground_truth: Entry
         if (trained.path / name).exists():
             _link(trained.path / name, folder / name)
     _link(evaluated.path / stages.PER_VIEW_FILE, folder / stages.PER_VIEW_FILE)
-    for source, target in ((evaluated.path / "renders", "renders"), (ground_truth.path, "ground_truth")):
-        (folder / target).mkdir(exist_ok=True)
-        for picture in sorted(source.glob("*.png")):
-            _link(picture, folder / target / picture.name)
+    sources = {
+        "renders": evaluated.path / "renders",
+        "ground_truth": ground_truth.path,
+        "maps": evaluated.path / "maps",
+    }
+    for target, source in sources.items():
+        for file in sorted([*source.glob("*.png"), *source.glob("*.npz")]):
+            (folder / target).mkdir(exist_ok=True)
+            _link(file, folder / target / file.name)
 
 
 def _link(source: Path, target: Path) -> None:

@@ -58,7 +58,7 @@ def _check_camera(camera: Camera) -> None:
 
 
 def raise_for_values(gaussians: Gaussians) -> None:
-    """Raise ValueError on the first parameter with a non-finite value or a quaternion without length, if there is one."""
+    """Raise ValueError on the first parameter that has a non-finite value or, of quaternions, no length."""
     for name, tensor in gaussians.tensors().items():
         finite = torch.isfinite(tensor.detach())
         while finite.dim() > 1:

@@ -30,8 +30,8 @@ _LEAF, _DEEP_LEAF, _PALE_LEAF = (0.10, 0.20, 0.045), (0.055, 0.13, 0.04), (0.17,
 class Layout:
     """The primitives as arrays, sorted by group; a group is a box in space that rays test first.
 
-    ``size``: BOX half extents; SPHERE (radius, -, -); TUBE (outer radius, half height, inner radius or 0), axis
-    along local z; and, fourth, the radius of the bounding sphere. ``rotation`` [S, 3, 3] takes local to world directions.
+    ``size``: BOX half extents; SPHERE (radius, -, -); TUBE (outer radius, half height, inner radius or 0), axis along
+    local z; and, fourth, the radius of the bounding sphere. ``rotation`` [S, 3, 3] takes local to world directions.
     """
 
     kind: NDArray[np.int64]  # [S]

@@ -10,9 +10,9 @@ from pathlib import Path
 from jinja2 import Environment, StrictUndefined
 
 from gsbench.errors import InputError
-from gsbench.eval.cells import by_key
+from gsbench.eval.cells import by_key, with_variants
 from gsbench.eval.errors_by_region import read_image
-from gsbench.eval.pairing import ViewCache, arm_name
+from gsbench.eval.pairing import BASELINE, ViewCache, arm_name, choose_pairs
 from gsbench.eval.paper import inconsistencies, load_paper
 from gsbench.eval.paper_tables import PAPER_TABLES, paper_tables
 from gsbench.eval.report.crops import data_uri
@@ -23,8 +23,8 @@ from gsbench.eval.report.sections import (
     training_charts,
     volume_charts,
 )
+from gsbench.eval.report.tradeoff_charts import tradeoff_charts, tradeoff_gaps
 from gsbench.eval.results import Experiment, Trial, load_experiment
-from gsbench.eval.statistics import all_arms_pairs
 from gsbench.eval.table_formats import to_html
 from gsbench.eval.tables import build_table
 
@@ -39,10 +39,11 @@ def main_report(argv: Sequence[str], runs_dir: Path) -> int:
     )
     parser.add_argument("experiment")
     parser.add_argument("--out", type=Path, metavar="FILE", help=f"default: {REPORT_NAME} in the experiment's folder")
+    parser.add_argument("--baseline", default=BASELINE, help=f"the densifier that others are held against ({BASELINE})")
     options = parser.parse_args(argv)
     experiment = load_experiment(runs_dir, options.experiment)
     path = options.out or experiment.folder / REPORT_NAME
-    text = build_report(experiment)
+    text = build_report(experiment, options.baseline)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(f".{path.name}.tmp")
@@ -54,12 +55,12 @@ def main_report(argv: Sequence[str], runs_dir: Path) -> int:
     return 0
 
 
-def build_report(experiment: Experiment) -> str:
-    """The report as HTML; a pure function of the experiment's files."""
-    trials = experiment.trials
-    arms = sorted({(trial.init, trial.densify) for trial in trials})
+def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
+    """The report as HTML, with every densifier held against ``baseline``; a pure function of the experiment's files."""
+    trials = with_variants(experiment.trials)
+    arms = sorted({trial.arm for trial in trials})
     views = ViewCache()
-    versus = [compare_arms(trials, first, second, views) for first, second in all_arms_pairs(arms)]
+    versus = [compare_arms(trials, first, second, views) for first, second in choose_pairs(arms, baseline)]
     is_paper = experiment.name in PAPER_TABLES
     tables = paper_tables(experiment, experiment.name) if is_paper else [build_table(experiment)]
     volumes, volume_notes = volume_charts(trials, arms)
@@ -77,6 +78,8 @@ def build_report(experiment: Experiment) -> str:
         versus=versus,
         tables=[to_html(table) for table in tables],
         contradictions=inconsistencies(load_paper()) if is_paper else [],
+        tradeoffs=tradeoff_charts(trials),
+        gaps=tradeoff_gaps(trials, baseline),
         training=training_charts(trials, arms),
         events=event_charts(trials, arms),
         volumes=volumes,
@@ -91,7 +94,7 @@ def build_report(experiment: Experiment) -> str:
 def trial_figures(trials: Sequence[Trial]) -> list[tuple[str, str]]:
     """(caption, data URI) of the pictures that trials left for the report; one seed of each scene and arm."""
     found = []
-    for group in by_key(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values():
+    for group in by_key(trials, lambda trial: (trial.scene, trial.arm)).values():
         trial = group[0]
         for path in sorted((trial.path / FIGURES).glob("*.png")):
             caption = f"{path.stem.replace('_', ' ')}: {trial.scene}, {trial.init}-{trial.densify}, seed {trial.seed}"

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import html
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-WIDTH, HEIGHT = 420, 260
-LEFT, RIGHT, TOP, BOTTOM = 58, 12, 12, 44
+WIDTH, HEIGHT = 380, 250  # px at full size; text is 12 px
+LEFT, RIGHT, TOP, BOTTOM = 62, 18, 12, 44
 COLORS = ("#4477aa", "#cc3311", "#228833", "#aa3377", "#b8860b", "#0099a8")  # told apart also by colour-blind readers
 DASHES = ("", "6 3", "2 3", "8 3 2 3", "1 2", "10 4")
 TICKS = 5
+THOUSANDS = 1e4  # from here on numbers are written with k or M
 
 
 @dataclass(frozen=True)
@@ -68,11 +70,7 @@ def line_chart(
                 f'<circle cx="{x_axis.place(x):.1f}" cy="{y_axis.place(y):.1f}" r="3.5" fill="{color}"/>'
                 for x, y in one.points
             ]
-    ends = "; ".join(
-        f"{s.name} from {_short(s.points[0][1])} at {_short(s.points[0][0])} to {_short(s.points[-1][1])} at "
-        f"{_short(s.points[-1][0])}"
-        for s in shown
-    )
+    ends = "; ".join(f"{s.name} from {_point(s.points[0])} to {_point(s.points[-1])}" for s in shown)
     return _figure(title, f"{y_label} against {x_label}: {ends}.", parts, HEIGHT, [s.name for s in shown])
 
 
@@ -94,14 +92,14 @@ def bar_chart(title: str, labels: Sequence[str], series: Sequence[tuple[str, Seq
             parts.append(
                 f'<rect x="{start + index * bar:.1f}" y="{min(top, base):.1f}" width="{bar * 0.92:.1f}" '
                 f'height="{height:.1f}" fill="{COLORS[index % len(COLORS)]}"><title>{_escape(name)}, {_escape(label)}: '
-                f"{_short(row[place])}</title></rect>"
+                f"{short_number(row[place])}</title></rect>"
             )
         parts.append(_text(LEFT + (place + 0.5) * slot, HEIGHT - BOTTOM + 16, label, "middle"))
     words = "; ".join(
-        f"{label}: " + ", ".join(f"{name} {_short(row[place])}" for name, row in series)
+        f"{label}: " + ", ".join(f"{name} {short_number(row[place])}" for name, row in series)
         for place, label in enumerate(labels)
     )
-    return _figure(title, f"{y_label}. {words}.", parts, HEIGHT, [name for name, _ in series])
+    return _figure(title, f"{y_label}. {words}.", parts, HEIGHT, [name for name, _ in series], dashed=False)
 
 
 def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int) -> str:
@@ -117,7 +115,7 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
     for tick in axis.ticks:
         x = axis.place(tick)
         parts.append(f'<line class="grid" x1="{x:.1f}" x2="{x:.1f}" y1="{TOP}" y2="{bottom}"/>')
-        parts.append(_text(x, bottom + 15, _short(tick), "middle"))
+        parts.append(_text(x, bottom + 15, axis.label(tick), "middle"))
     zero = axis.place(0.0)
     parts.append(f'<line class="axis" x1="{zero:.1f}" x2="{zero:.1f}" y1="{TOP}" y2="{bottom}"/>')
     for index, row in enumerate(rows):
@@ -134,9 +132,9 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
         parts.append(_text(left - 8, y + 4, row.label, "end"))
     parts.append(_text((left + WIDTH - RIGHT) / 2, height - 6, x_label, "middle"))
     words = "; ".join(
-        f"{row.label} {_short(row.mean)}"
+        f"{row.label} {short_number(row.mean)}"
         + (
-            f", interval {_short(row.low)} to {_short(row.high)}"
+            f", interval {short_number(row.low)} to {short_number(row.high)}"
             if row.low is not None and row.high is not None
             else ""
         )
@@ -159,6 +157,14 @@ class _Axis:
         zero_based = not log and min(values) == 0.0
         self._low, self._high = (low if zero_based else low - margin), high + margin
         self.ticks = self._log_ticks() if log else _round_ticks(self._low, self._high)
+
+    def label(self, tick: float) -> str:
+        """The tick's value with as many digits as tell it from its neighbours."""
+        step = min((b - a for a, b in itertools.pairwise(self.ticks)), default=0.0)
+        if self._log or step == 0 or abs(tick) >= THOUSANDS:
+            return short_number(tick)
+        decimals = max(0, math.ceil(-math.log10(step) - 1e-9) + (f"{step:e}"[2] != "0"))
+        return f"{tick:.{decimals}f}".replace("-", "−")
 
     def place(self, value: float) -> float:
         part = (self._scale(value) - self._low) / (self._high - self._low)
@@ -189,7 +195,7 @@ def _round_ticks(low: float, high: float) -> list[float]:
 def _frame(x_axis: _Axis, y_axis: _Axis, x_label: str, y_label: str) -> str:
     bottom = HEIGHT - BOTTOM
     parts = [_y_grid(y_axis, y_label)]
-    parts += [_text(x_axis.place(tick), bottom + 16, _short(tick), "middle") for tick in x_axis.ticks]
+    parts += [_text(x_axis.place(tick), bottom + 16, x_axis.label(tick), "middle") for tick in x_axis.ticks]
     parts.append(_text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, x_label, "middle"))
     return "".join(parts)
 
@@ -199,7 +205,7 @@ def _y_grid(axis: _Axis, label: str) -> str:
     for tick in axis.ticks:
         y = axis.place(tick)
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(_text(LEFT - 6, y + 4, _short(tick), "end"))
+        parts.append(_text(LEFT - 6, y + 4, axis.label(tick), "end"))
     middle = (TOP + HEIGHT - BOTTOM) / 2
     parts.append(
         f'<text x="12" y="{middle}" transform="rotate(-90 12 {middle})" text-anchor="middle">{_escape(label)}</text>'
@@ -207,10 +213,12 @@ def _y_grid(axis: _Axis, label: str) -> str:
     return "".join(parts)
 
 
-def _figure(title: str, words: str, parts: Sequence[str], height: float, names: Sequence[str]) -> str:
+def _figure(
+    title: str, words: str, parts: Sequence[str], height: float, names: Sequence[str], dashed: bool = True
+) -> str:
     keys = "".join(
         f'<li><svg viewBox="0 0 26 8" width="26" height="8" aria-hidden="true"><line x1="0" x2="26" y1="4" y2="4" '
-        f'stroke="{COLORS[i % len(COLORS)]}" stroke-width="3" stroke-dasharray="{DASHES[i % len(DASHES)]}"/></svg>'
+        f'stroke="{COLORS[i % len(COLORS)]}" stroke-width="3" stroke-dasharray="{DASHES[i % len(DASHES)] if dashed else ""}"/></svg>'
         f"{_escape(name)}</li>"
         for i, name in enumerate(names)
     )
@@ -226,10 +234,14 @@ def _text(x: float, y: float, text: str, anchor: str) -> str:
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{_escape(text)}</text>'
 
 
-def _short(value: float) -> str:
-    """A number as short as a tick label needs it."""
+def _point(point: tuple[float, float]) -> str:
+    return f"{short_number(point[1])} at {short_number(point[0])}"
+
+
+def short_number(value: float) -> str:
+    """A number as short as a tick label needs it, such as 26k or −0.02."""
     size = abs(value)
-    for limit, suffix in ((1e6, "M"), (1e4, "k")):
+    for limit, suffix in ((1e6, "M"), (THOUSANDS, "k")):
         if size >= limit:
             return f"{value / {'M': 1e6, 'k': 1e3}[suffix]:.3g}{suffix}".replace("-", "−")
     text = f"{value:.0e}" if 0 < size < 1e-4 else f"{value:.3g}" if size < 1000 else f"{value:.0f}"

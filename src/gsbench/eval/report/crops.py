@@ -15,7 +15,7 @@ from gsbench.errors import InputError
 from gsbench.eval.errors_by_region import GROUND_TRUTH, RENDERS, absolute_error, read_image, view_names
 from gsbench.eval.results import Trial
 
-CROP = 128  # px a side
+CROP = 128  # px a side, but at most a third of the image
 SHOWN = 288  # px: crops are enlarged to it without smoothing, so that pixels stay pixels
 
 
@@ -84,7 +84,7 @@ def _extremes(
 ) -> list[tuple[float, tuple[int, int, int, int]]]:
     """The boxes of largest and smallest mean gain of the second image in a view."""
     gain = absolute_error(first, truth) - absolute_error(second, truth)  # [H, W]
-    height, width = (min(CROP, size) for size in gain.shape)
+    height = width = max(1, min(CROP, min(gain.shape) // 3))
     sums = np.pad(gain.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))  # integral image
     boxes = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
     found = []

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from gsbench.errors import InputError
 from gsbench.eval.cells import by_key
 from gsbench.eval.errors_by_region import MAP_PROPERTIES, RegionErrors, errors_by_region
-from gsbench.eval.pairing import Arm, ViewCache, arm_name, pair_arms, pair_trials
+from gsbench.eval.pairing import ViewCache, arm_name, pair_arms, pair_trials
 from gsbench.eval.quantities import Quantity, choose_quantities
-from gsbench.eval.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
+from gsbench.eval.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart, short_number
 from gsbench.eval.report.crops import Crop, choose_crops
 from gsbench.eval.report.volumes import share_above, volume_histogram
-from gsbench.eval.results import Trial, read_json_lines
+from gsbench.eval.results import Arm, Trial, read_json_lines
 from gsbench.eval.statistics import Comparison, compare, seeds_needed
 from gsbench.eval.tables import cost_change
 from gsbench.eval.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve
@@ -71,7 +71,7 @@ def compare_arms(trials: Sequence[Trial], first: Arm, second: Arm, views: ViewCa
     """Verdicts, costs, forest plots, regions and crops of two arms; what cannot be had is said in the notes."""
     notes: list[str] = []
     verdicts = []
-    own = [trial for trial in trials if (trial.init, trial.densify) in (first, second)]
+    own = [trial for trial in trials if trial.arm in (first, second)]
     for quantity in choose_quantities(own):
         if quantity.cost or quantity.direction == 0:
             continue
@@ -112,7 +112,7 @@ def training_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
     for key, title, y_label in CURVES:
         series = []
         for arm in arms:
-            own = [trial for trial in trials if (trial.init, trial.densify) == arm]
+            own = [trial for trial in trials if trial.arm == arm]
             points = mean_by_step([_rows(trial, "metrics.jsonl", key) for trial in own])
             series.append(Series(arm_name(arm), points))
         charts.append(line_chart(title, series, "iteration", y_label))
@@ -123,7 +123,7 @@ def event_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
     """Events by cause: totals of every arm, and over the iterations of each arm."""
     totals = []
     for arm in arms:
-        own = [trial.data.get("events") or {} for trial in trials if (trial.init, trial.densify) == arm]
+        own = [trial.data.get("events") or {} for trial in trials if trial.arm == arm]
         totals.append(
             (arm_name(arm), {c: statistics.fmean(float(events.get(c, 0)) for events in own) for c in EVENT_CAUSES})
         )
@@ -134,7 +134,7 @@ def event_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
     bars = [(name, [counts[cause] for cause in causes]) for name, counts in totals]
     charts = [bar_chart("Refinement by cause, mean of a trial", labels, bars, "Gaussians")]
     for arm in arms:
-        own = [trial for trial in trials if (trial.init, trial.densify) == arm]
+        own = [trial for trial in trials if trial.arm == arm]
         series = [
             Series(label, mean_by_step([_rows(trial, EVENTS_FILE, cause) for trial in own]))
             for cause, label in zip(causes, labels, strict=True)
@@ -149,7 +149,7 @@ def volume_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> tuple[list[st
     final = []
     threshold = _threshold(trials)
     for arm in arms:
-        own = [trial for trial in trials if (trial.init, trial.densify) == arm]
+        own = [trial for trial in trials if trial.arm == arm]
         try:
             final.append(Series(arm_name(arm), volume_histogram(own)))
             if threshold:
@@ -160,7 +160,7 @@ def volume_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> tuple[list[st
     title = "Volumes of the trained Gaussians"
     charts = [line_chart(title, final, "volume (cubed scene units)", "share", log_x=True, log_y=True, marker=marker)]
     for arm in arms:
-        own = [trial for trial in trials if (trial.init, trial.densify) == arm]
+        own = [trial for trial in trials if trial.arm == arm]
         series = [Series(f"iteration {step}", points) for step, points in _logged_histograms(own).items()]
         title = f"Volumes during training: {arm_name(arm)}"
         charts.append(
@@ -218,13 +218,14 @@ def _headline(verdicts: Sequence[Verdict], first: Arm, second: Arm) -> str:
 
 
 def _costs(trials: Sequence[Trial], first: Arm, second: Arm) -> list[str]:
-    arms = [[trial for trial in trials if (trial.init, trial.densify) == arm] for arm in (first, second)]
+    arms = [[trial for trial in trials if trial.arm == arm] for arm in (first, second)]
     lines = []
-    for name, key in (("Gaussians", "gaussians"), ("training time", "seconds")):
+    for name, key in (("Gaussians", "gaussians"), ("Training time", "seconds")):
         change = cost_change(arms[0], arms[1], COST_READERS[key])
         if change is not None:
             of_totals, of_scenes, scenes = change
-            lines.append(f"{name} {of_totals:+.1%} (ratio of totals; mean of {scenes} scenes {of_scenes:+.1%})")
+            rules = f"ratio of totals; mean of {scenes} scenes {of_scenes:+.1%}"
+            lines.append(f"{name} {of_totals:+.1%} ({rules})")
         gap = curve_gap(*(training_curve(own, key, "psnr") for own in arms))
         if gap is not None:
             lines.append(_gap_words(gap, name))
@@ -232,7 +233,9 @@ def _costs(trials: Sequence[Trial], first: Arm, second: Arm) -> list[str]:
 
 
 def _gap_words(gap: CurveGap, cost: str) -> str:
-    return f"PSNR at equal {cost} during training {gap.gap:+.2f} dB on average (from {gap.low:.3g} to {gap.high:.3g})"
+    amount = f"{gap.gap:+.2f}".replace("-", "−")
+    span = f"{short_number(gap.low)} to {short_number(gap.high)}"
+    return f"PSNR at equal {cost} during training {amount} dB on average ({span})"
 
 
 def _forest(verdict: Verdict) -> str:
@@ -285,7 +288,7 @@ def _logged_histograms(trials: Sequence[Trial]) -> dict[int, list[tuple[float, f
 
 def _threshold(trials: Sequence[Trial]) -> float | None:
     """The volume threshold in scene units, where every arm that has one has this one."""
-    settings = [group[0].config for group in by_key(trials, lambda trial: (trial.init, trial.densify)).values()]
+    settings = [group[0].config for group in by_key(trials, lambda trial: trial.arm).values()]
     found = {
         config["densify.volume_threshold"]
         for config in settings

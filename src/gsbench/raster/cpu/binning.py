@@ -1,7 +1,8 @@
 """Which records each tile composites, front to back.
 
-The records are sorted once by depth; shards of the sorted order are then counted and filled in that order, so the list of
-every tile comes out sorted. A tile that the contour alpha = 1/255 does not reach is left out: nothing there could be seen.
+The records are sorted once by depth; shards of the sorted order are then counted and filled in that order, so the list
+of every tile comes out sorted. A tile that the contour alpha = 1/255 does not reach is left out: nothing there could be
+seen.
 """
 
 from __future__ import annotations
@@ -13,9 +14,12 @@ import numpy as np
 
 from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.jit import inlined, kernel
+from gsbench.raster.cpu.simd import prefetch
 
 LOG2_ALPHA_MIN_MARGIN = 1e-3  # of the contour's reach, for float32
 PIXEL_MARGIN = 0.02  # px
+LOW_WORD = np.uint64(0xFFFFFFFF)  # of a key: the record
+AHEAD = 12  # records that the prefetch runs ahead
 TILE_WORK = 16  # list entries that the fixed work of a tile weighs
 
 
@@ -41,11 +45,15 @@ def _columns(records: Any, base: int, tile_y: int, first: int, past: int, cutoff
 
 
 @kernel
-def count_shard(begin: int, end: int, keys: Any, records: Any, record_ints: Any, tiles_x: int, cutoff: Any, counts: Any) -> None:
+def count_shard(
+    begin: int, end: int, keys: Any, records: Any, record_ints: Any, tiles_x: int, cutoff: Any, counts: Any
+) -> None:
     """Add to ``counts`` [tiles] the records of the sorted ``keys`` ``begin`` to ``end``."""
-    counts[:] = 0
+    for tile in range(len(counts)):
+        counts[tile] = 0
     for position in range(begin, end):
-        base = int(keys[position] & np.uint64(0xFFFFFFFF)) * at.RECORD
+        prefetch(records, int(keys[min(position + AHEAD, end - 1)] & LOW_WORD) * at.RECORD)
+        base = int(keys[position] & LOW_WORD) * at.RECORD
         spans_x, spans_y = record_ints[base + at.TILES_X], record_ints[base + at.TILES_Y]
         first, past = spans_x & 0xFFFF, spans_x >> 16
         for tile_y in range(spans_y & 0xFFFF, spans_y >> 16):
@@ -58,7 +66,7 @@ def count_shard(begin: int, end: int, keys: Any, records: Any, record_ints: Any,
 
 @kernel
 def start_tiles(counts: Any, starts: Any) -> None:
-    """Turn ``counts`` [shards, tiles] into the place of each shard's first entry; ``starts`` [tiles + 1] of each tile."""
+    """Turn ``counts`` [shards, tiles] into the places of first entries; ``starts`` [tiles + 1] gets those of the tiles."""
     shards, tiles = counts.shape
     place = 0
     for tile in range(tiles):
@@ -72,11 +80,20 @@ def start_tiles(counts: Any, starts: Any) -> None:
 
 @kernel
 def fill_shard(
-    begin: int, end: int, keys: Any, records: Any, record_ints: Any, tiles_x: int, cutoff: Any, places: Any, entries: Any
+    begin: int,
+    end: int,
+    keys: Any,
+    records: Any,
+    record_ints: Any,
+    tiles_x: int,
+    cutoff: Any,
+    places: Any,
+    entries: Any,
 ) -> None:
-    """Write the records of the sorted ``keys`` ``begin`` to ``end`` to the lists of their tiles, at ``places`` [tiles]."""
+    """Write the records of the sorted ``keys`` ``begin`` to ``end`` to their tiles' lists, at ``places`` [tiles]."""
     for position in range(begin, end):
-        record = int(keys[position] & np.uint64(0xFFFFFFFF))
+        prefetch(records, int(keys[min(position + AHEAD, end - 1)] & LOW_WORD) * at.RECORD)
+        record = int(keys[position] & LOW_WORD)
         base = record * at.RECORD
         spans_x, spans_y = record_ints[base + at.TILES_X], record_ints[base + at.TILES_Y]
         first, past = spans_x & 0xFFFF, spans_x >> 16
@@ -105,5 +122,3 @@ def balance_tiles(starts: Any, shards: int, bounds: Any, tile_shard: Any) -> Non
                 tile_shard[tile] = shard
                 tile += 1
         bounds[shard + 1] = tile
-
-

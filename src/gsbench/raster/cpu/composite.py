@@ -75,6 +75,7 @@ def _touched_blocks(records: Any, base: int, tile_x: Any, tile_y: Any, column: A
 
 @kernel
 def composite_tiles(
+    memory: Any,
     first: int,
     past: int,
     starts: Any,
@@ -92,17 +93,16 @@ def composite_tiles(
 ) -> None:
     """Blend the tiles ``first`` to ``past``.
 
-    In: ``starts`` [tiles + 1], ``entries`` [pairs], ``records``, ``background`` [3]. Out: ``image`` [H * W * 3], ``alpha``
-    [H * W]; for the backward pass ``masks`` [pairs] uint16, ``processed`` [tiles], and by tile, block and lane
-    [tiles * 256] the final ``transmittance`` and ``last``, the number of the last entry that was blended, plus one.
+    In: ``starts`` [tiles + 1], ``entries`` [pairs], ``records``, ``background`` [3]. Out: ``image`` [H * W * 3],
+    ``alpha`` [H * W]; for the backward pass ``masks`` [pairs] uint16, ``processed`` [tiles], and by tile, block and
+    lane [tiles * 256] the final ``transmittance`` and ``last``, the number of the last entry that was blended, plus
+    one.
     """
     tiles_x = (width + at.TILE - 1) // at.TILE
     lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
     column, row = lane_x * np.float32(at.BLOCK), lane_y * np.float32(at.BLOCK)
-    red = np.empty(at.TILE_PIXELS, np.float32)
-    green = np.empty(at.TILE_PIXELS, np.float32)
-    blue = np.empty(at.TILE_PIXELS, np.float32)
-    live = np.empty(16, np.uint64)
+    floats, _, live = memory
+    red, green, blue = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :], floats[2 * at.TILE_PIXELS :]
     for tile in range(first, past):
         left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
         tile_x, tile_y = np.float32(left), np.float32(top)
@@ -158,7 +158,7 @@ def composite_tiles(
                     used |= bit
                 stopped = mask_bits(stop)
                 if stopped != 0:
-                    live[block] &= ~stopped
+                    live[block] &= ~np.int64(stopped)
                     if live[block] == 0:
                         alive &= ~bit
             masks[entry] = used
@@ -189,6 +189,7 @@ def _place_in_tile(x: int, y: int) -> int:
 
 @kernel
 def decomposite_tiles(
+    memory: Any,
     first: int,
     past: int,
     starts: Any,
@@ -209,16 +210,14 @@ def decomposite_tiles(
     """Add the gradient sums of the tiles ``first`` to ``past`` to ``rows`` [N * 16], back to front.
 
     Behind a record lies light S = sum of later (c . g) alpha T plus what the background gets; the loss changes with its
-    alpha by T (c . g) - S / (1 - alpha). Going back to front S grows from the background's part, so that nothing cancels.
-    ``g_alpha`` may be empty for zero. ``want_absolute`` is True or None: a value that numba compiles out.
+    alpha by T (c . g) - S / (1 - alpha). Going back to front S grows from the background's part, so that nothing
+    cancels. ``g_alpha`` may be empty for zero. ``want_absolute`` is True or None: a value that numba compiles out.
     """
     tiles_x = (width + at.TILE - 1) // at.TILE
     lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
-    red = np.empty(at.TILE_PIXELS, np.float32)
-    green = np.empty(at.TILE_PIXELS, np.float32)
-    blue = np.empty(at.TILE_PIXELS, np.float32)
-    behind = np.empty(at.TILE_PIXELS, np.float32)  # S
-    through = np.empty(at.TILE_PIXELS, np.float32)  # T behind the current record
+    floats, _, _ = memory
+    red, green, blue = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :], floats[2 * at.TILE_PIXELS :]
+    behind, through = floats[3 * at.TILE_PIXELS :], floats[4 * at.TILE_PIXELS :]  # S, and T behind the current record
     for tile in range(first, past):
         left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
         tile_x, tile_y = np.float32(left), np.float32(top)

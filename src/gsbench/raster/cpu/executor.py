@@ -36,8 +36,8 @@ def available_threads() -> int:
 class CpuRasterizer:
     """float32 on the CPU, compiled by numba at first use; the same bits on every run and for any number of ``threads``.
 
-    Each render keeps its intermediate results until its graph is freed; memory is kept and used again. Safe to call from
-    several threads.
+    Each render keeps its intermediate results until its graph is freed; memory is kept and used again. Safe to call
+    from several threads.
     """
 
     name = "cpu"
@@ -65,7 +65,9 @@ class CpuRasterizer:
         """See ``raster.base.Rasterizer``. Raises ValueError naming the parameter that cannot be used."""
         check_settings(gaussians, camera, sh_degree, background)
         if gaussians.means.dtype != torch.float32 or gaussians.means.device.type != "cpu":
-            raise ValueError(f"means: raster=cpu needs float32 on the cpu, got {gaussians.means.dtype} on {gaussians.means.device}")
+            raise ValueError(
+                f"means: raster=cpu needs float32 on the cpu, got {gaussians.means.dtype} on {gaussians.means.device}"
+            )
         screen_points = torch.zeros(len(gaussians), 2, requires_grad=True)
         absolute = torch.zeros(len(gaussians), 2) if absolute_gradient else None
         image, alpha, radii = _Render.apply(
@@ -123,7 +125,9 @@ def _forward(
 
     def project(shard: int) -> None:
         begin, end = edges[shard], edges[shard + 1]
-        project_shard(begin, end, *arrays, degree, view, records, record_ints, keys, radii_array, flags[shard])
+        project_shard(
+            at.kernel_memory(), begin, end, *arrays, degree, view, records, record_ints, keys, radii_array, flags[shard]
+        )
 
     run(GAUSSIAN_SHARDS, project)
     if flags[:, BAD_VALUE].any():
@@ -171,6 +175,7 @@ def _forward(
 def _tile_arguments(frame: _Frame, shard: int) -> tuple[Any, ...]:
     """The arguments that the two compositing kernels share."""
     return (
+        at.kernel_memory(),
         int(frame.bounds[shard]),
         int(frame.bounds[shard + 1]),
         frame.starts,
@@ -214,6 +219,7 @@ def _backward(
 
     def backproject(shard: int) -> None:
         backproject_shard(
+            at.kernel_memory(),
             edges[shard],
             edges[shard + 1],
             int(frame.visible[shard]),
@@ -224,14 +230,13 @@ def _backward(
             sh_rest,
             frame.degree,
             frame.view,
-            frame.records,
             frame.records.view(np.int32),
             frame.tile_shard,
-            rows,
+            rows.reshape(-1),
             g_means,
             g_log_scales,
             g_quaternions,
-            g_logits,
+            g_logits.reshape(count, 1),
             g_sh_dc,
             g_sh_rest.reshape(count, 45),
             g_screen.numpy(),
@@ -257,7 +262,16 @@ class _Render(torch.autograd.Function):
     """The bridge between the kernels and autograd."""
 
     @staticmethod
-    def forward(ctx: Any, rasterizer: CpuRasterizer, camera: Camera, degree: int, absolute: Tensor | None, background: Tensor, screen_points: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        ctx: Any,
+        rasterizer: CpuRasterizer,
+        camera: Camera,
+        degree: int,
+        absolute: Tensor | None,
+        background: Tensor,
+        screen_points: Tensor,
+        *tensors: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
         gaussians = Gaussians(*(tensor.contiguous() for tensor in tensors))
         ctx.holder = _Holder()
         arena = rasterizer._frames.lease(ctx.holder)
@@ -267,7 +281,7 @@ class _Render(torch.autograd.Function):
         background_array = background.detach().contiguous().numpy()
         ctx.frame = _forward(rasterizer, arena, gaussians, camera, degree, background_array, image, alpha, radii)
         ctx.rasterizer, ctx.absolute = rasterizer, absolute
-        ctx.save_for_backward(background, alpha if ctx.needs_input_grad[4] else None, *gaussians.tensors().values())
+        ctx.save_for_backward(alpha if ctx.needs_input_grad[4] else None, *gaussians.tensors().values())
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
         return image, alpha, radii
@@ -275,7 +289,7 @@ class _Render(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
-        background, alpha, *tensors = ctx.saved_tensors
+        alpha, *tensors = ctx.saved_tensors
         frame: _Frame = ctx.frame
         if g_image is None:
             g_image = torch.zeros(frame.view.height, frame.view.width, 3)

@@ -80,3 +80,46 @@ def direction_gradient(degree: int, x: Any, y: Any, z: Any, g: Any) -> Any:
             + T5 * (xx - yy) * g[14]
         )
     return gx, gy, gz
+
+
+@inlined
+def add_colors(degree: int, direction: Any, sh_dc: Any, sh_rest: Any, i: int, basis: Any, rgb: Any) -> int:
+    """Write the colour of Gaussian i to ``rgb`` [3]; returns a bit for each channel that was below 0 and is clamped."""
+    fill_basis(degree, direction[0], direction[1], direction[2], basis)
+    red, green, blue = basis[0] * sh_dc[i, 0], basis[0] * sh_dc[i, 1], basis[0] * sh_dc[i, 2]
+    for k in range((degree + 1) * (degree + 1) - 1):
+        red += basis[k + 1] * sh_rest[i, 3 * k]
+        green += basis[k + 1] * sh_rest[i, 3 * k + 1]
+        blue += basis[k + 1] * sh_rest[i, 3 * k + 2]
+    red, green, blue = red + HALF, green + HALF, blue + HALF
+    rgb[0] = ZERO if red < ZERO else red  # NaN stays
+    rgb[1] = ZERO if green < ZERO else green
+    rgb[2] = ZERO if blue < ZERO else blue
+    return (1 if red < ZERO else 0) + (2 if green < ZERO else 0) + (4 if blue < ZERO else 0)
+
+
+@inlined
+def pull_back_colors(
+    degree: int,
+    direction: Any,
+    g_rgb: Any,
+    sh_rest: Any,
+    i: int,
+    basis: Any,
+    g_basis: Any,
+    g_sh_dc: Any,
+    g_sh_rest: Any,
+) -> Any:
+    """Write the gradients of Gaussian i's coefficients; returns the gradient (not yet tangential) at its direction."""
+    red, green, blue = g_rgb
+    fill_basis(degree, direction[0], direction[1], direction[2], basis)
+    g_sh_dc[i, 0], g_sh_dc[i, 1], g_sh_dc[i, 2] = basis[0] * red, basis[0] * green, basis[0] * blue
+    used = (degree + 1) * (degree + 1) - 1
+    for k in range(used):
+        g_basis[k + 1] = red * sh_rest[i, 3 * k] + green * sh_rest[i, 3 * k + 1] + blue * sh_rest[i, 3 * k + 2]
+        g_sh_rest[i, 3 * k] = basis[k + 1] * red
+        g_sh_rest[i, 3 * k + 1] = basis[k + 1] * green
+        g_sh_rest[i, 3 * k + 2] = basis[k + 1] * blue
+    for k in range(3 * used, g_sh_rest.shape[1]):
+        g_sh_rest[i, k] = ZERO
+    return direction_gradient(degree, direction[0], direction[1], direction[2], g_basis)

@@ -20,8 +20,8 @@ _logger = logging.getLogger(__name__)
 def _cache_folder() -> Path:
     """Where compiled kernels are kept: a folder of its own for each state of the sources.
 
-    numba looks at the file of a kernel, not at what that file imports, so a changed helper would leave stale machine code
-    in use. Base: ``NUMBA_CACHE_DIR``, else the user's cache folder, else the temporary folder.
+    numba looks at the file of a kernel, not at what that file imports, so a changed helper would leave stale machine
+    code in use. Base: ``NUMBA_CACHE_DIR``, else the user's cache folder, else the temporary folder.
     """
     digest = hashlib.sha256(numba.__version__.encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
@@ -45,18 +45,22 @@ CACHE_FOLDER = _cache_folder()
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile ``function`` at its first call: without the GIL, without Python's division checks, cached on disk."""
+    """Compile ``function`` at its first call: without the GIL, without Python's division checks, cached on disk.
+
+    Also without reference counts (``_nrt``), which numba would keep, atomically, at each inlined call: a kernel borrows
+    all its arrays and may not allocate.
+    """
     previous = numba.config.CACHE_DIR  # read when the decorator runs; other users of numba in this process keep theirs
     numba.config.CACHE_DIR = str(CACHE_FOLDER)
     try:
-        return numba.njit(nogil=True, cache=True, error_model="numpy")(function)
+        return numba.njit(nogil=True, cache=True, error_model="numpy", _nrt=False)(function)
     finally:
         numba.config.CACHE_DIR = previous
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile ``function`` into the kernels that call it."""
-    return numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)
+    return numba.njit(nogil=True, error_model="numpy", forceinline=True, _nrt=False)(function)
 
 
 def announce_compilation() -> None:

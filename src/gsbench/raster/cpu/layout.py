@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gsbench.raster.base import RasterConstants
-from gsbench.raster.cpu.simd import LANES, SUM_LANES
+from gsbench.raster.cpu.simd import LANES, SUM_LANES, WIDE_LANES
 from gsbench.scene.camera import Camera
 
 BLOCK = 4  # px; one vector holds the 4x4 pixels of a block, row by row
@@ -13,8 +17,8 @@ TILE = 16  # px; a tile is 4x4 blocks, row by row; fixed by the 16-bit masks, ch
 TILE_PIXELS = TILE * TILE
 
 # A record: what compositing needs of one visible Gaussian, 16 float32, one cache line. With d = pixel - mean and
-# t = dx + SHEAR dy, log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2: the conic as a sum of squares, which, unlike
-# a dx^2 + 2b dx dy + c dy^2, does not cancel for needles and is never positive.
+# t = dx + SHEAR dy, log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2: the conic as a sum of squares, which,
+# unlike a dx^2 + 2b dx dy + c dy^2, does not cancel for needles and is never positive.
 RECORD = LANES
 MEAN_X, MEAN_Y = 0, 1  # px, integer pixel centres
 SHEAR = 2  # b / a
@@ -34,6 +38,15 @@ ROW = LANES
 SUM_H, SUM_H_T, SUM_H_Y, SUM_H_TT, SUM_H_TY, SUM_H_YY = SUM_LANES[:6]
 SUM_RED, SUM_GREEN, SUM_BLUE = SUM_LANES[6:9]
 SUM_ABS_T, SUM_ABS_Y = SUM_LANES[9:11]  # |h t|, |h (d power / d dy)|
+
+
+def kernel_memory() -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]]:
+    """Scratch memory for one call of a kernel; kernels allocate nothing themselves."""
+    return (
+        np.empty(5 * TILE_PIXELS, np.float32),
+        np.empty(2 * RECORD * WIDE_LANES, np.float64),
+        np.empty(LANES, np.int64),
+    )
 
 
 class View(NamedTuple):
@@ -71,6 +84,7 @@ class View(NamedTuple):
     sigma_extent: float
     eigenvalue_floor: float
     alpha_min: float
+    log2_alpha_min: float
 
 
 def make_view(camera: Camera, constants: RasterConstants) -> View:
@@ -97,4 +111,5 @@ def make_view(camera: Camera, constants: RasterConstants) -> View:
         constants.sigma_extent,
         constants.eigenvalue_floor,
         constants.alpha_min,
+        math.log2(constants.alpha_min),
     )

@@ -1,16 +1,17 @@
-"""Explicit SIMD values inside numba kernels: 16 floats in one LLVM vector.
+"""Explicit SIMD values inside numba kernels: 16 float32 or 8 float64 in one LLVM vector.
 
-Auto-vectorisation of numba loops is fragile: an unlucky index type makes an inner loop scalar. Here a ``<16 x float>`` is
-a value like any other: ``load`` and ``store`` move it, ``+ - * /``, ``-x`` and comparisons work lane by lane (a Python or
-numpy number is broadcast), comparisons give a ``<16 x i1>`` mask for ``select``, ``&``, ``|`` and ``~``. LLVM maps the vector to
-what the host has: one AVX-512 register, two of AVX2, four of SSE or NEON; the lanes' results do not depend on it,
-apart from ``fma``, which is fused only where the host can.
+Auto-vectorisation of numba loops is fragile: an unlucky index type makes an inner loop scalar. Here a vector is a value
+like any other: ``load`` and ``store`` move it, ``+ - * /``, ``-x`` and comparisons work lane by lane (a Python or numpy
+number is broadcast), comparisons give a mask for ``select``, ``&``, ``|`` and ``~``. LLVM maps the vector to what the
+host has: one AVX-512 register, two of AVX2, four of SSE or NEON; the lanes' results do not depend on it, apart from
+``fma``, which is fused only where the host can.
 
-Indices count array elements, are not checked and must not be negative. Arrays are contiguous, float32.
+Indices count array elements, are not checked and must not be negative. Arrays are contiguous.
 """
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -20,154 +21,178 @@ from numba.core import cgutils, types
 from numba.core.extending import intrinsic, lower_builtin, models, register_model
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 
-LANES = 16
-
-_F32 = ir.FloatType()
-_I32 = ir.IntType(32)
-_VECTOR = ir.VectorType(_F32, LANES)
-_INTEGERS = ir.VectorType(_I32, LANES)
-_MASK = ir.VectorType(ir.IntType(1), LANES)
+LANES = 16  # of float32
+WIDE_LANES = 8  # of float64
 
 
 class _Vector(types.Type):
-    """The numba type of 16 float32."""
+    """The numba type of ``lanes`` numbers of a type."""
 
-    def __init__(self) -> None:
-        super().__init__(name=f"float32x{LANES}")
+    def __init__(self, element: Any, lanes: int) -> None:
+        self.element, self.lanes = element, lanes
+        self.scalar_ir = ir.FloatType() if element == types.float32 else ir.DoubleType()
+        self.ir = ir.VectorType(self.scalar_ir, lanes)
+        self.bits_ir = ir.VectorType(ir.IntType(element.bitwidth), lanes)
+        self.suffix = f"v{lanes}f{element.bitwidth}"  # of LLVM's intrinsic functions
+        super().__init__(name=f"{element}x{lanes}")
+
+    def constant(self, value: float) -> ir.Constant:
+        return ir.Constant(self.ir, [ir.Constant(self.scalar_ir, value)] * self.lanes)
+
+    def bits(self, value: int) -> ir.Constant:
+        return ir.Constant(self.bits_ir, [ir.Constant(self.bits_ir.element, value)] * self.lanes)
 
 
 class _Mask(types.Type):
-    """The numba type of 16 truth values."""
+    """The numba type of ``lanes`` truth values."""
 
-    def __init__(self) -> None:
-        super().__init__(name=f"bool{LANES}")
+    def __init__(self, lanes: int) -> None:
+        self.lanes = lanes
+        self.ir = ir.VectorType(ir.IntType(1), lanes)
+        super().__init__(name=f"maskx{lanes}")
 
 
-vector_type = _Vector()
-mask_type = _Mask()
+_NARROW = _Vector(types.float32, LANES)
+_WIDE = _Vector(types.float64, WIDE_LANES)
+_OF_ARRAY = {types.float32: _NARROW, types.float64: _WIDE}
 
 
 @register_model(_Vector)
-class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
-    def __init__(self, manager: Any, frontend_type: Any) -> None:
-        super().__init__(manager, frontend_type, _VECTOR)
-
-
 @register_model(_Mask)
-class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
+class _Model(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager: Any, frontend_type: Any) -> None:
-        super().__init__(manager, frontend_type, _MASK)
+        super().__init__(manager, frontend_type, frontend_type.ir)
 
 
-# --- operators ----------------------------------------------------------------------------------------------------------
+# --- operators
+# ----------------------------------------------------------------------------------------------------------
 
 
-def _constant(value: float) -> ir.Constant:
-    return ir.Constant(_VECTOR, [ir.Constant(_F32, value)] * LANES)
+def _lane_indices(lanes: Sequence[int]) -> ir.Constant:
+    return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), [ir.Constant(ir.IntType(32), lane) for lane in lanes])
 
 
-def _integers(value: int) -> ir.Constant:
-    return ir.Constant(_INTEGERS, [ir.Constant(_I32, value)] * LANES)
-
-
-def _broadcast(builder: Any, scalar: Any) -> Any:
-    first = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), scalar, ir.Constant(_I32, 0))
-    return builder.shuffle_vector(first, ir.Constant(_VECTOR, ir.Undefined), ir.Constant(_INTEGERS, None))
-
-
-def _as_vector(context: Any, builder: Any, value: Any, frontend_type: Any) -> Any:
-    if isinstance(frontend_type, _Vector):
+def _as_vector(context: Any, builder: Any, value: Any, kind: Any, vector: _Vector) -> Any:
+    if isinstance(kind, _Vector):
         return value
-    return _broadcast(builder, context.cast(builder, value, frontend_type, types.float32))
+    scalar = context.cast(builder, value, kind, vector.element)
+    undefined = ir.Constant(vector.ir, ir.Undefined)
+    first = builder.insert_element(undefined, scalar, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(first, undefined, _lane_indices([0] * vector.lanes))
 
 
-def _register_binary(function: Any, operand: type, result: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
-    """Let ``function(a, b)`` of two ``operand`` values, or of a vector and a number, be what ``emit`` builds."""
+def _common_vector(kinds: Sequence[Any]) -> _Vector | None:
+    """The vector type of arguments of which each is that vector or a number; None if they are anything else."""
+    vectors = {kind for kind in kinds if isinstance(kind, _Vector)}
+    fits = len(vectors) == 1 and all(isinstance(kind, _Vector | types.Number) for kind in kinds)
+    return vectors.pop() if fits else None
 
-    @infer_global(function)
+
+def _register_operator(functions: Sequence[Any], arity: int, emit: Callable[..., Any], compares: bool = False) -> None:
+    """Let ``functions`` of vectors (or vectors and numbers) be what ``emit(builder, *operands)`` builds."""
+
     class _Template(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: Sequence[Any], kws: Any) -> Any:
-            vectors = sum(isinstance(argument, operand) for argument in args)
-            numbers = sum(isinstance(argument, types.Number) for argument in args) if operand is _Vector else 0
-            return signature(result, *args) if len(args) == 2 and vectors and vectors + numbers == 2 else None
+            vector = _common_vector(args) if len(args) == arity else None
+            return signature(_Mask(vector.lanes) if compares else vector, *args) if vector else None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        if operand is _Vector:
-            args = [_as_vector(context, builder, value, kind) for value, kind in zip(args, sig.args, strict=True)]
-        return emit(builder, *args)
+        vector = _common_vector(sig.args)
+        return emit(builder, *(_as_vector(context, builder, v, k, vector) for v, k in zip(args, sig.args, strict=True)))
 
-    lower_builtin(function, operand, operand)(lower)
-    if operand is _Vector:
-        lower_builtin(function, operand, types.Number)(lower)
-        lower_builtin(function, types.Number, operand)(lower)
+    for function in functions:
+        infer_global(function)(type("_Template", (_Template,), {}))
+        combinations = (
+            [(_Vector,)] if arity == 1 else [(_Vector, _Vector), (_Vector, types.Number), (types.Number, _Vector)]
+        )
+        for combination in combinations:
+            lower_builtin(function, *combination)(lower)
 
 
-def _register_unary(function: Any, operand: type, result: Any, emit: Callable[[Any, Any], Any]) -> None:
-    @infer_global(function)
+def _register_mask_operator(functions: Sequence[Any], arity: int, emit: Callable[..., Any]) -> None:
     class _Template(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: Sequence[Any], kws: Any) -> Any:
-            return signature(result, *args) if len(args) == 1 and isinstance(args[0], operand) else None
+            fits = len(args) == arity and isinstance(args[0], _Mask) and set(args) == {args[0]}
+            return signature(args[0], *args) if fits else None
 
-    lower_builtin(function, operand)(lambda context, builder, sig, args: emit(builder, args[0]))
-
-
-for _function, _in_place, _method in (
-    (operator.add, operator.iadd, "fadd"),
-    (operator.sub, operator.isub, "fsub"),
-    (operator.mul, operator.imul, "fmul"),
-    (operator.truediv, operator.itruediv, "fdiv"),
-):
-    for _name in (_function, _in_place):
-        _register_binary(_name, _Vector, vector_type, lambda builder, a, b, m=_method: getattr(builder, m)(a, b))
-for _function, _symbol in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
-    _register_binary(
-        _function, _Vector, mask_type, lambda builder, a, b, symbol=_symbol: builder.fcmp_ordered(symbol, a, b)
-    )
-for _name in (operator.and_, operator.iand):
-    _register_binary(_name, _Mask, mask_type, lambda builder, a, b: builder.and_(a, b))
-for _name in (operator.or_, operator.ior):
-    _register_binary(_name, _Mask, mask_type, lambda builder, a, b: builder.or_(a, b))
-_register_unary(operator.neg, _Vector, vector_type, lambda builder, a: builder.fneg(a))
-_register_unary(operator.invert, _Mask, mask_type, lambda builder, a: builder.not_(a))
+    for function in functions:
+        infer_global(function)(type("_Template", (_Template,), {}))
+        lower_builtin(function, *[_Mask] * arity)(lambda context, builder, sig, args: emit(builder, *args))
 
 
-# --- memory -------------------------------------------------------------------------------------------------------------
+_register_operator([operator.add, operator.iadd], 2, lambda builder, a, b: builder.fadd(a, b))
+_register_operator([operator.sub, operator.isub], 2, lambda builder, a, b: builder.fsub(a, b))
+_register_operator([operator.mul, operator.imul], 2, lambda builder, a, b: builder.fmul(a, b))
+_register_operator([operator.truediv, operator.itruediv], 2, lambda builder, a, b: builder.fdiv(a, b))
+_register_operator([operator.neg], 1, lambda builder, a: builder.fneg(a))
+_register_operator([operator.lt], 2, lambda builder, a, b: builder.fcmp_ordered("<", a, b), compares=True)
+_register_operator([operator.le], 2, lambda builder, a, b: builder.fcmp_ordered("<=", a, b), compares=True)
+_register_operator([operator.gt], 2, lambda builder, a, b: builder.fcmp_ordered(">", a, b), compares=True)
+_register_operator([operator.ge], 2, lambda builder, a, b: builder.fcmp_ordered(">=", a, b), compares=True)
+_register_mask_operator([operator.and_, operator.iand], 2, lambda builder, a, b: builder.and_(a, b))
+_register_mask_operator([operator.or_, operator.ior], 2, lambda builder, a, b: builder.or_(a, b))
+_register_mask_operator([operator.invert], 1, lambda builder, a: builder.not_(a))
 
 
-def _address(context: Any, builder: Any, array_type: Any, array: Any, index_type: Any, index: Any) -> Any:
-    data = context.make_array(array_type)(context, builder, array).data
-    offset = context.cast(builder, index, index_type, types.intp)
-    return builder.gep(data, [offset])
+# --- memory
+# -------------------------------------------------------------------------------------------------------------
 
 
-def _check_array(array: Any) -> None:
-    if not (isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.float32):
-        raise TypeError(f"a contiguous float32 array is needed, got {array}")
+def _address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Of element ``args[1]`` of the array ``args[0]``."""
+    data = context.make_array(sig.args[0])(context, builder, args[0]).data
+    return builder.gep(data, [context.cast(builder, args[1], sig.args[1], types.intp)])
+
+
+def _vector_of(array: Any) -> _Vector:
+    if not (isinstance(array, types.Array) and array.layout == "C" and array.dtype in _OF_ARRAY):
+        raise TypeError(f"a contiguous float32 or float64 array is needed, got {array}")
+    return _OF_ARRAY[array.dtype]
 
 
 @intrinsic
 def load(typing_context: Any, array: Any, index: Any) -> Any:
-    """The vector ``array.flat[index : index + 16]``."""
-    _check_array(array)
+    """The vector ``array.flat[index : index + lanes]``, 16 float32 or 8 float64."""
+    vector = _vector_of(array)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = _address(context, builder, sig.args[0], args[0], sig.args[1], args[1])
-        return builder.load(builder.bitcast(pointer, _VECTOR.as_pointer()), align=4)
+        pointer = builder.bitcast(_address(context, builder, sig, args), vector.ir.as_pointer())
+        return builder.load(pointer, align=vector.element.bitwidth // 8)
 
-    return vector_type(array, index), codegen
+    return vector(array, index), codegen
 
 
 @intrinsic
-def store(typing_context: Any, array: Any, index: Any, vector: Any) -> Any:
-    """Write ``vector`` to ``array.flat[index : index + 16]``."""
-    _check_array(array)
+def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
+    """Write the vector ``value`` to ``array.flat[index : index + lanes]``."""
+    vector = _vector_of(array)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = _address(context, builder, sig.args[0], args[0], sig.args[1], args[1])
-        builder.store(args[2], builder.bitcast(pointer, _VECTOR.as_pointer()), align=4)
+        pointer = builder.bitcast(_address(context, builder, sig, args), vector.ir.as_pointer())
+        operand = _as_vector(context, builder, args[2], sig.args[2], vector)
+        builder.store(operand, pointer, align=vector.element.bitwidth // 8)
         return context.get_dummy_value()
 
-    return types.void(array, index, vector), codegen
+    return types.void(array, index, value), codegen
+
+
+@intrinsic
+def gather(typing_context: Any, array: Any, indices: Any, stride: Any, offset: Any) -> Any:
+    """8 float64: ``array.flat[indices[k] * stride + offset]`` of a float32 array; ``indices`` is an int64 array [8]."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        places = context.make_array(sig.args[1])(context, builder, args[1]).data
+        factor = context.cast(builder, args[2], sig.args[2], types.intp)
+        shift = context.cast(builder, args[3], sig.args[3], types.intp)
+        narrow = ir.Constant(ir.VectorType(ir.FloatType(), WIDE_LANES), ir.Undefined)
+        for lane in range(WIDE_LANES):
+            place = builder.load(builder.gep(places, [ir.Constant(ir.IntType(64), lane)]))
+            element = builder.load(builder.gep(data, [builder.add(builder.mul(place, factor), shift)]))
+            narrow = builder.insert_element(narrow, element, ir.Constant(ir.IntType(32), lane))
+        return builder.fpext(narrow, _WIDE.ir)
+
+    return _WIDE(array, indices, stride, offset), codegen
 
 
 @intrinsic
@@ -175,81 +200,109 @@ def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
     """Ask for the cache line of ``array.flat[index]``; never faults."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = _address(context, builder, sig.args[0], args[0], sig.args[1], args[1])
-        byte_pointer = ir.IntType(8).as_pointer()
-        kind = ir.FunctionType(ir.VoidType(), [byte_pointer, _I32, _I32, _I32])
+        byte_pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte_pointer, word, word, word])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        read, keep_in_all_caches, data = (ir.Constant(_I32, value) for value in (0, 3, 1))
-        builder.call(function, [builder.bitcast(pointer, byte_pointer), read, keep_in_all_caches, data])
+        read, keep_in_all_caches, data = (ir.Constant(word, value) for value in (0, 3, 1))
+        pointer = builder.bitcast(_address(context, builder, sig, args), byte_pointer)
+        builder.call(function, [pointer, read, keep_in_all_caches, data])
         return context.get_dummy_value()
 
     return types.void(array, index), codegen
 
 
-# --- functions ----------------------------------------------------------------------------------------------------------
+# --- functions
+# ----------------------------------------------------------------------------------------------------------
 
 
-def _call(builder: Any, name: str, *args: Any) -> Any:
-    kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(args))
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"{name}.v{LANES}f32"), args)
+def _call(builder: Any, name: str, vector: _Vector, *operands: Any) -> Any:
+    kind = ir.FunctionType(vector.ir, [vector.ir] * len(operands))
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.{vector.suffix}"), operands)
 
 
-def _vector_intrinsic(typing_context: Any, emit: Callable[..., Any], *argument_types: Any) -> Any:
+def _function(emit: Callable[..., Any], *kinds: Any) -> Any:
+    """Signature and code of an intrinsic: ``emit(builder, vector type, *operands)`` of vectors, or vectors and numbers."""
+    vector = _common_vector(kinds)
+    if vector is None:
+        return None
+
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        vectors = [_as_vector(context, builder, value, kind) for value, kind in zip(args, sig.args, strict=True)]
-        return emit(builder, *vectors)
+        operands = (_as_vector(context, builder, v, k, vector) for v, k in zip(args, sig.args, strict=True))
+        return emit(builder, vector, *operands)
 
-    return vector_type(*argument_types), codegen
+    return vector(*kinds), codegen
+
+
+def _splat(scalar: Any, vector: _Vector) -> Any:
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _as_vector(context, builder, args[0], sig.args[0], vector)
+
+    return vector(scalar), codegen
 
 
 @intrinsic
 def splat(typing_context: Any, scalar: Any) -> Any:
-    """``scalar`` in every lane."""
-    return _vector_intrinsic(typing_context, lambda builder, a: a, scalar)
+    """``scalar`` in all of 16 float32."""
+    return _splat(scalar, _NARROW)
+
+
+@intrinsic
+def wide(typing_context: Any, scalar: Any) -> Any:
+    """``scalar`` in all of 8 float64."""
+    return _splat(scalar, _WIDE)
 
 
 @intrinsic
 def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
     """``a * b + c``, fused where the host can do so fast."""
-    return _vector_intrinsic(typing_context, lambda builder, *v: _call(builder, "llvm.fmuladd", *v), a, b, c)
+    return _function(lambda builder, vector, *v: _call(builder, "fmuladd", vector, *v), a, b, c)
 
 
 @intrinsic
 def minimum(typing_context: Any, a: Any, b: Any) -> Any:
     """``a if a < b else b``: b where either is NaN."""
-
-    def emit(builder: Any, x: Any, y: Any) -> Any:
-        return builder.select(builder.fcmp_ordered("<", x, y), x, y)
-
-    return _vector_intrinsic(typing_context, emit, a, b)
+    return _function(lambda builder, _, x, y: builder.select(builder.fcmp_ordered("<", x, y), x, y), a, b)
 
 
 @intrinsic
 def maximum(typing_context: Any, a: Any, b: Any) -> Any:
     """``a if a > b else b``: b where either is NaN."""
-
-    def emit(builder: Any, x: Any, y: Any) -> Any:
-        return builder.select(builder.fcmp_ordered(">", x, y), x, y)
-
-    return _vector_intrinsic(typing_context, emit, a, b)
+    return _function(lambda builder, _, x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y), a, b)
 
 
 @intrinsic
 def absolute(typing_context: Any, a: Any) -> Any:
     """``|a|``."""
-    return _vector_intrinsic(typing_context, lambda builder, x: _call(builder, "llvm.fabs", x), a)
+    return _function(lambda builder, vector, x: _call(builder, "fabs", vector, x), a)
+
+
+@intrinsic
+def square_root(typing_context: Any, a: Any) -> Any:
+    return _function(lambda builder, vector, x: _call(builder, "sqrt", vector, x), a)
+
+
+@intrinsic
+def floor(typing_context: Any, a: Any) -> Any:
+    return _function(lambda builder, vector, x: _call(builder, "floor", vector, x), a)
+
+
+@intrinsic
+def ceil(typing_context: Any, a: Any) -> Any:
+    return _function(lambda builder, vector, x: _call(builder, "ceil", vector, x), a)
 
 
 @intrinsic
 def select(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
-    """``a`` where ``mask``, else ``b``."""
+    """``a`` where ``mask``, else ``b``; one of the two may be a number."""
+    vector = _common_vector((a, b))
+    if vector is None or mask != _Mask(vector.lanes):
+        return None
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        x = _as_vector(context, builder, args[1], sig.args[1])
-        y = _as_vector(context, builder, args[2], sig.args[2])
+        x, y = (_as_vector(context, builder, args[k], sig.args[k], vector) for k in (1, 2))
         return builder.select(args[0], x, y)
 
-    return vector_type(mask, a, b), codegen
+    return vector(mask, a, b), codegen
 
 
 @intrinsic
@@ -257,20 +310,21 @@ def mask_bits(typing_context: Any, mask: Any) -> Any:
     """The mask as an integer: lane k is bit k."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(64))
+        return builder.zext(builder.bitcast(args[0], ir.IntType(mask.lanes)), ir.IntType(64))
 
     return types.uint64(mask), codegen
 
 
 @intrinsic
 def mask_from_bits(typing_context: Any, bits: Any) -> Any:
-    """The mask whose lane k is bit k of an integer."""
+    """The mask of 16 lanes whose lane k is bit k of an integer."""
+    mask = _Mask(LANES)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        wide = context.cast(builder, args[0], sig.args[0], types.uint64)
-        return builder.bitcast(builder.trunc(wide, ir.IntType(LANES)), _MASK)
+        wide_bits = context.cast(builder, args[0], sig.args[0], types.uint64)
+        return builder.bitcast(builder.trunc(wide_bits, ir.IntType(LANES)), mask.ir)
 
-    return mask_type(bits), codegen
+    return mask(bits), codegen
 
 
 @intrinsic
@@ -278,31 +332,64 @@ def lowest_bit(typing_context: Any, bits: Any) -> Any:
     """The place of the lowest set bit of an integer that is not zero."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        wide = context.cast(builder, args[0], sig.args[0], types.uint64)
-        return builder.cttz(wide, ir.Constant(ir.IntType(1), 1))
+        wide_bits = context.cast(builder, args[0], sig.args[0], types.uint64)
+        return builder.cttz(wide_bits, ir.Constant(ir.IntType(1), 1))
 
     return types.uint64(bits), codegen
 
 
-# 2^f on [-1/2, 1/2], constant term first: relative least-squares fit at 200 Chebyshev nodes, exact at 0, error 1.0e-7.
-_EXP2_POLYNOMIAL = (1.0, 0.69314688444, 0.24022237957, 0.05550893024, 0.00967169832, 0.00132186722)
-_ROUND_MAGIC = 12582912.0  # 1.5 * 2^23: adding it leaves the nearest integer in the low mantissa bits
+def _polynomial(builder: Any, vector: _Vector, x: Any, coefficients: Sequence[float]) -> Any:
+    """``sum_k coefficients[k] x^k``."""
+    value = vector.constant(coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        value = _call(builder, "fmuladd", vector, value, x, vector.constant(coefficient))
+    return value
+
+
+def _emit_exp2(builder: Any, vector: _Vector, x: Any, coefficients: Sequence[float]) -> Any:
+    """2^x = 2^n 2^f: adding 1.5 * 2^mantissa_bits leaves the nearest integer n in the low mantissa bits."""
+    mantissa_bits = 23 if vector is _NARROW else 52
+    magic = vector.constant(1.5 * 2.0**mantissa_bits)
+    shifted = builder.fadd(x, magic)
+    fraction = builder.fsub(x, builder.fsub(shifted, magic))
+    value = builder.bitcast(_polynomial(builder, vector, fraction, coefficients), vector.bits_ir)
+    exponent = builder.shl(builder.bitcast(shifted, vector.bits_ir), vector.bits(mantissa_bits))
+    return builder.bitcast(builder.add(value, exponent), vector.ir)
+
+
+# 2^f on [-1/2, 1/2]: relative least-squares fit at 200 Chebyshev nodes, exact at 0, error 1.0e-7.
+_EXP2_NARROW = (1.0, 0.69314688444, 0.24022237957, 0.05550893024, 0.00967169832, 0.00132186722)
+_EXP2_WIDE = tuple(math.log(2.0) ** k / math.factorial(k) for k in range(12))  # Taylor series, error 1e-14
+# log2(m) = 2 / ln 2 artanh(s), s = (m - 1) / (m + 1), as a series in s^2; for m in [sqrt(1/2), sqrt(2)] error 1e-14
+_LOG2_SERIES = tuple(2.0 / math.log(2.0) / (2 * k + 1) for k in range(9))
 
 
 @intrinsic
 def exp2(typing_context: Any, a: Any) -> Any:
-    """``2^a`` within 2.5e-7 relative, for -126 <= a < 127.5; any value elsewhere."""
+    """``2^a``: float32 within 2.5e-7 for -126 <= a < 127.5, float64 within 1e-13 for |a| < 1022; beyond, any value."""
 
-    def emit(builder: Any, x: Any) -> Any:
-        shifted = builder.fadd(x, _constant(_ROUND_MAGIC))
-        fraction = builder.fsub(x, builder.fsub(shifted, _constant(_ROUND_MAGIC)))
-        value = _constant(_EXP2_POLYNOMIAL[-1])
-        for coefficient in _EXP2_POLYNOMIAL[-2::-1]:
-            value = _call(builder, "llvm.fmuladd", value, fraction, _constant(coefficient))
-        exponent = builder.shl(builder.bitcast(shifted, _INTEGERS), _integers(23))
-        return builder.bitcast(builder.add(builder.bitcast(value, _INTEGERS), exponent), _VECTOR)
+    def emit(builder: Any, vector: _Vector, x: Any) -> Any:
+        return _emit_exp2(builder, vector, x, _EXP2_NARROW if vector is _NARROW else _EXP2_WIDE)
 
-    return _vector_intrinsic(typing_context, emit, a)
+    return _function(emit, a)
+
+
+@intrinsic
+def log2(typing_context: Any, a: Any) -> Any:
+    """``log2(a)`` of 8 positive, normal float64, within 1e-13; any value elsewhere."""
+    if a is not _WIDE:
+        return None
+
+    def emit(builder: Any, vector: _Vector, x: Any) -> Any:
+        # The bits above those of sqrt(1/2), shifted down, are the exponent n of x = 2^n m.
+        bits, low = builder.bitcast(x, vector.bits_ir), vector.bits(0x3FE6A09E00000000)
+        exponent = builder.ashr(builder.sub(bits, low), vector.bits(52))
+        mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, vector.bits(52))), vector.ir)
+        s = builder.fdiv(builder.fsub(mantissa, vector.constant(1.0)), builder.fadd(mantissa, vector.constant(1.0)))
+        series = _polynomial(builder, vector, builder.fmul(s, s), _LOG2_SERIES)
+        return _call(builder, "fmuladd", vector, s, series, builder.sitofp(exponent, vector.ir))
+
+    return _function(emit, a)
 
 
 # Lane of ``lane_sums`` that holds the sum of its k-th argument: the bits of k reversed.
@@ -311,12 +398,13 @@ SUM_LANES = tuple(int(f"{k:04b}"[::-1], 2) for k in range(LANES))
 
 @intrinsic
 def lane_sums(typing_context: Any, vectors: Any) -> Any:
-    """One vector with the 16-lane sums of a tuple of up to 16 vectors; the k-th in lane ``SUM_LANES[k]``, the rest zero.
+    """One vector with the 16-lane sums of a tuple of up to 16 vectors; the k-th in lane ``SUM_LANES[k]``, the rest
+    zero.
 
-    A tree of shuffles and additions: each level joins two vectors into one, so that the sum of eleven vectors costs about
-    as much as three single sums.
+    A tree of shuffles and additions: each level joins two vectors into one, so that the sums of eleven vectors cost
+    about as much as three single sums.
     """
-    if not (isinstance(vectors, types.UniTuple) and isinstance(vectors.dtype, _Vector)):
+    if not (isinstance(vectors, types.UniTuple) and vectors.dtype is _NARROW):
         return None
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -324,23 +412,15 @@ def lane_sums(typing_context: Any, vectors: Any) -> Any:
         half = LANES // 2
         while half:
             if len(level) % 2:
-                level.append(_constant(0.0))
-            low = [lane + source * LANES for lane, source in _halves(half)]
-            high = [lane + half for lane in low]
+                level.append(_NARROW.constant(0.0))
+            # Of each group of 2 * half lanes the first half comes from a, the second from b.
+            low = [lane // (2 * half) * 2 * half + lane % half + lane // half % 2 * LANES for lane in range(LANES)]
+            first, second = _lane_indices(low), _lane_indices([lane + half for lane in low])
             level = [
-                builder.fadd(_shuffle(builder, a, b, low), _shuffle(builder, a, b, high))
+                builder.fadd(builder.shuffle_vector(a, b, first), builder.shuffle_vector(a, b, second))
                 for a, b in zip(level[::2], level[1::2], strict=True)
             ]
             half //= 2
         return level[0]
 
-    return vector_type(vectors), codegen
-
-
-def _halves(half: int) -> list[tuple[int, int]]:
-    """For every lane: the lane and the operand that its lower summand comes from, for groups of 2 * ``half`` lanes."""
-    return [(lane // (2 * half) * 2 * half + lane % half, lane // half % 2) for lane in range(LANES)]
-
-
-def _shuffle(builder: Any, a: Any, b: Any, lanes: list[int]) -> Any:
-    return builder.shuffle_vector(a, b, ir.Constant(_INTEGERS, [ir.Constant(_I32, lane) for lane in lanes]))
+    return _NARROW(vectors), codegen

@@ -1,0 +1,56 @@
+"""What each pixel of a test view shows: its depth, how far the initial cloud is, and how voluminous the Gaussians are."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gsbench.densify.volume import log_volume
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.spherical_harmonics import rgb_to_dc
+from gsbench.raster.base import Rasterizer
+from gsbench.scene.camera import Camera
+
+MIN_ALPHA = 0.5  # a pixel that is covered less shows no surface: not a number
+
+
+def view_maps(
+    rasterizer: Rasterizer, gaussians: Gaussians, camera: Camera, initial_points: cKDTree
+) -> dict[str, NDArray[np.float16]]:
+    """Maps [H, W] of one view, NaN where no surface is seen; world units.
+
+    ``depth``: view z, the mean over the Gaussians of a pixel weighted by their contribution. ``distance``: from the point at
+    that depth to the nearest of ``initial_points``. ``volume``: of the Gaussians, the weighted geometric mean.
+    """
+    view_z = gaussians.means @ gaussians.means.new_tensor(camera.rotation[2]) + float(camera.translation[2])  # [N]
+    volumes = log_volume(gaussians.log_scales)  # [N]
+    lowest = volumes.min()
+    features = torch.stack([view_z.clamp_min(0), volumes - lowest, torch.zeros_like(view_z)], -1)  # [N, 3], none negative
+    painted = Gaussians(**(gaussians.tensors() | {"sh_dc": rgb_to_dc(features)}))
+    with torch.no_grad():
+        out = rasterizer.render(painted, camera, 0, torch.zeros_like(features[0]))
+    seen = out.alpha >= MIN_ALPHA
+    mean = torch.where(seen.unsqueeze(-1), out.image / out.alpha.clamp_min(MIN_ALPHA).unsqueeze(-1), math.nan)
+    depth = mean[..., 0].double().cpu().numpy()  # [H, W]
+    volume = torch.exp(mean[..., 1] + lowest).cpu().numpy()
+    distance = np.full_like(depth, np.nan)
+    covered = np.isfinite(depth)
+    distance[covered] = initial_points.query(unproject(depth, camera)[covered])[0]
+    largest = float(np.finfo(np.float16).max)
+    return {
+        name: np.minimum(values, largest).astype(np.float16)
+        for name, values in (("depth", depth), ("distance", distance), ("volume", volume))
+    }
+
+
+def unproject(depth: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """The world points [H, W, 3] of the pixel centres at ``depth`` [H, W] along z."""
+    rows, columns = np.mgrid[: camera.height, : camera.width]
+    x = (columns + 0.5 - camera.cx) / camera.fx * depth
+    y = (rows + 0.5 - camera.cy) / camera.fy * depth
+    in_view = np.stack([x, y, depth], -1)  # [H, W, 3]
+    return (in_view - camera.translation) @ camera.rotation

@@ -1,0 +1,118 @@
+"""Every file in ``conf`` composes, its classes can be built, and what is written there is what the code defaults to."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from gsbench.config import TrainConfig, check, check_target, conf_dir, config_hash, plain, register_schemas
+from gsbench.errors import InputError
+from gsbench.pipeline.components import build
+
+GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch")
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in Path(conf_dir(), group).glob("*.yaml"))
+
+
+def composed(*overrides: str) -> dict[str, Any]:
+    register_schemas()
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        config = compose("config", overrides=list(overrides))
+    check(config)
+    return plain(config)
+
+
+@pytest.mark.parametrize(("group", "option"), [(group, option) for group in GROUPS for option in options(group)])
+def test_every_option_composes(group: str, option: str) -> None:
+    extra = ["scene.path=/data/capture"] if group == "scene" else []
+    values = composed(f"{group}={option}", *extra)
+    assert values[group]["name"] == option
+
+
+@pytest.mark.parametrize("option", options("densify"))
+def test_every_densifier_can_be_built_and_matches_its_class(option: str) -> None:
+    values = composed(f"densify={option}", "train=paper")["densify"]
+    densifier = build("densify", values, [])
+    if dataclasses.is_dataclass(densifier):
+        names = {field.name for field in dataclasses.fields(densifier) if field.init}
+        assert names == set(values) - {"_target_", "name"}  # the YAML shows every option
+    if option in ("adc", "volumetric", "mcmc"):
+        assert densifier == type(densifier)()  # and the values of the class
+
+
+@pytest.mark.parametrize("option", options("init"))
+def test_every_initialiser_shows_all_its_options(option: str) -> None:
+    values = composed(f"init={option}")["init"]
+    initializer = build("init", values, [])
+    names = {field.name for field in dataclasses.fields(initializer) if field.init}
+    assert names == set(values) - {"_target_", "name"}
+
+
+def test_the_paper_schedule_is_the_class_default() -> None:
+    values = composed("train=paper")["train"]
+    defaults = dataclasses.asdict(TrainConfig(name="paper"))
+    assert {key: list(v) if isinstance(v, tuple) else v for key, v in defaults.items()} == {
+        key: list(v) if isinstance(v, tuple) else v for key, v in values.items()
+    }
+
+
+def sweep_size(experiment: str) -> int:
+    register_schemas()
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        config = compose("config", overrides=[f"+experiment={experiment}"], return_hydra_config=True)
+    size = 1
+    for value in OmegaConf.to_container(config.hydra.sweeper.params).values():  # type: ignore[union-attr]
+        size *= len(str(value).split(","))
+    return size
+
+
+def test_experiments_have_the_size_of_the_paper() -> None:
+    assert sweep_size("table1") == 13 * 2 * 3
+    assert sweep_size("table2") == 12 * 2 * 2 * 3
+    assert sweep_size("demo") == 6
+    assert {path.stem for path in Path(conf_dir(), "experiment").glob("*.yaml")} >= {"table1", "table2", "threshold", "budget"}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "key"),
+    [
+        (["scene.test_every=1"], "scene.test_every"),
+        (["train.iterations=0"], "train.iterations"),
+        (["eval.protocol=best"], "eval.protocol"),
+        (["threads=0"], "threads"),
+        (["name=a/b"], "name"),
+        (["train.background=[0,0,2]"], "train.background"),
+    ],
+)
+def test_rules_name_the_key(overrides: list[str], key: str) -> None:
+    with pytest.raises(InputError, match=key):
+        composed(*overrides)
+
+
+def test_wrong_type_in_a_component_names_the_key() -> None:
+    with pytest.raises(InputError, match=r"densify\.max_gaussians"):
+        build("densify", composed("densify.max_gaussians=1.5")["densify"], [])
+    with pytest.raises(InputError, match=r"densify\.cap.*'soft'"):
+        build("densify", composed("densify.cap=squishy")["densify"], [])
+
+
+def test_only_trusted_code_is_imported() -> None:
+    check_target("gsbench.densify.ADC", "densify", [])
+    check_target("mine.Densifier", "densify", ["mine"])
+    for target in ("os.system", "gsbench_evil.X", "minefield.X"):
+        with pytest.raises(InputError, match="allow_targets"):
+            check_target(target, "densify", ["mine"])
+
+
+def test_hash_ignores_what_cannot_change_a_result() -> None:
+    base = config_hash(composed())
+    assert config_hash(composed("name=other", "seed=5", "threads=1", "tracking=none", "device=cpu")) == base
+    assert config_hash(composed("densify.volume_threshold=0.04")) != base
+    assert config_hash(composed("scene.max_size=200")) != base
