@@ -6,8 +6,13 @@ reference implementation of 3DGS.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from gsbench.pipeline.loss_cpu import CompiledLoss
 
 SSIM_WEIGHT = 0.2
 WINDOW_RADIUS = 5  # px; 11 taps
@@ -36,7 +41,7 @@ class PhotometricLoss:
             raise ValueError(f"ssim_weight: must be between 0 and 1, got {ssim_weight}")
         self.ssim_weight = ssim_weight
         self._threads = threads
-        self._compiled = None
+        self._compiled: CompiledLoss | None = None
 
     def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         if image.dim() != 3 or image.shape[-1] != 3 or image.shape != target.shape:

@@ -25,6 +25,7 @@ EVENTS_FILE, HISTOGRAMS_FILE = "events.jsonl", "volume_histograms.jsonl"
 # The smallest differences worth resolving, by metric: about what papers on densification claim as an improvement.
 WORTHWHILE = {"psnr": 0.1, "ssim": 0.005, "flip": 0.005}
 WORTHWHILE_LPIPS = 0.005
+COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time"}
 EVENT_CAUSES = ("cloned", "split_gradient", "split_volume", "added", "relocated", "pruned_opacity", "pruned_size")
 CURVES = (  # key of metrics.jsonl, title, y axis
     ("num_gaussians", "Gaussians during training", "Gaussians"),
@@ -228,7 +229,7 @@ def _costs(trials: Sequence[Trial], first: Arm, second: Arm) -> list[str]:
             lines.append(f"{name} {of_totals:+.1%} ({rules})")
         gap = curve_gap(*(training_curve(own, key, "psnr") for own in arms))
         if gap is not None:
-            lines.append(_gap_words(gap, name))
+            lines.append(_gap_words(gap, COST_LABELS[key]))
     return lines
 
 

@@ -66,7 +66,7 @@ def count_shard(
 
 @kernel
 def start_tiles(counts: Any, starts: Any) -> None:
-    """Turn ``counts`` [shards, tiles] into the places of first entries; ``starts`` [tiles + 1] gets those of the tiles."""
+    """Turn ``counts`` [shards, tiles] into places of first entries; ``starts`` [tiles + 1] gets those of tiles."""
     shards, tiles = counts.shape
     place = 0
     for tile in range(tiles):

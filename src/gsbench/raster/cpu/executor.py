@@ -15,10 +15,11 @@ from torch.autograd.function import once_differentiable
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, RenderOutput
 from gsbench.raster.cpu import layout as at
+from gsbench.raster.cpu.backprojection import backproject_shard
 from gsbench.raster.cpu.binning import balance_tiles, count_shard, fill_shard, start_tiles
 from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_tiles, decomposite_tiles
 from gsbench.raster.cpu.jit import announce_compilation
-from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, backproject_shard, project_shard
+from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, project_shard
 from gsbench.raster.cpu.workspace import Arena, ArenaPool, ShardRunner, TensorPool
 from gsbench.raster.validate import check_settings, raise_for_values
 from gsbench.scene.camera import Camera

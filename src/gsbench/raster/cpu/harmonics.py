@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from gsbench.gaussians.model import NUM_SH_REST
 from gsbench.gaussians.spherical_harmonics import C0, C1, C2, C3
 from gsbench.raster.cpu.jit import inlined
 
@@ -14,6 +15,7 @@ D0, D1, D2, D3, D4 = (np.float32(value) for value in C2)
 T0, T1, T2, T3, T4, T5, T6 = (np.float32(value) for value in C3)
 HALF, TWO, THREE, FOUR, SIX, EIGHT = (np.float32(value) for value in (0.5, 2, 3, 4, 6, 8))
 ZERO = np.float32(0)
+SH_TERMS = NUM_SH_REST + 1
 
 
 @inlined

@@ -18,8 +18,11 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.core.extending import intrinsic, lower_builtin, models, register_model
+from numba.core import extending as numba_extending
+from numba.core.extending import lower_builtin, models, register_model
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+
+intrinsic: Any = numba_extending.intrinsic  # its functions take one argument less than they are written with
 
 LANES = 16  # of float32
 WIDE_LANES = 8  # of float64
@@ -221,7 +224,7 @@ def _call(builder: Any, name: str, vector: _Vector, *operands: Any) -> Any:
 
 
 def _function(emit: Callable[..., Any], *kinds: Any) -> Any:
-    """Signature and code of an intrinsic: ``emit(builder, vector type, *operands)`` of vectors, or vectors and numbers."""
+    """An intrinsic that is ``emit(builder, vector type, *operands)`` of vectors, or of vectors and numbers."""
     vector = _common_vector(kinds)
     if vector is None:
         return None

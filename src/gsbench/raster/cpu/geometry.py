@@ -1,0 +1,105 @@
+"""The geometry of projection for 8 Gaussians at a time, in float64, shared by the forward and the backward kernel.
+
+In float32 the 2D covariance of a needle would lose too many digits. Matrices are tuples of rows, vectors tuples.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from gsbench.raster.cpu.jit import inlined
+from gsbench.raster.cpu.simd import exp2, gather, maximum, minimum, square_root
+
+LOG2_E = 1.0 / math.log(2.0)
+MAX_LOG2 = (
+    1000.0  # beyond, exp2 is undefined; a scale of 2^1000 overflows in the determinant, and its Gaussian is culled
+)
+
+
+@inlined
+def exponential(x: Any) -> Any:
+    return exp2(maximum(minimum(x * LOG2_E, MAX_LOG2), -MAX_LOG2))
+
+
+@inlined
+def rotation_matrix(w: Any, x: Any, y: Any, z: Any) -> Any:
+    """The rows of the rotation matrix of a unit quaternion."""
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@inlined
+def to_view(mean: Any, v: Any) -> Any:
+    x = mean[0] * v.r00 + mean[1] * v.r01 + mean[2] * v.r02 + v.tx
+    y = mean[0] * v.r10 + mean[1] * v.r11 + mean[2] * v.r12 + v.ty
+    z = mean[0] * v.r20 + mean[1] * v.r21 + mean[2] * v.r22 + v.tz
+    return x, y, z
+
+
+@inlined
+def image_axes(slope_x: Any, slope_y: Any, inverse_z: Any, v: Any) -> Any:
+    """A = J W, the derivative of the pixel with respect to the world position, as two rows; the clamped slopes."""
+    slope_x = minimum(maximum(slope_x, v.slope_x_min), v.slope_x_max)
+    slope_y = minimum(maximum(slope_y, v.slope_y_min), v.slope_y_max)
+    jx, jy = inverse_z * v.fx, inverse_z * v.fy
+    first = (jx * (v.r00 - slope_x * v.r20), jx * (v.r01 - slope_x * v.r21), jx * (v.r02 - slope_x * v.r22))
+    second = (jy * (v.r10 - slope_y * v.r20), jy * (v.r11 - slope_y * v.r21), jy * (v.r12 - slope_y * v.r22))
+    return first, second, slope_x, slope_y
+
+
+@inlined
+def dot(a: Any, b: Any) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def times(row: Any, matrix: Any) -> Any:
+    """``row`` [3] times ``matrix`` [3, 3]."""
+    return (
+        row[0] * matrix[0][0] + row[1] * matrix[1][0] + row[2] * matrix[2][0],
+        row[0] * matrix[0][1] + row[1] * matrix[1][1] + row[2] * matrix[2][1],
+        row[0] * matrix[0][2] + row[1] * matrix[1][2] + row[2] * matrix[2][2],
+    )
+
+
+@inlined
+def scaled(row: Any, scales: Any) -> Any:
+    return row[0] * scales[0], row[1] * scales[1], row[2] * scales[2]
+
+
+@inlined
+def gather_vectors(array: Any, indices: Any) -> Any:
+    return gather(array, indices, 3, 0), gather(array, indices, 3, 1), gather(array, indices, 3, 2)
+
+
+@inlined
+def gather_quaternions(quaternions: Any, indices: Any) -> Any:
+    """The unit quaternions, and the inverse norm and squared norm of what is stored."""
+    w, x = gather(quaternions, indices, 4, 0), gather(quaternions, indices, 4, 1)
+    y, z = gather(quaternions, indices, 4, 2), gather(quaternions, indices, 4, 3)
+    squared = w * w + x * x + y * y + z * z
+    inverse = 1 / square_root(squared)
+    return (w * inverse, x * inverse, y * inverse, z * inverse), inverse, squared
+
+
+@inlined
+def covariance(m0: Any, m1: Any, blur: Any) -> Any:
+    """xx, xy, yy and the determinant of M M^T + blur I, for the rows of M.
+
+    The determinant has no cancellation: det(M M^T) is the squared cross product of the rows.
+    """
+    xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1)
+    cross = (m0[1] * m1[2] - m0[2] * m1[1], m0[2] * m1[0] - m0[0] * m1[2], m0[0] * m1[1] - m0[1] * m1[0])
+    return xx + blur, xy, yy + blur, dot(cross, cross) + blur * (xx + yy + blur)
+
+
+@inlined
+def direction_from_camera(mean: Any, v: Any) -> Any:
+    """From the camera centre to the mean, of length 1; the inverse distance."""
+    dx, dy, dz = mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
+    inverse = 1 / square_root(dx * dx + dy * dy + dz * dz)
+    return dx * inverse, dy * inverse, dz * inverse, inverse
