@@ -69,6 +69,7 @@ class TrainConfig:
     volume_histogram: list[int] = field(default_factory=lambda: [4000, 8000, 12_000])  # iterations (Fig. 5)
     log_every: int = 10
     checkpoint_every: int = 1000  # iterations; a killed trial goes on from the last one
+    checkpoint_minutes: float = 10.0  # and after so many minutes, whichever is first
 
 
 @dataclass
@@ -163,6 +164,7 @@ def check(config: DictConfig) -> None:
         ("train.position_steps", config.train.position_steps >= 1, "at least 1"),
         ("train.log_every", config.train.log_every >= 1, "at least 1"),
         ("train.checkpoint_every", config.train.checkpoint_every >= 1, "at least 1"),
+        ("train.checkpoint_minutes", config.train.checkpoint_minutes > 0, "above 0"),
         ("train.max_seconds", config.train.max_seconds is None or config.train.max_seconds > 0, "above 0 or null"),
         ("train.background", all(0 <= c <= 1 for c in config.train.background), "three numbers in [0, 1]"),
         ("eval.protocol", config.eval.protocol in ("paper", "standard"), "paper or standard"),

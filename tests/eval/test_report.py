@@ -1,4 +1,4 @@
-"""The report: it stands alone, says the verdict first, can be read without a mouse or eyes, and shows the right places."""
+"""The report: it stands alone, says the verdict first, needs neither mouse nor eyes, and shows the right places."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ADC, VOLUMETRIC = ("sfm", "adc"), ("sfm", "volumetric")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two scenes with pictures, in which "volumetric" has a clearly better LPIPS and nothing else differs."""
     folder = tmp_path_factory.mktemp("runs")
-    write_runs(folder, Plan(effect={"lpips_vgg_raw": -0.05}, views=3, pictures=True))
+    write_runs(folder, Plan(effect={"lpips_vgg_raw": -0.05}, views=3, pictures=True, random_seed=1))
     return folder
 
 
@@ -228,6 +228,13 @@ def test_the_verb_writes_the_file(runs: Path, tmp_path: Path, capsys: pytest.Cap
     assert (tmp_path / "sub" / "r.html").read_text().startswith("<!doctype html>")
     assert str(tmp_path / "sub" / "r.html") in capsys.readouterr().out
     assert [path.name for path in (tmp_path / "sub").iterdir()] == ["r.html"]
+
+
+def test_one_trial_of_each_arm_is_no_verdict(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan(seeds=(0,), scenes=("garden",), effect={"psnr": 9.0}))
+    page = build_report(load_experiment(tmp_path, "exp"))
+    assert "no verdict, one trial of each on this scene; run more seeds" in page
+    assert "▲ better" not in page
 
 
 def test_a_single_arm_and_bare_results_still_make_a_report(tmp_path: Path) -> None:

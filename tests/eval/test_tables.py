@@ -228,7 +228,14 @@ def test_latex_escapes_what_is_special() -> None:
     assert escape_latex("a_b & 5 % ± 1 → #1") == "a\\_b \\& 5 \\% $\\pm$ 1 ? \\#1"
 
 
-@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed")
+def has_latex() -> bool:
+    """Whether pdflatex and booktabs are installed."""
+    if shutil.which("pdflatex") is None or shutil.which("kpsewhich") is None:
+        return False
+    return subprocess.run(["kpsewhich", "booktabs.sty"], capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.skipif(not has_latex(), reason="pdflatex with booktabs is not installed")
 def test_latex_compiles(make_experiment: Make, tmp_path: Path) -> None:
     experiment = make_experiment()
     (experiment.trials[0].path / "results.json").write_text("{")

@@ -61,8 +61,8 @@ def test_sift_through_the_external_path_gives_the_same_model(
     verify_pairs(external, pairs, verification_options(0, 15), no_progress)
     assert database_counts(external) == database_counts(own)
 
-    first = map_images(own, bare_photos.images, tmp_path / "first", MAPPING, no_progress)
-    second = map_images(external, bare_photos.images, tmp_path / "second", MAPPING, no_progress)
+    first, _ = map_images(own, bare_photos.images, tmp_path / "first", MAPPING, no_progress)
+    second, _ = map_images(external, bare_photos.images, tmp_path / "second", MAPPING, no_progress)
     assert first.num_points3D() == second.num_points3D() > 100
     for point_id, point in first.points3D.items():
         np.testing.assert_array_equal(point.xyz, second.points3D[point_id].xyz)

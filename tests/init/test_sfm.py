@@ -153,6 +153,20 @@ def test_names_with_spaces_and_photos_of_two_sizes(courtyard: Capture, tmp_path:
     assert len(model.cameras) == 2
 
 
+def test_webp_photos_give_what_png_ones_give(courtyard: Capture, tmp_path: Path):
+    """COLMAP cannot read WebP; lossless copies must lead to the same points."""
+    images = tmp_path / "images"
+    images.mkdir()
+    names = [f"{Path(name).stem}{'.webp' if index % 2 else '.png'}" for index, name in enumerate(courtyard.image_names)]
+    for name, new in zip(courtyard.image_names, names, strict=True):
+        Image.open(courtyard.images / name).save(images / new, lossless=True)
+    Sfm().run(capture_of(images), tmp_path / "webp")
+    Sfm().run(replace(courtyard, model=None), tmp_path / "png")
+    first, second = (read_cloud(tmp_path / kind / MODEL_FOLDER) for kind in ("webp", "png"))
+    np.testing.assert_array_equal(first.points, second.points)
+    np.testing.assert_array_equal(first.colors, second.colors)
+
+
 def test_detection_at_a_smaller_size_comes_back_at_the_files_size(courtyard: Capture, tmp_path: Path):
     Sfm(max_image_size=200).run(courtyard, tmp_path)
     assert np.median(surface_distance(read_cloud(tmp_path / MODEL_FOLDER).points)) < 0.06

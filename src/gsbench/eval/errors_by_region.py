@@ -74,7 +74,7 @@ def errors_by_region(
     """
     pairs = pair_trials(trials, first, second)
     if not pairs:
-        raise InputError("no trials of the two arms share a scene and a seed")
+        raise InputError("no trials of the two arms share a scene, a seed and their conditions")
     read_property = _property_reader(property_name)
     scenes: list[str] = []
     errors: list[Array] = []
@@ -107,7 +107,7 @@ def view_names(trial: Trial) -> list[str]:
     folder = trial.path / RENDERS
     names = sorted(path.stem for path in folder.glob("*.png"))
     if not names:
-        raise InputError(f"{folder} holds no renders")
+        raise InputError(f"{trial.label} holds no {RENDERS}")
     return names
 
 
@@ -165,7 +165,10 @@ def _pair_means(one: Trial, other: Trial, read_property: Reader, edges: Array) -
         counts = np.bincount(index, minlength=len(edges) + 2)[:-1]
         means = []
         for trial in (one, other):
-            errors = absolute_error(read_image(trial.path / RENDERS / f"{name}.png"), truth).ravel()
+            render = read_image(trial.path / RENDERS / f"{name}.png")
+            if render.shape != truth.shape:
+                raise InputError(f"{trial.label}: the render of {name} has not the size of the ground truth")
+            errors = absolute_error(render, truth).ravel()
             sums = np.bincount(index, weights=errors, minlength=len(edges) + 2)[:-1]
             means.append(np.where(counts > 0, sums / np.maximum(counts, 1), np.nan))
         yield means[0], means[1]

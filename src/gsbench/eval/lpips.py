@@ -9,15 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from gsbench.errors import InputError
 from gsbench.weights import MissingWeights, WeightsFile, find_weights, load_state
-
-LpipsNet = Literal["vgg", "alex", "squeeze"]
 
 # The networks' input normalisation, per channel: (x - SHIFT) / SCALE for x in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
@@ -168,7 +165,7 @@ class Lpips:
 
     def __init__(
         self,
-        net: LpipsNet,
+        net: str,
         features: Mapping[str, Tensor],
         heads: Mapping[str, Tensor],
         device: torch.device | str = "cpu",
@@ -204,7 +201,7 @@ class Lpips:
         )
         total = torch.zeros((), device=self.device)
         heads = iter(self._heads)
-        for index, layer in enumerate(self._layers):
+        for index, layer in enumerate(self._layers.children()):
             first, second = layer(first), layer(second)  # [1, C, h, w] each
             if index in self.backbone.taps:
                 total = total + _feature_distance(first, second, next(heads))
@@ -212,7 +209,7 @@ class Lpips:
 
 
 def load_lpips(
-    net: LpipsNet, folder: Path | None = None, download: bool = True, device: torch.device | str = "cpu"
+    net: str, folder: Path | None = None, download: bool = True, device: torch.device | str = "cpu"
 ) -> Lpips:
     """An LPIPS network from weights in ``folder``, the usual places or a download; may raise ``MissingWeights``."""
     backbone = BACKBONES[net]

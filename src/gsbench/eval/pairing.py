@@ -96,11 +96,12 @@ def pair_arms(trials: Sequence[Trial], first: Arm, second: Arm, metric: str, vie
 
 
 def pair_trials(trials: Sequence[Trial], first: Arm, second: Arm) -> list[tuple[Trial, Trial]]:
-    """The pairs (first arm, second arm) of one scene and seed, sorted by both."""
-    pairs = []
+    """The pairs (first arm, second arm) of one scene and seed, sorted; those under unlike conditions are left out."""
+    pairs: list[tuple[Trial, Trial]] = []
     for scene, group in sorted(by_key(trials, lambda trial: trial.scene).items()):
         one, other = (_by_seed(group, arm, scene) for arm in (first, second))
-        pairs += [(one[seed], other[seed]) for seed in sorted(one.keys() & other.keys())]
+        both = [(one[seed], other[seed]) for seed in sorted(one.keys() & other.keys())]
+        pairs += [pair for pair in both if not differing_conditions(pair)]
     return pairs
 
 

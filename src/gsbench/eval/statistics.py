@@ -27,9 +27,10 @@ BOOTSTRAP_SAMPLES = 4000
 POWER = 0.8
 MAX_SEEDS = 1000
 
+NOT_REPEATED = "none, since no trial was repeated with another seed"
 SCENES_LIKE_THESE, THESE_SCENES, THIS_SCENE = "scenes like these", "these scenes", "this scene"
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -116,19 +117,16 @@ def compare(paired: Paired, direction: int, samples: int = BOOTSTRAP_SAMPLES, se
 def _overall_test(per_trial: Sequence[Array], per_scene: Array) -> tuple[float | None, str, str, Array]:
     """(p, test, scope, units tested): over scenes where there are enough, else over trials."""
     if len(per_scene) >= MIN_SCENES:
-        p = sign_flip_p(per_scene, np.full(len(per_scene), 1.0))
-        return p, f"exact sign flips of {len(per_scene)} scenes", SCENES_LIKE_THESE, per_scene
+        test = f"exact sign flips of {len(per_scene)} scenes"
+        return sign_flip_p(per_scene, np.ones(len(per_scene))), test, SCENES_LIKE_THESE, per_scene
     scope = THESE_SCENES if len(per_scene) > 1 else THIS_SCENE
     pairs = np.concatenate(list(per_trial))  # [sum of K]
     weights = np.concatenate([np.full(len(values), 1 / len(values)) for values in per_trial])
     if len(pairs) >= MIN_PAIRS:
         return sign_flip_p(pairs, weights), f"exact sign flips of {len(pairs)} pairs of trials", scope, pairs
-    return (
-        stratified_t_p(per_trial),
-        f"Student's t over {len(pairs)} pairs of trials (too few for an exact test)",
-        scope,
-        pairs,
-    )
+    p = stratified_t_p(per_trial)
+    test = f"Student's t over {len(pairs)} pairs of trials (too few for an exact test)"
+    return p, test if p is not None else NOT_REPEATED, scope, pairs
 
 
 def sign_flip_p(values: Array, weights: Array) -> float:
@@ -209,7 +207,8 @@ def bootstrap_interval(
 def _resampled_means(values: Array, samples: int, rng: np.random.Generator) -> Array:
     """Means [samples] of as many values drawn with replacement from ``values`` [n]."""
     n = len(values)
-    return rng.multinomial(n, np.full(n, 1 / n), size=samples) @ values / n
+    drawn: Array = rng.multinomial(n, np.full(n, 1 / n), size=samples) @ values / n
+    return drawn
 
 
 def _stretch(units: int, degrees: int) -> float:

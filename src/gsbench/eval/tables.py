@@ -177,7 +177,7 @@ def _mean_rows(
     def full(other: tuple[str, ...], arm: tuple[str, ...], scene: str) -> tuple[str, ...]:
         return (*other[:place], scene, *other[place:], *arm)
 
-    cells: dict[object, Cell] = {}
+    cells: dict[tuple[tuple[str, ...], tuple[str, ...], str], Cell] = {}
     counts = {}
     for quantity in quantities:
         arms = list(itertools.product(others, arm_keys))
@@ -212,13 +212,15 @@ def _reading_notes(
     grid: dict[tuple[tuple[str, ...], str], Cell], quantities: Sequence[Quantity], expected: int, by_scene: bool
 ) -> list[str]:
     spread = "trials" if by_scene else "the trials' means of scenes"
-    trials = (
-        "one trial a cell, so no deviation is known" if expected == 1 else f"± is the deviation (n − 1) over {spread}"
-    )
-    notes = [f"Mean over {expected} trials; {trials}. Bold: best mean of a scene after rounding, which is no test."]
-    if any(not cell.complete for cell in grid.values()):
+    if expected == 1:
+        notes = ["One trial a cell, so no deviation is known."]
+    else:
+        notes = [f"Mean over {expected} trials; ± is the deviation (n − 1) over {spread}."]
+    notes.append("Bold: best mean of a scene after rounding, which is no test.")
+    cells = grid.values()
+    if any(0 < cell.count < expected or not cell.trials for cell in cells):
         notes.append(f"(k/{expected}): only k of {expected} trials have a value; —: none.")
-    protocols = {str(trial.data["protocol"]) for cell in grid.values() for trial in cell.trials}
+    protocols = {str(trial.data["protocol"]) for cell in cells for trial in cell.trials}
     notes.append(f"Protocol {', '.join(sorted(protocols))}.")
     for quantity in quantities:
         reasons = {
@@ -237,11 +239,7 @@ def _cost_notes(trials: Sequence[Trial]) -> list[str]:
             for what, read in _COSTS.items():
                 change = cost_change(arms[BASELINE], arms[name], read)
                 if change is not None:
-                    of_totals, of_scenes, scenes = change
-                    notes.append(
-                        f"{what}, {name} against {BASELINE} (init {init}): {of_totals:+.1%} as a ratio of totals, "
-                        f"{of_scenes:+.1%} as the mean of {scenes} scenes."
-                    )
+                    notes.append(f"{what}, {name} against {BASELINE} (init {init}): {change_words(*change)}.")
     return notes
 
 
@@ -263,6 +261,14 @@ def cost_change(
     totals = [sum(group[scene] for scene in scenes) for group in means]
     ratios = [means[1][scene] / means[0][scene] for scene in scenes]
     return totals[1] / totals[0] - 1, statistics.fmean(ratios) - 1, len(scenes)
+
+
+def change_words(of_totals: float, of_scenes: float, scenes: int) -> str:
+    """A relative change with its averaging rules named; over one scene there is nothing to average."""
+    totals, ratios = (f"{value:+.1%}".replace("-", "−") for value in (of_totals, of_scenes))
+    if scenes == 1:
+        return totals
+    return f"{totals} as a ratio of totals, {ratios} as the mean of {scenes} scenes"
 
 
 _COSTS: dict[str, Callable[[Trial], float | None]] = {

@@ -61,9 +61,9 @@ def training_curve(trials: Sequence[Trial], cost: str, quality: str) -> Curve:
     by_step: dict[int, list[tuple[float, float]]] = {}
     for trial in trials:
         for row in read_json_lines(trial.path / METRICS_FILE):
-            values = row.get(key), row.get(quality)
-            if all(isinstance(value, int | float) for value in values):
-                by_step.setdefault(int(row["step"]), []).append(values)
+            x, y = row.get(key), row.get(quality)
+            if isinstance(x, int | float) and isinstance(y, int | float):
+                by_step.setdefault(int(row["step"]), []).append((x, y))
     full = {step: rows for step, rows in by_step.items() if len(rows) == len(trials)}
     points = [
         (statistics.fmean(row[0] for row in rows), statistics.fmean(row[1] for row in rows), str(step))

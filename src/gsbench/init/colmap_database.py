@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,12 +14,35 @@ from PIL import Image
 
 from gsbench.init.base import Progress
 from gsbench.scene.colmap import rescaled_camera
+from gsbench.scene.images import image_size, read_image
 
+COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 VERIFY_CALLS = 20  # COLMAP reports no progress within a call, so it is called for a twentieth of the pairs
 MIN_PAIRS_PER_CALL = 50
 
 
 Groups = Sequence[tuple[pycolmap.Camera, Sequence[str]]]  # each camera with the names of its images
+
+
+def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
+    """A folder with the same ``names`` in which COLMAP can read every image.
+
+    It is ``images`` itself unless some have a format that COLMAP lacks (WebP). Else it is made below ``work_dir``:
+    links to the files, and for those PNG content, which COLMAP recognises whatever the name says.
+    """
+    unreadable = [name for name in names if Path(name).suffix.lower() not in COLMAP_SUFFIXES]
+    if not unreadable:
+        return images
+    folder = work_dir / "images"
+    shutil.rmtree(folder, ignore_errors=True)
+    for name in names:
+        copy = folder / name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        if name in unreadable:
+            Image.fromarray(read_image(images / name)).save(copy, format="PNG")
+        else:
+            copy.symlink_to((images / name).resolve())
+    return folder
 
 
 def reference_groups(reference: pycolmap.Reconstruction) -> list[tuple[pycolmap.Camera, list[str]]]:
@@ -47,8 +71,7 @@ def guessed_groups(
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     for name in names:
-        with Image.open(images / name) as image:
-            size = image.size
+        size = image_size(images / name)
         folder = str(Path(name).parent)
         key = {"single": size, "per_folder": (folder, *size), "per_image": (name,)}[sharing]
         groups.setdefault(key, []).append(name)

@@ -61,6 +61,21 @@ class Job:
     preparation: Preparation
 
 
+@dataclass(frozen=True)
+class DatabaseTask:
+    """What is to be filled: the database with cameras and images in it, and the pairs of images to be matched.
+
+    ``images`` is a folder with the same names as the capture's in which COLMAP can read every file.
+    """
+
+    database: Path
+    images: Path
+    names: list[str]
+    pairs: list[tuple[str, str]]
+    capture: Capture
+    work_dir: Path
+
+
 @dataclass(frozen=True, kw_only=True)
 class ColmapInitializer(ABC):
     """Options shared by `Sfm`, `SfmDense` and `Dim`.
@@ -156,17 +171,8 @@ class ColmapInitializer(ABC):
         return Preparation()
 
     @abstractmethod
-    def fill_database(
-        self,
-        database: Path,
-        names: list[str],
-        pairs: list[tuple[str, str]],
-        capture: Capture,
-        work_dir: Path,
-        progress: Progress,
-        timer: Timer,
-    ) -> None:
-        """Write features, matches and verified geometries of the images ``names``; runs in the isolated process."""
+    def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> None:
+        """Write features, matches and verified geometries; runs in the isolated process."""
 
     @property
     def num_threads(self) -> int:
@@ -189,15 +195,17 @@ def build_model(job: Job, progress: Progress) -> InitReport:
     timer = Timer(dict(job.preparation.seconds))
     reference = reconstruct.load_reference(capture, job.reference)
     database = job.work_dir / "database.db"
+    images = colmap_database.readable_images(capture.images, capture.image_names, job.work_dir)
     if reference is not None and takes_reference_cameras(options):
         cameras = colmap_database.reference_groups(reference)
     else:
         cameras = colmap_database.guessed_groups(
-            capture.images, capture.image_names, options.camera, options.camera_model, options.focal_length
+            images, capture.image_names, options.camera, options.camera_model, options.focal_length
         )
     names = list(colmap_database.create_database(database, cameras))
     pairs = reconstruct.select_pairs(capture.images, names, options, reference)
-    options.fill_database(database, names, pairs, capture, job.work_dir, progress, timer)
+    task = DatabaseTask(database, images, names, pairs, capture, job.work_dir)
+    options.fill_database(task, progress, timer)
     counts = {**job.preparation.counts, **colmap_database.database_counts(database)}
     if counts["pairs_verified"] == 0:
         raise InputError(
@@ -214,10 +222,10 @@ def build_model(job: Job, progress: Progress) -> InitReport:
     shutil.rmtree(scratch, ignore_errors=True)
     if options.poses == "shared" and reference is not None:
         with timer.phase("triangulate"):
-            model = reconstruct.triangulate(database, capture.images, scratch, reference, settings, progress)
+            model = reconstruct.triangulate(database, images, scratch, reference, settings, progress)
         return _finish(job, "shared", model, reference, None, timer, counts)
     with timer.phase("map"):
-        model = reconstruct.map_images(database, capture.images, scratch, settings, progress)
+        model, counts["models"] = reconstruct.map_images(database, images, scratch, settings, progress)
     similarity = None if reference is None else reconstruct.similarity_to(model, reference)
     return _finish(job, "own", model, reference, similarity, timer, counts)
 

@@ -11,7 +11,7 @@ from typing import ClassVar
 from gsbench.errors import InputError
 from gsbench.init.base import Progress
 from gsbench.init.checks import check_choice, check_integer, check_number
-from gsbench.init.colmap_initializer import ColmapInitializer, Preparation
+from gsbench.init.colmap_initializer import ColmapInitializer, DatabaseTask, Preparation
 from gsbench.init.feature_settings import FeatureSettings
 from gsbench.init.network_weights import ALIKED_WEIGHTS, EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS, SUPERPOINT_LICENCE
 from gsbench.init.relay import run_with_progress
@@ -69,27 +69,18 @@ class FeatureInitializer(ColmapInitializer):
         job = NetworkJob(self, capture, reference, work_dir, *self.find_weights())
         return run_with_progress(extract_and_match, job, progress, what=f"{self.name}: features and matches")
 
-    def fill_database(
-        self,
-        database: Path,
-        names: list[str],
-        pairs: list[tuple[str, str]],
-        capture: Capture,
-        work_dir: Path,
-        progress: Progress,
-        timer: Timer,
-    ) -> None:
+    def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> None:
         from gsbench.init.colmap_database import verify_pairs, write_keypoints, write_matches
         from gsbench.init.extract_and_match import open_store
         from gsbench.init.reconstruct import verification_options
 
-        store = open_store(self, capture, work_dir, *self.find_weights())
-        write_keypoints(database, {name: store.require_features(name).colmap_keypoints for name in names})
-        matches = {pair: store.require_matches(*pair) for pair in pairs}
+        store = open_store(self, task.capture, task.work_dir, *self.find_weights())
+        write_keypoints(task.database, {name: store.require_features(name).colmap_keypoints for name in task.names})
+        matches = {pair: store.require_matches(*pair) for pair in task.pairs}
         matches = {pair: indices for pair, indices in matches.items() if len(indices) > 0}
-        write_matches(database, matches)
+        write_matches(task.database, matches)
         with timer.phase("verify"):
-            verify_pairs(database, sorted(matches), verification_options(self.seed, self.min_inliers), progress)
+            verify_pairs(task.database, sorted(matches), verification_options(self.seed, self.min_inliers), progress)
 
     def packages(self) -> tuple[str, ...]:
         return (*super().packages(), "torch", "kornia")
@@ -100,7 +91,6 @@ class Dim(FeatureInitializer):
     """Deep image matching: SuperPoint, ALIKED or DISK features, matched by LightGlue or as mutual nearest ones."""
 
     name: ClassVar[str] = "dim"
-    key_ignores: ClassVar[tuple[str, ...]] = ("weights", "download")  # where the files come from, not what they hold
 
     extractor: str = "superpoint"
     matcher: str = "lightglue"

@@ -84,8 +84,8 @@ def verification_options(seed: int, min_inliers: int) -> pycolmap.TwoViewGeometr
 
 def map_images(
     database: Path, images: Path, output: Path, settings: MappingSettings, progress: Progress
-) -> pycolmap.Reconstruction:
-    """COLMAP's incremental mapping. Of several models the one with the most images is returned, not the first.
+) -> tuple[pycolmap.Reconstruction, int]:
+    """COLMAP's incremental mapping: the model with the most images, not the first, and how many models there were.
 
     Raises ``InputError`` where no model with at least `MIN_IMAGES` images comes out.
     """
@@ -116,7 +116,7 @@ def map_images(
             f"structure from motion placed only {largest.num_reg_images()} of {total} images: the photos need more "
             "overlap, more texture, or a focal length (init.focal_length, px)"
         )
-    return largest
+    return largest, len(models)
 
 
 def triangulate(

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 from gsbench.errors import InputError
 from gsbench.init.base import Progress
 from gsbench.init.checks import check_integer, check_number
-from gsbench.init.colmap_initializer import ColmapInitializer
+from gsbench.init.colmap_initializer import ColmapInitializer, DatabaseTask
 from gsbench.init.timer import Timer
-from gsbench.scene.types import Capture
 
 DEFAULT_PEAK_THRESHOLD = 0.02 / 3  # COLMAP's defaults
 DEFAULT_EDGE_THRESHOLD = 10.0
@@ -29,7 +27,6 @@ class Sfm(ColmapInitializer):
 
     name: ClassVar[str] = "sfm"
     is_own_reference: ClassVar[bool] = True
-    key_ignores: ClassVar[tuple[str, ...]] = ("threads",)  # the database is the same for any number
 
     max_image_size: int = 1600
     max_num_features: int = 8192
@@ -49,27 +46,18 @@ class Sfm(ColmapInitializer):
         check_integer("first_octave", self.first_octave, -1, 5)
         check_number("max_ratio", self.max_ratio, 0, 1, exclusive=True)
 
-    def fill_database(
-        self,
-        database: Path,
-        names: list[str],
-        pairs: list[tuple[str, str]],
-        capture: Capture,
-        work_dir: Path,
-        progress: Progress,
-        timer: Timer,
-    ) -> None:
+    def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> None:
         from gsbench.init.colmap_database import database_counts
         from gsbench.init.reconstruct import verification_options
         from gsbench.init.sift import extract_sift, match_sift
 
         with timer.phase("extract"):
-            extract_sift(database, capture.images, names, self, self.num_threads, progress)
-        if database_counts(database)["features"] == 0:
+            extract_sift(task.database, task.images, task.names, self, self.num_threads, progress)
+        if database_counts(task.database)["features"] == 0:
             raise InputError(f"{self.name}: no keypoint in any image: lower init.peak_threshold, or check the photos")
         with timer.phase("match"):
             verification = verification_options(self.seed, self.min_inliers)
-            match_sift(database, pairs, self, verification, self.num_threads, progress)
+            match_sift(task.database, task.pairs, self, verification, self.num_threads, progress)
 
 
 @dataclass(frozen=True, kw_only=True)

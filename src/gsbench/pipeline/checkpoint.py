@@ -1,45 +1,93 @@
-"""Checkpoints of a training: written so that a kill at any moment leaves a readable one."""
+"""Checkpoints of a training: written so that a kill at any moment leaves a readable one, and damage is noticed.
+
+A checkpoint is what ``torch.save`` writes, which ``torch.load`` reads, and after it the sha256 of that.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
+
+from gsbench.pipeline.files import CHUNK, sync_to_disk
 
 log = logging.getLogger(__name__)
 
 KEPT = 2  # the newest, and the one before in case the newest is damaged
 PATTERN = "checkpoint-*.pt"
+DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> None:
     """Write ``state`` (tensors and plain values) as the checkpoint of ``step``, then drop all but the last two."""
     path = folder / f"checkpoint-{step:08d}.pt"
     temporary = folder / f".{path.name}.tmp"
-    with temporary.open("wb") as stream:
-        torch.save(state, stream)
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(temporary, path)
+    try:
+        with temporary.open("wb") as stream:
+            writer = _HashingWriter(stream)
+            torch.save(state, writer)
+            stream.write(writer.digest.digest())
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+    sync_to_disk(folder)
     for old in sorted(folder.glob(PATTERN))[:-KEPT]:
         old.unlink()
 
 
 def load_checkpoint(folder: Path, device: torch.device) -> dict[str, Any] | None:
-    """The newest readable checkpoint, or None. A damaged one is named and passed over; nothing in it is run as code."""
+    """The newest sound checkpoint, or None. A damaged one is named and removed; nothing in it is run as code."""
     for path in sorted(folder.glob(PATTERN), reverse=True):
         try:
+            _check_digest(path)
             return torch.load(path, map_location=device, weights_only=True)
         except Exception as error:  # noqa: BLE001 - torch.load raises many kinds on damaged files
-            log.warning("checkpoint %s is damaged (%s) and is passed over", path, str(error).splitlines()[0])
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            log.warning("checkpoint %s is damaged (%s) and is passed over", path, reason)
             path.unlink()
     return None
 
 
 def remove_checkpoints(folder: Path) -> None:
-    """Drop all checkpoints, when the training is finished."""
+    """Drop all checkpoints, when what they were for is safe."""
     for path in folder.glob(PATTERN):
         path.unlink()
+
+
+class _HashingWriter:
+    """Passes bytes on to ``stream`` and keeps their sha256."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self.stream = stream
+        self.digest = hashlib.sha256()
+
+    def write(self, data: bytes) -> int:
+        self.digest.update(data)
+        return self.stream.write(data)
+
+    def flush(self) -> None:
+        self.stream.flush()
+
+
+def _check_digest(path: Path) -> None:
+    """Raise ValueError unless the file ends with the sha256 of what is before."""
+    remaining = path.stat().st_size - DIGEST_BYTES
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while remaining > 0:
+            chunk = stream.read(min(CHUNK, remaining))
+            if not chunk:
+                break
+            digest.update(chunk)
+            remaining -= len(chunk)
+        if remaining != 0 or stream.read() != digest.digest():
+            raise ValueError("its checksum differs")

@@ -27,9 +27,11 @@ from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Sfm, read_cloud
 from gsbench.init.base import MODEL_FOLDER, REPORT_FILE, Initializer
 from gsbench.pipeline.components import available_threads, options_of
+from gsbench.pipeline.files import write_json
 from gsbench.pipeline.maps import view_maps
 from gsbench.pipeline.progress import Report, progress
-from gsbench.pipeline.store import Entry, Stage, Store, write_json
+from gsbench.pipeline.stage_list import CAPTURE, EVALUATE, GROUND_TRUTH, INIT, TRAIN
+from gsbench.pipeline.store import Entry, Store
 from gsbench.pipeline.trainer import Status, Trainer
 from gsbench.raster import Rasterizer
 from gsbench.scene.courtyard import render_courtyard
@@ -39,12 +41,6 @@ from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Capture, Scene
 
 log = logging.getLogger(__name__)
-
-CAPTURE = Stage("scene", 1)
-INIT = Stage("init", 1, resumable=True)
-TRAIN = Stage("train", 1, resumable=True)
-GROUND_TRUTH = Stage("ground_truth", 1)
-EVALUATE = Stage("evaluate", 1)
 
 PLY_FILE = "point_cloud.ply"
 TRAINING_FILE = "training.json"
@@ -131,7 +127,7 @@ def train(
     device: torch.device,
 ) -> Entry:
     """Train, and keep the model, its lineage, metrics and events."""
-    ignored = ("name", "log_every", "checkpoint_every", "volume_histogram")
+    ignored = ("name", "log_every", "checkpoint_every", "checkpoint_minutes", "volume_histogram")
     inputs = {
         "scene": scene_inputs,
         "init": init.key,

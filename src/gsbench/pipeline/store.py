@@ -1,43 +1,46 @@
 """A content-addressed store of stage results: the same inputs are never computed twice.
 
 Layout: ``<root>/<stage>/<key>/`` holds a finished result, with ``manifest.json`` written last; ``.<key>.partial/`` is where it
-is built, and what a killed build leaves; ``.<key>.lock`` lets one process build while others wait.
+is built, and what a killed build leaves; ``.<key>.lock`` lets one process build while others wait, and stays (it is empty).
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock
-
 from gsbench import __version__
 from gsbench.config import sha256_of
+from gsbench.pipeline.files import remove_temporaries, storage_errors, sync_to_disk, write_json
+from gsbench.pipeline.locks import BusyError, hold
+from gsbench.weights import file_sha256
 
 log = logging.getLogger(__name__)
 
 MANIFEST = "manifest.json"
-CHUNK = 1 << 20
+LEFTOVER_AGE = 24 * 3600.0  # seconds: temporary files outside the locks are swept when older
 
 
 @dataclass(frozen=True)
 class Stage:
     """A step of the pipeline. Bump ``version`` by hand when its code changes what it computes.
 
-    ``resumable`` stages find what a killed build left and go on from it; the others start in an empty folder.
+    ``resumable`` stages find what a killed build left and go on from it; the others start in an empty folder. Files that
+    match ``scratch`` serve the build only: they are removed when the result is complete.
     """
 
     name: str
     version: int
     resumable: bool = False
+    scratch: tuple[str, ...] = ()
 
     def key(self, inputs: dict[str, Any]) -> str:
         """sha256 of canonical JSON of the stage and all that it reads, upstream keys included."""
@@ -63,48 +66,87 @@ class Store:
     def path(self, stage: Stage, key: str) -> Path:
         return self.root / stage.name / key
 
+    def partial(self, stage: Stage, key: str) -> Path:
+        return self.root / stage.name / f".{key}.partial"
+
     def find(self, stage: Stage, inputs: dict[str, Any]) -> Entry | None:
-        """The finished result for ``inputs``, or None; a damaged one is named, removed and counts as none."""
-        key = stage.key(inputs)
-        path = self.path(stage, key)
-        if not path.is_dir():
-            return None
+        """The finished and sound result for ``inputs``, or None."""
         try:
-            manifest = read_manifest(path)
-        except ValueError as error:
-            log.warning("store: %s is damaged (%s) and is built again", path, error)
-            shutil.rmtree(path, ignore_errors=True)
+            return self._read(self.path(stage, stage.key(inputs)))
+        except ValueError:
             return None
-        return Entry(path, key, float(manifest["seconds"]), cached=True)
 
     def get(self, stage: Stage, inputs: dict[str, Any], build: Callable[[Path], None]) -> Entry:
-        """The result for ``inputs``, computed by ``build(folder)`` unless it is there; published by an atomic rename."""
+        """The result for ``inputs``, computed by ``build(folder)`` unless it is there; published by an atomic rename.
+
+        A damaged result is named and built again. Raises DiskFullError, or InputError where the store is read-only.
+        """
+        found = self.find(stage, inputs)
+        if found is not None:
+            return found
         key = stage.key(inputs)
         final = self.path(stage, key)
-        final.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(final.parent / f".{key}.lock"):
-            found = self.find(stage, inputs)
-            if found is not None:
-                return found
-            partial = final.parent / f".{key}.partial"
+        with storage_errors(self.root):
+            final.parent.mkdir(parents=True, exist_ok=True)
+            with hold(final.parent / f".{key}.lock", f"{stage.name} {key[:8]}"):
+                if final.exists():
+                    try:
+                        return self._read(final)
+                    except ValueError as error:
+                        log.warning("store: %s is damaged (%s) and is built again", final, error)
+                        _remove(final)
+                return self._build(stage, key, inputs, build)
+
+    def _read(self, path: Path) -> Entry:
+        return Entry(path, path.name, float(read_manifest(path)["seconds"]), cached=True)
+
+    def _build(self, stage: Stage, key: str, inputs: dict[str, Any], build: Callable[[Path], None]) -> Entry:
+        """Build or finish the partial folder and publish it; the caller holds the lock of ``key``."""
+        final, partial = self.path(stage, key), self.partial(stage, key)
+        seconds = _finished_seconds(partial, key)
+        if seconds is None:
             if partial.exists() and not stage.resumable:
-                shutil.rmtree(partial)
+                _remove(partial)
             partial.mkdir(exist_ok=True)
+            remove_temporaries(partial)
+            (partial / MANIFEST).unlink(missing_ok=True)
             started = time.perf_counter()
             build(partial)
             seconds = time.perf_counter() - started
             write_manifest(partial, stage, key, inputs, seconds)
-            os.replace(partial, final)
+        for pattern in stage.scratch:
+            for path in partial.rglob(pattern):
+                path.unlink()
+        os.replace(partial, final)
+        sync_to_disk(final.parent)
         return Entry(final, key, seconds, cached=False)
+
+    def sweep(self, stages: Iterable[Stage]) -> None:
+        """Remove what killed processes left and nobody goes on with; what a living process holds is left alone."""
+        for stage in stages:
+            for partial in (self.root / stage.name).glob(".*.partial"):
+                key = partial.name[1 : -len(".partial")]
+                if not stage.resumable or self.path(stage, key).exists():
+                    with suppress(BusyError, OSError), hold(partial.with_name(f".{key}.lock"), key, wait=False):
+                        _remove(partial)
+            for doomed in (self.root / stage.name).glob(".*.removed"):
+                shutil.rmtree(doomed, ignore_errors=True)
+        for work in (self.root / "views").glob(".*"):  # prepared images are published by a rename from such folders
+            with suppress(OSError):
+                if work.is_dir() and time.time() - work.stat().st_mtime > LEFTOVER_AGE:
+                    shutil.rmtree(work, ignore_errors=True)
 
 
 def write_manifest(folder: Path, stage: Stage, key: str, inputs: dict[str, Any], seconds: float) -> None:
-    """Record what made ``folder`` and a checksum of every file in it."""
-    outputs = {
-        str(path.relative_to(folder)): {"size": path.stat().st_size, "sha256": sha256_of_file(path)}
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+    """Record what made ``folder`` and a checksum of every file in it, after all of them are on the disk."""
+    scratch = {path for pattern in stage.scratch for path in folder.rglob(pattern)}
+    outputs = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path not in scratch:
+            sync_to_disk(path)
+            state = path.stat()
+            recorded = {"size": state.st_size, "mtime_ns": state.st_mtime_ns, "sha256": file_sha256(path)}
+            outputs[path.relative_to(folder).as_posix()] = recorded
     manifest = {
         "stage": stage.name,
         "version": stage.version,
@@ -118,35 +160,53 @@ def write_manifest(folder: Path, stage: Stage, key: str, inputs: dict[str, Any],
     write_json(folder / MANIFEST, manifest)
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a finished result; raises ValueError naming what is damaged."""
+def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) -> dict[str, Any]:
+    """The manifest of the finished result of ``key`` (else the folder's name); raises ValueError naming what is damaged.
+
+    A file whose size and time of change are as recorded counts as sound unless ``thorough``; others are read whole.
+    """
     try:
-        manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_text())
-        outputs = manifest["outputs"]
-        if manifest["key"] != folder.name:
+        manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        outputs = manifest["outputs"].items()
+        if manifest["key"] != (key or folder.name):
             raise ValueError(f"{MANIFEST} belongs to another key")
         expected = sha256_of({name: manifest[name] for name in ("stage", "version", "inputs")})
         if expected != manifest["key"]:
             raise ValueError(f"{MANIFEST} does not match its key")
-    except (OSError, KeyError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        float(manifest["seconds"])
+    except (OSError, KeyError, TypeError, AttributeError, json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{MANIFEST} is missing or unreadable") from error
-    for name, recorded in outputs.items():
-        path = folder / name
-        if not path.is_file() or path.stat().st_size != recorded["size"] or sha256_of_file(path) != recorded["sha256"]:
+    for name, recorded in outputs:
+        if not _is_sound(folder / name, recorded, thorough):
             raise ValueError(f"{name} differs from what was written")
     return manifest
 
 
-def sha256_of_file(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as stream:
-        while chunk := stream.read(CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()
+def _is_sound(path: Path, recorded: dict[str, Any], thorough: bool) -> bool:
+    try:
+        state = path.stat()
+        if state.st_size != recorded["size"]:
+            return False
+        if not thorough and state.st_mtime_ns == recorded["mtime_ns"]:
+            return True
+        return file_sha256(path) == recorded["sha256"]
+    except (OSError, KeyError, TypeError):
+        return False
 
 
-def write_json(path: Path, values: Any) -> None:
-    """Write JSON so that a reader sees the old file or the new one, never a part. NaN and infinity are refused."""
-    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
-    temporary.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n")
-    os.replace(temporary, path)
+def _finished_seconds(partial: Path, key: str) -> float | None:
+    """The build's time, where ``partial`` was killed after its last file was written and only has to be published."""
+    if not (partial / MANIFEST).exists():
+        return None
+    try:
+        return float(read_manifest(partial, key)["seconds"])
+    except ValueError:
+        return None
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder so that a kill in between leaves nothing that looks like a result."""
+    doomed = folder.with_name(f".{folder.name.lstrip('.')}.removed")
+    shutil.rmtree(doomed, ignore_errors=True)
+    os.replace(folder, doomed)
+    shutil.rmtree(doomed, ignore_errors=True)

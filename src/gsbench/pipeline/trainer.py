@@ -20,8 +20,9 @@ from gsbench.densify.volume import log_volume
 from gsbench.errors import TrainingError
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
-from gsbench.pipeline.checkpoint import load_checkpoint, remove_checkpoints, save_checkpoint
+from gsbench.pipeline.checkpoint import load_checkpoint, save_checkpoint
 from gsbench.pipeline.loss import photometric_loss
+from gsbench.pipeline.stopping import deferred, requested
 from gsbench.raster import Rasterizer
 from gsbench.scene.types import Scene, View
 
@@ -63,7 +64,8 @@ class Trainer:
     """Trains Gaussians on the training views of a scene.
 
     All randomness comes from generators made of ``seed``. ``run`` writes metrics, events and checkpoints into a folder, and
-    goes on from the newest checkpoint that it finds there: on the CPU, to the same bits as an undisturbed run.
+    goes on from the newest checkpoint that it finds there: on the CPU, to the same bits as an undisturbed run. A signal
+    to stop (see `gsbench.pipeline.stopping`) ends it after the iteration, with a checkpoint.
     """
 
     def __init__(
@@ -94,7 +96,8 @@ class Trainer:
         first_step, started = self.step, time.perf_counter()
         before = self.seconds
         options = self.options
-        with (folder / METRICS).open("a") as metrics, (folder / EVENTS).open("a") as events:
+        last_checkpoint = time.monotonic()
+        with (folder / METRICS).open("a") as metrics, (folder / EVENTS).open("a") as events, deferred():
             while self.step < options.iterations:
                 record, event = self._iterate(folder)
                 self.seconds = before + time.perf_counter() - started
@@ -111,11 +114,13 @@ class Trainer:
                     on_status(Status(self.step, self.smoothed_loss, len(self.gaussians), rate))
                 if last:
                     break
-                if self.step % options.checkpoint_every == 0:
-                    metrics.flush()
-                    events.flush()
+                minutes = (time.monotonic() - last_checkpoint) / 60
+                if self.step % options.checkpoint_every == 0 or minutes >= options.checkpoint_minutes or requested():
                     save_checkpoint(folder, self.step, self._state())
-        remove_checkpoints(folder)
+                    last_checkpoint = time.monotonic()
+                if requested():
+                    log.info("stopping at iteration %d, with a checkpoint", self.step)
+                    break
         return self.gaussians.values.detach()
 
     def _iterate(self, folder: Path) -> tuple[dict[str, Any], dict[str, object] | None]:

@@ -9,8 +9,7 @@ import shutil
 import time
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,56 +21,53 @@ from gsbench.errors import GsbenchError
 from gsbench.init.base import REPORT_FILE
 from gsbench.pipeline import stages
 from gsbench.pipeline.components import available_threads, build, select_device
-from gsbench.pipeline.store import Entry, Store, write_json
+from gsbench.pipeline.files import remove_temporaries, storage_errors, write_json, write_text
+from gsbench.pipeline.locks import hold
+from gsbench.pipeline.stage_list import EVALUATE, GROUND_TRUTH, INIT, TRAIN
+from gsbench.pipeline.store import Entry, Store
 from gsbench.pipeline.trainer import EVENTS, HISTOGRAMS, METRICS
+from gsbench.pipeline.trial_files import CONFIG, FAILED, LOG, RESULTS, TrialPaths, find_finished, read_object, record_inputs
 from gsbench.raster import create_rasterizer, resolve_name
+from gsbench.scene.colmap_files import model_files
+from gsbench.scene.types import Capture
 from gsbench.tracking import Mirror
 
 log = logging.getLogger(__name__)
 
-RESULTS = "results.json"
-FAILED = "failed.json"
-CONFIG = "config.yaml"
-LOG = "log.txt"
 
-
-@dataclass(frozen=True)
-class TrialPaths:
-    """Where a trial's files lie."""
-
-    runs: Path
-    folder: Path
-
-    @classmethod
-    def of(cls, values: dict[str, Any]) -> TrialPaths:
-        """The folders of the trial with the resolved configuration ``values``."""
-        runs = Path(values["runs"]).expanduser().resolve()
-        arm = f"{values['init']['name']}-{values['densify']['name']}"
-        leaf = f"{config_hash(values)[:8]}-seed{values['seed']}"
-        return cls(runs, runs / values["name"] / values["scene"]["name"] / arm / leaf)
-
-
-def run_trial(values: dict[str, Any], config_yaml: str) -> dict[str, Any]:
+def run_trial(values: dict[str, Any], config_yaml: str, wait: bool = True) -> dict[str, Any]:
     """Run the trial with the resolved configuration ``values``, or find it done; returns what ``results.json`` holds.
 
-    On failure ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again.
+    On failure ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again. Where another
+    process runs this trial, waits for it, or raises BusyError if ``wait`` is False.
     """
     paths = TrialPaths.of(values)
-    paths.folder.mkdir(parents=True, exist_ok=True)
-    with _log_to(paths.folder / LOG):
-        try:
-            return _run(values, config_yaml, paths)
-        except (Exception, KeyboardInterrupt) as error:
-            log.debug("the trial failed", exc_info=True)
-            kind = type(error).__name__
-            message = str(error) if isinstance(error, GsbenchError) else f"{kind}: {error}"
-            record = {"status": "failed", "error": kind, "message": message, "traceback": traceback.format_exc()}
-            write_json(paths.folder / FAILED, record | {"time": time.time(), "seed": values["seed"]})
-            raise
+    with storage_errors(paths.runs):
+        paths.folder.mkdir(parents=True, exist_ok=True)
+        with hold(paths.lock, paths.label, wait), _log_to(paths.folder / LOG):
+            finished = find_finished(values)
+            if finished is not None:
+                log.info("%s: was done", paths.label)
+                return finished
+            remove_temporaries(paths.folder)
+            try:
+                with storage_errors(paths.runs):
+                    return _run(values, config_yaml, paths)
+            except Exception as error:
+                _record_failure(error, values, paths)
+                raise
+
+
+def _record_failure(error: Exception, values: dict[str, Any], paths: TrialPaths) -> None:
+    log.debug("the trial failed", exc_info=True)
+    kind = type(error).__name__
+    message = str(error) if isinstance(error, GsbenchError) else f"{kind}: {error}"
+    record = {"status": "failed", "error": kind, "message": message, "traceback": traceback.format_exc()}
+    with suppress(OSError):  # on a full disk the error itself has to do
+        write_json(paths.folder / FAILED, record | {"time": time.time(), "seed": values["seed"]})
 
 
 def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[str, Any]:
-    label = f"{paths.folder.parent.parent.name}/{paths.folder.parent.name} seed {values['seed']}"
     device = select_device(values["device"])
     threads = available_threads(values["launch"]["parallel"]) if values["threads"] == "auto" else values["threads"]
     torch.set_num_threads(threads)
@@ -83,7 +79,8 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
     eval_options = EvalConfig(**values["eval"])
     store = Store(paths.runs / "store")
 
-    (paths.folder / CONFIG).write_text(config_yaml)
+    write_text(paths.folder / CONFIG, config_yaml)
+    (paths.folder / FAILED).unlink(missing_ok=True)
     mirror = Mirror(values["tracking"], paths.runs, paths.folder, values)
     with mirror:
         capture = stages.read_capture(store, scene_options)
@@ -91,7 +88,7 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
         init = stages.initialize(store, capture, initializer)
         _link(init.path / REPORT_FILE, paths.folder / "init_report.json")
         scene = stages.prepare_scene(store, capture, init, scene_options)
-        log.info("%s: %d training and %d test views", label, len(scene.train), len(scene.test))
+        log.info("%s: %d training and %d test views", paths.label, len(scene.train), len(scene.test))
         trained = stages.train(
             store, scene, inputs, init, densifier, rasterizer, train_options, values["seed"], device
         )
@@ -99,16 +96,25 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
         evaluated = stages.evaluate(
             store, scene, init, trained, rasterizer, train_options, eval_options, device
         )
-        _publish(paths.folder, trained, evaluated, ground_truth)
+        published = _publish(paths.folder, trained, evaluated, ground_truth)
         results = _results(values, capture.fingerprint, scene, init, trained, evaluated, rasterizer.name)
-        done = paths.folder / RESULTS
-        again = done.exists() and json.loads(done.read_text()).get("hashes") == results["hashes"]
+        entries = {INIT.name: init, TRAIN.name: trained, GROUND_TRUTH.name: ground_truth, EVALUATE.name: evaluated}
+        where = {name: entry.path for name, entry in entries.items()}
+        again = read_object(paths.folder / RESULTS) == results
+        record_inputs(paths.folder, values, results, source_files(capture, store), where, published)
         if not again:
-            write_json(done, results)
-        (paths.folder / FAILED).unlink(missing_ok=True)
+            write_json(paths.folder / RESULTS, results)
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results["metrics"].items())
-    log.info("%s: %s  %d Gaussians%s", label, metrics, results["num_gaussians"], "  (was done)" if again else "")
+    log.info("%s: %s  %d Gaussians%s", paths.label, metrics, results["num_gaussians"], "  (was done)" if again else "")
     return results
+
+
+def source_files(capture: Capture, store: Store) -> list[Path]:
+    """The user's files that a capture was read from; none for a scene that was made in the store."""
+    if capture.images.resolve().is_relative_to(store.root.resolve()):
+        return []
+    images = [(capture.images / name).resolve() for name in capture.image_names]
+    return images + ([] if capture.model is None else [path.resolve() for path in model_files(capture.model)])
 
 
 def _results(
@@ -166,21 +172,23 @@ def evaluated_protocol(evaluated: Entry) -> str:
     return str(json.loads((evaluated.path / "manifest.json").read_text())["inputs"]["protocol"])
 
 
-def _publish(folder: Path, trained: Entry, evaluated: Entry, ground_truth: Entry) -> None:
-    """Show the stages' files in the trial's folder, as hard links where the file system has them."""
-    for name in (stages.PLY_FILE, stages.LINEAGE_FILE, METRICS, EVENTS, HISTOGRAMS):
-        if (trained.path / name).exists():
-            _link(trained.path / name, folder / name)
-    _link(evaluated.path / stages.PER_VIEW_FILE, folder / stages.PER_VIEW_FILE)
+def _publish(folder: Path, trained: Entry, evaluated: Entry, ground_truth: Entry) -> list[Path]:
+    """Show the stages' files in the trial's folder, as hard links where the file system has them; returns the links."""
+    names = (stages.PLY_FILE, stages.LINEAGE_FILE, METRICS, EVENTS, HISTOGRAMS)
+    links = {folder / name: trained.path / name for name in names if (trained.path / name).exists()}
+    links[folder / stages.PER_VIEW_FILE] = evaluated.path / stages.PER_VIEW_FILE
     sources = {
         "renders": evaluated.path / "renders",
         "ground_truth": ground_truth.path,
         "maps": evaluated.path / "maps",
     }
     for target, source in sources.items():
-        for file in sorted([*source.glob("*.png"), *source.glob("*.npz")]):
-            (folder / target).mkdir(exist_ok=True)
-            _link(file, folder / target / file.name)
+        files = sorted([*source.glob("*.png"), *source.glob("*.npz")])
+        links |= {folder / target / file.name: file for file in files}
+    for link, file in links.items():
+        link.parent.mkdir(exist_ok=True)
+        _link(file, link)
+    return list(links)
 
 
 def _link(source: Path, target: Path) -> None:
@@ -194,10 +202,17 @@ def _link(source: Path, target: Path) -> None:
     temporary.unlink(missing_ok=True)  # os.replace leaves it where both are links to one file
 
 
+class _QuietFileHandler(logging.FileHandler):
+    """Keeps silent where it cannot write: on a full disk the trial's own error says so."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
+        return
+
+
 @contextmanager
 def _log_to(path: Path) -> Iterator[None]:
     """Write everything that gsbench logs, tracebacks included, to ``path`` as well."""
-    handler = logging.FileHandler(path, encoding="utf-8")
+    handler = _QuietFileHandler(path, encoding="utf-8")
     handler.setLevel(logging.DEBUG)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logger = logging.getLogger("gsbench")
@@ -206,4 +221,5 @@ def _log_to(path: Path) -> Iterator[None]:
         yield
     finally:
         logger.removeHandler(handler)
-        handler.close()
+        with suppress(OSError):
+            handler.close()

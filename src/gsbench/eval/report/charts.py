@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 WIDTH, HEIGHT = 380, 250  # px at full size; text is 12 px
-LEFT, RIGHT, TOP, BOTTOM = 62, 18, 12, 44
+LEFT, RIGHT, TOP, BOTTOM = 58, 18, 26, 44
 COLORS = ("#4477aa", "#cc3311", "#228833", "#aa3377", "#b8860b", "#0099a8")  # told apart also by colour-blind readers
 DASHES = ("", "6 3", "2 3", "8 3 2 3", "1 2", "10 4")
 TICKS = 5
@@ -94,7 +94,8 @@ def bar_chart(title: str, labels: Sequence[str], series: Sequence[tuple[str, Seq
                 f'height="{height:.1f}" fill="{COLORS[index % len(COLORS)]}"><title>{_escape(name)}, {_escape(label)}: '
                 f"{short_number(row[place])}</title></rect>"
             )
-        parts.append(_text(LEFT + (place + 0.5) * slot, HEIGHT - BOTTOM + 16, label, "middle"))
+        for row_index, word in enumerate(label.split()):
+            parts.append(_text(LEFT + (place + 0.5) * slot, HEIGHT - BOTTOM + 15 + 13 * row_index, word, "middle"))
     words = "; ".join(
         f"{label}: " + ", ".join(f"{name} {short_number(row[place])}" for name, row in series)
         for place, label in enumerate(labels)
@@ -107,19 +108,20 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
     if not rows:
         return ""
     left, step = 132, 26
-    height = TOP + step * len(rows) + BOTTOM
+    top = 12
+    height = top + step * len(rows) + BOTTOM
     ends = [value for row in rows for value in (row.mean, row.low, row.high, 0.0) if value is not None]
-    axis = _Axis(ends, False, left, WIDTH - RIGHT)
+    axis = _Axis(ends, False, left, WIDTH - RIGHT, ticks=3)
     bottom = height - BOTTOM
     parts = []
     for tick in axis.ticks:
         x = axis.place(tick)
-        parts.append(f'<line class="grid" x1="{x:.1f}" x2="{x:.1f}" y1="{TOP}" y2="{bottom}"/>')
+        parts.append(f'<line class="grid" x1="{x:.1f}" x2="{x:.1f}" y1="{top}" y2="{bottom}"/>')
         parts.append(_text(x, bottom + 15, axis.label(tick), "middle"))
     zero = axis.place(0.0)
-    parts.append(f'<line class="axis" x1="{zero:.1f}" x2="{zero:.1f}" y1="{TOP}" y2="{bottom}"/>')
+    parts.append(f'<line class="axis" x1="{zero:.1f}" x2="{zero:.1f}" y1="{top}" y2="{bottom}"/>')
     for index, row in enumerate(rows):
-        y = TOP + step * (index + 0.5)
+        y = top + step * (index + 0.5)
         known = row.low is not None and row.high is not None
         decided = known and (row.low > 0 or row.high < 0)  # type: ignore[operator]
         color = "#555555" if not decided else "#1b7837" if row.mean * better > 0 else "#b2182b"
@@ -146,7 +148,7 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
 class _Axis:
     """Maps values to pixels, with round tick values."""
 
-    def __init__(self, values: Sequence[float], log: bool, start: float, end: float) -> None:
+    def __init__(self, values: Sequence[float], log: bool, start: float, end: float, ticks: int = TICKS) -> None:
         self._log, self._start, self._end = log, start, end
         scaled = [self._scale(value) for value in values]
         low, high = min(scaled), max(scaled)
@@ -156,7 +158,7 @@ class _Axis:
         margin = 0.04 * (high - low)
         zero_based = not log and min(values) == 0.0
         self._low, self._high = (low if zero_based else low - margin), high + margin
-        self.ticks = self._log_ticks() if log else _round_ticks(self._low, self._high)
+        self.ticks = self._log_ticks() if log else _round_ticks(self._low, self._high, ticks)
 
     def label(self, tick: float) -> str:
         """The tick's value with as many digits as tell it from its neighbours."""
@@ -184,8 +186,8 @@ class _Axis:
         )
 
 
-def _round_ticks(low: float, high: float) -> list[float]:
-    raw = (high - low) / TICKS
+def _round_ticks(low: float, high: float, count: int) -> list[float]:
+    raw = (high - low) / count
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(factor * power for factor in (1, 2, 2.5, 5, 10) if factor * power >= raw)
     first = math.ceil(low / step)
@@ -206,19 +208,17 @@ def _y_grid(axis: _Axis, label: str) -> str:
         y = axis.place(tick)
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
         parts.append(_text(LEFT - 6, y + 4, axis.label(tick), "end"))
-    middle = (TOP + HEIGHT - BOTTOM) / 2
-    parts.append(
-        f'<text x="12" y="{middle}" transform="rotate(-90 12 {middle})" text-anchor="middle">{_escape(label)}</text>'
-    )
+    parts.append(_text(0, 12, label, "start"))
     return "".join(parts)
 
 
 def _figure(
     title: str, words: str, parts: Sequence[str], height: float, names: Sequence[str], dashed: bool = True
 ) -> str:
+    dashes = DASHES if dashed else ("",)
     keys = "".join(
         f'<li><svg viewBox="0 0 26 8" width="26" height="8" aria-hidden="true"><line x1="0" x2="26" y1="4" y2="4" '
-        f'stroke="{COLORS[i % len(COLORS)]}" stroke-width="3" stroke-dasharray="{DASHES[i % len(DASHES)] if dashed else ""}"/></svg>'
+        f'stroke="{COLORS[i % len(COLORS)]}" stroke-width="3" stroke-dasharray="{dashes[i % len(dashes)]}"/></svg>'
         f"{_escape(name)}</li>"
         for i, name in enumerate(names)
     )

@@ -45,7 +45,7 @@ def choose_crops(pairs: Sequence[tuple[Trial, Trial]], count: int) -> tuple[list
     One seed of each scene is looked at, and at most one place in a view is taken for each list.
     """
     places: list[tuple[float, tuple[Trial, Trial], str, tuple[int, int, int, int]]] = []
-    faults: list[str] = []
+    faults: dict[str, str] = {}  # by scene
     seen: set[str] = set()
     for one, other in pairs:
         if one.scene in seen:
@@ -57,10 +57,10 @@ def choose_crops(pairs: Sequence[tuple[Trial, Trial]], count: int) -> tuple[list
                 places += [(gain, (one, other), view, box) for gain, box in _extremes(*images)]
             seen.add(one.scene)
         except InputError as error:
-            faults.append(str(error))
+            faults.setdefault(one.scene, str(error))
     best = sorted((place for place in places if place[0] > 0), key=lambda place: -place[0])[:count]
     worst = sorted((place for place in places if place[0] < 0), key=lambda place: place[0])[:count]
-    return [_cut(*place[1:]) for place in best], [_cut(*place[1:]) for place in worst], faults
+    return [_cut(*place[1:]) for place in best], [_cut(*place[1:]) for place in worst], list(faults.values())
 
 
 def data_uri(image: NDArray[np.uint8]) -> str:

@@ -17,7 +17,7 @@ from gsbench.eval.report.crops import Crop, choose_crops
 from gsbench.eval.report.volumes import share_above, volume_histogram
 from gsbench.eval.results import Arm, Trial, read_json_lines
 from gsbench.eval.statistics import Comparison, compare, seeds_needed
-from gsbench.eval.tables import cost_change
+from gsbench.eval.tables import change_words, cost_change
 from gsbench.eval.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve
 
 CROPS = 4  # places of each kind
@@ -124,16 +124,16 @@ def event_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
     """Events by cause: totals of every arm, and over the iterations of each arm."""
     totals = []
     for arm in arms:
-        own = [trial.data.get("events") or {} for trial in trials if trial.arm == arm]
+        logged = [trial.data.get("events") or {} for trial in trials if trial.arm == arm]
         totals.append(
-            (arm_name(arm), {c: statistics.fmean(float(events.get(c, 0)) for events in own) for c in EVENT_CAUSES})
+            (arm_name(arm), {c: statistics.fmean(float(events.get(c, 0)) for events in logged) for c in EVENT_CAUSES})
         )
     causes = [cause for cause in EVENT_CAUSES if any(counts[cause] for _, counts in totals)]
     if not causes:
         return []
-    labels = [cause.replace("split_", "split: ").replace("pruned_", "pruned: ") for cause in causes]
+    labels = [cause.replace("_", " ") for cause in causes]
     bars = [(name, [counts[cause] for cause in causes]) for name, counts in totals]
-    charts = [bar_chart("Refinement by cause, mean of a trial", labels, bars, "Gaussians")]
+    charts = [bar_chart("Refinement by cause, mean of a trial", labels, bars, "Gaussians"), _origin_chart(trials, arms)]
     for arm in arms:
         own = [trial for trial in trials if trial.arm == arm]
         series = [
@@ -142,6 +142,22 @@ def event_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
         ]
         charts.append(line_chart(f"Refinement over time: {arm_name(arm)}", series, "iteration", "Gaussians"))
     return [chart for chart in charts if chart]
+
+
+def _origin_chart(trials: Sequence[Trial], arms: Sequence[Arm]) -> str:
+    """What made the Gaussians that are left at the end, as the mean of a trial."""
+    origins = {arm: [trial.data.get("causes") or {} for trial in trials if trial.arm == arm] for arm in arms}
+    causes = list(dict.fromkeys(cause for logged in origins.values() for counts in logged for cause in counts))
+    means = {
+        arm: [statistics.fmean(float(counts.get(cause, 0)) for counts in logged) for cause in causes]
+        for arm, logged in origins.items()
+    }
+    shown = [index for index in range(len(causes)) if any(row[index] for row in means.values())]
+    if not shown:
+        return ""
+    bars = [(arm_name(arm), [row[index] for index in shown]) for arm, row in means.items()]
+    labels = [causes[index].replace("_", " ") for index in shown]
+    return bar_chart("What made the final Gaussians, mean of a trial", labels, bars, "Gaussians")
 
 
 def volume_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> tuple[list[str], list[str]]:
@@ -205,6 +221,11 @@ def _verdict(quantity: Quantity, comparison: Comparison) -> Verdict:
 def _headline(verdicts: Sequence[Verdict], first: Arm, second: Arm) -> str:
     if not verdicts:
         return f"{arm_name(second)} and {arm_name(first)} cannot be compared: no metric has paired trials."
+    scope = verdicts[0].comparison.scope
+    if all(verdict.comparison.p is None for verdict in verdicts):
+        return (
+            f"{arm_name(second)} against {arm_name(first)}: no verdict, one trial of each on {scope}; run more seeds."
+        )
     words = []
     for word, opening in (
         ("better", "better in"),
@@ -214,7 +235,6 @@ def _headline(verdicts: Sequence[Verdict], first: Arm, second: Arm) -> str:
         names = [v.quantity.name for v in verdicts if v.comparison.verdict == word]
         if names:
             words.append(f"{opening} {', '.join(names)}")
-    scope = verdicts[0].comparison.scope
     return f"{arm_name(second)} against {arm_name(first)}, on {scope}: {'; '.join(words)}."
 
 
@@ -224,9 +244,7 @@ def _costs(trials: Sequence[Trial], first: Arm, second: Arm) -> list[str]:
     for name, key in (("Gaussians", "gaussians"), ("Training time", "seconds")):
         change = cost_change(arms[0], arms[1], COST_READERS[key])
         if change is not None:
-            of_totals, of_scenes, scenes = change
-            rules = f"ratio of totals; mean of {scenes} scenes {of_scenes:+.1%}"
-            lines.append(f"{name} {of_totals:+.1%} ({rules})")
+            lines.append(f"{name} {change_words(*change)}")
         gap = curve_gap(*(training_curve(own, key, "psnr") for own in arms))
         if gap is not None:
             lines.append(_gap_words(gap, COST_LABELS[key]))

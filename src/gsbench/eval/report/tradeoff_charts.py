@@ -45,11 +45,12 @@ def tradeoff_gaps(trials: Sequence[Trial], baseline: str = BASELINE) -> list[str
 
 
 def _main_metrics(trials: Sequence[Trial]) -> list[Quantity]:
-    """PSNR and the protocol's LPIPS, or FLIP where that is missing."""
-    chosen = [quantity("psnr", trials), quantity("lpips", trials)]
-    if not any(chosen[1].read(trial) is not None for trial in trials):
-        chosen[1] = quantity("flip", trials)
-    return chosen
+    """PSNR, and the first perceptual metric that is at hand, beginning with the protocol's LPIPS."""
+    for name in ("lpips", "lpips_vgg", "lpips_alex", "lpips_squeeze", "flip"):
+        perceptual = quantity(name, trials)
+        if all(perceptual.read(trial) is not None for trial in trials):
+            return [quantity("psnr", trials), perceptual]
+    return [quantity("psnr", trials)]
 
 
 def _curves(trials: Sequence[Trial], metric: Quantity, cost: str) -> dict[Arm, Curve]:

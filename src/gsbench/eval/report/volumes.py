@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,7 @@ def share_above(trials: Sequence[Trial], threshold: float) -> float:
     return float(np.mean(volumes > math.log10(threshold)))
 
 
-def _read_header(file) -> tuple[int, np.dtype]:
+def _read_header(file: BinaryIO) -> tuple[int, np.dtype]:
     """(number of vertices, their record) of a little-endian PLY whose first element is the vertices."""
     if file.readline().strip() != b"ply" or b"binary_little_endian" not in file.readline():
         raise ValueError("not a little-endian binary PLY")

@@ -46,6 +46,9 @@ ALL_BLOCKS = np.uint64(0xFFFF)
 
 LANE_X = (np.arange(LANES) % at.BLOCK).astype(np.float32)  # px within a block
 LANE_Y = (np.arange(LANES) // at.BLOCK).astype(np.float32)
+# px within a tile, in the order by block and lane
+PIXEL_X = np.concatenate([block % at.BLOCK * at.BLOCK + LANE_X for block in range(LANES)]).astype(np.float32)
+PIXEL_Y = np.concatenate([block // at.BLOCK * at.BLOCK + LANE_Y for block in range(LANES)]).astype(np.float32)
 
 
 @inlined
@@ -137,8 +140,8 @@ def composite_tiles(
                 block = lowest_bit(todo)
                 todo &= todo - np.uint64(1)
                 place = block * np.uint64(LANES)
-                dx = lane_x + (offset_x + np.float32((block & np.uint64(3)) * np.uint64(4)))
-                dy = lane_y + (offset_y + np.float32((block >> np.uint64(2)) * np.uint64(4)))
+                dx = load(PIXEL_X, place) + offset_x
+                dy = load(PIXEL_Y, place) + offset_y
                 t = fma(dy, shear, dx)
                 power = fma(curve_y * dy, dy, fma(curve_t * t, t, log2_opacity))  # log2(alpha)
                 blend = (power >= LOG2_ALPHA_MIN) & mask_from_bits(live[block])
@@ -214,7 +217,6 @@ def decomposite_tiles(
     cancels. ``g_alpha`` may be empty for zero. ``want_absolute`` is True or None: a value that numba compiles out.
     """
     tiles_x = (width + at.TILE - 1) // at.TILE
-    lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
     floats, _, _ = memory
     red, green, blue = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :], floats[2 * at.TILE_PIXELS :]
     behind, through = floats[3 * at.TILE_PIXELS :], floats[4 * at.TILE_PIXELS :]  # S, and T behind the current record
@@ -267,8 +269,8 @@ def decomposite_tiles(
                 block = lowest_bit(todo)
                 todo &= todo - np.uint64(1)
                 place = block * np.uint64(LANES)
-                dx = lane_x + (offset_x + np.float32((block & np.uint64(3)) * np.uint64(4)))
-                dy = lane_y + (offset_y + np.float32((block >> np.uint64(2)) * np.uint64(4)))
+                dx = load(PIXEL_X, place) + offset_x
+                dy = load(PIXEL_Y, place) + offset_y
                 t = fma(dy, shear, dx)
                 power = fma(curve_y * dy, dy, fma(curve_t * t, t, log2_opacity))
                 blended = (power >= LOG2_ALPHA_MIN) & (number <= load(last, state + place))

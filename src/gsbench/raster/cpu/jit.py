@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import logging
 import os
@@ -12,7 +13,18 @@ from typing import Any
 
 import numba
 
+# What kernels import, constants included, below the package's folder.
+COMPILED_FROM = (
+    "raster/*.py",
+    "raster/cpu/*.py",
+    "gaussians/model.py",
+    "gaussians/spherical_harmonics.py",
+    "pipeline/loss.py",
+)
 FIRST_COMPILE_SECONDS = 20  # about; measured on one core of a 2024 server
+
+njit: Any = numba.njit
+config: Any = numba.config
 
 _logger = logging.getLogger(__name__)
 
@@ -21,16 +33,17 @@ def _cache_folder() -> Path:
     """Where compiled kernels are kept: a folder of its own for each state of the sources.
 
     numba looks at the file of a kernel, not at what that file imports, so a changed helper would leave stale machine
-    code in use. Base: ``NUMBA_CACHE_DIR``, else the user's cache folder, else the temporary folder.
+    code in use. The base is ``NUMBA_CACHE_DIR``, else the user's cache folder; where neither can be written, a private
+    temporary folder, and the next process compiles again.
     """
     digest = hashlib.sha256(numba.__version__.encode())
-    for source in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(source.read_bytes())
+    package = Path(__file__).parents[2]
+    for pattern in COMPILED_FROM:
+        for source in sorted(package.glob(pattern)):
+            digest.update(source.read_bytes())
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     given = os.environ.get("NUMBA_CACHE_DIR")
-    bases = [Path(given)] if given else []
-    bases += [Path(home) / "gsbench" / "numba", Path(tempfile.gettempdir()) / f"gsbench-numba-{os.getuid()}"]
-    for base in bases:
+    for base in [*([Path(given)] if given else []), Path(home) / "gsbench" / "numba"]:
         folder = base / digest.hexdigest()[:16]
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -38,7 +51,7 @@ def _cache_folder() -> Path:
             continue
         if os.access(folder, os.W_OK):
             return folder
-    raise OSError(f"no folder for compiled kernels can be written, tried {bases}; set NUMBA_CACHE_DIR")
+    return Path(tempfile.mkdtemp(prefix="gsbench-numba-"))
 
 
 CACHE_FOLDER = _cache_folder()
@@ -50,20 +63,21 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     Also without reference counts (``_nrt``), which numba would keep, atomically, at each inlined call: a kernel borrows
     all its arrays and may not allocate.
     """
-    previous = numba.config.CACHE_DIR  # read when the decorator runs; other users of numba in this process keep theirs
-    numba.config.CACHE_DIR = str(CACHE_FOLDER)
+    previous = config.CACHE_DIR  # read when the decorator runs; other users of numba in this process keep theirs
+    config.CACHE_DIR = str(CACHE_FOLDER)
     try:
-        return numba.njit(nogil=True, cache=True, error_model="numpy", _nrt=False)(function)
+        return njit(nogil=True, cache=True, error_model="numpy", _nrt=False)(function)
     finally:
-        numba.config.CACHE_DIR = previous
+        config.CACHE_DIR = previous
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile ``function`` into the kernels that call it."""
-    return numba.njit(nogil=True, error_model="numpy", forceinline=True, _nrt=False)(function)
+    return njit(nogil=True, error_model="numpy", forceinline=True, _nrt=False)(function)
 
 
+@functools.cache
 def announce_compilation() -> None:
-    """Tell the user that the first call will take a while, if the cache on disk is empty."""
+    """Tell the user, once, that the first call will take a while, if the cache on disk is empty."""
     if not any(CACHE_FOLDER.rglob("*.nbc")):
         _logger.warning("compiling the CPU rasterizer, about %d s, once", FIRST_COMPILE_SECONDS)

@@ -90,26 +90,24 @@ class View(NamedTuple):
 def make_view(camera: Camera, constants: RasterConstants) -> View:
     margin_x = constants.fov_margin * camera.width / (2 * camera.fx)
     margin_y = constants.fov_margin * camera.height / (2 * camera.fy)
-    return View(
-        camera.width,
-        camera.height,
-        -(-camera.width // TILE),
-        -(-camera.height // TILE),
-        float(camera.fx),
-        float(camera.fy),
-        float(camera.cx) - 0.5,
-        float(camera.cy) - 0.5,
+    numbers = [
+        camera.fx,
+        camera.fy,
+        camera.cx - 0.5,
+        camera.cy - 0.5,
         -camera.cx / camera.fx - margin_x,
         (camera.width - camera.cx) / camera.fx + margin_x,
         -camera.cy / camera.fy - margin_y,
         (camera.height - camera.cy) / camera.fy + margin_y,
-        *(float(value) for value in camera.rotation.ravel()),
-        *(float(value) for value in camera.translation),
-        *(float(value) for value in camera.center),
+        *camera.rotation.ravel(),
+        *camera.translation,
+        *camera.center,
         constants.near,
         constants.blur,
         constants.sigma_extent,
         constants.eigenvalue_floor,
         constants.alpha_min,
         math.log2(constants.alpha_min),
-    )
+    ]
+    tiles = -(-camera.width // TILE), -(-camera.height // TILE)
+    return View(camera.width, camera.height, *tiles, *map(float, numbers))

@@ -1,7 +1,7 @@
 """From Gaussians to records.
 
-One call handles a shard: the Gaussians ``begin`` to ``end``. Its visible ones become the records ``begin``, ``begin + 1``, ... in
-the order of their index.
+One call handles a shard: the Gaussians ``begin`` to ``end``. Its visible ones become the records ``begin``,
+``begin + 1``, ... in the order of their index.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ CONTOUR_MARGIN = 0.01  # px, and relative: rounding of the contour alpha = 1/255
 
 VISIBLE, BAD_VALUE = 0, 1  # places of a shard's flags
 
-# Rows of 8 numbers by which the vector part of ``project_shard`` hands over to the part for single Gaussians. Those of a
-# record's own numbers have the place that they have in the record.
+# Rows of 8 numbers by which the vector part of ``project_shard`` hands over to the part for single Gaussians. Numbers
+# of a record have the place there that they have in the record.
 FIRST_X, PAST_X, FIRST_Y, PAST_Y, RADIUS, TO_X, TO_Y, TO_Z = range(at.RECORD, at.RECORD + 8)
 
 

@@ -62,7 +62,7 @@ _OF_ARRAY = {types.float32: _NARROW, types.float64: _WIDE}
 
 @register_model(_Vector)
 @register_model(_Mask)
-class _Model(models.PrimitiveModel):  # type: ignore[misc]
+class _Model(models.PrimitiveModel):
     def __init__(self, manager: Any, frontend_type: Any) -> None:
         super().__init__(manager, frontend_type, frontend_type.ir)
 
@@ -94,13 +94,13 @@ def _common_vector(kinds: Sequence[Any]) -> _Vector | None:
 def _register_operator(functions: Sequence[Any], arity: int, emit: Callable[..., Any], compares: bool = False) -> None:
     """Let ``functions`` of vectors (or vectors and numbers) be what ``emit(builder, *operands)`` builds."""
 
-    class _Template(AbstractTemplate):  # type: ignore[misc]
+    class _Template(AbstractTemplate):
         def generic(self, args: Sequence[Any], kws: Any) -> Any:
             vector = _common_vector(args) if len(args) == arity else None
             return signature(_Mask(vector.lanes) if compares else vector, *args) if vector else None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        vector = _common_vector(sig.args)
+        vector: Any = _common_vector(sig.args)
         return emit(builder, *(_as_vector(context, builder, v, k, vector) for v, k in zip(args, sig.args, strict=True)))
 
     for function in functions:
@@ -113,7 +113,7 @@ def _register_operator(functions: Sequence[Any], arity: int, emit: Callable[...,
 
 
 def _register_mask_operator(functions: Sequence[Any], arity: int, emit: Callable[..., Any]) -> None:
-    class _Template(AbstractTemplate):  # type: ignore[misc]
+    class _Template(AbstractTemplate):
         def generic(self, args: Sequence[Any], kws: Any) -> Any:
             fits = len(args) == arity and isinstance(args[0], _Mask) and set(args) == {args[0]}
             return signature(args[0], *args) if fits else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from math import prod
 
 import numpy as np
@@ -43,6 +43,10 @@ class Arena:
             self._blocks[name] = block
         return block[:size].view(dtype).reshape(shape)
 
+    def drop(self, name: str) -> None:
+        """Forget an array whose content cannot be trusted."""
+        self._blocks.pop(name, None)
+
 
 class ArenaPool:
     """Arenas that outlive the graph of a render: an arena comes back when its ``holder`` is collected."""
@@ -51,7 +55,10 @@ class ArenaPool:
         self._free: list[Arena] = []
 
     def lease(self, holder: object) -> Arena:
-        arena = self._free.pop() if self._free else Arena()  # list operations are atomic
+        try:
+            arena = self._free.pop()  # atomic
+        except IndexError:
+            arena = Arena()
         weakref.finalize(holder, self._free.append, arena).atexit = False
         return arena
 
@@ -89,10 +96,16 @@ class ShardRunner:
         self._executor = ThreadPoolExecutor(threads, thread_name_prefix="gsbench-raster") if threads > 1 else None
 
     def run(self, shards: int, work: Callable[[int], None]) -> None:
-        """Call ``work(shard)`` for every shard and wait."""
+        """Call ``work(shard)`` for every shard and wait; on an error or an interrupt, for what was begun."""
         if self._executor is None:
             for shard in range(shards):
                 work(shard)
-        else:
-            for _ in self._executor.map(work, range(shards)):
-                pass
+            return
+        futures = [self._executor.submit(work, shard) for shard in range(shards)]
+        try:
+            for future in futures:
+                future.result()
+        finally:
+            for future in futures:
+                future.cancel()
+            wait(futures)  # nobody may write to memory that is about to be used again

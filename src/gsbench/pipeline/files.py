@@ -1,0 +1,102 @@
+"""Files that are whole or absent, and what to say when the disk is full or may not be written to."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from gsbench.errors import GsbenchError, InputError
+
+CHUNK = 1 << 20
+TEMPORARY = re.compile(r"^\..+\.tmp(-\d+)?$")  # how gsbench names a file that it is still writing
+FULL = (errno.ENOSPC, errno.EDQUOT)
+FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
+# What libraries say without an error number when a write is cut short: numpy's tofile, torch's zip writer, SQLite.
+FULL_TEXT = re.compile(r"No space left|requested and \d+ written|PytorchStreamWriter failed|unexpected pos|disk is full")
+NEARLY_NOTHING = 64 * 1024  # bytes free: with less, any failed write is a full disk
+
+
+class DiskFullError(GsbenchError):
+    """The disk of the runs folder is full: no trial can go on (exit code 1)."""
+
+
+def write_json(path: Path, values: Any) -> None:
+    """Write JSON so that a reader sees the old file or the new one, never a part. NaN and infinity are refused."""
+    write_text(path, json.dumps(values, indent=1, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file so that a reader sees the old file or the new one, never a part."""
+    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
+    try:
+        with temporary.open("w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except OSError:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+
+
+def sync_to_disk(path: Path) -> None:
+    """Wait until a file or folder is on the disk, where the system can say so."""
+    with suppress(OSError):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Remove what killed writers left below ``folder``; nobody may be writing there."""
+    for path in folder.rglob(".*"):
+        if TEMPORARY.match(path.name) and path.is_file():
+            with suppress(OSError):
+                path.unlink()
+
+
+@contextmanager
+def storage_errors(folder: Path) -> Iterator[None]:
+    """Turn a full disk and forbidden writing within the block into one line that names ``folder``."""
+    try:
+        yield
+    except Exception as error:
+        found = explain_storage(error, folder)
+        if found is None or isinstance(error, GsbenchError):
+            raise
+        raise found from error
+
+
+def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
+    """The error in gsbench's words if storage is its cause, else None."""
+    number = error.errno if isinstance(error, OSError) else None
+    place = getattr(error, "filename", None) or folder
+    if number in FULL or FULL_TEXT.search(str(error)) or (_is_write_error(error) and _free(folder) < NEARLY_NOTHING):
+        return DiskFullError(f"the disk of {folder} is full: free some space, and the same command goes on from here")
+    if number in FORBIDDEN:
+        return InputError(f"{place} may not be written to ({os.strerror(number)}): set runs=FOLDER or GSBENCH_RUNS")
+    return None
+
+
+def _is_write_error(error: BaseException) -> bool:
+    return isinstance(error, (OSError, RuntimeError))
+
+
+def _free(folder: Path) -> int:
+    place = folder
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    try:
+        return shutil.disk_usage(place).free
+    except OSError:
+        return NEARLY_NOTHING

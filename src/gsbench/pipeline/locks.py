@@ -1,0 +1,109 @@
+"""Locks between processes: one works, the others wait and say for what."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+log = logging.getLogger(__name__)
+
+SECONDS_BETWEEN_TRIES = 0.25
+
+
+class BusyError(Exception):
+    """Another process holds the lock."""
+
+
+@contextmanager
+def hold(path: Path, what: str, wait: bool = True) -> Iterator[None]:
+    """Hold the lock ``path`` while the block runs; ``what`` is the work that it guards.
+
+    The system frees the lock when its process ends, however it ends; the file stays. Raises BusyError where another process
+    holds it and ``wait`` is False.
+    """
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        if not wait:
+            raise BusyError(f"{what}: {describe_holder(path)} is at it") from None
+        log.info("waiting for %s: %s is at it", what, describe_holder(path))
+        lock.acquire(poll_interval=SECONDS_BETWEEN_TRIES)
+    holder = _holder_file(path)
+    with suppress(OSError):  # it only informs
+        holder.write_text(json.dumps(this_process() | {"what": what}))
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            holder.unlink(missing_ok=True)
+        lock.release()
+
+
+def is_held(path: Path) -> bool:
+    """Whether a process holds the lock ``path``; needs no right to write."""
+    if fcntl is None:
+        lock = FileLock(path)
+        try:
+            lock.acquire(timeout=0)
+        except (Timeout, OSError):
+            return True
+        lock.release()
+        return False
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def read_holder(path: Path) -> dict[str, Any]:
+    """What the holder of the lock ``path`` wrote about itself: host, pid, since (s), and its Slurm job; empty if nothing."""
+    try:
+        content = json.loads(_holder_file(path).read_text())
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def describe_holder(path: Path) -> str:
+    holder = read_holder(path)
+    if not holder:
+        return "another process"
+    job = f", Slurm job {holder['slurm']}" if holder.get("slurm") else ""
+    return f"process {holder.get('pid')} on {holder.get('host')}{job}"
+
+
+def this_process() -> dict[str, Any]:
+    return {
+        "pid": os.getpid(),
+        "host": socket.gethostname(),
+        "slurm": os.environ.get("SLURM_JOB_ID"),
+        "since": time.time(),
+    }
+
+
+def _holder_file(path: Path) -> Path:
+    return path.with_name(f"{path.name}.holder")

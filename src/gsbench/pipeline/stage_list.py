@@ -1,0 +1,13 @@
+"""The stages of a trial, by name and version. Loads no torch."""
+
+from __future__ import annotations
+
+from gsbench.pipeline.store import Stage
+
+CAPTURE = Stage("scene", 1)
+INIT = Stage("init", 1, resumable=True)
+TRAIN = Stage("train", 1, resumable=True, scratch=("checkpoint-*.pt",))
+GROUND_TRUTH = Stage("ground_truth", 1)
+EVALUATE = Stage("evaluate", 1)
+
+STAGES = (CAPTURE, INIT, TRAIN, GROUND_TRUTH, EVALUATE)

@@ -1,0 +1,74 @@
+"""Stopping on a signal: at once, or in a training at the end of its iteration, with a checkpoint.
+
+Signals belong to the process, and so does the state in this module. SIGINT is Ctrl-C; SIGTERM comes from shells and from
+Slurm when a job is preempted or cancelled; SIGUSR2 comes from submitit shortly before a job's time is up.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR2") if hasattr(signal, name)
+)
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal asked the program to end; what was done so far is kept."""
+
+    def __init__(self, signum: int) -> None:
+        super().__init__(signal.Signals(signum).name)
+        self.signum = signum
+
+    @property
+    def exit_code(self) -> int:
+        """128 plus the signal's number, as shells count."""
+        return 128 + self.signum
+
+
+class _State:
+    deferring = 0  # depth of blocks that stop where it suits them
+    requested: int | None = None
+
+
+def requested() -> bool:
+    """Whether a signal came that the present ``deferred`` block has still to act on."""
+    return _State.requested is not None
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[None]:
+    """Raise `Stopped` in the main thread when a signal comes; the earlier handlers are back afterwards."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    earlier = {signum: signal.signal(signum, _on_signal) for signum in SIGNALS}
+    try:
+        yield
+    finally:
+        for signum, handler in earlier.items():
+            signal.signal(signum, handler)
+        _State.requested = None
+
+
+@contextmanager
+def deferred() -> Iterator[None]:
+    """Within the block a first signal only sets `requested`, a second one stops at once; raises `Stopped` at the end."""
+    _State.deferring += 1
+    try:
+        yield
+    finally:
+        _State.deferring -= 1
+    if _State.requested is not None:
+        raise Stopped(_State.requested)
+
+
+def _on_signal(signum: int, frame: FrameType | None) -> None:
+    if _State.deferring and _State.requested is None:
+        _State.requested = signum
+        return
+    raise Stopped(signum)

@@ -1,0 +1,134 @@
+"""What the viewer needs of a trial, read from its folder and from the initial model in the store."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsbench.densify.volume import log_volume
+from gsbench.errors import InputError
+from gsbench.eval.results import Trial, load_experiment
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.ply import read_ply
+from gsbench.init.base import MODEL_FOLDER, PointCloud
+from gsbench.pipeline.stages import INIT, LINEAGE_FILE, PLY_FILE, png_name
+from gsbench.pipeline.store import Store
+from gsbench.scene.camera import Camera
+from gsbench.scene.colmap import PINHOLE_MODELS, pinhole_camera, points_of, read_model
+from gsbench.scene.images import read_image
+from gsbench.scene.types import View
+
+ADDRESS = "a trial's folder, or EXPERIMENT:SCENE:DENSIFY[:SEED] such as demo:courtyard:volumetric:0"
+
+
+@dataclass(frozen=True)
+class ViewedTrial:
+    """A trained model with what can be drawn beside it.
+
+    ``causes`` [N] holds the ``Cause`` that made each Gaussian and ``log10_volumes`` [N] its volume (world units^3);
+    ``cloud`` is the initial one; ``views`` are the test views with the cameras and photographs of the evaluation.
+    """
+
+    label: str
+    gaussians: Gaussians
+    causes: NDArray[np.uint8]
+    log10_volumes: NDArray[np.float64]
+    cloud: PointCloud
+    views: tuple[View, ...]
+    background: tuple[float, float, float]
+
+
+def find_trial(address: str, runs: Path) -> Trial:
+    """The trial at ``address`` (see ``ADDRESS``); raises InputError where there is none or more than one."""
+    folder = Path(address).expanduser()
+    if folder.is_dir():
+        return _trial_in(folder.resolve())
+    parts = address.split(":")
+    if len(parts) not in (3, 4) or not all(parts):
+        raise InputError(f"{address!r} is neither a folder nor EXPERIMENT:SCENE:DENSIFY[:SEED]")
+    name, scene, densify, *seed = parts
+    experiment = load_experiment(runs, name)
+    found = [
+        trial
+        for trial in experiment.trials
+        if trial.scene == scene
+        and densify in (trial.densify, f"{trial.init}-{trial.densify}")
+        and (not seed or str(trial.seed) == seed[0])
+    ]
+    if not found:
+        known = sorted({f"{name}:{t.scene}:{t.init}-{t.densify}:{t.seed}" for t in experiment.trials})
+        raise InputError(f"no complete trial {address}; there are {', '.join(known)}")
+    first = [trial for trial in found if trial.seed == found[0].seed]
+    if len(first) > 1:
+        raise InputError(f"{address} names {len(first)} trials; give a folder: {', '.join(str(t.path) for t in first)}")
+    return found[0]
+
+
+def _trial_in(folder: Path) -> Trial:
+    if len(folder.parents) < 4:
+        raise InputError(f"{folder} is not a trial's folder; give {ADDRESS}")
+    experiment = load_experiment(folder.parents[3], folder.parents[2].name)
+    for trial in experiment.trials:
+        if trial.path == folder:
+            return trial
+    raise InputError(f"{folder} is not a complete trial; give {ADDRESS}")
+
+
+def load_viewed(trial: Trial, device: torch.device) -> ViewedTrial:
+    """Read what the viewer draws of ``trial``; raises InputError naming the file that is missing or damaged."""
+    gaussians = read_ply(trial.path / PLY_FILE, device)
+    runs = trial.path.parents[3]
+    model_dir = Store(runs / "store").path(INIT, str(trial.data["hashes"]["init"])) / MODEL_FOLDER
+    if not model_dir.is_dir():
+        raise InputError(f"{model_dir} is gone, which has the cameras of {trial.label}: run this trial again")
+    background = trial.config.get("train.background", (0.0, 0.0, 0.0))
+    return ViewedTrial(
+        label=f"{trial.scene} {trial.init}-{trial.densify} seed {trial.seed}",
+        gaussians=gaussians,
+        causes=read_causes(trial.path / LINEAGE_FILE, len(gaussians)),
+        log10_volumes=(log_volume(gaussians.log_scales).double() / np.log(10)).cpu().numpy(),
+        cloud=PointCloud(*points_of(read_model(model_dir))),
+        views=read_test_views(trial, model_dir),
+        background=tuple(background),
+    )
+
+
+def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
+    """The cause that made each living Gaussian, [N], from ``lineage.npz``."""
+    try:
+        with np.load(path) as lineage:
+            causes = lineage["causes"][lineage["ids"]]
+    except (OSError, ValueError, KeyError, IndexError) as error:
+        raise InputError(f"{path} cannot be read ({error}): run this trial again") from error
+    if len(causes) != num_gaussians:
+        raise InputError(f"{path} is of {len(causes)} Gaussians, the model has {num_gaussians}: run this trial again")
+    return causes
+
+
+def read_test_views(trial: Trial, model_dir: Path) -> tuple[View, ...]:
+    """The test views in the order of their names: ground truth and camera as the evaluation used them."""
+    import pycolmap
+
+    model = read_model(model_dir)
+    centred = trial.config.get("scene.principal_point") == "centred"
+    views = []
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        path = trial.path / "ground_truth" / png_name(image.name)
+        if not (image.has_pose and path.is_file()):
+            continue
+        picture = read_image(path)  # [H, W, 3]
+        height, width = picture.shape[:2]
+        intrinsics = model.cameras[image.camera_id]
+        if intrinsics.model not in PINHOLE_MODELS:
+            intrinsics = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), intrinsics)
+        camera: Camera = pinhole_camera(intrinsics, image.cam_from_world()).resized(width, height)
+        if centred:
+            camera = replace(camera, cx=width / 2, cy=height / 2)
+        views.append(View(image.name, camera, picture))
+    if not views:
+        raise InputError(f"{trial.path / 'ground_truth'} holds no picture of a test view: run this trial again")
+    return tuple(views)
