@@ -77,7 +77,12 @@ def test_experiments_have_the_size_of_the_paper() -> None:
     assert sweep_size("table1") == 13 * 2 * 3
     assert sweep_size("table2") == 12 * 2 * 2 * 3
     assert sweep_size("demo") == 6
-    assert {path.stem for path in Path(conf_dir(), "experiment").glob("*.yaml")} >= {"table1", "table2", "threshold", "budget"}
+    assert {path.stem for path in Path(conf_dir(), "experiment").glob("*.yaml")} >= {
+        "table1",
+        "table2",
+        "threshold",
+        "budget",
+    }
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ VERBS = {
     "ui": ("gsbench.verbs.ui", "open the MLflow dashboard on this machine"),
     "status": ("gsbench.verbs.status", "what an experiment has done, runs, failed and misses"),
     "export": ("gsbench.verbs.export", "copy a trained model or an initial cloud to where another program reads it"),
+    "view": ("gsbench.verbs.view", "look at trained models in the browser: one, or two side by side"),
     "doctor": ("gsbench.verbs.doctor", "check this machine and say what is missing"),
 }
 log = logging.getLogger("gsbench")

@@ -40,6 +40,7 @@ def compose_trials(overrides: Sequence[str], multirun: bool = False) -> list[Com
 
     Raises InputError, one line, for what does not compose or does not hold together.
     """
+    _check_words(overrides)
     with _errors(overrides), _hydra():
         master = compose("config", overrides=[word for word in overrides if not _is_sweep(word)], return_hydra_config=True)
         hydra = master.hydra
@@ -82,6 +83,12 @@ def _sweep(words: Sequence[str]) -> Iterator[Composed]:
         for match in seeds:
             config.seed = int(match.group(1))
         yield _composed(_check(config), point)
+
+
+def _check_words(overrides: Sequence[str]) -> None:
+    for word in overrides:
+        if "=" not in word and not word.startswith("~"):
+            raise InputError(f"{word!r} is not a setting like key=value")
 
 
 def _text(override: Override) -> str:
@@ -147,8 +154,8 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
         said = " ".join(value.group(2).split())
         said = re.sub(r"^of type '\w+' could not be converted to (\w+)", r"is not of type \1", said)
         return f"{value.group(3)}={value.group(1)} {said}".strip()
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return " ".join(lines)[:MAX_MESSAGE]
+    text = re.sub(r"\s*(full_key|reference_type|object_type)[:=].*", "", text)
+    return " ".join(text.split())[:MAX_MESSAGE]
 
 
 def _chain(error: BaseException | None) -> list[str]:

@@ -1,4 +1,5 @@
-"""The schema of the configuration, its checks, and where ``conf/`` lies. Loads neither torch nor the library packages."""
+"""The schema of the configuration, its checks, and where ``conf/`` lies. Loads neither torch nor the library
+packages."""
 
 from __future__ import annotations
 
@@ -188,7 +189,9 @@ def check_target(target: str | None, group: str, allowed: list[str]) -> None:
     """Refuse a ``_target_`` outside gsbench and the prefixes that the user allowed: importing it would run its code."""
     if not target:
         raise InputError(f"{group} names no _target_: the class to use")
-    if not any(target == prefix or target.startswith(prefix.rstrip(".") + ".") for prefix in (*ALLOWED_TARGETS, *allowed)):
+    if not any(
+        target == prefix or target.startswith(prefix.rstrip(".") + ".") for prefix in (*ALLOWED_TARGETS, *allowed)
+    ):
         prefix = target.split(".")[0]
         raise InputError(
             f"{group}._target_={target} is not gsbench's own; if you trust that code, add allow_targets=[{prefix}]"

@@ -26,7 +26,8 @@ def test_isotropic_keeps_its_size() -> None:
 
 
 def test_elongated_by_two() -> None:
-    """Axes 2, 1, 1: kappa = 4; eigenvalues 4, 1, 1 become 1, 1/4, 1/4; axes 1, 1/2, 1/2; volume divided by 8 = 4^1.5."""
+    """Axes 2, 1, 1: kappa = 4; eigenvalues 4, 1, 1 become 1, 1/4, 1/4; axes 1, 1/2, 1/2; volume divided by 8 =
+    4^1.5."""
     parent = scales((2.0, 1.0, 1.0))
     assert math.exp(log_condition(parent)) == pytest.approx(4)
     child = child_log_scales(parent)
@@ -116,7 +117,9 @@ def test_threshold_modes() -> None:
 def test_auto_threshold_does_not_depend_on_the_gauge() -> None:
     log_scales = random_gaussians(500, log_scale=(-5, 0.5)).log_scales
     log_scales[:5] += 2.5
-    counts = {run_volume_rule(log_scales + math.log(k), threshold_mode="auto")[1][0].split_volume for k in (0.01, 1, 50)}
+    counts = {
+        run_volume_rule(log_scales + math.log(k), threshold_mode="auto")[1][0].split_volume for k in (0.01, 1, 50)
+    }
     assert len(counts) == 1
     assert counts.pop() > 0
 

@@ -37,7 +37,10 @@ SMALL = [
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """The environment of the program: no weights, its own runs folder, the shared cache of compiled kernels."""
     kept = {key: value for key, value in os.environ.items() if not key.startswith(("GSBENCH_", "MLFLOW_"))}
-    return kept | {"GSBENCH_RUNS": str(tmp_path_factory.mktemp("runs")), "TORCH_HOME": str(tmp_path_factory.mktemp("hub"))}
+    return kept | {
+        "GSBENCH_RUNS": str(tmp_path_factory.mktemp("runs")),
+        "TORCH_HOME": str(tmp_path_factory.mktemp("hub")),
+    }
 
 
 @pytest.fixture

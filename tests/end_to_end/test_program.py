@@ -24,7 +24,12 @@ def test_sweep_leaves_complete_trials_and_a_table(gsbench: Run, tmp_path: Path) 
     done = gsbench("-m", *SMALL, "name=small", "densify=adc,volumetric", "seed=0,1", GSBENCH_RUNS=str(runs))
     assert done.returncode == 0, done.stderr
     results = [json.loads(path.read_text()) for path in sorted(runs.glob("small/courtyard/*/*/results.json"))]
-    assert {(r["densify"], r["seed"]) for r in results} == {("adc", 0), ("adc", 1), ("volumetric", 0), ("volumetric", 1)}
+    assert {(r["densify"], r["seed"]) for r in results} == {
+        ("adc", 0),
+        ("adc", 1),
+        ("volumetric", 0),
+        ("volumetric", 1),
+    }
     for result in results:
         assert result["status"] == "complete"
         assert result["protocol"] == "paper-1"
@@ -33,7 +38,9 @@ def test_sweep_leaves_complete_trials_and_a_table(gsbench: Run, tmp_path: Path) 
         assert "lpips_vgg_raw" in result["unavailable"]
     trial = next(runs.glob("small/courtyard/random-volumetric/*-seed0"))
     names = {path.name for path in trial.iterdir()}
-    wanted = "config.yaml results.json per_view.csv metrics.jsonl events.jsonl renders ground_truth point_cloud.ply log.txt"
+    wanted = (
+        "config.yaml results.json per_view.csv metrics.jsonl events.jsonl renders ground_truth point_cloud.ply log.txt"
+    )
     assert set(wanted.split()) <= names
     with (trial / "per_view.csv").open() as stream:
         rows = list(csv.DictReader(stream))
@@ -72,7 +79,9 @@ def test_sweep_leaves_complete_trials_and_a_table(gsbench: Run, tmp_path: Path) 
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_bad_input_is_one_line_and_exit_code_2(gsbench: Run, tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+def test_bad_input_is_one_line_and_exit_code_2(
+    gsbench: Run, tmp_path: Path, arguments: list[str], words: list[str]
+) -> None:
     (tmp_path / "images").mkdir()
     for i in range(3):
         Image.new("RGB", (32, 24), (i, 0, 0)).save(tmp_path / "images" / f"{i}.png")
@@ -101,7 +110,10 @@ def test_truncated_photo_is_named(gsbench: Run, tmp_path: Path) -> None:
 
 def test_help_is_quick_to_load(gsbench: Run) -> None:
     """No torch, no MLflow: the modules say so, whatever the machine's speed."""
-    code = "import sys, gsbench.cli as c; c.run(['--help']); sys.exit(any(m in sys.modules for m in ('torch', 'mlflow', 'numba')))"
+    code = (
+        "import sys, gsbench.cli as c; c.run(['--help']); "
+        "sys.exit(any(m in sys.modules for m in ('torch', 'mlflow', 'numba')))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     assert "volumetric" in done.stdout
@@ -120,7 +132,8 @@ def test_wheel_runs_a_trial_outside_the_checkout(environment: dict[str, str], tm
     dependencies = Path(pytest.__file__).resolve().parents[1]
     (packages / "zz_dependencies.pth").write_text(f"{dependencies}\n")
     subprocess.run(
-        [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(packages), str(wheel)], check=True
+        [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(packages), str(wheel)],
+        check=True,
     )
     where = "import gsbench, gsbench.config as c; print(gsbench.__file__); print(c.conf_dir())"
     found = subprocess.run([python, "-c", where], cwd=tmp_path, capture_output=True, text=True, check=True)

@@ -70,4 +70,6 @@ def test_all_tensors_stay_in_step() -> None:
     trainable.edit(append=random_gaussians(3, seed=1))
     values = trainable.values
     assert isinstance(Gaussians(**values.tensors()), Gaussians)  # checks all shapes
-    assert [group["params"][0] is values.tensors()[group["name"]] for group in trainable.optimizer.param_groups] == [True] * 6
+    assert [group["params"][0] is values.tensors()[group["name"]] for group in trainable.optimizer.param_groups] == [
+        True
+    ] * 6

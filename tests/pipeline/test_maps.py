@@ -16,7 +16,8 @@ from tests.pipeline.conftest import orbit_camera
 
 
 def test_maps_of_a_flat_wall() -> None:
-    """Opaque discs on the plane z = 3 in front of a camera at the origin; the nearest initial point is 0.5 behind it."""
+    """Opaque discs on the plane z = 3 in front of a camera at the origin; the nearest initial point is 0.5 behind
+    it."""
     x, y = np.meshgrid(np.linspace(-3, 3, 41), np.linspace(-3, 3, 41))
     points = np.stack([x.ravel(), y.ravel(), np.full(x.size, 3.0)], 1)
     n = len(points)
@@ -29,7 +30,7 @@ def test_maps_of_a_flat_wall() -> None:
         sh_rest=torch.zeros(n, 15, 3),
     )
     camera = orbit_camera(0.0)
-    maps = view_maps(ReferenceRasterizer(), wall, camera, cKDTree(points + [0, 0, 0.5]))
+    maps = view_maps(ReferenceRasterizer(), wall, camera, cKDTree(points + np.array([0, 0, 0.5])))
     assert np.nanmax(np.abs(maps["depth"] - 3)) < 0.01
     assert np.isfinite(maps["depth"]).mean() > 0.99
     assert np.nanmedian(maps["distance"]) == pytest.approx(0.5, abs=0.02)

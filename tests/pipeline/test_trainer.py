@@ -48,14 +48,22 @@ def rasterizer() -> Rasterizer:
 
 
 def train(
-    scene: Scene, truth: Gaussians, rasterizer: Rasterizer, folder: Path, densifier: Densifier, seed: int = 0, **changes: object
+    scene: Scene,
+    truth: Gaussians,
+    rasterizer: Rasterizer,
+    folder: Path,
+    densifier: Densifier,
+    seed: int = 0,
+    **changes: object,
 ) -> Gaussians:
     folder.mkdir(parents=True, exist_ok=True)
     return Trainer(scene, cloud(truth), densifier, rasterizer, options(**changes), seed).run(folder)
 
 
 def same(a: Gaussians, b: Gaussians) -> bool:
-    return len(a) == len(b) and all(torch.equal(x, y) for x, y in zip(a.tensors().values(), b.tensors().values(), strict=True))
+    return len(a) == len(b) and all(
+        torch.equal(x, y) for x, y in zip(a.tensors().values(), b.tensors().values(), strict=True)
+    )
 
 
 def records(path: Path) -> list[dict[str, float]]:
@@ -91,15 +99,15 @@ def test_interrupted_training_ends_in_the_same_bits(
     whole = train(tiny_scene, truth, rasterizer, tmp_path / "whole", make())
     broken = tmp_path / "broken"
 
-    class Stop(Exception):
+    class StopError(Exception):
         pass
 
     def stop_at_70(status: Status) -> None:
         if status.step == 70:
-            raise Stop
+            raise StopError
 
     broken.mkdir()
-    with pytest.raises(Stop):
+    with pytest.raises(StopError):
         Trainer(tiny_scene, cloud(truth), make(), rasterizer, options(), 0).run(broken, stop_at_70)
     assert sorted(path.name for path in broken.glob("*.pt")) == ["checkpoint-00000050.pt"]
     assert same(whole, train(tiny_scene, truth, rasterizer, broken, make()))
@@ -135,7 +143,9 @@ def test_nothing_is_refined_in_the_last_iteration(
     assert [event["step"] for event in records(tmp_path / "events.jsonl")] == [40, 60, 80]
 
 
-def test_time_budget_ends_a_training(tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path) -> None:
+def test_time_budget_ends_a_training(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
     train(tiny_scene, truth, rasterizer, tmp_path, NoDensifier(), iterations=10**6, max_seconds=0.3)
     last = records(tmp_path / "metrics.jsonl")[-1]
     assert last["seconds"] >= 0.3

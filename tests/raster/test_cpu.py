@@ -14,7 +14,7 @@ import torch
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.raster.cpu import CpuRasterizer, simd
+from gsbench.raster.cpu import CpuRasterizer, executor, simd
 from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
 from gsbench.raster.reference import ReferenceRasterizer
 from tests.raster.strategies import Case, render_with_gradients
@@ -108,6 +108,22 @@ def test_gradients_accumulate() -> None:
     once = leaves.sh_rest.grad.clone()
     rasterizer.render(leaves, CASE.camera(), 3, BLACK).image.sum().backward()
     assert torch.equal(leaves.sh_rest.grad, 2 * once)
+
+
+def test_an_interrupted_backward_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+    for threads in (1, 2):
+        rasterizer = CpuRasterizer(threads=threads)
+        _, expected = render_with_gradients(rasterizer, CASE, torch.float32)
+        with monkeypatch.context() as patch:
+            patch.setattr(executor, "backproject_shard", _interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                render_with_gradients(rasterizer, CASE, torch.float32)
+        _, gradients = render_with_gradients(rasterizer, CASE, torch.float32)
+        assert torch.equal(gradients["means"], expected["means"])
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
 
 
 def test_strided_parameters_and_the_gradient_of_the_background() -> None:

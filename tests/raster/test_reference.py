@@ -178,7 +178,9 @@ def test_spherical_harmonics_match_gsplat() -> None:
 def test_nothing_visible_gives_the_background() -> None:
     gaussians = random_gaussians(5)
     gaussians.means[:, 2] = -5.0
-    out = ReferenceRasterizer().render(gaussians, front_camera(), 3, torch.tensor([0.5, 0.25, 1.0], dtype=torch.float64))
+    out = ReferenceRasterizer().render(
+        gaussians, front_camera(), 3, torch.tensor([0.5, 0.25, 1.0], dtype=torch.float64)
+    )
     assert torch.equal(out.image[0, 0], torch.tensor([0.5, 0.25, 1.0], dtype=torch.float64))
     assert not out.visible.any()
     assert not out.alpha.any()

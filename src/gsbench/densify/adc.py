@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
@@ -22,8 +22,8 @@ from gsbench.raster.base import RenderOutput
 class ADC(Densifier):
     """Clone what is small, split what is large, prune what is faint or huge (Kerbl et al. 2023, section 5).
 
-    Sizes are fractions of the scene extent; ``gradient_threshold`` is in NDC units, averaged over the iterations in which a
-    Gaussian was visible.
+    Sizes are fractions of the scene extent; ``gradient_threshold`` is in NDC units, averaged over the iterations in
+    which a Gaussian was visible.
     """
 
     start: int = 500  # refine where start < step < stop and step % interval == 0
@@ -44,6 +44,11 @@ class ADC(Densifier):
     max_gaussians: int | None = None
     cap: CapKind = "soft"
 
+    initial_count: int = field(init=False, repr=False, compare=False, default=0)
+    gradient_sum: Tensor = field(init=False, repr=False, compare=False)  # [N] NDC, since the last refinement
+    visible_count: Tensor = field(init=False, repr=False, compare=False)  # [N] iterations
+    max_radii: Tensor = field(init=False, repr=False, compare=False)  # [N] px
+
     def __post_init__(self) -> None:
         require(self.start >= 0, "start", self.start, "at least 0")
         require(self.stop > self.start, "stop", self.stop, f"above densify.start ({self.start})")
@@ -59,9 +64,13 @@ class ADC(Densifier):
         require(radius is None or radius > 0, "prune_screen_radius", radius, "above 0 or null")
         require(self.opacity_reset_interval >= 1, "opacity_reset_interval", self.opacity_reset_interval, "at least 1")
         require(0 < self.opacity_reset_value < 1, "opacity_reset_value", self.opacity_reset_value, "in (0, 1)")
-        require(self.max_gaussians is None or self.max_gaussians >= 1, "max_gaussians", self.max_gaussians, "at least 1")
+        require(
+            self.max_gaussians is None or self.max_gaussians >= 1, "max_gaussians", self.max_gaussians, "at least 1"
+        )
         require(self.cap in ("soft", "hard", "curve"), "cap", self.cap, "soft, hard or curve")
-        require(self.cap != "curve" or self.max_gaussians is not None, "max_gaussians", None, "set for densify.cap=curve")
+        require(
+            self.cap != "curve" or self.max_gaussians is not None, "max_gaussians", None, "set for densify.cap=curve"
+        )
 
     @property
     def needs_absolute_gradient(self) -> bool:  # type: ignore[override]
@@ -84,7 +93,9 @@ class ADC(Densifier):
             return
         gradient = render.screen_gradient_abs if self.gradient == "absolute" else render.screen_points.grad
         if gradient is None:
-            raise RuntimeError("observe needs the screen gradient: call it after backward, with absolute_gradient if used")
+            raise RuntimeError(
+                "observe needs the screen gradient: call it after backward, with absolute_gradient if used"
+            )
         visible = render.visible  # [N]
         self.gradient_sum += torch.where(visible, gradient.norm(dim=-1), 0.0)
         self.visible_count += visible
@@ -106,7 +117,9 @@ class ADC(Densifier):
         event.after = len(gaussians)
         return event
 
-    def _grow_and_prune(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator, event: RefineEvent) -> None:
+    def _grow_and_prune(
+        self, step: int, gaussians: TrainableGaussians, rng: torch.Generator, event: RefineEvent
+    ) -> None:
         """One round in the order of the baseline; a subclass adds its rule to it."""
         self._grow_by_gradient(step, gaussians, rng, event)
         self._prune(step, gaussians, event)
@@ -123,7 +136,9 @@ class ADC(Densifier):
         selected, blocked = admit(over, mean, max(1, gain), allowed)
         event.blocked_by_cap += blocked
         self._clone(step, gaussians, selected & ~large, event)
-        to_split = torch.cat([selected & large, selected.new_zeros(len(gaussians) - len(selected))])  # clones never split
+        to_split = torch.cat(
+            [selected & large, selected.new_zeros(len(gaussians) - len(selected))]
+        )  # clones never split
         event.split_gradient += self._split(
             step,
             gaussians,
@@ -163,7 +178,8 @@ class ADC(Densifier):
         keep_parent: bool = False,
         sampled: bool = True,
     ) -> int:
-        """Replace the Gaussians at the mask ``selected`` [N] by children; returns how many more there are than before."""
+        """Replace the Gaussians at the mask ``selected`` [N] by children; returns how many more there are than
+        before."""
         parents = selected.nonzero().squeeze(-1)  # [S]
         new = split(gaussians.values.detach().select(parents), children, child_log_scales, rng, sampled)
         if revised_opacity:

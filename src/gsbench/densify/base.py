@@ -1,4 +1,5 @@
-"""The contract of a densifier: hyper-parameters, a state that can be saved, and a record of what each refinement did."""
+"""The contract of a densifier: hyper-parameters, a state that can be saved, and a record of what each refinement
+did."""
 
 from __future__ import annotations
 
@@ -8,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsbench.errors import InputError
 from gsbench.densify.events import Cause, Lineage, RefineEvent
+from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
@@ -26,9 +27,9 @@ class DensifyContext:
 class Densifier:
     """Base of all densifiers, and the one that never changes the Gaussians (``densify=none``).
 
-    A subclass is a dataclass of hyper-parameters. In every iteration the trainer calls ``regularizer`` before the backward
-    pass, ``observe`` after it, then ``refine``, then the optimiser step, then ``after_step``. Mutable state is in
-    ``context``, ``lineage`` and what ``state_dict`` of a subclass adds.
+    A subclass is a dataclass of hyper-parameters. In every iteration the trainer calls ``regularizer`` before the
+    backward pass, ``observe`` after it, then ``refine``, then the optimiser step, then ``after_step``. Mutable state
+    is in ``context``, ``lineage`` and what ``state_dict`` of a subclass adds.
     """
 
     context: DensifyContext
@@ -59,7 +60,8 @@ class Densifier:
         """Called after the optimiser step of iteration ``step``."""
 
     def state_dict(self) -> dict[str, Any]:
-        """The state as tensors and plain values; with the same hyper-parameters, ``load_state_dict`` goes on from it."""
+        """The state as tensors and plain values; with the same hyper-parameters, ``load_state_dict`` goes on from
+        it."""
         return {"lineage": self.lineage.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any], context: DensifyContext) -> None:

@@ -13,8 +13,8 @@ CapKind = Literal["soft", "hard", "curve"]
 def limit_at(step: int, start: int, stop: int, initial: int, max_gaussians: int | None, cap: CapKind) -> int | None:
     """The cap that holds at iteration ``step``.
 
-    ``curve`` rises from the ``initial`` count at ``start`` to ``max_gaussians`` at ``stop`` along n0 + (n - n0) (2x - x^2), so
-    that arms grow alike and the last refinements are small (the idea of Taming 3DGS, arXiv 2406.15643).
+    ``curve`` rises from the ``initial`` count at ``start`` to ``max_gaussians`` at ``stop`` along n0 + (n - n0) (2x -
+    x^2), so that arms grow alike and the last refinements are small (the idea of Taming 3DGS, arXiv 2406.15643).
     """
     if max_gaussians is None or cap != "curve":
         return max_gaussians
@@ -25,8 +25,8 @@ def limit_at(step: int, start: int, stop: int, initial: int, max_gaussians: int 
 def allowance(num_gaussians: int, max_gaussians: int | None, cap: CapKind) -> int | None:
     """How many Gaussians a growth step may add; None for no limit.
 
-    ``soft``: no limit up to ``max_gaussians``, nothing beyond it, so one step may overshoot (the paper's cap, whose counts
-    end at 3.41 to 3.57 M for 3.4 M). ``hard`` and ``curve``: never beyond it.
+    ``soft``: no limit up to ``max_gaussians``, nothing beyond it, so one step may overshoot (the paper's cap, whose
+    counts end at 3.41 to 3.57 M for 3.4 M). ``hard`` and ``curve``: never beyond it.
     """
     if max_gaussians is None:
         return None

@@ -24,11 +24,11 @@ class Cause(IntEnum):
 class RefineEvent:
     """One refinement, as a closed record of counts by cause.
 
-    ``after = before + cloned + split_gradient + split_volume + added - pruned_opacity - pruned_size`` where a split counts
-    the Gaussians that it adds beyond its parent (one per parent, for two children). ``blocked_by_cap`` counts candidates
-    that the budget refused. ``isotropic_resplit`` counts parents split by volume whose children are still above the
-    threshold, so that they are split again at the next refinement; ``vanished`` counts parents split by volume whose
-    children are far below a pixel. ``relocated`` moves dead Gaussians and changes no count (3DGS-MCMC).
+    ``after = before + cloned + split_gradient + split_volume + added - pruned_opacity - pruned_size``, where a split
+    counts the Gaussians that it adds beyond its parent (one per parent, for two children). ``blocked_by_cap`` counts
+    candidates that the budget refused. ``isotropic_resplit`` counts parents split by volume whose children are still
+    above the threshold, so that they are split again at the next refinement; ``vanished`` counts parents split by
+    volume whose children are far below a pixel. ``relocated`` moves dead Gaussians and changes no count (3DGS-MCMC).
     """
 
     step: int
@@ -54,7 +54,9 @@ class RefineEvent:
     @staticmethod
     def count_names() -> tuple[str, ...]:
         """The fields that can be summed over a trial."""
-        return tuple(f.name for f in fields(RefineEvent) if f.name not in ("step", "before", "after", "volume_threshold"))
+        return tuple(
+            f.name for f in fields(RefineEvent) if f.name not in ("step", "before", "after", "volume_threshold")
+        )
 
 
 def sum_events(events: list[dict[str, object]]) -> dict[str, int]:
@@ -76,7 +78,7 @@ class Lineage:
         self._total = num_gaussians
 
     def edit(self, keep: Tensor | None, parents: Tensor | None, cause: Cause, step: int) -> None:
-        """Follow an edit: keep the living at the mask ``keep`` [N], then append children of ``parents`` [A] (indices before it)."""
+        """Keep the living at the mask ``keep`` [N], then append children of ``parents`` [A] (indices before that)."""
         living = self.ids if keep is None else self.ids[keep.cpu()]
         if parents is not None and len(parents):
             a = len(parents)

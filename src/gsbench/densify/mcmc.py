@@ -1,4 +1,5 @@
-"""3DGS as Markov chain Monte Carlo (Kheradmand et al., arXiv 2404.09591): relocation and noise instead of heuristics."""
+"""3DGS as Markov chain Monte Carlo (Kheradmand et al., arXiv 2404.09591): relocation and noise instead of
+heuristics."""
 
 from __future__ import annotations
 
@@ -130,10 +131,12 @@ class MCMC(Densifier):
         gaussians.overwrite("opacity_logits", logits, where=touched)
         gaussians.overwrite("log_scales", log_scales, where=touched)
 
+
 def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     """Opacity of each of n coincident copies that look like one of opacity o, and the factor for their scales.
 
-    o' = 1 - (1 - o)^(1/n) and s'/s = o / sum_{i=1..n} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1) (eq. 9); [M] each.
+    o' = 1 - (1 - o)^(1/n) and s'/s = o / sum_{i=1..n} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1), eq. 9;
+    [M] each.
     """
     copies = copies.clamp_max(MAX_COPIES)
     new = 1 - (1 - opacities.double()).pow(1 / copies)  # [M]
@@ -147,7 +150,8 @@ def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _draw(weights: Tensor, count: int, rng: torch.Generator) -> Tensor:
-    """``count`` indices drawn with replacement in proportion to ``weights`` [N]; on the CPU, so a seed means the same anywhere."""
+    """``count`` indices drawn with replacement in proportion to ``weights`` [N]; on the CPU, so a seed means the
+    same anywhere."""
     cumulative = weights.double().cpu().cumsum(0)
     draws = torch.rand(count, generator=rng, dtype=torch.float64) * cumulative[-1]
     return torch.searchsorted(cumulative, draws, right=True).clamp_max(len(weights) - 1).to(weights.device)

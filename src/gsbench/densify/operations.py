@@ -34,6 +34,7 @@ def split(
 
 
 def revised_logits(opacity_logits: Tensor) -> Tensor:
-    """Logits of 1 - sqrt(1 - o): two such children one behind the other are as opaque as the parent (arXiv 2404.06109)."""
+    """Logits of 1 - sqrt(1 - o): two such children one behind the other are as opaque as the parent (arXiv
+    2404.06109)."""
     transmittance = (-opacity_logits).sigmoid().sqrt()  # sqrt(1 - o)
     return torch.logit((1 - transmittance).clamp_min(MIN_REVISED_OPACITY))

@@ -26,8 +26,8 @@ def child_log_scales(
 ) -> Tensor:
     """Scales of the children (eq. 7), [N, 3].
 
-    ``eigenvalues``: lambda' = lambda / kappa, so log s' = log s - log(kappa) / 2. ``scales``: s' = s / kappa. ``max_condition``
-    (at least 1) limits the kappa that is divided by.
+    ``eigenvalues``: lambda' = lambda / kappa, so log s' = log s - log(kappa) / 2. ``scales``: s' = s / kappa.
+    ``max_condition`` (at least 1) limits the kappa that is divided by.
     """
     condition = log_condition(log_scales)  # [N]
     if max_condition is not None:

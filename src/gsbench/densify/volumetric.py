@@ -1,7 +1,7 @@
 """The paper's rule: besides the gradient rule, split Gaussians whose volume is too large.
 
-Every question that the paper leaves open is an option; the defaults are its equations where they speak and the ADC split,
-which the rule extends, where they do not.
+Every question that the paper leaves open is an option; the defaults are its equations where they speak and the ADC
+split, which the rule extends, where they do not.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ VANISHING_SIZE = 1e-4  # of the extent: a tenth of a pixel at a distance of one 
 class Volumetric(ADC):
     """ADC, then a split of every Gaussian with V > V_th (eq. 5 to 7, Fig. 4), then the pruning of ADC.
 
-    ``threshold_mode`` says what ``volume_threshold`` is: ``absolute``, in the units of the COLMAP model, cubed (the paper);
-    ``extent_relative``, a fraction of the scene extent cubed; ``quantile`` ignores it and splits what lies above the
-    ``volume_quantile`` of all volumes; ``auto`` ignores both and takes the upper Tukey fence of log V (third quartile plus
-    1.5 interquartile ranges), which follows the scene's own histogram in any gauge and selects little where no volume
-    stands out. ``volume_start``, ``volume_stop`` and ``volume_interval`` default to those of ADC.
+    ``threshold_mode`` says what ``volume_threshold`` is: ``absolute``, in the units of the COLMAP model, cubed (the
+    paper); ``extent_relative``, a fraction of the scene extent cubed; ``quantile`` ignores it and splits what lies
+    above the ``volume_quantile`` of all volumes; ``auto`` ignores both and takes the upper Tukey fence of log V (third
+    quartile plus 1.5 interquartile ranges), which follows the scene's own histogram in any gauge and selects little
+    where no volume stands out. ``volume_start``, ``volume_stop`` and ``volume_interval`` default to those of ADC.
     """
 
     volume_threshold: float = 0.03
@@ -57,7 +57,9 @@ class Volumetric(ADC):
         require(self.volume_threshold > 0, "volume_threshold", self.volume_threshold, "above 0")
         require(self.threshold_mode in modes, "threshold_mode", self.threshold_mode, " or ".join(modes))
         require(0 < self.volume_quantile < 1, "volume_quantile", self.volume_quantile, "in (0, 1)")
-        require(self.condition_of in ("eigenvalues", "scales"), "condition_of", self.condition_of, "eigenvalues or scales")
+        require(
+            self.condition_of in ("eigenvalues", "scales"), "condition_of", self.condition_of, "eigenvalues or scales"
+        )
         limit = self.max_condition
         require(limit is None or limit >= 1, "max_condition", limit, "at least 1 or null")
         require(self.volume_children >= 2, "volume_children", self.volume_children, "at least 2")
@@ -74,7 +76,9 @@ class Volumetric(ADC):
             f"a multiple of densify.interval ({self.interval})",
         )
 
-    def _grow_and_prune(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator, event: RefineEvent) -> None:
+    def _grow_and_prune(
+        self, step: int, gaussians: TrainableGaussians, rng: torch.Generator, event: RefineEvent
+    ) -> None:
         due = self._volume_due(step)
         if due and self.volume_order == "before_adc":
             self._split_by_volume(step, gaussians, rng, event)
@@ -91,7 +95,9 @@ class Volumetric(ADC):
         stop = self.stop if self.volume_stop is None else self.volume_stop
         return start < step < stop and step % (self.volume_interval or self.interval) == 0
 
-    def _split_by_volume(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator, event: RefineEvent) -> None:
+    def _split_by_volume(
+        self, step: int, gaussians: TrainableGaussians, rng: torch.Generator, event: RefineEvent
+    ) -> None:
         log_scales = gaussians.values.log_scales.detach()
         volumes = log_volume(log_scales)  # [N]
         threshold = self.log_threshold(volumes)
@@ -139,4 +145,3 @@ def _quantile(ordered: Tensor, q: float) -> float:
     low = math.floor(position)
     high = min(low + 1, len(ordered) - 1)
     return float(ordered[low] + (position - low) * (ordered[high] - ordered[low]))
-

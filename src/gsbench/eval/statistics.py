@@ -82,10 +82,6 @@ class Comparison:
     seed_deviation: float | None
     left_out: tuple[str, ...]
 
-    @property
-    def trials(self) -> int:
-        return sum(scene.trials for scene in self.scenes)
-
 
 def compare(paired: Paired, direction: int, samples: int = BOOTSTRAP_SAMPLES, seed: int = 0) -> Comparison:
     """Compare two arms; ``direction`` is +1 where more of the metric is better, -1 where less is.

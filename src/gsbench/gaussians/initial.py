@@ -21,8 +21,8 @@ def gaussians_from_cloud(
 ) -> Gaussians:
     """One isotropic Gaussian at each of ``points`` [P, 3] with ``colors`` [P, 3] (0 to 255), float32.
 
-    The standard deviation is the root of the mean *squared* distance to the 3 nearest other points (simple-knn of 3DGS).
-    Raises InputError for fewer than 4 points or points that are not finite.
+    The standard deviation is the root of the mean *squared* distance to the 3 nearest other points (simple-knn of
+    3DGS). Raises InputError for fewer than 4 points or points that are not finite.
     """
     if len(points) <= NEIGHBOURS:
         raise InputError(f"the initial cloud has {len(points)} points, at least {NEIGHBOURS + 1} are needed")

@@ -36,8 +36,8 @@ class LearningRates:
 class TrainableGaussians:
     """Raw parameters as leaves of the graph, one Adam group each.
 
-    Adding, removing or overwriting Gaussians goes through ``edit``: it keeps parameters and moments in step. As in 3DGS,
-    an edited parameter is a new leaf without gradient, so the optimiser step of that iteration passes it over.
+    Adding, removing or overwriting Gaussians goes through ``edit``: it keeps parameters and moments in step. As in
+    3DGS, an edited parameter is a new leaf without gradient, so the optimiser step of that iteration passes it over.
     """
 
     def __init__(self, gaussians: Gaussians, rates: LearningRates, spatial_scale: float) -> None:
@@ -128,7 +128,8 @@ class TrainableGaussians:
 
     @torch.no_grad()
     def overwrite(self, name: str, values: Tensor, where: Tensor | None = None) -> None:
-        """Set parameter ``name`` to ``values`` (same shape) and zero its moments (at the mask ``where`` [N], or all)."""
+        """Set parameter ``name`` to ``values`` (same shape) and zero its moments (at the mask ``where`` [N], or
+        all)."""
         parameter = getattr(self.values, name)
         if values.shape != parameter.shape:
             raise ValueError(f"overwrite: {name} has shape {tuple(parameter.shape)}, got {tuple(values.shape)}")
@@ -155,7 +156,7 @@ class TrainableGaussians:
         setattr(self.values, name, parameter)
         return state
 
-    def _group(self, name: str) -> dict:  # type: ignore[type-arg]
+    def _group(self, name: str) -> dict:
         return next(group for group in self.optimizer.param_groups if group["name"] == name)
 
     def state_dict(self) -> dict[str, object]:
@@ -166,7 +167,7 @@ class TrainableGaussians:
         }
 
     @classmethod
-    def load(cls, state: dict, rates: LearningRates, spatial_scale: float) -> TrainableGaussians:  # type: ignore[type-arg]
+    def load(cls, state: dict, rates: LearningRates, spatial_scale: float) -> TrainableGaussians:
         """The inverse of ``state_dict``; copies."""
         trainable = cls(Gaussians(**state["gaussians"]), rates, spatial_scale)
         trainable.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))  # torch itself would share the moments

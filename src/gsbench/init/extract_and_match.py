@@ -77,7 +77,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
         raise InputError(f"{options.name}: no pair of images has a match: the photos need more overlap or texture")
     warnings = []
     if empty:
-        warnings.append(f"no keypoint in {_some(empty)}: these images are not used")
+        warnings.append(f"no keypoint in {_some(empty)}: no point comes from these images")
     if halved:
         warnings.append(f"out of GPU memory: {len(halved)} pairs were matched with fewer keypoints")
     weights = [path for path in (job.extractor_weights, job.matcher_weights) if path is not None]

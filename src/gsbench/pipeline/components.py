@@ -30,7 +30,9 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     known = [name for name in inspect.signature(cls).parameters if name != "self"]
     for key in options:
         if key not in known:
-            raise InputError(f"{group}.{key} is not an option of {target}{closest(key, known)} (options: {', '.join(known)})")
+            raise InputError(
+                f"{group}.{key} is not an option of {target}{closest(key, known)} (options: {', '.join(known)})"
+            )
     try:
         if dataclasses.is_dataclass(cls):
             return TypeAdapter(cls).validate_python(options)
@@ -57,7 +59,9 @@ def options_of(component: Any) -> dict[str, Any]:
     """Class and options of a component, as they enter a stage's key; those that cannot change a result are left out."""
     values = {"class": f"{type(component).__module__}.{type(component).__qualname__}"}
     if dataclasses.is_dataclass(component):
-        fields = [field.name for field in dataclasses.fields(component) if field.init and field.name not in WITHOUT_EFFECT]
+        fields = [
+            field.name for field in dataclasses.fields(component) if field.init and field.name not in WITHOUT_EFFECT
+        ]
         values |= {name: _plain(getattr(component, name)) for name in fields}
     return values
 
@@ -79,7 +83,9 @@ def select_device(name: str) -> torch.device:
     except RuntimeError as error:
         raise InputError(f"device={name} is not known to torch; use auto, cpu, cuda or cuda:1") from error
     if device.type == "cuda" and not torch.cuda.is_available():
-        raise InputError(f"device={name}: torch finds no CUDA device here; use device=cpu, or install a CUDA build of torch")
+        raise InputError(
+            f"device={name}: torch finds no CUDA device here; use device=cpu, or install a CUDA build of torch"
+        )
     if device.type == "cuda" and device.index is not None and device.index >= torch.cuda.device_count():
         raise InputError(f"device={name}: there are {torch.cuda.device_count()} CUDA devices, numbered from 0")
     return device

@@ -1,4 +1,5 @@
-"""What each pixel of a test view shows: its depth, how far the initial cloud is, and how voluminous the Gaussians are."""
+"""What each pixel of a test view shows: its depth, how far the initial cloud is, and how voluminous the Gaussians
+are."""
 
 from __future__ import annotations
 
@@ -20,16 +21,18 @@ MIN_ALPHA = 0.5  # a pixel that is covered less shows no surface: not a number
 
 def view_maps(
     rasterizer: Rasterizer, gaussians: Gaussians, camera: Camera, initial_points: cKDTree
-) -> dict[str, NDArray[np.float16]]:
+) -> dict[str, NDArray[np.float32]]:
     """Maps [H, W] of one view, NaN where no surface is seen; world units.
 
-    ``depth``: view z, the mean over the Gaussians of a pixel weighted by their contribution. ``distance``: from the point at
-    that depth to the nearest of ``initial_points``. ``volume``: of the Gaussians, the weighted geometric mean.
+    ``depth``: view z, the mean over the Gaussians of a pixel weighted by their contribution. ``distance``: from the
+    point at that depth to the nearest of ``initial_points``. ``volume``: of the Gaussians, the weighted geometric mean.
     """
     view_z = gaussians.means @ gaussians.means.new_tensor(camera.rotation[2]) + float(camera.translation[2])  # [N]
     volumes = log_volume(gaussians.log_scales)  # [N]
     lowest = volumes.min()
-    features = torch.stack([view_z.clamp_min(0), volumes - lowest, torch.zeros_like(view_z)], -1)  # [N, 3], none negative
+    features = torch.stack(
+        [view_z.clamp_min(0), volumes - lowest, torch.zeros_like(view_z)], -1
+    )  # [N, 3], none negative
     painted = Gaussians(**(gaussians.tensors() | {"sh_dc": rgb_to_dc(features)}))
     with torch.no_grad():
         out = rasterizer.render(painted, camera, 0, torch.zeros_like(features[0]))
@@ -40,11 +43,8 @@ def view_maps(
     distance = np.full_like(depth, np.nan)
     covered = np.isfinite(depth)
     distance[covered] = initial_points.query(unproject(depth, camera)[covered])[0]
-    largest = float(np.finfo(np.float16).max)
-    return {
-        name: np.minimum(values, largest).astype(np.float16)
-        for name, values in (("depth", depth), ("distance", distance), ("volume", volume))
-    }
+    maps = {"depth": depth, "distance": distance, "volume": volume}
+    return {name: values.astype(np.float32) for name, values in maps.items()}
 
 
 def unproject(depth: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:

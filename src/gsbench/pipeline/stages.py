@@ -11,7 +11,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Sfm, read_cloud
-from gsbench.init.base import MODEL_FOLDER, REPORT_FILE, Initializer
+from gsbench.init.base import MODEL_FOLDER, Initializer
 from gsbench.pipeline.components import available_threads, options_of
 from gsbench.pipeline.files import write_json
 from gsbench.pipeline.maps import view_maps
@@ -35,8 +35,8 @@ from gsbench.pipeline.store import Entry, Store
 from gsbench.pipeline.trainer import Status, Trainer
 from gsbench.raster import Rasterizer
 from gsbench.scene.courtyard import render_courtyard
-from gsbench.scene.images import read_image
-from gsbench.scene.load import load_scene
+from gsbench.scene.images import Resample, read_image
+from gsbench.scene.load import PrincipalPoint, load_scene
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Capture, Scene
 
@@ -109,8 +109,8 @@ def prepare_scene(store: Store, capture: Capture, init: Entry, options: SceneCon
             store.root / "views",
             downscale=options.downscale,
             max_size=options.max_size,
-            resample=options.resample,
-            principal_point=options.principal_point,
+            resample=cast(Resample, options.resample),
+            principal_point=cast(PrincipalPoint, options.principal_point),
             progress=lambda done, total: report("views", done, total),
         )
 
@@ -145,12 +145,13 @@ def train(
         with progress("train") as report:
 
             def show(status: Status) -> None:
-                note = f"loss {status.loss:.4f} | {status.num_gaussians:,} Gaussians | {status.iterations_per_second:.1f} it/s"
+                speed = f"{status.iterations_per_second:.1f} it/s"
+                note = f"loss {status.loss:.4f} | {status.num_gaussians:,} Gaussians | {speed}"
                 report("iteration", status.step, options.iterations, note)
 
             gaussians = trainer.run(folder, show)
         write_ply(gaussians, folder / PLY_FILE)
-        lineage = {name: tensor.numpy() for name, tensor in densifier.lineage.state_dict().items()}
+        lineage: dict[str, Any] = {name: tensor.numpy() for name, tensor in densifier.lineage.state_dict().items()}
         np.savez_compressed(folder / LINEAGE_FILE, **lineage)
         summary = {
             "iterations": trainer.step,
@@ -225,7 +226,7 @@ def write_maps(folder: Path, scene: Scene, init: Entry, gaussians: Gaussians, ra
     folder.mkdir(exist_ok=True)
     points = cKDTree(read_cloud(init.path / MODEL_FOLDER).points)
     for view in scene.test:
-        maps = view_maps(rasterizer, gaussians, view.camera, points)
+        maps: dict[str, Any] = view_maps(rasterizer, gaussians, view.camera, points)
         np.savez_compressed(folder / Path(png_name(view.name)).with_suffix(".npz"), **maps)
 
 
@@ -289,4 +290,3 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
-

@@ -63,9 +63,9 @@ class CameraOrder:
 class Trainer:
     """Trains Gaussians on the training views of a scene.
 
-    All randomness comes from generators made of ``seed``. ``run`` writes metrics, events and checkpoints into a folder, and
-    goes on from the newest checkpoint that it finds there: on the CPU, to the same bits as an undisturbed run. A signal
-    to stop (see `gsbench.pipeline.stopping`) ends it after the iteration, with a checkpoint.
+    All randomness comes from generators made of ``seed``. ``run`` writes metrics, events and checkpoints into a
+    folder, and goes on from the newest checkpoint that it finds there: on the CPU, to the same bits as an undisturbed
+    run. A signal to stop (see `gsbench.pipeline.stopping`) ends it after the iteration, with a checkpoint.
     """
 
     def __init__(
@@ -131,17 +131,24 @@ class Trainer:
         view = self.scene.train[self.order.next()]
         try:
             render = self.rasterizer.render(
-                self.gaussians.values, view.camera, self.sh_degree, self.background, self.densifier.needs_absolute_gradient
+                self.gaussians.values,
+                view.camera,
+                self.sh_degree,
+                self.background,
+                self.densifier.needs_absolute_gradient,
             )
         except ValueError as error:  # the optimiser has driven a parameter out of range
-            raise TrainingError(f"iteration {step}: {error}; the last good state is the newest checkpoint in {folder}") from error
+            raise TrainingError(
+                f"iteration {step}: {error}; the last good state is the newest checkpoint in {folder}"
+            ) from error
         loss, l1, ssim = photometric_loss(render.image, self._target(view), options.ssim_weight)
         regularizer = self.densifier.regularizer(self.gaussians.values)
         total = loss if regularizer is None else loss + regularizer
         value = loss.item()
         if not math.isfinite(total.item()):
             raise TrainingError(
-                f"the loss became {total.item()} at iteration {step}; the last good state is the newest checkpoint in {folder}"
+                f"the loss became {total.item()} at iteration {step}; "
+                f"the last good state is the newest checkpoint in {folder}"
             )
         self.smoothed_loss = (
             value
@@ -249,5 +256,3 @@ def drop_after(path: Path, step: int) -> None:
 def _append(stream: Any, record: dict[str, Any]) -> None:
     stream.write(json.dumps(record) + "\n")
     stream.flush()
-
-

@@ -16,27 +16,33 @@ NAMES = ("reference", "cpu", "cuda")
 
 
 def resolve_name(name: str, device: torch.device) -> str:
-    """The executor that ``name`` (``auto`` included) means on ``device``; raises InputError where it cannot run there."""
+    """The executor that ``name`` (``auto`` included) means on ``device``; raises InputError where it cannot run
+    there."""
     if name == "auto":
         if device.type == "cpu":
             return "cpu"
         if device.type == "cuda" and importlib.util.find_spec("gsplat") is not None:
             return "cuda"
-        log.warning("raster=auto: gsplat is not installed, so the slow reference rasterizer runs; pip install 'gsbench[cuda]'")
+        log.warning(
+            "raster=auto: gsplat is not installed, so the slow reference rasterizer runs; pip install 'gsbench[cuda]'"
+        )
         return "reference"
     if name not in NAMES:
         raise InputError(f"raster={name} is not known; choose auto, {', '.join(NAMES)}")
     if name == "cpu" and device.type != "cpu":
         raise InputError(f"raster=cpu runs on device=cpu, not on {device}; use raster=cuda or device=cpu")
     if name == "cuda" and device.type != "cuda":
-        raise InputError(f"raster=cuda needs a CUDA device and device is {device}; use raster=cpu, or device=cuda on a GPU machine")
+        raise InputError(
+            f"raster=cuda needs a CUDA device and device is {device}; use raster=cpu, or device=cuda on a GPU machine"
+        )
     if name == "cuda" and importlib.util.find_spec("gsplat") is None:
         raise InputError("raster=cuda needs gsplat: pip install 'gsbench[cuda]'")
     return name
 
 
 def create_rasterizer(name: str, device: torch.device, threads: int | None = None) -> Rasterizer:
-    """The executor called ``name`` (see ``resolve_name``) for ``device``, on ``threads`` CPU threads where that applies."""
+    """The executor called ``name`` (see ``resolve_name``) for ``device``, on ``threads`` CPU threads where that
+    applies."""
     resolved = resolve_name(name, device)
     if resolved == "cpu":
         from gsbench.raster.cpu import CpuRasterizer

@@ -34,10 +34,10 @@ class RenderOutput:
     """One rendered view.
 
     ``image`` is [H, W, 3], not clamped above; ``alpha`` is [H, W]; ``radii`` is [N] int32 in px, 0 where a Gaussian was
-    culled. ``screen_points`` is [N, 2], all zero, and a leaf: after ``backward`` its ``.grad`` is the gradient of the loss
-    with respect to the projected means in NDC units, as 3DGS's densification reads it (pixel gradient times W/2, H/2).
-    ``screen_gradient_abs`` is [N, 2], filled by ``backward`` with the same sum over pixels of absolute values (AbsGS,
-    arXiv 2404.10484), or None if it was not asked for.
+    culled. ``screen_points`` is [N, 2], all zero, and a leaf: after ``backward`` its ``.grad`` is the gradient of the
+    loss with respect to the projected means in NDC units, as 3DGS's densification reads it (pixel gradient times W/2,
+    H/2). ``screen_gradient_abs`` is [N, 2], filled by ``backward`` with the same sum over pixels of absolute values
+    (AbsGS, arXiv 2404.10484), or None if it was not asked for.
     """
 
     image: Tensor
@@ -65,9 +65,9 @@ class Rasterizer(Protocol):
         background: Tensor,
         absolute_gradient: bool = False,
     ) -> RenderOutput:
-        """Render ``gaussians`` from ``camera`` with spherical harmonics up to ``sh_degree`` (0 to 3) over ``background`` [3].
+        """Render ``gaussians`` from ``camera`` with harmonics up to ``sh_degree`` (0 to 3) over ``background`` [3].
 
-        Differentiable in the six tensors of ``gaussians`` and in ``screen_points``. Pixel (column i, row j) is sampled at
-        its centre: a point projects to ``fx x/z + cx - 0.5`` in units where pixel centres are integers.
+        Differentiable in the six tensors of ``gaussians`` and in ``screen_points``. Pixel (column i, row j) is sampled
+        at its centre: a point projects to ``fx x/z + cx - 0.5`` in units where pixel centres are integers.
         """
         ...

@@ -1,10 +1,10 @@
 """The CUDA executor: gsplat's kernels (Ye et al., arXiv 2409.06765) under the contract of ``raster.base``.
 
-gsplat's parts are put together here so that the conventions of 3DGS hold where its own ``rasterization`` has others: the near
-plane is 0.2, and a Gaussian reaches the tiles of a square of 3 sigma along its larger axis, whatever its opacity. What still
-differs, since it stands in gsplat's kernels: alpha is clamped to 0.999 instead of 0.99, and no gradient passes the clamp; a
-tile at the edge of the square is taken in when any part of it is reached, not only its first pixel; sums are made with
-atomics, so two runs differ in the last bits.
+gsplat's parts are put together here so that the conventions of 3DGS hold where its own ``rasterization`` has others:
+the near plane is 0.2, and a Gaussian reaches the tiles of a square of 3 sigma along its larger axis, whatever its
+opacity. What still differs, since it stands in gsplat's kernels: alpha is clamped to 0.999 instead of 0.99, and no
+gradient passes the clamp; a tile at the edge of the square is taken in when any part of it is reached, not only its
+first pixel; sums are made with atomics, so two runs differ in the last bits.
 """
 
 from __future__ import annotations

@@ -19,8 +19,8 @@ EXTENT_MARGIN = 1.1  # 3DGS: cameras_extent = 1.1 x the largest distance of a tr
 class Capture:
     """Photographs on disk, and the cameras that came with them, if any.
 
-    ``images`` is the folder; ``image_names`` are the selected files in it (relative, sorted) and ``test_names`` those of
-    them held out. ``model`` is a COLMAP sparse folder with reference cameras, or None for bare photographs;
+    ``images`` is the folder; ``image_names`` are the selected files in it (relative, sorted) and ``test_names`` those
+    of them held out. ``model`` is a COLMAP sparse folder with reference cameras, or None for bare photographs;
     ``exact_poses`` says that its poses are the truth (a procedural scene), not an estimate. ``fingerprint`` is a sha256
     over names and contents of all that was selected.
     """

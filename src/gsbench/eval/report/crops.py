@@ -33,11 +33,6 @@ class Crop:
     first_error: float
     second_error: float
 
-    @property
-    def gain(self) -> float:
-        """How much smaller the second arm's error is."""
-        return self.first_error - self.second_error
-
 
 def choose_crops(pairs: Sequence[tuple[Trial, Trial]], count: int) -> tuple[list[Crop], list[Crop], list[str]]:
     """Up to ``count`` places each where the second arm gains most and loses most, and what could not be read.

@@ -298,8 +298,12 @@ class _Render(torch.autograd.Function):
         g_alpha_array = np.empty(0, np.float32) if g_alpha is None else g_alpha.contiguous().numpy().reshape(-1)
         holder = _Holder()
         arena = ctx.rasterizer._scratch.lease(holder)
-        gradients, g_screen = _backward(
-            ctx.rasterizer, arena, frame, Gaussians(*tensors), g_image_array, g_alpha_array, ctx.absolute
-        )
+        try:
+            gradients, g_screen = _backward(
+                ctx.rasterizer, arena, frame, Gaussians(*tensors), g_image_array, g_alpha_array, ctx.absolute
+            )
+        except BaseException:
+            arena.drop("rows")  # it must be all zero, and an interrupt may have left sums in it
+            raise
         g_background = None if alpha is None else (g_image * (1 - alpha).unsqueeze(-1)).sum((0, 1))
         return None, None, None, None, g_background, g_screen, *gradients

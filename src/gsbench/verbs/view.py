@@ -1,0 +1,47 @@
+"""``gsbench view``: look at one trained model in the browser, or at two side by side."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import threading
+
+from gsbench.errors import InputError
+
+DEFAULT_PORT = 8080
+
+
+def main(argv: list[str]) -> int:
+    parser = argparse.ArgumentParser(
+        prog="gsbench view", description="Look at trained models in the browser: one, or two side by side."
+    )
+    trial_help = "a trial's folder, or EXPERIMENT:SCENE:DENSIFY[:SEED] such as demo:courtyard:volumetric:0"
+    parser.add_argument("trial", nargs="+", metavar="TRIAL", help=trial_help)
+    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help=f"on this machine; 0: any ({DEFAULT_PORT})")
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:1")
+    options = parser.parse_args(argv)
+    if len(options.trial) > 2:
+        raise InputError(f"one or two trials can be viewed, not {len(options.trial)}")
+    if importlib.util.find_spec("viser") is None:
+        raise InputError("the viewer needs viser: pip install 'gsbench[view]'")
+
+    from gsbench.cli import runs_dir
+    from gsbench.pipeline.components import select_device
+    from gsbench.raster import create_rasterizer
+    from gsbench.view.picture import TrialPainter
+    from gsbench.view.server import Viewer, check_port
+    from gsbench.view.trials import find_trial, load_viewed
+
+    check_port(options.port)
+    device = select_device(options.device)
+    trials = [find_trial(address, runs_dir()) for address in options.trial]
+    rasterizer = create_rasterizer("auto", device)
+    viewer = Viewer([TrialPainter(load_viewed(trial, device), rasterizer) for trial in trials], options.port)
+    print(f"{viewer.url}  (Ctrl+C ends it)", flush=True)
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        print("stopped")
+    finally:
+        viewer.stop()
+    return 0

@@ -1,0 +1,275 @@
+"""The viewer's page: viser carries the camera and the controls, gsbench's own rasterizer draws.
+
+One trial fills the page; two stand side by side under one camera. Everything on the page is drawn here, so that what is
+seen is what was evaluated, in any browser.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbench.densify.events import Cause
+from gsbench.errors import InputError
+from gsbench.scene.camera import Camera
+from gsbench.scene.types import View
+from gsbench.view.picture import CAUSE_COLORS, Layers, Picture, TrialPainter, photograph_at, side_by_side
+
+log = logging.getLogger(__name__)
+
+HOST = "127.0.0.1"  # nobody but this machine
+FREE_VIEW = "free"
+MOVING_HEIGHT = 180  # px while the camera moves
+HEIGHTS = ("270", "540", "810")  # px when it rests
+REST_SECONDS = 0.25  # after the last change the sharp picture is drawn
+DEFAULT_THRESHOLD = math.log10(0.03)  # the paper's V_th
+SHARES = (1, 100)  # %, of the Gaussians, the most opaque first
+
+
+class Viewer:
+    """Serves ``painters`` (one or two) on a loopback port until ``stop``; port 0 picks a free one."""
+
+    def __init__(self, painters: Sequence[TrialPainter], port: int) -> None:
+        import viser
+
+        self.painters = tuple(painters)
+        self.views: dict[str, View] = {view.name: view for view in painters[0].trial.views}
+        self.server: Any = viser.ViserServer(host=HOST, port=port or free_port(), verbose=False)
+        self.server.gui.configure_theme(control_layout="collapsible", show_logo=False, show_share_button=False)
+        self.server.scene.set_up_direction(mean_up(painters[0].trial.views))
+        self._sessions: dict[int, Session] = {}
+        self._add_controls()
+        self.server.on_client_connect(self._connect)
+        self.server.on_client_disconnect(self._disconnect)
+
+    @property
+    def url(self) -> str:
+        return f"http://{HOST}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        """Close the page and end all drawing."""
+        for session in list(self._sessions.values()):
+            session.stop()
+        self.server.stop()
+
+    def draw(self, camera: Camera, layers: Layers, view: View | None) -> Picture:
+        """The page's picture: one pane for each trial and, with ``view``, its photograph; all from ``camera``."""
+        panes = [] if view is None else [(f"photograph {view.name}", photograph_at(camera, view))]
+        for painter in self.painters:
+            label = f"{painter.trial.label}: {len(painter.trial.gaussians):,} Gaussians"
+            panes.append((label, painter.draw(camera, layers_of(layers, painter, self._share.value))))
+        return side_by_side(panes)
+
+    def layers(self) -> Layers:
+        """What the controls ask for."""
+        return Layers(
+            sh_degree=int(self._degree.value),
+            ellipsoids=bool(self._ellipsoids.value),
+            log10_volume=float(self._threshold.value),
+            cloud=bool(self._cloud.value),
+            cameras=bool(self._cameras.value),
+        )
+
+    def photograph(self) -> View | None:
+        """The photograph to show beside the renders, if any."""
+        return self.views.get(self._view.value) if self._beside.value else None
+
+    @property
+    def resting_height(self) -> int:
+        return int(self._height.value)
+
+    def _add_controls(self) -> None:
+        gui = self.server.gui
+        lowest = min(float(painter.trial.log10_volumes.min()) for painter in self.painters)
+        highest = max(float(painter.trial.log10_volumes.max()) for painter in self.painters)
+        lowest, highest = math.floor(min(lowest, DEFAULT_THRESHOLD)), math.ceil(max(highest, DEFAULT_THRESHOLD))
+        with gui.add_folder("Test views"):
+            self._view = gui.add_dropdown("View", (FREE_VIEW, *self.views), initial_value=next(iter(self.views)))
+            self._beside = gui.add_checkbox("Photograph beside", True)
+            self._cameras = gui.add_checkbox("Cameras", False)
+        with gui.add_folder("Gaussians"):
+            self._degree = gui.add_slider("SH degree", 0, 3, 1, 3)
+            self._share = gui.add_slider("Most opaque, %", *SHARES, 1, 100)
+        with gui.add_folder("Growth"):
+            self._cloud = gui.add_checkbox("Initial cloud", False)
+            self._ellipsoids = gui.add_checkbox("Ellipsoids by cause", False)
+            self._threshold = gui.add_slider("log10 volume >", lowest, highest, 0.001, round(DEFAULT_THRESHOLD, 3))
+            self._legend = gui.add_markdown(self._legend_text())
+        self._height = gui.add_dropdown("Picture height, px", HEIGHTS, initial_value=HEIGHTS[1])
+        changes = (self._cameras, self._degree, self._share, self._cloud, self._ellipsoids, self._height)
+        for control in changes:
+            control.on_update(lambda _: self._redraw())
+        self._threshold.on_update(lambda _: self._update_threshold())
+        self._view.on_update(self._go_to_view)
+        self._beside.on_update(self._go_to_view)  # the panes change their width
+
+    def _legend_text(self) -> str:
+        volume = 10 ** float(self._threshold.value)
+        counts = [painter.counts_above(float(self._threshold.value)) for painter in self.painters]
+        lines = [f"V > {volume:.3g}"]
+        for cause in Cause:
+            if any(count[cause] for count in counts):
+                color = "#{:02x}{:02x}{:02x}".format(*CAUSE_COLORS[cause])
+                numbers = " | ".join(f"{count[cause]:,}" for count in counts)
+                lines.append(f"<span style='color:{color}'>&#9679;</span> {cause.name.lower()}: {numbers}")
+        return "<br>".join(lines)
+
+    def _update_threshold(self) -> None:
+        self._legend.content = self._legend_text()
+        self._redraw()
+
+    def _redraw(self) -> None:
+        for session in list(self._sessions.values()):
+            session.wake()
+
+    def _go_to_view(self, event: Any) -> None:
+        view = self.views.get(self._view.value)
+        session = None if event.client is None else self._sessions.get(event.client.client_id)
+        if view is not None and session is not None:
+            session.go_to(view)
+        self._redraw()
+
+    def _connect(self, client: Any) -> None:
+        session = Session(self, client)
+        self._sessions[client.client_id] = session
+        session.go_to(self.views.get(self._view.value, next(iter(self.views.values()))))
+        session.start()
+
+    def _disconnect(self, client: Any) -> None:
+        session = self._sessions.pop(client.client_id, None)
+        if session is not None:
+            session.stop()
+
+
+class Session:
+    """One browser page: a thread that draws the newest state, coarsely while it changes and sharply when it rests."""
+
+    def __init__(self, viewer: Viewer, client: Any) -> None:
+        self.viewer, self.client = viewer, client
+        self._changed, self._stopped = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._loop, name=f"gsbench view {client.client_id}", daemon=True)
+        client.camera.on_update(lambda _: self.wake())
+
+    def start(self) -> None:
+        self._changed.set()
+        self._thread.start()
+
+    def wake(self) -> None:
+        self._changed.set()
+
+    def stop(self) -> None:
+        self._stopped.set()
+        self._changed.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=10)
+
+    def go_to(self, view: View) -> None:
+        """Put the page's camera where ``view`` was taken, with a field of view that shows all of it."""
+        own, camera = view.camera, self.client.camera
+        aspect = float(camera.aspect or 1.0) / self._panes()
+        forward = own.rotation[2]  # [3] world
+        with self.client.atomic():
+            camera.up_direction = -own.rotation[1]
+            camera.position = own.center
+            camera.look_at = own.center + forward * orbit_distance(list(self.viewer.views.values()))
+            camera.fov = fitting_fov(own, aspect)
+
+    def _panes(self) -> int:
+        return len(self.viewer.painters) + (self.viewer.photograph() is not None)
+
+    def _loop(self) -> None:
+        while not self._stopped.is_set():
+            self._changed.wait()
+            self._changed.clear()
+            self._show(MOVING_HEIGHT)
+            if not self._changed.wait(REST_SECONDS):
+                self._show(self.viewer.resting_height)
+
+    def _show(self, height: int) -> None:
+        if self._stopped.is_set():
+            return
+        page = self.client.camera
+        camera = page_camera(page.wxyz, page.position, page.fov, page.aspect, height, self._panes())
+        try:
+            image = self.viewer.draw(camera, self.viewer.layers(), self.viewer.photograph())
+        except ValueError as error:  # a camera that cannot be drawn, such as inside out while the page is being built
+            log.debug("view: %s", error)
+            return
+        if not self._stopped.is_set():
+            self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=90)
+
+
+def layers_of(layers: Layers, painter: TrialPainter, share: float) -> Layers:
+    """``layers`` with ``share`` per cent of the Gaussians of this trial."""
+    count = len(painter.trial.gaussians)
+    return layers if share >= SHARES[1] else replace(layers, max_gaussians=max(1, round(share / 100 * count)))
+
+
+def page_camera(
+    wxyz: NDArray[np.float64], position: NDArray[np.float64], fov: float, aspect: float, height: int, panes: int
+) -> Camera:
+    """The camera of one of ``panes`` equal panes of a page.
+
+    ``wxyz`` turns camera axes (x right, y down, z forward) to the world, ``position`` [3] is in world units, ``fov`` the
+    vertical field of view in radians and ``aspect`` the page's width over its height; ``height`` in px.
+    """
+    w, x, y, z = np.asarray(wxyz, dtype=np.float64) / np.linalg.norm(wxyz)
+    to_world = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    width = max(1, round(height * aspect / panes))
+    focal = height / 2 / math.tan(fov / 2)
+    rotation = to_world.T
+    return Camera(width, height, focal, focal, width / 2, height / 2, rotation, -rotation @ np.asarray(position))
+
+
+def fitting_fov(camera: Camera, aspect: float) -> float:
+    """The vertical field of view (radians) with which a pane of ``aspect`` shows all that ``camera`` sees."""
+    half_height = max(camera.cy, camera.height - camera.cy) / camera.fy
+    half_width = max(camera.cx, camera.width - camera.cx) / camera.fx
+    return 2 * math.atan(max(half_height, half_width / aspect))
+
+
+def mean_up(views: Sequence[View]) -> NDArray[np.float64]:
+    """The mean upward direction of the cameras, a unit vector [3]."""
+    up = -np.mean([view.camera.rotation[1] for view in views], axis=0)
+    length = float(np.linalg.norm(up))
+    return up / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+
+
+def orbit_distance(views: Sequence[View]) -> float:
+    """How far ahead of a page's camera the point is that it turns around: the mean distance of the views to their centre."""
+    centers = np.stack([view.camera.center for view in views])  # [V, 3]
+    return max(float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()), 1e-3)
+
+
+def free_port() -> int:
+    """A port of the loopback interface that nobody uses now."""
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        return int(probe.getsockname()[1])
+
+
+def check_port(port: int) -> None:
+    """Raise InputError where ``port`` cannot be used (0: any free one)."""
+    import socket
+
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            raise InputError(f"port {port} cannot be used ({error.strerror}); give another --port") from None
