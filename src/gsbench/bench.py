@@ -1,9 +1,9 @@
 """What one training step costs with each rasterizer: times, their split, and peak memory.
 
-A step is what training does: render, photometric loss, backward, Adam on all parameters, spherical harmonics of degree
-3. The synthetic scene has the statistics of a trained model (many small flat Gaussians, few large ones, opacities of
-all kinds) and is the same for one count on every machine. torch is imported inside functions, as everywhere near the
-command line.
+A step is what training does: render, photometric loss, backward, Adam on all parameters, spherical harmonics of
+degree 3. The synthetic scene is meant to resemble a trained model (many small flat Gaussians, few large ones,
+opacities of all kinds) without being fitted to one, and is the same for one count on every machine. torch is imported
+inside functions, as everywhere near the command line.
 """
 
 from __future__ import annotations

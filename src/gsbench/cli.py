@@ -37,7 +37,7 @@ def run(argv: list[str]) -> int:
     """Run the command line ``argv``; returns the exit code and prints errors as one line."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: its idle threads must not spin beside ours
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    _set_up_logging()
+    set_up_logging()
     try:
         if argv and argv[0] in ("help", "--help", "-h"):
             return _help()
@@ -81,7 +81,7 @@ def _trials(argv: list[str]) -> int:
 
 
 def _help() -> int:
-    from gsbench.launch import options_text
+    from gsbench.compose import options_text
 
     print("gsbench: does an idea help 3D Gaussian Splatting?\n")
     print("  gsbench scene=courtyard init=sfm densify=volumetric seed=0     one trial")
@@ -96,7 +96,8 @@ def _help() -> int:
     return DONE
 
 
-def _set_up_logging() -> None:
+def set_up_logging() -> None:
+    """Show what gsbench logs, from INFO on, on stderr."""
     if not log.handlers:
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("%(message)s"))

@@ -95,8 +95,19 @@ class TrackingConfig:
 
 @dataclass
 class LaunchConfig:
-    name: str = MISSING
-    parallel: int = 1  # trials at once on this machine
+    name: str = MISSING  # serial | local | slurm
+    parallel: int = 1  # trials at once
+    timeout_min: int | None = None  # minutes until a trial is stopped with a checkpoint and queued again
+    max_requeues: int = 20  # Slurm only, as are the next: how often a trial may run out of time
+    signal_seconds: int = 120  # so long before the end a trial is told to save its checkpoint
+    cpus_per_trial: int | None = None
+    gpus_per_trial: int = 0
+    mem_gb: int | None = None  # null: the cluster's default
+    partition: str | None = None
+    account: str | None = None
+    qos: str | None = None
+    setup: list[str] = field(default_factory=list)  # shell lines before the trial, such as "module load cuda"
+    sbatch: dict[str, Any] = field(default_factory=dict)  # further options of sbatch, such as {constraint: a100}
 
 
 @dataclass
@@ -169,6 +180,8 @@ def check(config: DictConfig) -> None:
         ("train.max_seconds", config.train.max_seconds is None or config.train.max_seconds > 0, "above 0 or null"),
         ("train.background", all(0 <= c <= 1 for c in config.train.background), "three numbers in [0, 1]"),
         ("eval.protocol", config.eval.protocol in ("paper", "standard"), "paper or standard"),
+        ("launch", config.launch.name in ("serial", "local", "slurm"), "serial, local or slurm"),
+        ("launch.timeout_min", config.launch.timeout_min is None or config.launch.timeout_min >= 1, "at least 1 or null"),
         ("launch.parallel", config.launch.parallel >= 1, "at least 1"),
         ("threads", config.threads == "auto" or _is_positive(config.threads), "auto or a whole number above 0"),
         ("name", _is_folder_name(config.name), "a plain folder name"),

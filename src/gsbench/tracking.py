@@ -189,6 +189,16 @@ def connect(uri: str | None, runs: Path) -> MlflowClient:
     return client
 
 
+def prepare(options: dict[str, Any], runs: Path, experiment: str) -> None:
+    """Create tables and ``experiment`` before many processes need them; a tracker that fails is only mentioned."""
+    if not options["enabled"]:
+        return
+    try:
+        ensure_experiment(connect(options["uri"], runs), experiment, runs)
+    except Exception as error:  # noqa: BLE001 - the mirror must never harm a sweep, whatever the tracker raises
+        log.warning("tracking: %s; the files will be complete, `gsbench sync` mirrors them later", _one_line(error))
+
+
 def ensure_experiment(client: MlflowClient, name: str, runs: Path) -> str:
     """The id of experiment ``name``, created once under a lock."""
     with FileLock(runs / ".mlflow.lock"):

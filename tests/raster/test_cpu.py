@@ -208,6 +208,37 @@ def test_vector_functions() -> None:
     np.testing.assert_array_equal(out[80:96], np.where(0b1010 >> np.arange(16) & 1, a, b))
 
 
+@numba.njit
+def _wide_functions(x, out):  # type: ignore[no-untyped-def]
+    for i in range(0, len(x), simd.WIDE_LANES):
+        value = simd.load(x, i)
+        power = simd.exp2(value)
+        simd.store(out[0], i, power)
+        simd.store(out[1], i, simd.log2(power))
+        simd.store(out[2], i, simd.square_root(power) + simd.floor(value) - simd.ceil(value))
+
+
+def test_float64_functions_over_their_range() -> None:
+    x = np.linspace(-1000, 1000, 8 * 4096)
+    out = np.empty((3, len(x)))
+    _wide_functions(x, out)
+    np.testing.assert_allclose(out[0], np.exp2(x), rtol=1e-13)
+    np.testing.assert_allclose(out[1], x, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(out[2], np.sqrt(np.exp2(x)) + np.floor(x) - np.ceil(x), rtol=1e-12)
+
+
+@numba.njit
+def _gather(array, indices, out):  # type: ignore[no-untyped-def]
+    simd.store(out, 0, simd.gather(array, indices, 3, 1))
+
+
+def test_gather() -> None:
+    array = np.arange(60, dtype=np.float32).reshape(20, 3)
+    indices, out = np.array([5, 0, 19, 7, 7, 2, 1, 3]), np.empty(8)
+    _gather(array, indices, out)
+    np.testing.assert_array_equal(out, array[indices, 1])
+
+
 def test_exp2_over_its_range() -> None:
     x = np.linspace(-126, 127, 16 * 4096).astype(np.float32)
     out = np.empty_like(x)

@@ -1,6 +1,7 @@
 """Initial clouds: from photographs, or from what came with them, to a COLMAP model on disk."""
 
 from gsbench.init.base import (
+    GAUSSIANS_FILE,
     MODEL_FOLDER,
     OWN_GAUGE_FOLDER,
     PICTURE_FILE,
@@ -15,10 +16,12 @@ from gsbench.init.base import (
 )
 from gsbench.init.dataset import Dataset
 from gsbench.init.dim import Dim, SiftKornia
+from gsbench.init.ply import Ply
 from gsbench.init.random import Random
 from gsbench.init.sfm import Sfm, SfmDense
 
 __all__ = [
+    "GAUSSIANS_FILE",
     "MODEL_FOLDER",
     "OWN_GAUGE_FOLDER",
     "PICTURE_FILE",
@@ -31,6 +34,7 @@ __all__ = [
     "PointCloud",
     "PoseErrors",
     "Progress",
+    "Ply",
     "Random",
     "Sfm",
     "SfmDense",

@@ -16,6 +16,7 @@ from gsbench.scene.types import Capture
 MODEL_FOLDER = Path("sparse", "0")  # below the output folder: where COLMAP users and 3DGS trainers look
 OWN_GAUGE_FOLDER = Path("sparse_own_gauge", "0")  # the same model as its own mapper scaled it, before alignment
 REPORT_FILE = "report.json"
+GAUSSIANS_FILE = "gaussians.ply"  # optional: the Gaussians to start from, where there is more than points
 PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
 POSES = ("shared", "own")
 

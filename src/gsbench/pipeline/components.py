@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
-import os
 from typing import Any
 
 import torch
@@ -89,12 +88,3 @@ def select_device(name: str) -> torch.device:
     if device.type == "cuda" and device.index is not None and device.index >= torch.cuda.device_count():
         raise InputError(f"device={name}: there are {torch.cuda.device_count()} CUDA devices, numbered from 0")
     return device
-
-
-def available_threads(parallel: int = 1) -> int:
-    """The CPU threads for one of ``parallel`` trials: what Slurm gave, else this process's cores, shared evenly."""
-    slurm = os.environ.get("SLURM_CPUS_PER_TASK", "")
-    if slurm.isdigit() and int(slurm) > 0:
-        return int(slurm)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // parallel)

@@ -9,12 +9,11 @@ from __future__ import annotations
 import logging
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 from gsbench.compose import Composed
 from gsbench.errors import InputError
 from gsbench.pipeline.files import write_json
-from gsbench.pipeline.locks import BusyError, hold
 from gsbench.pipeline.outcome import Outcome, outcome_of_results
+from gsbench.pipeline.resources import assign_gpu, assign_threads, take_slot
 from gsbench.pipeline.stopping import Stopped, stop_on_signals
 from gsbench.pipeline.trial_files import TrialPaths, find_finished, read_object
 
@@ -38,7 +37,6 @@ SECONDS_BETWEEN_POLLS = 1.0
 SECONDS_BETWEEN_QUEUE_CHECKS = 20.0
 CHECKS_UNTIL_LOST = 2  # a job that the queue does not know so often in a row, and that left no result, is lost
 DAYS = 24 * 60  # minutes
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 @dataclass
@@ -62,7 +60,7 @@ class TrialJob:
                 if launch["name"] == "local":
                     slot = stack.enter_context(take_slot(TrialPaths.of(self.values).runs, launch["parallel"]))
                     assign_gpu(slot, self.visible_gpus)
-                assign_threads(self.values)
+                assign_threads(self.values["threads"], launch["parallel"])
                 from gsbench.pipeline.serial import run_one
 
                 return run_one(Composed(self.values, self.yaml, ()), wait=True)
@@ -239,49 +237,3 @@ def _prepare_tracking(values: dict[str, Any]) -> None:
     from gsbench.tracking import prepare
 
     prepare(values["tracking"], TrialPaths.of(values).runs, values["name"])
-
-
-@contextmanager
-def take_slot(runs: Path, count: int) -> Iterator[int]:
-    """Hold the first free one of ``count`` slots of this machine, so that no more trials run at once, whoever started them."""
-    folder = runs / ".slots" / socket.gethostname()
-    folder.mkdir(parents=True, exist_ok=True)
-    while True:
-        for slot in range(count):
-            with ExitStack() as stack:
-                try:
-                    stack.enter_context(hold(folder / f"{slot}.lock", f"slot {slot}", wait=False))
-                except BusyError:
-                    continue
-                yield slot
-                return
-        time.sleep(SECONDS_BETWEEN_POLLS)
-
-
-def assign_gpu(slot: int, visible: str | None) -> None:
-    """Let this process see one GPU: the slot's turn among those that the parent saw. Before torch is loaded."""
-    gpus = [gpu.strip() for gpu in visible.split(",") if gpu.strip()] if visible is not None else installed_gpus()
-    if gpus:
-        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[slot % len(gpus)]
-    elif visible is None:
-        os.environ.pop("CUDA_VISIBLE_DEVICES", None)  # submitit has emptied it
-
-
-def installed_gpus() -> list[str]:
-    """The indices of NVIDIA GPUs of this machine, as its driver lists them."""
-    try:
-        listing = subprocess.run(
-            ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"], capture_output=True, text=True, timeout=60, check=True
-        )
-    except (OSError, subprocess.SubprocessError):
-        return []
-    return listing.stdout.split()
-
-
-def assign_threads(values: dict[str, Any]) -> None:
-    """Limit the libraries' threads in this process to its share of the cores. Before torch is loaded."""
-    from gsbench.pipeline.threads import available_threads
-
-    threads = available_threads(values["launch"]["parallel"]) if values["threads"] == "auto" else int(values["threads"])
-    for variable in THREAD_VARIABLES:
-        os.environ[variable] = str(threads)

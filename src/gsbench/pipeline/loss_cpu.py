@@ -2,7 +2,7 @@
 
 Images stay interleaved [H, W, 3]: a row is 3 W numbers and a horizontal neighbour is 3 numbers away, so one vector
 covers 16 numbers of any channel. Rows are filtered horizontally once into a ring of 11 and combined vertically from
-there. The statistics of the target are computed again at each step: that costs less than fetching them from memory.
+there. The statistics of the target are computed again at each step, so that no memory is needed for each view.
 """
 
 from __future__ import annotations

@@ -25,11 +25,13 @@ from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Sfm, read_cloud
-from gsbench.init.base import MODEL_FOLDER, Initializer
-from gsbench.pipeline.components import available_threads, options_of
+from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, Initializer
+from gsbench.pipeline.components import options_of
 from gsbench.pipeline.files import write_json
+from gsbench.pipeline.figures import draw_ellipsoids
 from gsbench.pipeline.maps import view_maps
 from gsbench.pipeline.progress import Report, progress
+from gsbench.pipeline.resources import available_threads
 from gsbench.pipeline.stage_list import CAPTURE, EVALUATE, GROUND_TRUTH, INIT, TRAIN
 from gsbench.pipeline.store import Entry, Store
 from gsbench.pipeline.trainer import Status, Trainer
@@ -47,6 +49,7 @@ TRAINING_FILE = "training.json"
 LINEAGE_FILE = "lineage.npz"
 PER_VIEW_FILE = "per_view.csv"
 METRICS_FILE = "metrics.json"
+FIGURE_VOLUME = 0.03  # the paper's V_th, for baseline and idea alike
 
 
 def read_capture(store: Store, options: SceneConfig) -> Capture:
@@ -80,6 +83,7 @@ def initialize(store: Store, capture: Capture, initializer: Initializer) -> Entr
         "test": sha256_of(list(capture.test_names)),
         "exact_poses": capture.exact_poses,
         "options": options_of(initializer),
+        "content": initializer.content() if hasattr(initializer, "content") else None,
         "reference": None if reference is None else reference.key,
         "pycolmap": version("pycolmap"),
     }
@@ -138,8 +142,7 @@ def train(
     }
 
     def build(folder: Path) -> None:
-        cloud = read_cloud(init.path / MODEL_FOLDER)
-        initial = gaussians_from_cloud(cloud.points, cloud.colors, device)
+        initial = initial_gaussians(init, device)
         trainer = Trainer(scene, initial, densifier, rasterizer, options, seed)
         reset_peak_memory(device)
         with progress("train") as report:
@@ -165,6 +168,14 @@ def train(
         write_json(folder / TRAINING_FILE, summary)
 
     return store.get(TRAIN, inputs, build)
+
+
+def initial_gaussians(init: Entry, device: torch.device) -> Gaussians:
+    """What the training starts from: the Gaussians that the initialiser left, or one for each of its points."""
+    if (init.path / GAUSSIANS_FILE).exists():
+        return read_ply(init.path / GAUSSIANS_FILE, device)
+    cloud = read_cloud(init.path / MODEL_FOLDER)
+    return gaussians_from_cloud(cloud.points, cloud.colors, device)
 
 
 def keep_ground_truth(store: Store, scene: Scene, scene_inputs: dict[str, Any], init: Entry) -> Entry:
@@ -214,6 +225,7 @@ def evaluate(
                 per_view[view.name] = evaluator.evaluate_view(image, view.image)
         if options.maps:
             write_maps(folder / "maps", scene, init, gaussians, rasterizer)
+            draw_figures(folder / "figures", folder / "renders", scene, trained, gaussians)
         write_per_view(folder / PER_VIEW_FILE, per_view)
         metrics = {"metrics": summarize(per_view, evaluator.unavailable), "unavailable": evaluator.unavailable}
         write_json(folder / METRICS_FILE, metrics)
@@ -228,6 +240,17 @@ def write_maps(folder: Path, scene: Scene, init: Entry, gaussians: Gaussians, ra
     for view in scene.test:
         maps: dict[str, Any] = view_maps(rasterizer, gaussians, view.camera, points)
         np.savez_compressed(folder / Path(png_name(view.name)).with_suffix(".npz"), **maps)
+
+
+def draw_figures(folder: Path, renders: Path, scene: Scene, trained: Entry, gaussians: Gaussians) -> None:
+    """The voluminous Gaussians of the model, drawn over its first test view."""
+    folder.mkdir(exist_ok=True)
+    with np.load(trained.path / LINEAGE_FILE) as lineage:
+        causes = torch.from_numpy(lineage["causes"][lineage["ids"]])  # [N]
+    for view in scene.test[:1]:
+        render = np.asarray(Image.open(renders / png_name(view.name)))
+        picture = draw_ellipsoids(render, gaussians, causes, view.camera, FIGURE_VOLUME)
+        picture.save(folder / "ellipsoids.png")
 
 
 def png_name(view_name: str) -> str:

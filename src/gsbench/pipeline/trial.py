@@ -18,11 +18,12 @@ import torch
 from gsbench.config import EvalConfig, SceneConfig, TrainConfig, config_hash
 from gsbench.densify.events import sum_events
 from gsbench.errors import GsbenchError
-from gsbench.init.base import REPORT_FILE
+from gsbench.init.base import PICTURE_FILE, REPORT_FILE
 from gsbench.pipeline import stages
-from gsbench.pipeline.components import available_threads, build, select_device
+from gsbench.pipeline.components import build, select_device
 from gsbench.pipeline.files import remove_temporaries, storage_errors, write_json, write_text
 from gsbench.pipeline.locks import hold
+from gsbench.pipeline.resources import available_threads
 from gsbench.pipeline.stage_list import EVALUATE, GROUND_TRUTH, INIT, TRAIN
 from gsbench.pipeline.store import Entry, Store
 from gsbench.pipeline.trainer import EVENTS, HISTOGRAMS, METRICS
@@ -96,7 +97,7 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
         evaluated = stages.evaluate(
             store, scene, init, trained, rasterizer, train_options, eval_options, device
         )
-        published = _publish(paths.folder, trained, evaluated, ground_truth)
+        published = _publish(paths.folder, init, trained, evaluated, ground_truth)
         results = _results(values, capture.fingerprint, scene, init, trained, evaluated, rasterizer.name)
         entries = {INIT.name: init, TRAIN.name: trained, GROUND_TRUTH.name: ground_truth, EVALUATE.name: evaluated}
         where = {name: entry.path for name, entry in entries.items()}
@@ -172,7 +173,7 @@ def evaluated_protocol(evaluated: Entry) -> str:
     return str(json.loads((evaluated.path / "manifest.json").read_text())["inputs"]["protocol"])
 
 
-def _publish(folder: Path, trained: Entry, evaluated: Entry, ground_truth: Entry) -> list[Path]:
+def _publish(folder: Path, init: Entry, trained: Entry, evaluated: Entry, ground_truth: Entry) -> list[Path]:
     """Show the stages' files in the trial's folder, as hard links where the file system has them; returns the links."""
     names = (stages.PLY_FILE, stages.LINEAGE_FILE, METRICS, EVENTS, HISTOGRAMS)
     links = {folder / name: trained.path / name for name in names if (trained.path / name).exists()}
@@ -181,10 +182,13 @@ def _publish(folder: Path, trained: Entry, evaluated: Entry, ground_truth: Entry
         "renders": evaluated.path / "renders",
         "ground_truth": ground_truth.path,
         "maps": evaluated.path / "maps",
+        "figures": evaluated.path / "figures",
     }
     for target, source in sources.items():
         files = sorted([*source.glob("*.png"), *source.glob("*.npz")])
         links |= {folder / target / file.name: file for file in files}
+    if (init.path / PICTURE_FILE).exists():
+        links[folder / "figures" / "initial_cloud.png"] = init.path / PICTURE_FILE
     for link, file in links.items():
         link.parent.mkdir(exist_ok=True)
         _link(file, link)

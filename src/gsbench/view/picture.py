@@ -32,7 +32,8 @@ MAX_ELLIPSOIDS = 20_000  # the largest; more would hide one another
 DIMMED = 0.35  # brightness of the render below ellipsoids or the cloud
 FRUSTUM_DEPTH = 0.1  # of the distance of the cameras to their mean
 LINE_COLOR, TEXT_COLOR, SHADOW_COLOR = (255, 210, 60), (255, 255, 255), (0, 0, 0)
-TEXT_SIZE = 14  # px
+TEXT_SIZE = 1 / 36  # of a picture's height; smaller where a label would not fit its pane
+MARGIN = 0.5  # of the text's size
 Picture = NDArray[np.uint8]
 
 
@@ -172,11 +173,15 @@ def side_by_side(panes: Sequence[tuple[str, Picture]]) -> Picture:
     """Labelled pictures of one height, left to right."""
     row = np.hstack([picture for _, picture in panes])
     image = Image.fromarray(row)
-    draw, font = ImageDraw.Draw(image), ImageFont.load_default(TEXT_SIZE)
+    draw = ImageDraw.Draw(image)
     left = 0
     for label, picture in panes:
+        height, width = picture.shape[:2]
+        size = TEXT_SIZE * height
+        size *= min(1.0, width / (ImageFont.load_default(size).getlength(label) + 2 * MARGIN * size))
         if left:
-            draw.line([(left, 0), (left, image.height)], fill=TEXT_COLOR)
-        draw.text((left + 8, 6), label, TEXT_COLOR, font, stroke_width=2, stroke_fill=SHADOW_COLOR)
-        left += picture.shape[1]
+            draw.line([(left, 0), (left, height)], fill=TEXT_COLOR)
+        at, stroke = (left + MARGIN * size, MARGIN * size), max(1, round(size / 8))
+        draw.text(at, label, TEXT_COLOR, ImageFont.load_default(size), stroke_width=stroke, stroke_fill=SHADOW_COLOR)
+        left += width
     return np.asarray(image)

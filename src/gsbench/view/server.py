@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 HOST = "127.0.0.1"  # nobody but this machine
 FREE_VIEW = "free"
-MOVING_HEIGHT = 180  # px while the camera moves
+MOVING_HEIGHT = 240  # px while the camera moves
 HEIGHTS = ("270", "540", "810")  # px when it rests
 REST_SECONDS = 0.25  # after the last change the sharp picture is drawn
 DEFAULT_THRESHOLD = math.log10(0.03)  # the paper's V_th

@@ -1,0 +1,32 @@
+"""Two small finished trials for the viewer to show."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.end_to_end.conftest import SMALL
+
+
+@pytest.fixture(scope="session")
+def small_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A runs folder with the experiment ``small``: ADC and volumetric, one seed."""
+    runs = tmp_path_factory.mktemp("view-runs")
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(("GSBENCH_", "MLFLOW_"))}
+    changes = {"GSBENCH_RUNS": str(runs), "TORCH_HOME": str(tmp_path_factory.mktemp("hub"))}
+    arguments = ["-m", *SMALL, "name=small", "densify=adc,volumetric", "tracking=none", "eval.flip=false"]
+    done = subprocess.run(
+        [sys.executable, "-m", "gsbench.cli", *arguments],
+        cwd=runs,
+        env=kept | changes,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return runs

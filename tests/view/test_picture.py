@@ -1,0 +1,109 @@
+"""Photographs, frustums and the page's camera, against the cameras that they come from."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from gsbench.scene.camera import Camera
+from gsbench.scene.types import View
+from gsbench.view.picture import FRUSTUM_DEPTH, draw_cameras, photograph_at, side_by_side
+from gsbench.view.server import fitting_fov, page_camera
+
+
+def smooth_image(height: int, width: int) -> np.ndarray:
+    noise = np.random.default_rng(0).uniform(0, 255, (height, width, 3))
+    blurred = gaussian_filter(noise, (4, 4, 0))
+    return np.uint8(255 * (blurred - blurred.min()) / np.ptp(blurred))
+
+
+def make_view(x: float = 0.0) -> View:
+    camera = Camera(80, 60, 70.0, 70.0, 38.0, 31.0, np.eye(3), np.array([-x, 0.0, 0.0]))
+    return View("a.png", camera, smooth_image(60, 80))
+
+
+def test_photograph_in_its_own_camera_is_itself() -> None:
+    view = make_view()
+    np.testing.assert_array_equal(photograph_at(view.camera, view), view.image)
+
+
+@pytest.mark.parametrize("scale", [2, 0.5])
+def test_photograph_follows_the_focal_length_and_the_principal_point(scale: float) -> None:
+    view = make_view()
+    width, height = round(80 * scale), round(60 * scale)
+    camera = Camera(width, height, 70 * scale, 70 * scale, 38 * scale, 31 * scale, np.eye(3), np.zeros(3))
+    expected = np.asarray(Image.fromarray(view.image).resize((width, height), Image.Resampling.BILINEAR), int)
+    got = photograph_at(camera, view).astype(int)
+    assert np.abs(got - expected)[4:-4, 4:-4].mean() < 3
+    assert np.abs(got[:, ::-1] - expected).mean() > 15
+
+
+def test_frustum_shows_the_photograph_where_its_plane_projects() -> None:
+    """From b behind a view, its photograph at depth d is the view's own picture, d / (d + b) times as large."""
+    first, second = make_view(0.0), make_view(40.0)  # 20 from their mean
+    depth, behind = FRUSTUM_DEPTH * 20, 0.5
+    camera = Camera(80, 60, 70.0, 70.0, 38.0, 31.0, np.eye(3), np.array([0.0, 0.0, behind]))
+    drawn = draw_cameras(np.zeros((60, 80, 3), np.uint8), camera, [first, second]).astype(int)
+    scale = depth / (depth + behind)
+    rows, columns = np.mgrid[:60, :80]
+    u = (columns + 0.5 - 38) / scale + 38  # photograph pixels
+    v = (rows + 0.5 - 31) / scale + 31
+    inside = (u > 3) & (u < 77) & (v > 3) & (v < 57)
+    outside = (u < -3) | (u > 83) | (v < -3) | (v > 63)
+    expected = first.image[np.clip(v, 0, 59).astype(int), np.clip(u, 0, 79).astype(int)].astype(int)
+    error = np.abs(drawn - expected).max(-1)
+    assert np.median(error[inside]) < 12  # the lines to the corners cross it, and it is sampled twice
+    assert (drawn[outside] == 0).all()
+    assert inside.sum() > 1000
+    assert outside.sum() > 100
+
+
+def test_camera_behind_the_page_is_not_drawn() -> None:
+    page = Camera(80, 60, 70.0, 70.0, 40.0, 30.0, np.eye(3), np.array([0.0, 0.0, -50.0]))
+    image = smooth_image(60, 80)
+    np.testing.assert_array_equal(draw_cameras(image, page, [make_view(0.0), make_view(40.0)]), image)
+
+
+def test_panes_stand_side_by_side_with_labels() -> None:
+    left, right = np.full((50, 60, 3), 40, np.uint8), np.full((50, 60, 3), 80, np.uint8)
+    row = side_by_side([("a label far too long for such a small pane", left), ("b", right)])
+    assert row.shape == (50, 120, 3)
+    assert (row[20:, :59] == 40).all()
+    assert (row[20:, 62:] == 80).all()
+    assert (row[:20, :60] != 40).any()
+    assert (row[:20, 62:] != 80).any()
+    assert (row[:, 57:60] == 40).all()  # the label was made to fit
+
+
+def test_page_camera_projects_as_the_page_does() -> None:
+    turn = Rotation.from_euler("xyz", [0.3, -0.5, 1.1])
+    x, y, z, w = turn.as_quat()
+    position, fov, aspect = np.array([1.0, 2.0, -3.0]), 0.9, 1.6
+    camera = page_camera(np.array([w, x, y, z]), position, fov, aspect, 200, 2)
+    assert (camera.height, camera.width) == (200, 160)
+    ahead = position + turn.apply([0, 0, 2.0])
+    seen = camera.rotation @ ahead + camera.translation
+    np.testing.assert_allclose(seen, [0, 0, 2], atol=1e-12)
+    top = position + turn.apply([0, -math.tan(fov / 2) * 2, 2.0])  # y is down
+    seen = camera.rotation @ top + camera.translation
+    assert camera.fy * seen[1] / seen[2] + camera.cy == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("aspect", [0.4, 1.0, 3.0])
+def test_fitting_field_of_view_shows_the_whole_picture_and_no_more(aspect: float) -> None:
+    view = make_view()
+    fov = fitting_fov(view.camera, aspect)
+    pane = page_camera(np.array([1.0, 0, 0, 0]), np.zeros(3), fov, aspect, 1000, 1)
+    shown = []
+    for u, v in ((0, 0), (80, 0), (80, 60), (0, 60)):
+        x, y = (u - 38.0) / 70, (v - 31.0) / 70
+        shown.append(((pane.fx * x + pane.cx) / pane.width, (pane.fy * y + pane.cy) / pane.height))
+    corners = np.array(shown)
+    assert corners.min() > -0.002
+    assert corners.max() < 1.002
+    assert min(corners.min(), 1 - corners.max()) < 0.002  # it touches an edge

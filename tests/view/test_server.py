@@ -1,0 +1,169 @@
+"""The viewer on finished trials: what it draws, and that its page comes and goes."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from gsbench.densify.events import Cause
+from gsbench.errors import InputError
+from gsbench.raster import create_rasterizer
+from gsbench.verbs import view as verb
+from gsbench.view.picture import CAUSE_COLORS, Layers, TrialPainter
+from gsbench.view.server import Viewer, check_port, free_port
+from gsbench.view.trials import find_trial, load_viewed, read_causes
+
+pytestmark = pytest.mark.end_to_end
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def painters(small_runs: Path) -> list[TrialPainter]:
+    rasterizer = create_rasterizer("cpu", CPU)
+    trials = [find_trial(f"small:courtyard:{name}:0", small_runs) for name in ("adc", "volumetric")]
+    return [TrialPainter(load_viewed(trial, CPU), rasterizer) for trial in trials]
+
+
+@pytest.fixture
+def viewer(painters: list[TrialPainter]) -> Iterator[Viewer]:
+    pytest.importorskip("viser", reason="the viewer needs viser: pip install 'gsbench[view]'")
+    viewer = Viewer(painters, 0)
+    yield viewer
+    viewer.stop()
+
+
+def test_drawing_a_test_view_gives_the_trials_own_render(small_runs: Path, painters: list[TrialPainter]) -> None:
+    for painter, name in zip(painters, ("adc", "volumetric"), strict=True):
+        trial = find_trial(f"small:courtyard:{name}", small_runs)
+        assert [view.name for view in painter.trial.views] == ["0000.png", "0008.png"]
+        for view in painter.trial.views:
+            render = np.asarray(Image.open(trial.path / "renders" / view.name))
+            np.testing.assert_array_equal(painter.draw(view.camera, Layers()), render)
+            photograph = np.asarray(Image.open(trial.path / "ground_truth" / view.name))
+            np.testing.assert_array_equal(view.image, photograph)
+
+
+def test_fewer_gaussians_are_the_most_opaque(painters: list[TrialPainter]) -> None:
+    painter = painters[0]
+    camera, gaussians = painter.trial.views[0].camera, painter.trial.gaussians
+    count = len(gaussians) // 10
+    kept = gaussians.select(torch.topk(gaussians.opacities, count).indices)
+    with torch.no_grad():
+        direct = painter.rasterizer.render(kept, camera, 1, torch.zeros(3)).image
+    drawn = painter.draw(camera, Layers(sh_degree=1, max_gaussians=count))
+    assert np.abs(drawn - 255 * direct.clamp(0, 1).numpy()).max() < 1.01
+    assert np.abs(drawn.astype(int) - painter.draw(camera, Layers())).mean() > 3
+
+
+def test_ellipsoids_are_those_above_the_threshold_in_the_colour_of_their_cause(painters: list[TrialPainter]) -> None:
+    painter = painters[1]
+    trial = painter.trial
+    scales = trial.gaussians.scales.double().prod(-1).numpy()
+    threshold = float(np.quantile(np.log10(4 / 3 * np.pi * scales), 0.98))
+    chosen = painter.above(threshold)
+    expected = np.flatnonzero(4 / 3 * np.pi * scales > 10**threshold)
+    assert sorted(chosen) == sorted(expected)
+    counts = painter.counts_above(threshold)
+    assert sum(counts.values()) == len(expected)
+    camera = trial.views[0].camera
+    picture = painter.draw(camera, Layers(ellipsoids=True, log10_volume=threshold)).astype(float)
+    plain = painter.draw(camera, Layers(ellipsoids=True, log10_volume=99.0))
+    changed = (picture != plain).any(-1)
+    hues = np.array([CAUSE_COLORS[cause] for cause in Cause if counts[cause]], float)
+    ratios = picture[changed][:, None] / np.maximum(hues.max(-1, keepdims=True), 1)  # shading scales a colour
+    unit = hues / hues.max(-1, keepdims=True)
+    distance = np.abs(ratios - unit * ratios.max(-1, keepdims=True)).max(-1).min(-1)
+    assert changed.any()
+    assert distance.max() < 0.02
+
+
+def test_page_answers_until_it_is_stopped(painters: list[TrialPainter]) -> None:
+    pytest.importorskip("viser", reason="the viewer needs viser: pip install 'gsbench[view]'")
+    viewer = Viewer(painters[:1], free_port())
+    assert viewer.url.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(viewer.url, timeout=20) as answer:
+        assert answer.status == 200
+        assert b"<html" in answer.read().lower()
+    viewer.stop()
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:
+        try:
+            urllib.request.urlopen(viewer.url, timeout=2).close()
+        except (urllib.error.URLError, OSError):
+            break
+        time.sleep(0.2)
+    else:
+        pytest.fail("the page still answers after stop")
+
+
+def test_two_trials_and_their_photograph_share_one_camera(viewer: Viewer, painters: list[TrialPainter]) -> None:
+    view = painters[0].trial.views[1]
+    picture = viewer.draw(view.camera, viewer.layers(), view)
+    height, width = view.image.shape[:2]
+    assert picture.shape == (height, 3 * width, 3)
+    panes = [view.image, *(painter.draw(view.camera, Layers()) for painter in painters)]
+    for place, pane in enumerate(panes):
+        shown = picture[12:, place * width + 2 : (place + 1) * width]  # below the label, right of the dividing line
+        np.testing.assert_array_equal(shown, pane[12:, 2:])
+
+
+@pytest.mark.browser
+def test_page_shows_the_trials_in_a_browser(viewer: Viewer, tmp_path: Path) -> None:
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("needs a headless Chromium")
+    shot = tmp_path / "page.png"
+    flags = (
+        "--headless --no-sandbox --disable-gpu --enable-unsafe-swiftshader --no-first-run --disable-sync "
+        "--disable-background-networking --disable-component-update --virtual-time-budget=60000 --window-size=1200,600"
+    ).split()
+    command = [chromium, *flags, f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={shot}", viewer.url]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    page = np.asarray(Image.open(shot).convert("RGB")).astype(float)
+    left = page[150:, :800]  # without the controls and the browser's own notes
+    assert left.std() > 20, "the page is empty"
+
+
+def test_what_cannot_be_viewed_is_said(small_runs: Path, tmp_path: Path) -> None:
+    folder = find_trial("small:courtyard:adc", small_runs).path
+    assert find_trial(str(folder), tmp_path).path == folder
+    assert find_trial("small:courtyard:random-adc:0", small_runs).path == folder
+    for address, words in {
+        "small:courtyard:mcmc": "small:courtyard:random-adc:0",
+        "small:courtyard:adc:7": "small:courtyard:random-adc:0",
+        "small": "EXPERIMENT:SCENE:DENSIFY",
+        "nothing:courtyard:adc": "nothing",
+        str(folder.parent): "not a",
+    }.items():
+        with pytest.raises(InputError, match=words):
+            find_trial(address, small_runs)
+    with pytest.raises(InputError, match=r"lineage\.npz"):
+        read_causes(folder / "lineage.npz", 1)
+
+
+def test_without_viser_the_mend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'gsbench\[view\]'"):
+        verb.main(["a:b:c"])
+    with pytest.raises(InputError, match="one or two"):
+        verb.main(["a:b:c"] * 3)
+
+
+def test_a_port_in_use_is_said() -> None:
+    import socket
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(InputError, match="--port"):
+            check_port(taken.getsockname()[1])
