@@ -15,6 +15,7 @@ from pathlib import Path
 from gsbench.errors import GsbenchError, InputError
 
 DONE, TRIAL_FAILED, BAD_INPUT = 0, 1, 2
+INTERRUPTED = 130  # 128 + SIGINT, as shells count
 VERBS = {
     "tables": ("gsbench.verbs.tables", "Markdown, CSV, LaTeX or HTML tables of an experiment"),
     "bench": ("gsbench.bench", "time rasterizers and the training step"),
@@ -50,9 +51,9 @@ def run(argv: list[str]) -> int:
     except GsbenchError as error:
         print(f"gsbench: {error}", file=sys.stderr)
         return TRIAL_FAILED
-    except KeyboardInterrupt:
-        print("gsbench: interrupted; the same command goes on from here", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as stop:
+        print(f"gsbench: stopped{f' by {stop}' if str(stop) else ''}; the same command goes on from here", file=sys.stderr)
+        return getattr(stop, "exit_code", INTERRUPTED)
     except BrokenPipeError:  # the reader of our output, such as `head`, has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE

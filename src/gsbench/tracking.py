@@ -1,7 +1,8 @@
 """The MLflow mirror: what the files of a trial say, shown in a dashboard.
 
 Files come first. A thread reads them and writes to MLflow in batches, so a tracker that is slow, down or read-only never
-harms a trial; what it missed, ``mirror_trial`` adds later from the same files.
+harms a trial; what it missed, `mirror_trial` adds later from the same files. Each metric's time is a function of the files,
+so that MLflow, which drops exact repetitions, holds it once even if it was sent twice.
 """
 
 from __future__ import annotations
@@ -12,10 +13,16 @@ import os
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
+
+from gsbench.config import sha256_of
+from gsbench.pipeline.files import write_json
+from gsbench.pipeline.locks import BusyError, hold
+from gsbench.pipeline.trial_files import FAILED, RESULTS, read_object
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -23,11 +30,22 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 STATE = "mlflow.json"  # in the trial's folder: the run that mirrors it and how far
+LOCK = ".mlflow.lock"
 MAX_VALUE = 6000  # characters of a parameter (MLflow's limit)
 MAX_PARAMS = 100  # parameters in a batch
 MAX_METRICS = 1000  # metrics in a batch
-SECONDS_TO_FINISH = 120.0  # patience with the tracker at the end of a trial
+SECONDS_TO_FINISH = 30.0  # patience with the tracker at the end of a trial
+SECONDS_TO_STOP = 3.0  # and when a signal asks to end
+TRIES = 5  # to connect to a database that another process, perhaps on another machine, is just setting up
 CURVES = {"metrics.jsonl": "train", "events.jsonl": "events"}
+# What would print, phone home or hang for minutes in a thread beside a training.
+SETTINGS = {
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "MLFLOW_LOGGING_LEVEL": "WARNING",
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
+}
 
 
 class Mirror:
@@ -36,7 +54,7 @@ class Mirror:
     def __init__(self, options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any]) -> None:
         self.options, self.runs, self.folder, self.values = options, runs, folder, values
         self._ended = threading.Event()
-        self._failed = False
+        self._status = "FINISHED"
         self._sources: list[Path] = [folder]
         self._thread = threading.Thread(target=self._run, name="mlflow-mirror", daemon=True)
 
@@ -49,25 +67,41 @@ class Mirror:
             self._thread.start()
         return self
 
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
         if not self.options["enabled"]:
             return
-        self._failed = kind is not None
+        stopped = kind is not None and not issubclass(kind, Exception)
+        if kind is not None:
+            self._status = "KILLED" if stopped else "FAILED"
         self._ended.set()
-        self._thread.join(SECONDS_TO_FINISH)
+        self._thread.join(SECONDS_TO_STOP if stopped else SECONDS_TO_FINISH)
         if self._thread.is_alive():
-            log.warning("tracking: MLflow is too slow; `gsbench sync` mirrors the rest of %s later", self.folder)
+            log.warning("tracking: MLflow is slow; `gsbench sync` mirrors the rest of %s later", self.folder)
 
     def _run(self) -> None:
         try:
-            run = TrackedTrial(self.options, self.runs, self.folder, self.values)
-            while not self._ended.wait(self.options["flush_seconds"]):
+            with hold(self.folder / LOCK, "mirroring", wait=False):
+                run = TrackedTrial(self.options, self.runs, self.folder, self.values)
+                while not self._ended.wait(self.options["flush_seconds"]):
+                    run.add_curves(self._sources)
                 run.add_curves(self._sources)
-            run.add_curves(self._sources)
-            run.finish(failed=self._failed)
+                run.finish(self._status)
+        except BusyError:
+            log.debug("another process mirrors %s", self.folder)
         except Exception as error:  # noqa: BLE001 - the mirror must never harm the trial, whatever the tracker raises
             log.warning("tracking: %s; the files are complete, `gsbench sync` mirrors them later", _one_line(error))
             log.debug("tracking failed", exc_info=True)
+
+
+def mirror_trial(options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any]) -> bool:
+    """Mirror what is missing of an ended trial; False if nothing was missing. Raises what the tracker raises."""
+    with hold(folder / LOCK, "mirroring", wait=False):
+        run = TrackedTrial(options, runs, folder, values)
+        if run.is_complete:
+            return False
+        run.add_curves([folder])
+        run.finish("FAILED" if (folder / FAILED).exists() else "FINISHED")
+    return True
 
 
 class TrackedTrial:
@@ -76,21 +110,49 @@ class TrackedTrial:
     def __init__(self, options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any]) -> None:
         self.folder, self.values, self.images = folder, values, int(options["images"])
         self.client = connect(options["uri"], runs)
-        self.state = _read_state(folder, self._uri())
-        if "run_id" not in self.state:
+        self.state = self._known_state()
+        if not self.state:
             experiment = ensure_experiment(self.client, values["name"], runs)
             self.state = self._create_run(experiment)
             self._save()
-        elif not self.state.get("complete"):
+        elif not self.is_complete:
             self.client.update_run(self.state["run_id"], status="RUNNING")
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the run shows the present results."""
+        return self.state.get("complete") is not None and self.state["complete"] == self._results_hash()
+
+    def _known_state(self) -> dict[str, Any]:
+        """How far the trial is mirrored here; empty where it never was, was elsewhere, or was since computed anew."""
+        from mlflow.exceptions import MlflowException
+
+        state = read_object(self.folder / STATE)
+        if state.get("uri") != self._uri() or "run_id" not in state:
+            return {}
+        try:
+            run = self.client.get_run(state["run_id"])
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+                raise
+            return {}
+        if run.info.lifecycle_stage != "active":
+            return {}
+        if state.get("complete") not in (None, self._results_hash()) and self._results_hash() is not None:
+            self.client.delete_run(state["run_id"])  # it shows results that are no longer the trial's
+            return {}
+        return state
+
+    def _results_hash(self) -> str | None:
+        results = read_object(self.folder / RESULTS)
+        return sha256_of(results) if results else None
 
     def add_curves(self, sources: list[Path]) -> None:
         """Log the records that were written since the last call."""
-        if self.state.get("complete"):
+        if self.is_complete:
             return
         from mlflow.entities import Metric
 
-        now = int(time.time() * 1000)
         for name, prefix in CURVES.items():
             source = next((folder / name for folder in sources if (folder / name).exists()), None)
             if source is None:
@@ -101,7 +163,7 @@ class TrackedTrial:
                 if record["step"] > last:
                     newest = record["step"]
                     metrics += [
-                        Metric(f"{prefix}/{key}", float(value), now, record["step"])
+                        Metric(f"{prefix}/{key}", float(value), self._time_of(record), record["step"])
                         for key, value in record.items()
                         if key != "step" and isinstance(value, (int, float))
                     ]
@@ -110,19 +172,18 @@ class TrackedTrial:
             self.state["logged"][name] = newest
         self._save()
 
-    def finish(self, failed: bool) -> None:
-        """Log final metrics, pictures and tables from the trial's files, and close the run."""
-        if self.state.get("complete"):
+    def finish(self, status: str) -> None:
+        """Log final metrics, pictures and tables from the trial's files, and close the run with MLflow's ``status``."""
+        if self.is_complete:
             return
         run_id = self.state["run_id"]
-        results_path = self.folder / "results.json"
-        if failed or not results_path.exists():
-            self.client.set_terminated(run_id, "FAILED")
+        results = read_object(self.folder / RESULTS)
+        if status != "FINISHED" or not results:
+            self.client.set_terminated(run_id, "FAILED" if status == "FINISHED" else status)
             return
         from mlflow.entities import Metric, RunTag
 
-        results = json.loads(results_path.read_text())
-        now = int(time.time() * 1000)
+        ended = self._time_of({"step": results["iterations"], "seconds": results["seconds"]["train"]})
         numbers = dict(results["metrics"]) | {key: results[key] for key in ("num_gaussians", "num_init_points", "peak_memory_mb")}
         numbers |= {f"seconds_{key}": value for key, value in results["seconds"].items()}
         numbers |= {f"total/{key}": value for key, value in results["events"].items()}
@@ -130,7 +191,7 @@ class TrackedTrial:
         tags |= {f"hash_{key}": value for key, value in results["hashes"].items()}
         self.client.log_batch(
             run_id,
-            metrics=[Metric(key, float(value), now, 0) for key, value in numbers.items()],
+            metrics=[Metric(key, float(value), ended, 0) for key, value in numbers.items()],
             tags=[RunTag(key, value) for key, value in tags.items()],
         )
         for name in ("config.yaml", "results.json", "per_view.csv", "events.jsonl"):
@@ -140,7 +201,7 @@ class TrackedTrial:
             for picture in sorted((self.folder / kind).glob("*.png"))[: self.images]:
                 self.client.log_artifact(run_id, str(picture), kind)
         self.client.set_terminated(run_id, "FINISHED")
-        self.state["complete"] = True
+        self.state["complete"] = self._results_hash()
         self._save()
 
     def _create_run(self, experiment_id: str) -> dict[str, Any]:
@@ -161,16 +222,17 @@ class TrackedTrial:
         params = [Param(key, value[:MAX_VALUE]) for key, value in _flatten(values) if value]
         for start in range(0, len(params), MAX_PARAMS):
             self.client.log_batch(run_id, params=params[start : start + MAX_PARAMS], tags=[RunTag("gsbench", "1")])
-        return {"run_id": run_id, "uri": self._uri(), "logged": {}, "complete": False}
+        return {"run_id": run_id, "uri": self._uri(), "started": int(time.time() * 1000), "logged": {}, "complete": None}
+
+    def _time_of(self, record: dict[str, Any]) -> int:
+        """A record's time in ms: the run's start, and the training time or else the iterations since."""
+        return int(self.state["started"] + 1000 * float(record.get("seconds", record["step"] / 1000)))
 
     def _uri(self) -> str:
         return str(self.client.tracking_uri)
 
     def _save(self) -> None:
-        path = self.folder / STATE
-        temporary = path.with_name(f".{STATE}.tmp-{os.getpid()}")
-        temporary.write_text(json.dumps(self.state))
-        os.replace(temporary, path)
+        write_json(self.folder / STATE, self.state)
 
 
 def default_uri(runs: Path) -> str:
@@ -178,15 +240,30 @@ def default_uri(runs: Path) -> str:
 
 
 def connect(uri: str | None, runs: Path) -> MlflowClient:
-    """A client of the tracker; creates a new SQLite database under a lock, since MLflow's own set-up races."""
-    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    logging.getLogger("alembic").setLevel(logging.WARNING)
+    """A client of the tracker; creates a new database under a lock, since MLflow's own set-up races."""
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
     import mlflow
 
+    for logger in ("mlflow", "alembic"):  # importing mlflow has set their levels
+        logging.getLogger(logger).setLevel(logging.WARNING)
     client = mlflow.MlflowClient(tracking_uri=uri or default_uri(runs))
     with FileLock(runs / ".mlflow.lock"):
-        client.search_experiments(max_results=1)  # the first call creates the tables
+        _first_call(client)
     return client
+
+
+def _first_call(client: MlflowClient) -> None:
+    """The call that creates a database's tables; tried again, since another machine may be creating them."""
+    for attempt in range(TRIES):
+        try:
+            client.search_experiments(max_results=1)
+        except Exception:  # noqa: BLE001, PERF203 - SQLAlchemy, alembic and MLflow each raise their own kinds
+            if attempt == TRIES - 1 or str(client.tracking_uri).startswith("http"):
+                raise
+            time.sleep(0.5 * 2**attempt)
+        else:
+            return
 
 
 def prepare(options: dict[str, Any], runs: Path, experiment: str) -> None:
@@ -200,23 +277,22 @@ def prepare(options: dict[str, Any], runs: Path, experiment: str) -> None:
 
 
 def ensure_experiment(client: MlflowClient, name: str, runs: Path) -> str:
-    """The id of experiment ``name``, created once under a lock."""
+    """The id of experiment ``name``, created once under a lock; a deleted one is restored."""
+    from mlflow.exceptions import MlflowException
+
     with FileLock(runs / ".mlflow.lock"):
         found = client.get_experiment_by_name(name)
-        if found is not None:
-            return str(found.experiment_id)
-        local = str(client.tracking_uri).startswith("sqlite:")
-        location = (runs / "mlartifacts" / name).as_uri() if local else None
-        return str(client.create_experiment(name, artifact_location=location))
-
-
-def _read_state(folder: Path, uri: str) -> dict[str, Any]:
-    """How far ``folder`` is mirrored at ``uri``; empty where it never was, or elsewhere, or was since computed anew."""
-    try:
-        state: dict[str, Any] = json.loads((folder / STATE).read_text())
-    except (OSError, json.JSONDecodeError):
-        return {}
-    return state if state.get("uri") == uri and "run_id" in state else {}
+        if found is None:
+            local = str(client.tracking_uri).startswith("sqlite:")
+            location = (runs / "mlartifacts" / name).as_uri() if local else None
+            with suppress(MlflowException):  # a rival on another machine was first, or what follows says what is wrong
+                return str(client.create_experiment(name, artifact_location=location))
+            found = client.get_experiment_by_name(name)
+        if found is None:
+            raise RuntimeError(f"MLflow could not create the experiment {name}")
+        if found.lifecycle_stage != "active":
+            client.restore_experiment(found.experiment_id)
+        return str(found.experiment_id)
 
 
 def _records(path: Path) -> Iterator[dict[str, Any]]:

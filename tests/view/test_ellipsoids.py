@@ -51,7 +51,7 @@ def test_outline_is_the_image_of_the_dual_quadric() -> None:
 
 def test_depth_lies_on_the_near_side_and_the_nearer_ellipsoid_wins() -> None:
     camera = make_camera(2)
-    centers = np.array([[0.0, 0.0, 0.0], [0.2, 0.1, 1.5]])
+    centers = np.array([[0.0, 0.0, 0.0], [0.8, 0.4, 0.6]])
     turns = Rotation.random(2, random_state=3).as_matrix()
     axes = np.array([[0.9, 0.5, 0.7], [0.4, 0.3, 0.6]])
     canvas = blank(camera)

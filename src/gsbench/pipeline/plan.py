@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import statistics
 import time
 from collections.abc import Iterable, Sequence
@@ -21,20 +20,21 @@ from gsbench.pipeline.files import write_json
 from gsbench.pipeline.locks import hold, read_holder
 from gsbench.pipeline.trial_files import (
     CONFIG,
+    FAILED,
     LOCK,
     RESULTS,
     State,
     TrialPaths,
+    failure_of,
     find_finished,
     read_object,
+    stage_and_step,
     state_of,
 )
 
 PLAN = "plan.json"
 PLAN_VERSION = 1
-PROGRESS_FILE = "metrics.jsonl"
 TRIAL_GLOB = "*/*/*-seed*"
-TAIL_BYTES = 4096
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,6 @@ def progress_of_experiment(home: Path) -> list[Progress]:
 
 def progress_of(folder: Path, planned: float | None = None) -> Progress:
     """The state of the trial in ``folder``; ``planned`` is when it was asked for."""
-    from gsbench.pipeline.trial_files import FAILED, failure_of
-
     state = state_of(folder)
     if state == "done":
         return Progress(folder, state, _changed(folder / RESULTS), "")
@@ -118,10 +116,15 @@ def progress_of(folder: Path, planned: float | None = None) -> Progress:
         holder = read_holder(folder / LOCK)
         job = f", Slurm job {holder['slurm']}" if holder.get("slurm") else ""
         where = f"process {holder.get('pid', '?')} on {holder.get('host', '?')}{job}"
-        return Progress(folder, state, holder.get("since"), where)
+        return Progress(folder, state, holder.get("since"), f"{_reached(folder)} {where}".strip())
     if state == "partial":
-        return Progress(folder, state, _changed(folder / CONFIG), "stopped; the same command or `gsbench retry` goes on")
+        return Progress(folder, state, _changed(folder / CONFIG), f"stopped {_reached(folder)}".strip())
     return Progress(folder, state, planned, "never started")
+
+
+def _reached(folder: Path) -> str:
+    stage, step = stage_and_step(folder)
+    return f"in {stage}" + (f" at iteration {step}" if stage == "train" and step else "") if stage else ""
 
 
 def _changed(path: Path) -> float | None:
@@ -189,7 +192,8 @@ def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
             else:
                 assert estimator is not None
                 estimate = estimator.estimate(trial.values)
-                remaining += estimate.seconds * (1 - fraction_done(paths.folder, trial.values))
+                done = stage_and_step(paths.folder)[1] / trial.values["train"]["iterations"]
+                remaining += estimate.seconds * (1 - min(1.0, done))
                 learned = max(learned, estimate.learned_from)
                 unknown += estimate.learned_from == 0
         counts[state] += 1
@@ -204,18 +208,6 @@ def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
             took = readable_time(remaining / parallel)
             lines.append(f"time: about {took}{at_once}, judged by {learned} finished trials")
     return lines
-
-
-def fraction_done(folder: Path, values: dict[str, Any]) -> float:
-    """How much of a trial's training is behind it, by the metrics that it wrote; 0 where nothing is known."""
-    try:
-        with (folder / PROGRESS_FILE).open("rb") as stream:
-            stream.seek(0, os.SEEK_END)
-            stream.seek(max(0, stream.tell() - TAIL_BYTES))
-            steps = re.findall(rb'"step": (\d+)', stream.read())
-    except OSError:
-        return 0.0
-    return min(1.0, int(steps[-1]) / values["train"]["iterations"]) if steps else 0.0
 
 
 def readable_time(seconds: float) -> str:

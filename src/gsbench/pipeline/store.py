@@ -58,10 +58,10 @@ class Entry:
 
 
 class Store:
-    """The store below ``root``."""
+    """The store below ``root``; ``on_build`` is told of each stage that is built, and of the folder where that happens."""
 
-    def __init__(self, root: Path) -> None:
-        self.root = root
+    def __init__(self, root: Path, on_build: Callable[[Stage, Path], None] = lambda stage, folder: None) -> None:
+        self.root, self.on_build = root, on_build
 
     def path(self, stage: Stage, key: str) -> Path:
         return self.root / stage.name / key
@@ -110,6 +110,7 @@ class Store:
             partial.mkdir(exist_ok=True)
             remove_temporaries(partial)
             (partial / MANIFEST).unlink(missing_ok=True)
+            self.on_build(stage, partial)
             started = time.perf_counter()
             build(partial)
             seconds = time.perf_counter() - started

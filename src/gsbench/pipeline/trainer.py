@@ -21,7 +21,7 @@ from gsbench.errors import TrainingError
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
 from gsbench.pipeline.checkpoint import load_checkpoint, save_checkpoint
-from gsbench.pipeline.loss import photometric_loss
+from gsbench.pipeline.loss import PhotometricLoss
 from gsbench.pipeline.stopping import deferred, requested
 from gsbench.raster import Rasterizer
 from gsbench.scene.types import Scene, View
@@ -83,6 +83,7 @@ class Trainer:
         self.background = torch.tensor(list(options.background), dtype=torch.float32, device=self.device)  # [3]
         self.context = DensifyContext(scene.extent, white_background=bool((self.background == 1).all()))
         self.gaussians = TrainableGaussians(initial, learning_rates(options), scene.extent)
+        self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
         self.rngs = {name: generator(seed, stream) for stream, name in enumerate(STREAMS)}
         self.order = CameraOrder(len(scene.train), self.rngs["cameras"])
         self.step = 0
@@ -141,7 +142,7 @@ class Trainer:
             raise TrainingError(
                 f"iteration {step}: {error}; the last good state is the newest checkpoint in {folder}"
             ) from error
-        loss, l1, ssim = photometric_loss(render.image, self._target(view), options.ssim_weight)
+        loss, l1, ssim = self.loss(render.image, self._target(view))
         regularizer = self.densifier.regularizer(self.gaussians.values)
         total = loss if regularizer is None else loss + regularizer
         value = loss.item()

@@ -25,9 +25,19 @@ from gsbench.pipeline.files import remove_temporaries, storage_errors, write_jso
 from gsbench.pipeline.locks import hold
 from gsbench.pipeline.resources import available_threads
 from gsbench.pipeline.stage_list import EVALUATE, GROUND_TRUTH, INIT, TRAIN
-from gsbench.pipeline.store import Entry, Store
+from gsbench.pipeline.store import Entry, Stage, Store
 from gsbench.pipeline.trainer import EVENTS, HISTOGRAMS, METRICS
-from gsbench.pipeline.trial_files import CONFIG, FAILED, LOG, RESULTS, TrialPaths, find_finished, read_object, record_inputs
+from gsbench.pipeline.trial_files import (
+    BUILDING,
+    CONFIG,
+    FAILED,
+    LOG,
+    RESULTS,
+    TrialPaths,
+    find_finished,
+    read_object,
+    record_inputs,
+)
 from gsbench.raster import create_rasterizer, resolve_name
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture
@@ -78,11 +88,16 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
     scene_options = SceneConfig(**values["scene"])
     train_options = TrainConfig(**values["train"])
     eval_options = EvalConfig(**values["eval"])
-    store = Store(paths.runs / "store")
+    mirror = Mirror(values["tracking"], paths.runs, paths.folder, values)
 
+    def announce(stage: Stage, folder: Path) -> None:
+        write_json(paths.folder / BUILDING, {"stage": stage.name, "folder": str(folder)})
+        if stage is TRAIN:
+            mirror.follow(folder)
+
+    store = Store(paths.runs / "store", announce)
     write_text(paths.folder / CONFIG, config_yaml)
     (paths.folder / FAILED).unlink(missing_ok=True)
-    mirror = Mirror(values["tracking"], paths.runs, paths.folder, values)
     with mirror:
         capture = stages.read_capture(store, scene_options)
         inputs = stages.scene_inputs(capture, scene_options)
@@ -105,6 +120,7 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
         record_inputs(paths.folder, values, results, source_files(capture, store), where, published)
         if not again:
             write_json(paths.folder / RESULTS, results)
+        (paths.folder / BUILDING).unlink(missing_ok=True)
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results["metrics"].items())
     log.info("%s: %s  %d Gaussians%s", paths.label, metrics, results["num_gaussians"], "  (was done)" if again else "")
     return results

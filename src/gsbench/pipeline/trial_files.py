@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -21,7 +22,10 @@ FAILED = "failed.json"
 CONFIG = "config.yaml"
 LOG = "log.txt"
 INPUTS = "inputs.json"  # what the results were made of, so that a finished trial is recognised without reading photographs
+BUILDING = "building.json"  # the stage that an unfinished trial is at, and where
+PROGRESS_FILE = "metrics.jsonl"
 LOCK = ".lock"
+TAIL_BYTES = 4096
 INPUTS_VERSION = 1
 NOT_WANTED = "not asked for"  # how an unavailable metric's reason starts where the configuration leaves it out
 
@@ -84,6 +88,19 @@ def failure_of(folder: Path) -> str:
     record = read_object(folder / FAILED)
     text = str(record.get("message") or record.get("error") or "failed.json cannot be read").strip()
     return text.splitlines()[0] if text else "no reason was given"
+
+
+def stage_and_step(folder: Path) -> tuple[str, int]:
+    """The stage that an unfinished trial is at ("" if none has begun), and the last training iteration that it logged."""
+    building = read_object(folder / BUILDING)
+    try:
+        with Path(building["folder"], PROGRESS_FILE).open("rb") as stream:
+            stream.seek(0, os.SEEK_END)
+            stream.seek(max(0, stream.tell() - TAIL_BYTES))
+            steps = re.findall(rb'"step": (\d+)', stream.read())
+    except (OSError, KeyError, TypeError):
+        steps = []
+    return str(building.get("stage", "")), int(steps[-1]) if steps else 0
 
 
 def record_inputs(

@@ -63,7 +63,8 @@ class ReferenceRasterizer:
         rgb = self._colors(gaussians, projected.index, camera, sh_degree)  # [M, 3]
         opacities = gaussians.opacities[projected.index]  # [M]
 
-        image = background.expand(camera.height, camera.width, 3).clone()
+        # Adding zero joins image and graph even where no tile is reached, so that ``backward`` always works.
+        image = background.expand(camera.height, camera.width, 3) + 0 * screen_points.sum()
         alpha = torch.zeros(camera.height, camera.width, dtype=image.dtype, device=image.device)
         tiles_x = -(-camera.width // self.constants.tile)
         for tile, members in bin_gaussians(projected.depths, tile_min, tile_max, tiles_x):
