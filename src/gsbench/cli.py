@@ -18,10 +18,13 @@ DONE, TRIAL_FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
 VERBS = {
     "tables": ("gsbench.verbs.tables", "Markdown, CSV, LaTeX or HTML tables of an experiment"),
+    "report": ("gsbench.verbs.report", "one HTML file with the evidence of an experiment"),
+    "explain": ("gsbench.verbs.explain", "how a table's number came about; with --stale, why a stage is computed anew"),
+    "status": ("gsbench.verbs.status", "what an experiment has done, runs, failed and misses"),
+    "retry": ("gsbench.verbs.retry", "run what failed, was stopped or is missing of an experiment"),
     "bench": ("gsbench.bench", "time rasterizers and the training step"),
     "sync": ("gsbench.verbs.sync", "mirror to MLflow what it missed"),
     "ui": ("gsbench.verbs.ui", "open the MLflow dashboard on this machine"),
-    "status": ("gsbench.verbs.status", "what an experiment has done, runs, failed and misses"),
     "export": ("gsbench.verbs.export", "copy a trained model or an initial cloud to where another program reads it"),
     "view": ("gsbench.verbs.view", "look at trained models in the browser: one, or two side by side"),
     "doctor": ("gsbench.verbs.doctor", "check this machine and say what is missing"),
@@ -89,6 +92,7 @@ def _help() -> int:
     print("  gsbench -m densify=adc,volumetric seed=0,1,2                   a sweep")
     print("  gsbench +experiment=demo                                       a sweep from a file")
     print("  gsbench scene=photos scene.path=/my/photos                     your own photographs")
+    print("  gsbench +experiment=table1 --dry-run                           list the trials and their state; run nothing")
     print("  gsbench --cfg job [settings]                                   show the configuration\n")
     print("Verbs (gsbench VERB --help):")
     for name, (_, text) in VERBS.items():

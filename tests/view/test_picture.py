@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
 from gsbench.view.picture import FRUSTUM_DEPTH, draw_cameras, photograph_at, side_by_side
-from gsbench.view.server import fitting_fov, page_camera
+from gsbench.view.server import fitting_fov, level_up, mean_up, page_camera
 
 
 def smooth_image(height: int, width: int) -> np.ndarray:
@@ -107,3 +107,20 @@ def test_fitting_field_of_view_shows_the_whole_picture_and_no_more(aspect: float
     assert corners.min() > -0.002
     assert corners.max() < 1.002
     assert min(corners.min(), 1 - corners.max()) < 0.002  # it touches an edge
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.4, math.pi])
+def test_page_stands_upright_where_the_photograph_was_taken(roll: float) -> None:
+    """The page's camera is made of its forward and upward directions, as look-at cameras are."""
+    turn = Rotation.from_euler("YXZ", [0.7, -0.5, roll]).as_matrix()
+    camera = Camera(80, 60, 70.0, 70.0, 40.0, 30.0, turn.T, np.zeros(3))
+    up = level_up(camera, np.array([0.0, -1.0, 0.0]))
+    forward = camera.rotation[2]
+    right = np.cross(forward, up)
+    np.testing.assert_allclose(right / np.linalg.norm(right), camera.rotation[0], atol=1e-12)
+    if roll == 0:
+        np.testing.assert_allclose(up, [0, -1, 0], atol=1e-12)
+
+
+def test_mean_up_points_up() -> None:
+    np.testing.assert_allclose(mean_up([make_view(0.0), make_view(4.0)]), [0, -1, 0])

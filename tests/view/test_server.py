@@ -25,6 +25,16 @@ from gsbench.view.trials import find_trial, load_viewed, read_causes
 
 pytestmark = pytest.mark.end_to_end
 CPU = torch.device("cpu")
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--enable-unsafe-swiftshader",
+    "--no-first-run",
+    "--disable-sync",
+    "--disable-background-networking",
+    "--disable-component-update",
+)
 
 
 @pytest.fixture(scope="module")
@@ -123,13 +133,10 @@ def test_page_shows_the_trials_in_a_browser(viewer: Viewer, tmp_path: Path) -> N
     if chromium is None:
         pytest.skip("needs a headless Chromium")
     shot = tmp_path / "page.png"
-    flags = (
-        "--headless --no-sandbox --disable-gpu --enable-unsafe-swiftshader --no-first-run --disable-sync "
-        "--disable-background-networking --disable-component-update --virtual-time-budget=60000 --window-size=1200,600"
-    ).split()
+    arguments = [*FLAGS, "--virtual-time-budget=60000", "--window-size=1200,600"]
     for attempt in range(3):  # the browser's virtual time may run out before the server has drawn
         profile = f"--user-data-dir={tmp_path / str(attempt)}"
-        command = [chromium, *flags, profile, f"--screenshot={shot}", viewer.url]
+        command = [chromium, *arguments, profile, f"--screenshot={shot}", viewer.url]
         subprocess.run(command, check=True, capture_output=True, timeout=120)
         page = np.asarray(Image.open(shot).convert("RGB")).astype(float)
         if page[150:, :800].std() > 20:  # without the controls and the browser's own notes

@@ -31,6 +31,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class _State:
+    active = False  # within stop_on_signals
     deferring = 0  # depth of blocks that stop where it suits them
     requested: int | None = None
 
@@ -47,17 +48,27 @@ def stop_on_signals() -> Iterator[None]:
         yield
         return
     earlier = {signum: signal.signal(signum, _on_signal) for signum in SIGNALS}
+    was_active, _State.active = _State.active, True
     try:
         yield
     finally:
+        _State.active = was_active
         for signum, handler in earlier.items():
             signal.signal(signum, handler)
         _State.requested = None
 
 
+def take_signals_back() -> None:
+    """Install the handlers again, within `stop_on_signals`: importing pycolmap replaces SIGTERM's by one that only crashes."""
+    if _State.active and threading.current_thread() is threading.main_thread():
+        for signum in SIGNALS:
+            signal.signal(signum, _on_signal)
+
+
 @contextmanager
 def deferred() -> Iterator[None]:
     """Within the block a first signal only sets `requested`, a second one stops at once; raises `Stopped` at the end."""
+    take_signals_back()
     _State.deferring += 1
     try:
         yield

@@ -86,7 +86,7 @@ class Store:
             return found
         key = stage.key(inputs)
         final = self.path(stage, key)
-        with storage_errors(self.root):
+        with storage_errors(self.root.parent):
             final.parent.mkdir(parents=True, exist_ok=True)
             with hold(final.parent / f".{key}.lock", f"{stage.name} {key[:8]}"):
                 if final.exists():

@@ -113,14 +113,15 @@ class Trainer:
                     rate = (self.step - first_step) / max(self.seconds - before, 1e-9)
                     _append(metrics, record | {"seconds": round(self.seconds, 3)})
                     on_status(Status(self.step, self.smoothed_loss, len(self.gaussians), rate))
-                if last:
-                    break
                 minutes = (time.monotonic() - last_checkpoint) / 60
-                if self.step % options.checkpoint_every == 0 or minutes >= options.checkpoint_minutes or requested():
+                due = self.step % options.checkpoint_every == 0 or minutes >= options.checkpoint_minutes
+                stop = requested()
+                if stop or (due and not last):
                     save_checkpoint(folder, self.step, self._state())
                     last_checkpoint = time.monotonic()
-                if requested():
+                if stop:
                     log.info("stopping at iteration %d, with a checkpoint", self.step)
+                if last or stop:
                     break
         return self.gaussians.values.detach()
 

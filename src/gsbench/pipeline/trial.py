@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import pycolmap  # noqa: F401 - here, so that what its import does to signals can be undone
 import torch
 
 from gsbench.config import EvalConfig, SceneConfig, TrainConfig, config_hash
@@ -25,6 +26,7 @@ from gsbench.pipeline.files import remove_temporaries, storage_errors, write_jso
 from gsbench.pipeline.locks import hold
 from gsbench.pipeline.resources import available_threads
 from gsbench.pipeline.stage_list import EVALUATE, GROUND_TRUTH, INIT, TRAIN
+from gsbench.pipeline.stopping import take_signals_back
 from gsbench.pipeline.store import Entry, Stage, Store
 from gsbench.pipeline.trainer import EVENTS, HISTOGRAMS, METRICS
 from gsbench.pipeline.trial_files import (
@@ -52,6 +54,7 @@ def run_trial(values: dict[str, Any], config_yaml: str, wait: bool = True) -> di
     On failure ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again. Where another
     process runs this trial, waits for it, or raises BusyError if ``wait`` is False.
     """
+    take_signals_back()
     paths = TrialPaths.of(values)
     with storage_errors(paths.runs):
         paths.folder.mkdir(parents=True, exist_ok=True)

@@ -7,6 +7,7 @@ import importlib.util
 import threading
 
 from gsbench.errors import InputError
+from gsbench.view import ADDRESS
 
 DEFAULT_PORT = 8080
 
@@ -15,8 +16,7 @@ def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="gsbench view", description="Look at trained models in the browser: one, or two side by side."
     )
-    trial_help = "a trial's folder, or EXPERIMENT:SCENE:DENSIFY[:SEED] such as demo:courtyard:volumetric:0"
-    parser.add_argument("trial", nargs="+", metavar="TRIAL", help=trial_help)
+    parser.add_argument("trial", nargs="+", metavar="TRIAL", help=ADDRESS)
     parser.add_argument("--port", type=int, default=DEFAULT_PORT, help=f"on this machine; 0: any ({DEFAULT_PORT})")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:1")
     options = parser.parse_args(argv)

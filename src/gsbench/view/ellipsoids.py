@@ -27,7 +27,7 @@ class Canvas:
         self.depth = np.full(picture.shape[:2], np.inf)
 
     def points(self, points: Floats, colors: NDArray[np.uint8]) -> None:
-        """Draw ``points`` [P, 3] (world) with ``colors`` [P, 3] as squares of ``POINT_SIZE`` px, nearer ones in front."""
+        """Draw ``points`` [P, 3] (world) with ``colors`` [P, 3] as squares of ``POINT_SIZE`` px, nearest in front."""
         camera = self.camera
         seen = points @ camera.rotation.T + camera.translation  # [P, 3]
         order = np.argsort(-seen[:, 2])
@@ -45,7 +45,7 @@ class Canvas:
                 self.depth[row[inside], column[inside]] = z[inside]
 
     def ellipsoids(self, centers: Floats, rotations: Floats, semi_axes: Floats, colors: NDArray[np.uint8]) -> None:
-        """Draw ``centers`` [E, 3] (world), ``rotations`` [E, 3, 3] (columns: the axes), ``semi_axes`` [E, 3] in ``colors``."""
+        """Draw ellipsoids at ``centers`` [E, 3] (world); the columns of ``rotations`` [E, 3, 3] are their axes."""
         camera = self.camera
         seen = centers @ camera.rotation.T + camera.translation  # [E, 3]
         axes = camera.rotation @ rotations  # [E, 3, 3] in the camera

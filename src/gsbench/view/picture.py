@@ -39,7 +39,7 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Layers:
-    """What is drawn. ``max_gaussians`` keeps the most opaque (None: all); ``log10_volume`` is the ellipsoids' threshold."""
+    """What is drawn: ``max_gaussians`` keeps the most opaque (None: all), ellipsoids are those above a volume."""
 
     sh_degree: int = MAX_SH_DEGREE
     max_gaussians: int | None = None
@@ -157,7 +157,7 @@ def _paste_photograph(picture: Image.Image, camera: Camera, view: View, depth: f
 
 
 def photograph_at(camera: Camera, view: View) -> Picture:
-    """The photograph of ``view`` as ``camera`` would see it, were it turned and placed like the view's own; black around."""
+    """The photograph of ``view`` with the intrinsics of ``camera``, black where it shows nothing."""
     own, photograph = view.camera, Image.fromarray(view.image)
     shrink = max(own.fx / camera.fx, own.fy / camera.fy)
     if shrink > 1:  # with a filter first, since the transform looks at single pixels

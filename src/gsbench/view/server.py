@@ -176,7 +176,7 @@ class Session:
         aspect = float(camera.aspect or 1.0) / self._panes()
         forward = own.rotation[2]  # [3] world
         with self.client.atomic():
-            camera.up_direction = -own.rotation[1]
+            camera.up_direction = level_up(own, mean_up(self.viewer.painters[0].trial.views))
             camera.position = own.center
             camera.look_at = own.center + forward * orbit_distance(list(self.viewer.views.values()))
             camera.fov = fitting_fov(own, aspect)
@@ -217,8 +217,8 @@ def page_camera(
 ) -> Camera:
     """The camera of one of ``panes`` equal panes of a page.
 
-    ``wxyz`` turns camera axes (x right, y down, z forward) to the world, ``position`` [3] is in world units, ``fov`` the
-    vertical field of view in radians and ``aspect`` the page's width over its height; ``height`` in px.
+    ``wxyz`` turns camera axes (x right, y down, z forward) to the world, ``position`` [3] is in world units,
+    ``fov`` the vertical field of view in radians, ``aspect`` the page's width over its height; ``height`` in px.
     """
     w, x, y, z = np.asarray(wxyz, dtype=np.float64) / np.linalg.norm(wxyz)
     to_world = np.array(
@@ -248,8 +248,20 @@ def mean_up(views: Sequence[View]) -> NDArray[np.float64]:
     return up / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
 
 
+def level_up(camera: Camera, up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The upward direction nearest to ``up`` that leaves the picture of ``camera`` upright, a unit vector [3].
+
+    A page turns around its upward direction: with the picture's own, the horizon would tilt.
+    """
+    right = camera.rotation[0]
+    level = up - (up @ right) * right
+    length = float(np.linalg.norm(level))
+    upright = length > 1e-6 and float(level @ -camera.rotation[1]) > 0
+    return level / length if upright else -camera.rotation[1]
+
+
 def orbit_distance(views: Sequence[View]) -> float:
-    """How far ahead of a page's camera the point is that it turns around: the mean distance of the views to their centre."""
+    """How far ahead a page's camera has its pivot: the mean distance of the views to their centre, world units."""
     centers = np.stack([view.camera.center for view in views])  # [V, 3]
     return max(float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()), 1e-3)
 

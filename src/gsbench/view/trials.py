@@ -21,8 +21,7 @@ from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import PINHOLE_MODELS, pinhole_camera, points_of, read_model
 from gsbench.scene.images import read_image
 from gsbench.scene.types import View
-
-ADDRESS = "a trial's folder, or EXPERIMENT:SCENE:DENSIFY[:SEED] such as demo:courtyard:volumetric:0"
+from gsbench.view import ADDRESS
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,161 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Reading a result
+#
+# Baseline and idea, several seeds each: is the difference more than chance, and where on the picture is it? This
+# notebook runs a small sweep and reads it with the functions behind `gsbench tables` and `gsbench report`.
+
+# %%
+import logging
+import os
+import tempfile
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from IPython.display import Markdown
+
+from gsbench.cli import run
+from gsbench.eval.errors_by_region import errors_by_region
+from gsbench.eval.pairing import ViewCache, pair_arms
+from gsbench.eval.results import load_experiment
+from gsbench.eval.statistics import compare, seeds_needed
+from gsbench.eval.table_formats import to_markdown
+from gsbench.eval.tables import build_table
+
+os.environ["GSBENCH_RUNS"] = tempfile.mkdtemp(prefix="gsbench-")
+runs = Path(os.environ["GSBENCH_RUNS"])
+logging.disable(logging.INFO)  # only what went wrong
+
+# %% tags=["parameters"]
+small = bool(os.environ.get("GSBENCH_SMALL"))  # gsbench's own tests take a smaller scene and fewer iterations
+if small:
+    settings = ["scene.views=10", "scene.width=96", "scene.height=72"]
+    settings += ["init=random", "init.count=2000", "init.size=1.2"]
+    settings += ["train.iterations=150", "train.position_steps=150", "train.densify_start=30", "train.densify_stop=140"]
+    settings += ["train.densify_interval=20"]
+    init = "random"
+else:
+    settings = ["scene.views=24", "scene.width=240", "scene.height=180", "init=sfm", "train.iterations=1000"]
+    init = "sfm"
+settings += ["eval.lpips=[]", "eval.flip=false", "tracking=none"]
+
+# %% [markdown]
+# ## The sweep
+#
+# `-m` and commas: every combination is one trial. Two arms, three seeds, six trials.
+
+# %%
+run(["-m", "scene=courtyard", "densify=adc,volumetric", "seed=0,1,2", "name=reading", *settings])
+
+# %% [markdown]
+# ## The table
+#
+# One cell is the mean over trials, with their deviation. Bold is the best mean. Bold is no test.
+
+# %%
+experiment = load_experiment(runs, "reading")
+Markdown(to_markdown(build_table(experiment)))
+
+# %% [markdown]
+# ## Seeds are paired
+#
+# The same seed means the same order of photographs in both arms, and every trial is judged on the same test views. So
+# we look at differences: volumetric minus baseline, for each seed and each view.
+
+# %%
+adc, volumetric = (init, "adc"), (init, "volumetric")
+views = ViewCache()
+paired = pair_arms(experiment.trials, adc, volumetric, "psnr", views)
+(differences,) = paired.differences  # [seeds, views], one matrix a scene
+
+plt.figure(figsize=(7, 3))
+for seed, row in enumerate(differences):
+    plt.plot(np.full(len(row), seed), row, "o", color="C0", alpha=0.5)
+    plt.plot([seed - 0.2, seed + 0.2], [row.mean()] * 2, color="C3", linewidth=2)
+plt.axhline(0, color="grey", linewidth=1)
+plt.xticks(range(len(differences)))
+plt.xlabel("seed")
+plt.ylabel("PSNR difference, dB")
+plt.title("one dot a test view, one bar the mean of a trial pair")
+plt.tight_layout()
+
+# %% [markdown]
+# The views of one trial share its training, so they are no independent repetitions. The trial pair is the unit that a
+# test may count: here there are three.
+#
+# ## The verdict
+#
+# An arm is *better* or *worse* only if a test says p < 5 % **and** the bootstrap interval excludes zero. Otherwise
+# the verdict is *no evidence*, which is not the same as *no difference*.
+
+# %%
+result = compare(paired, direction=+1)  # +1: more PSNR is better
+print(f"mean difference  {result.mean:+.3f} dB ({result.relative:+.2%})")
+print(f"95 % interval    {result.interval.low:+.3f} to {result.interval.high:+.3f} dB")
+print(f"p                {result.p:.3f}, {result.test}")
+print(f"speaks of        {result.scope}")
+print(f"verdict          {result.verdict}")
+
+# %% [markdown]
+# With few trials, only a large difference can be seen. How many seeds would it take to see a given one in eight of
+# ten such experiments?
+
+# %%
+for difference in (0.05, 0.1, 0.2, 0.5):
+    print(f"{difference:4} dB: {seeds_needed(result.seed_deviation, 1, difference) or 'more than 1000'} seeds an arm")
+
+# %% [markdown]
+# More seeds tell more about *this* scene only. For "scenes like these", gsbench wants at least six scenes, since
+# fewer cannot reach 5 % in an exact test.
+#
+# ## Where it helps
+#
+# The paper's claim is about surfaces with little texture. So the pixels of the test views are sorted into five equal
+# bins by the texture of the ground truth, and the error of both arms is taken in each bin.
+
+# %%
+regions = errors_by_region(experiment.trials, adc, volumetric, "texture")
+middle = [comparison.mean for comparison in regions.comparisons]
+low = [c.mean - c.interval.low for c in regions.comparisons]
+high = [c.interval.high - c.mean for c in regions.comparisons]
+bins = np.arange(1, len(middle) + 1)
+figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.4))
+left.plot(bins, regions.first, "o-", label="adc")
+left.plot(bins, regions.second, "o-", label="volumetric")
+left.set(xlabel="texture, from the lowest fifth to the highest", ylabel="mean error, 8-bit levels", xticks=bins)
+left.legend()
+right.errorbar(bins, middle, [low, high], fmt="o", color="C3", capsize=4)
+right.axhline(0, color="grey", linewidth=1)
+right.set(xlabel="texture, from the lowest fifth to the highest", ylabel="volumetric minus adc", xticks=bins)
+figure.tight_layout()
+
+# %% [markdown]
+# A point below zero means that the volumetric rule has the smaller error there. Where the interval crosses zero,
+# there is no evidence either way. `errors_by_region` can also sort by depth, by the distance to the initial cloud, or
+# by the volume of the Gaussians, when the trials were run with `eval.maps=true`.
+#
+# ## Is the comparison fair?
+#
+# More Gaussians usually mean a better picture. If the arms end with different counts, ask again at equal ones:
+# `gsbench +experiment=budget` gives every arm exactly the same number.
+
+# %%
+for arm in (adc, volumetric):
+    counts = [trial.data["num_gaussians"] for trial in experiment.trials if trial.arm == arm]
+    print(f"{arm[1]:>10}: {', '.join(f'{count:,}' for count in counts)} Gaussians")
+
+# %% [markdown]
+# All of this, for every metric and with pictures, is in one file: `gsbench report reading`. To see what lies behind
+# one cell of the table: `gsbench explain reading:courtyard:psnr:volumetric`.

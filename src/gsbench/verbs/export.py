@@ -1,0 +1,131 @@
+"""``gsbench export``: a trained model, or an initial cloud, for other programs."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gsbench.errors import InputError
+
+if TYPE_CHECKING:
+    from gsbench.gaussians.model import Gaussians
+
+FORMATS = {
+    "ply": "the 3DGS point cloud, as every viewer and trainer reads it (248 bytes a Gaussian)",
+    "splat": "antimatter15's .splat for browsers: 32 bytes a Gaussian, colour without view dependence",
+    "compressed": "PlayCanvas's compressed .ply for SuperSplat: about 16 bytes a Gaussian and harmonics; needs gsplat",
+}
+
+
+def main(argv: list[str]) -> int:
+    from gsbench.cli import runs_dir
+    from gsbench.view.trials import ADDRESS, find_trial
+
+    parser = argparse.ArgumentParser(
+        prog="gsbench export",
+        description="Write a trained model for other programs; `gsbench export init TRIAL --out DIR` copies the COLMAP "
+        "model that the trial started from.",
+    )
+    parser.add_argument("trial", nargs="+", metavar="TRIAL", help=f"{ADDRESS}; after the word init: its initial model")
+    parser.add_argument("--to", choices=list(FORMATS), help="; ".join(f"{name}: {text}" for name, text in FORMATS.items()))
+    parser.add_argument("--out", type=Path, required=True, metavar="PATH", help="the file, or for init the folder, to write")
+    options = parser.parse_args(argv)
+    is_init = len(options.trial) == 2 and options.trial[0] == "init"
+    if len(options.trial) > 1 and not is_init:
+        raise InputError(f"one TRIAL is exported, not {len(options.trial)}; for an initial model: export init TRIAL")
+    trial = find_trial(options.trial[-1], runs_dir())
+    out = options.out.expanduser()
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        if is_init:
+            export_init(trial.path.parents[3] / "store" / "init" / trial.data["hashes"]["init"], out)
+        else:
+            export_model(trial.path / "point_cloud.ply", options.to or _format_of(out), out)
+    except OSError as error:
+        raise InputError(f"cannot write {out} ({error.strerror or error}); give another --out") from error
+    print(out)
+    return 0
+
+
+def export_model(ply: Path, form: str, out: Path) -> None:
+    """Write the Gaussians of the 3DGS file ``ply`` to ``out``, in one of ``FORMATS``."""
+    if form == "ply":
+        _write(out, lambda temporary: shutil.copyfile(ply, temporary))
+        return
+    from gsbench.gaussians.ply import read_ply
+
+    gaussians = read_ply(ply)
+    content = splat_bytes(gaussians) if form == "splat" else compressed_bytes(gaussians)
+    _write(out, lambda temporary: temporary.write_bytes(content))
+
+
+def export_init(entry: Path, out: Path) -> None:
+    """Copy the COLMAP model of the stage result ``entry`` as ``out/sparse/0``, where 3DGS trainers look for it."""
+    model = entry / "sparse" / "0"
+    if not model.is_dir():
+        raise InputError(f"the initial model is no longer in the store ({model}): run the trial again")
+    if (out / "sparse").exists():
+        raise InputError(f"{out / 'sparse'} exists already: give another --out")
+    shutil.copytree(model, out / "sparse" / "0")
+
+
+def splat_bytes(gaussians: Gaussians) -> bytes:
+    """antimatter15's layout, 32 bytes a Gaussian, the most important first.
+
+    Position and scale are 3 + 3 float32, colour and opacity 4 bytes (RGBA), the rotation 4 bytes, (w, x, y, z) of the unit
+    quaternion as 128 + 128 q. Importance is opacity times volume, as his ``convert.py`` orders them (viewers may draw the
+    first part of a file only).
+    """
+    import numpy as np
+    import torch
+
+    from gsbench.gaussians.spherical_harmonics import dc_to_rgb
+
+    raw = gaussians.detach()
+    record = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+    table = np.empty(len(raw), record)
+    opacity = torch.sigmoid(raw.opacity_logits)  # [N]
+    colors = torch.cat([dc_to_rgb(raw.sh_dc), opacity[:, None]], dim=1)  # [N, 4]
+    rotation = torch.nn.functional.normalize(raw.quaternions, dim=1)  # [N, 4]
+    table["mean"] = raw.means.numpy()
+    table["scale"] = raw.log_scales.exp().numpy()
+    table["rgba"] = (colors * 255).clamp(0, 255).to(torch.uint8).numpy()
+    table["rotation"] = (rotation * 128 + 128).clamp(0, 255).to(torch.uint8).numpy()
+    importance = raw.log_scales.sum(dim=1).exp() * opacity
+    order = torch.argsort(importance, descending=True, stable=True).numpy()
+    return table[order].tobytes()
+
+
+def compressed_bytes(gaussians: Gaussians) -> bytes:
+    """PlayCanvas's compressed PLY, as gsplat writes it. Raises InputError where gsplat is not installed."""
+    try:
+        from gsplat.exporter import export_splats
+    except ImportError:
+        raise InputError("--to compressed needs gsplat: pip install gsplat (its CUDA part is not used)") from None
+    raw = gaussians.detach()
+    return export_splats(
+        raw.means, raw.log_scales, raw.quaternions, raw.opacity_logits, raw.sh_dc[:, None], raw.sh_rest, "ply_compressed"
+    )
+
+
+def _format_of(out: Path) -> str:
+    name = out.name.lower()
+    if name.endswith(".compressed.ply"):
+        return "compressed"
+    form = out.suffix.lower().lstrip(".")
+    if form not in FORMATS:
+        raise InputError(f"what is {out.name} to hold? give --to {', '.join(FORMATS)}")
+    return form
+
+
+def _write(out: Path, write: Callable[[Path], object]) -> None:
+    temporary = out.with_name(f".{out.name}.tmp-{os.getpid()}")
+    try:
+        write(temporary)
+        os.replace(temporary, out)
+    finally:
+        temporary.unlink(missing_ok=True)

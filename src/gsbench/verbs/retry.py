@@ -1,0 +1,66 @@
+"""``gsbench retry``: run what failed, was stopped or is missing of an experiment, with its own settings."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from pathlib import Path
+
+import yaml
+
+from gsbench.compose import Composed, compose_one
+from gsbench.errors import InputError
+from gsbench.pipeline.plan import Planned, describe_plan, forget, progress_of_experiment, read_plan
+from gsbench.pipeline.trial_files import TrialPaths, label_of
+from gsbench.verbs.status import experiment_home
+from gsbench.verbs.sync import read_config
+
+log = logging.getLogger(__name__)
+
+
+def main(argv: list[str]) -> int:
+    """The verb: as the sweep's own command, the exit code says whether some trial failed."""
+    from gsbench.cli import runs_dir
+    from gsbench.launch import run_trials
+
+    parser = argparse.ArgumentParser(
+        prog="gsbench retry", description="Run the failed, stopped and missing trials of an experiment again."
+    )
+    parser.add_argument("experiment")
+    parser.add_argument("changes", nargs="*", metavar="KEY=VALUE", help="settings that make no other trial: launch=slurm …")
+    parser.add_argument("--dry-run", action="store_true", help="only list them")
+    options = parser.parse_args(argv)
+    home = experiment_home(runs_dir(), options.experiment)
+    unfinished = [trial.folder for trial in progress_of_experiment(home) if trial.state in ("failed", "partial", "missing")]
+    if not unfinished:
+        print(f"nothing to retry: all trials of {options.experiment} are done or running")
+        return 0
+    planned = {trial.folder: trial for trial in read_plan(home)}
+    trials = [recompose(folder, planned.get(folder), runs_dir(), options.changes) for folder in unfinished]
+    if options.dry_run:
+        print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
+        return 0
+    replaced = [old for old, trial in zip(unfinished, trials, strict=True) if TrialPaths.of(trial.values).folder != old]
+    for old in replaced:
+        log.info("%s: its configuration has changed since; the new one is run", label_of(old))
+    sys.path.insert(0, os.getcwd())
+    code = run_trials(trials)
+    forget(home, [old for old in replaced if old in planned])
+    return code
+
+
+def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[str]) -> Composed:
+    """The trial in ``folder``: from its planned overrides, else from the configuration that it wrote."""
+    if planned is not None:
+        own = [word for word in planned.overrides if word.split("=")[0] not in {change.split("=")[0] for change in changes}]
+        where = planned.cwd if Path(planned.cwd).is_dir() else os.getcwd()
+        if where != os.getcwd():
+            os.chdir(where)  # relative paths were meant from there, and the trials are run from there
+        trial = compose_one([*own, *changes])
+        return Composed(trial.values | {"runs": str(runs)}, trial.yaml, trial.overrides)
+    if changes:
+        raise InputError(f"{label_of(folder)} is in no plan, so no setting of it can be changed: run it by its own command")
+    values = read_config(folder) | {"runs": str(runs)}
+    return Composed(values, yaml.safe_dump(values, sort_keys=False), ())

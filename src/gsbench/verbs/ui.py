@@ -1,0 +1,70 @@
+"""``gsbench ui``: the MLflow dashboard on this machine, lean, with the address that compares an experiment's trials."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from urllib.parse import quote
+
+from gsbench.errors import InputError
+
+DEFAULT_PORT = 5000
+MAX_COMPARED = 100  # runs in an address; browsers limit its length
+
+
+def main(argv: list[str]) -> int:
+    """The verb: serves until Ctrl-C."""
+    from gsbench.cli import runs_dir
+
+    parser = argparse.ArgumentParser(prog="gsbench ui", description="The MLflow dashboard, on this machine only.")
+    parser.add_argument("experiment", nargs="?", help="print the address that compares its trials")
+    parser.add_argument("--uri", help="the tracker's database or server; default: the one in the runs folder")
+    parser.add_argument("--port", type=int, default=DEFAULT_PORT)
+    parser.add_argument("--print-url", action="store_true", help="only print the address")
+    options = parser.parse_args(argv)
+    runs = runs_dir()
+    if options.uri is None and not (runs / "mlflow.db").exists():
+        raise InputError(f"no MLflow database in {runs}: run a trial first, or `gsbench sync`, or give --uri")
+    from gsbench.tracking import default_uri
+
+    uri = options.uri or default_uri(runs)
+    base = uri if uri.startswith("http") else f"http://127.0.0.1:{options.port}"
+    print(base if options.experiment is None else comparison_url(base, uri, runs, options.experiment), flush=True)
+    if options.print_url or uri.startswith("http"):
+        return 0
+    return serve(uri, options.port)
+
+
+def comparison_url(base: str, uri: str, runs: Path, experiment: str) -> str:
+    """The address of MLflow's page that compares the finished trials of ``experiment``."""
+    from gsbench.tracking import connect
+
+    client = connect(uri, runs)
+    found = client.get_experiment_by_name(experiment)
+    if found is None:
+        names = sorted(e.name for e in client.search_experiments())
+        raise InputError(f"MLflow has no experiment {experiment!r}; it has {', '.join(names)}; see `gsbench sync`")
+    runs_found = client.search_runs(
+        [found.experiment_id], "tags.kind = 'trial' and attributes.status = 'FINISHED'", max_results=MAX_COMPARED
+    )
+    ids = quote(json.dumps([run.info.run_id for run in runs_found], separators=(",", ":")))
+    experiments = quote(json.dumps([found.experiment_id]))
+    return f"{base}/#/compare-runs?runs={ids}&experiments={experiments}"
+
+
+def serve(uri: str, port: int) -> int:
+    """Run ``mlflow ui`` with one worker and no job runner (its default takes eight processes and 2 GB)."""
+    command = [sys.executable, "-m", "mlflow", "ui", "--backend-store-uri", uri, "--host", "127.0.0.1", "--port", str(port)]
+    lean = {
+        "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
+        "MLFLOW_DISABLE_TELEMETRY": "true",
+        "MLFLOW_LOGGING_LEVEL": "WARNING",
+    }
+    try:
+        return subprocess.run([*command, "--workers", "1"], env=lean | dict(os.environ), check=False).returncode
+    except KeyboardInterrupt:
+        return 0

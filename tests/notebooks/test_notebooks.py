@@ -1,0 +1,66 @@
+"""The notebooks run from top to bottom, and each .ipynb is what its .py says, without outputs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
+TIMEOUT = 300  # s for a cell; on a fresh machine the first one also compiles the kernels
+
+
+def test_every_notebook_is_a_pair() -> None:
+    assert [path.stem for path in NOTEBOOKS] == [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))]
+    assert len(NOTEBOOKS) >= 4
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_pair_is_equal_and_has_no_outputs(path: Path) -> None:
+    jupytext = pytest.importorskip("jupytext", reason="needs jupytext (extra dev)")
+    nbformat = pytest.importorskip("nbformat", reason="needs nbformat (extra dev)")
+    source = jupytext.read(path)
+    notebook = nbformat.read(path.with_suffix(".ipynb"), as_version=4)
+    nbformat.validate(notebook)
+    mend = f"jupytext --to ipynb notebooks/{path.name}"
+    cells = [(cell.cell_type, cell.source, cell.metadata.get("tags", [])) for cell in notebook.cells]
+    assert cells == [(cell.cell_type, cell.source, cell.metadata.get("tags", [])) for cell in source.cells], mend
+    for cell in notebook.cells:
+        assert cell.get("outputs", []) == []
+        assert cell.get("execution_count") is None
+
+
+@pytest.mark.end_to_end
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nbclient = pytest.importorskip("nbclient", reason="needs nbclient and ipykernel (extra dev)")
+    nbformat = pytest.importorskip("nbformat", reason="needs nbformat (extra dev)")
+    pytest.importorskip("ipykernel", reason="needs nbclient and ipykernel (extra dev)")
+    for key in os.environ:
+        if key.startswith(("GSBENCH_", "MLFLOW_")):
+            monkeypatch.delenv(key)
+    command = tmp_path / "bin" / "gsbench"  # the console script of the sources under test
+    command.parent.mkdir()
+    command.write_text(f"#!{sys.executable}\nfrom gsbench.cli import main\nmain()\n")
+    command.chmod(0o755)
+    monkeypatch.setenv("PATH", str(command.parent), prepend=os.pathsep)
+    monkeypatch.setenv("GSBENCH_SMALL", "1")
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
+    monkeypatch.setenv("JUPYTER_RUNTIME_DIR", str(tmp_path / "jupyter"))
+    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    notebook = nbformat.read(path.with_suffix(".ipynb"), as_version=4)
+    resources = {"metadata": {"path": str(tmp_path)}}
+    client = nbclient.NotebookClient(notebook, timeout=TIMEOUT, kernel_name="python3", resources=resources)
+    client.execute()
+    pictures = [
+        output for cell in notebook.cells for output in cell.get("outputs", []) if "image/png" in output.get("data", {})
+    ]
+    assert pictures
+    keep = os.environ.get("KEEP_NOTEBOOKS")  # a folder: look at what came out
+    if keep:
+        nbformat.write(notebook, Path(keep) / path.with_suffix(".ipynb").name)
