@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -219,12 +220,11 @@ def _collect(job: Job[Outcome], folder: Path, trials: Sequence[Composed]) -> Out
     if finished is not None:
         return outcome_of_results(folder, finished)
     if job.paths.result_pickle.exists():
-        try:
-            outcome = job.result()
-        except Exception as error:  # noqa: BLE001 - submitit raises what the job raised, and its own kinds
-            return Outcome(folder, "failed", f"{' '.join(str(error).split())[-300:]}; log: {job.paths.stderr}")
-        if isinstance(outcome, Outcome):
-            return outcome
+        kind, value = pickle.loads(job.paths.result_pickle.read_bytes())  # submitit's own reader would ask sacct first
+        if isinstance(value, Outcome):
+            return value
+        last = str(value).strip().splitlines()[-1] if str(value).strip() else kind
+        return Outcome(folder, "failed", f"{last}; log: {job.paths.stderr}")
     return Outcome(folder, "failed", f"the process ended without a result (killed, or out of memory); log: {job.paths.stderr}")
 
 

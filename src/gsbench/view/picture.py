@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -50,14 +51,19 @@ class Layers:
 
 
 class TrialPainter:
-    """Draws one trial; keeps its Gaussians sorted by opacity, so that a subset is a slice."""
+    """Draws one trial from any camera; safe to call from several threads, as its rasterizer is."""
 
     def __init__(self, trial: ViewedTrial, rasterizer: Rasterizer) -> None:
         self.trial, self.rasterizer = trial, rasterizer
-        gaussians = trial.gaussians
-        self._by_opacity = gaussians.select(gaussians.opacity_logits.argsort(descending=True, stable=True))
-        self._background = torch.tensor(trial.background, dtype=torch.float32, device=gaussians.means.device)  # [3]
+        device = trial.gaussians.means.device
+        self._background = torch.tensor(trial.background, dtype=torch.float32, device=device)  # [3]
         self._by_volume = np.argsort(-trial.log10_volumes, kind="stable")  # [N]
+
+    @cached_property
+    def _by_opacity(self) -> Gaussians:
+        """A copy with the most opaque first, so that a subset is a slice."""
+        gaussians = self.trial.gaussians
+        return gaussians.select(gaussians.opacity_logits.argsort(descending=True, stable=True))
 
     def draw(self, camera: Camera, layers: Layers) -> Picture:
         """The trial from ``camera``, [H, W, 3] uint8; without layers, just what the evaluation renders."""

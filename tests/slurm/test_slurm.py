@@ -1,0 +1,144 @@
+"""A sweep in a real Slurm: out of time, requeued by hand, queued twice; it ends as an undisturbed one.
+
+Needs a running Slurm: ``scripts/slurm_one_node.sh start`` sets one up on this machine.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.end_to_end.conftest import SMALL, environment  # noqa: F401 - a fixture
+
+pytestmark = [pytest.mark.slurm, pytest.mark.end_to_end]
+
+SLOW = """
+import os, time
+from dataclasses import dataclass
+from gsbench.densify import ADC
+
+@dataclass
+class Slow(ADC):
+    def after_step(self, step, gaussians, rng):
+        time.sleep(float(os.environ.get("PAUSE", "0")))
+        super().after_step(step, gaussians, rng)
+"""
+PAUSE = 0.15  # seconds an iteration: with 300 of them a trial does not fit into Slurm's shortest time limit, a minute
+SWEEP = ["--config-dir", "conf", "-m", *SMALL, "name=cluster", "densify=slow", "allow_targets=[slow]", "tracking=none"]
+CLUSTER = [
+    "launch=slurm",
+    "launch.timeout_min=1",
+    "launch.signal_seconds=20",
+    "launch.cpus_per_trial=1",
+    "launch.gpus_per_trial=0",
+    "launch.parallel=2",
+]
+
+
+@pytest.fixture(autouse=True)
+def slurm() -> None:
+    if shutil.which("sinfo") is None:
+        pytest.skip("no Slurm here: scripts/slurm_one_node.sh start (root, Debian or Ubuntu) sets one up")
+    pytest.importorskip("submitit", reason="needs the extra slurm")
+    try:
+        states = subprocess.run(["sinfo", "-h", "-o", "%T"], capture_output=True, text=True, timeout=20, check=True).stdout
+    except (subprocess.SubprocessError, OSError) as error:
+        pytest.skip(f"Slurm does not answer: {error}")
+    if not any(state in states for state in ("idle", "mixed", "allocated")):
+        pytest.skip(f"no node is ready: {states.strip() or 'none'}")
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    (tmp_path / "slow.py").write_text(SLOW)
+    (tmp_path / "conf" / "densify").mkdir(parents=True)
+    (tmp_path / "conf" / "densify" / "slow.yaml").write_text("defaults: [adc, _self_]\n_target_: slow.Slow\nname: slow\n")
+    return tmp_path
+
+
+def start(place: Path, environment: dict[str, str], runs: Path, *words: str, pause: float = 0) -> subprocess.Popen[str]:
+    variables = environment | {"GSBENCH_RUNS": str(runs), "PAUSE": str(pause)}
+    command = [sys.executable, "-m", "gsbench.cli", *words]
+    return subprocess.Popen(command, cwd=place, env=variables, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def models(runs: Path) -> dict[str, bytes]:
+    return {path.parent.name: path.read_bytes() for path in runs.glob("cluster/*/*/*/point_cloud.ply")}
+
+
+def job_logs(runs: Path) -> str:
+    return "\n".join(path.read_text() for path in sorted(runs.glob(".jobs/cluster/*_log.*")))
+
+
+def queue() -> list[str]:
+    listing = subprocess.run(["squeue", "--me", "-h", "-r", "-o", "%i"], capture_output=True, text=True, check=True)
+    return listing.stdout.split()
+
+
+def test_sweep_runs_out_of_time_is_requeued_and_ends_as_undisturbed(place: Path, environment: dict[str, str]) -> None:
+    whole = start(place, environment, place / "whole", *SWEEP, "seed=0,1")
+    output, _ = whole.communicate(timeout=300)
+    assert whole.returncode == 0, output
+
+    runs = place / "runs"
+    first = start(place, environment, runs, *SWEEP, "seed=0,1", *CLUSTER, pause=PAUSE)
+    deadline = time.monotonic() + 120
+    while len(list(runs.glob("store/train/.*.partial/metrics.jsonl"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.2)
+    queued = queue()
+    assert len(queued) == 2
+    time.sleep(3)
+    subprocess.run(["scontrol", "requeue", queued[0]], check=True)  # as a preemption does: SIGTERM, then the queue
+    first.send_signal(signal.SIGINT)
+    output, _ = first.communicate(timeout=30)
+    assert first.returncode == 130
+    assert "the jobs stay in Slurm" in output
+
+    second = start(place, environment, runs, *SWEEP, "seed=0,1", *CLUSTER, pause=PAUSE)
+    output, _ = second.communicate(timeout=280)
+    logs = job_logs(runs)
+    assert second.returncode == 0, output + logs
+    assert set(queue()) & set(queued) == set()
+    assert sorted(models(runs)) == sorted(models(place / "whole"))
+    assert models(runs) == models(place / "whole")
+    assert len(list(runs.glob(".jobs/cluster/*_submission.sh"))) == 1, "the trials were submitted a second time"
+    assert "Requeued job" in logs
+    assert logs.count("stopping at iteration") >= 2, logs
+    assert logs.count("going on from iteration") >= 2, logs
+
+
+def test_failed_trial_and_killed_job_are_reported(place: Path, environment: dict[str, str]) -> None:
+    runs = place / "runs"
+    slow = start(place, environment, runs, *SWEEP, "seed=0", *CLUSTER, "launch.timeout_min=10", pause=PAUSE)
+    bad = start(place, environment, runs, *SWEEP, "seed=1,2", "densify.split_size=-1", *CLUSTER)
+    output, _ = bad.communicate(timeout=120)
+    assert bad.returncode == 2, output
+    assert "densify.split_size" in output
+    deadline = time.monotonic() + 120
+    while not list(runs.glob("store/train/.*.partial/metrics.jsonl")) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    (folder,) = [path.parent for path in runs.glob("cluster/*/*/*/.submitted.json") if "seed0" in str(path)]
+    job = json.loads((folder / ".submitted.json").read_text())["job"]
+    holder = json.loads((folder / ".lock.holder").read_text())
+    status = subprocess.run(
+        [sys.executable, "-m", "gsbench.cli", "status", "cluster"],
+        env=environment | {"GSBENCH_RUNS": str(runs)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "running" in status.stdout
+    assert f"Slurm job {holder['slurm']}" in status.stdout
+    os.kill(holder["pid"], signal.SIGKILL)
+    output, _ = slow.communicate(timeout=120)
+    assert slow.returncode == 1, output
+    assert "ended without a result" in output
+    assert job not in queue()
