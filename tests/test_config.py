@@ -124,3 +124,13 @@ def test_hash_ignores_what_cannot_change_a_result() -> None:
     assert config_hash(composed("name=other", "seed=5", "threads=1", "tracking=none", "device=cpu")) == base
     assert config_hash(composed("densify.volume_threshold=0.04")) != base
     assert config_hash(composed("scene.max_size=200")) != base
+
+
+def test_hash_follows_the_source_of_a_users_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    own = ["densify._target_=own_densifier.Mine", "allow_targets=[own_densifier]"]
+    hashes = []
+    for text in ("A = 1\n", "A = 2\n", "A = 1\n"):
+        (tmp_path / "own_densifier.py").write_text(text)
+        hashes.append(config_hash(composed(*own)))
+    assert hashes[0] == hashes[2] != hashes[1]

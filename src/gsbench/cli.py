@@ -55,7 +55,9 @@ def run(argv: list[str]) -> int:
         print(f"gsbench: {error}", file=sys.stderr)
         return TRIAL_FAILED
     except KeyboardInterrupt as stop:
-        print(f"gsbench: stopped{f' by {stop}' if str(stop) else ''}; the same command goes on from here", file=sys.stderr)
+        print(
+            f"gsbench: stopped{f' by {stop}' if str(stop) else ''}; the same command goes on from here", file=sys.stderr
+        )
         return getattr(stop, "exit_code", INTERRUPTED)
     except BrokenPipeError:  # the reader of our output, such as `head`, has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -72,7 +74,8 @@ def _verb(name: str, argv: list[str]) -> int:
         from gsbench.config import closest
 
         raise InputError(
-            f"{name!r} is neither a verb nor a setting like key=value{closest(name, list(VERBS))} (verbs: {', '.join(VERBS)})"
+            f"{name!r} is neither a verb nor a setting like key=value{closest(name, list(VERBS))} "
+            f"(verbs: {', '.join(VERBS)})"
         )
     main_function: Callable[[list[str]], int] = importlib.import_module(VERBS[name][0]).main
     return main_function(argv)
@@ -92,7 +95,9 @@ def _help() -> int:
     print("  gsbench -m densify=adc,volumetric seed=0,1,2                   a sweep")
     print("  gsbench +experiment=demo                                       a sweep from a file")
     print("  gsbench scene=photos scene.path=/my/photos                     your own photographs")
-    print("  gsbench +experiment=table1 --dry-run                           list the trials and their state; run nothing")
+    print(
+        "  gsbench +experiment=table1 --dry-run                           list the trials and their state; run nothing"
+    )
     print("  gsbench --cfg job [settings]                                   show the configuration\n")
     print("Verbs (gsbench VERB --help):")
     for name, (_, text) in VERBS.items():

@@ -15,7 +15,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import check, closest, conf_dir, plain, register_schemas
@@ -36,22 +36,28 @@ class Composed:
 
 
 def compose_trials(overrides: Sequence[str], multirun: bool = False) -> list[Composed]:
-    """The trials that ``overrides`` describe: one, or with ``multirun`` (or an experiment that is a sweep) all of its grid.
+    """The trials that ``overrides`` describe: one, or with ``multirun`` (or in an experiment that is a sweep) a grid.
 
     Raises InputError, one line, for what does not compose or does not hold together.
     """
     _check_words(overrides)
     with _errors(overrides), _hydra():
-        master = compose("config", overrides=[word for word in overrides if not _is_sweep(word)], return_hydra_config=True)
+        master = compose(
+            "config", overrides=[word for word in overrides if not _is_sweep(word)], return_hydra_config=True
+        )
         hydra = master.hydra
-        if not hydra.launcher._target_.endswith(".BasicLauncher") or not hydra.sweeper._target_.endswith(".BasicSweeper"):
+        if not hydra.launcher._target_.endswith(".BasicLauncher") or not hydra.sweeper._target_.endswith(
+            ".BasicSweeper"
+        ):
             raise InputError("hydra/launcher and hydra/sweeper are not used: choose launch=serial, local or slurm")
-        is_sweep = multirun or OmegaConf.select(hydra, "mode") is not None and hydra.mode.name == "MULTIRUN"
+        is_sweep = multirun or (OmegaConf.select(hydra, "mode") is not None and hydra.mode.name == "MULTIRUN")
         if not is_sweep:
             swept = [word for word in overrides if _is_sweep(word)]
             if swept:
                 raise InputError(f"{swept[0]} lists several values: add -m to run one trial for each")
-            return [_composed(_check(compose("config", overrides=list(overrides))), overrides)]
+            with open_dict(master):
+                del master["hydra"]
+            return [_composed(_check(master), overrides)]
         parameters = [f"{key}={value}" for key, value in (hydra.sweeper.params or {}).items()]
         return list(_sweep([*parameters, *overrides]))
 
@@ -63,7 +69,7 @@ def compose_one(overrides: Sequence[str]) -> Composed:
 
 
 def _sweep(words: Sequence[str]) -> Iterator[Composed]:
-    """Every point of the grid, seeds last where they stand last; trials that differ in the seed alone share a composition."""
+    """Every point of the grid; trials that differ in the seed alone share a composition."""
     grid: dict[str, list[str]] = {}
     for override in OverridesParser.create().parse_overrides(list(words)):
         key = override.get_key_element()
@@ -134,16 +140,22 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
         key = override.group(1) if override else unknown.group(1)
         bad = unknown.group(1)
         parent = key[: key.rindex(bad)].rstrip(".") if bad in key else key.rpartition(".")[0]
-        known = _keys_below(parent, overrides)
         where = re.search(r"In '([^']+)'", text)
-        file = f" in {where.group(1)}.yaml" if where and not override else ""
+        file = ""
+        if where and not override:  # in a YAML file, whose folder is the group
+            file, parent = f" in {where.group(1)}.yaml", where.group(1).rpartition("/")[0]
+        known = _keys_below(parent, overrides)
         return f"{key} is not a setting{file}{closest(bad, known)} ({parent or 'top level'} has: {', '.join(known)})"
-    group = re.search(r"Could not override '([\w/]+)'\.?\s*(?:Did you mean to override|No match in the defaults list)", text)
+    group = re.search(
+        r"Could not override '([\w/]+)'\.?\s*(?:Did you mean to override|No match in the defaults list)", text
+    )
     if group:
         word = group.group(1)
         known = [*GROUPS, *_keys_below("", overrides)]
         return f"{word} is not a group or setting{closest(word, known)} (groups: {', '.join(GROUPS)})"
-    missing = re.search(r"Could not find '([^']+)'.*?Available options in '([^']+)':\s*(.*?)(?:\n\n|Config search|$)", text, re.S)
+    missing = re.search(
+        r"Could not find '([^']+)'.*?Available options in '([^']+)':\s*(.*?)(?:\n\n|Config search|$)", text, re.S
+    )
     if missing:
         wanted, name = missing.group(1), missing.group(2)
         choices = sorted({*options(name), *re.findall(r"[\w.-]+", missing.group(3))})

@@ -23,7 +23,18 @@ from gsbench.pipeline.trial_files import TrialPaths, find_finished
 
 log = logging.getLogger(__name__)
 
-HYDRA_QUERIES = ("--cfg", "-c", "--info", "-i", "--hydra-help", "--shell-completion", "-sc", "--resolve", "--package", "-p")
+HYDRA_QUERIES = (
+    "--cfg",
+    "-c",
+    "--info",
+    "-i",
+    "--hydra-help",
+    "--shell-completion",
+    "-sc",
+    "--resolve",
+    "--package",
+    "-p",
+)
 
 
 def launch(argv: list[str]) -> int:
@@ -76,7 +87,9 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
                 raise InputError(f"--config-dir {folder}: no such folder")
             overrides.append(f"hydra.searchpath=['file://{Path(folder).resolve()}']")
         elif word.startswith("-"):
-            raise InputError(f"{word} is not an option; there are -m, --dry-run, --config-dir FOLDER, --cfg job, --help")
+            raise InputError(
+                f"{word} is not an option; there are -m, --dry-run, --config-dir FOLDER, --cfg job, --help"
+            )
         else:
             overrides.append(word)
     return overrides, multirun, dry_run

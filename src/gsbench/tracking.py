@@ -1,8 +1,8 @@
 """The MLflow mirror: what the files of a trial say, shown in a dashboard.
 
-Files come first. A thread reads them and writes to MLflow in batches, so a tracker that is slow, down or read-only never
-harms a trial; what it missed, `mirror_trial` adds later from the same files. Each metric's time is a function of the files,
-so that MLflow, which drops exact repetitions, holds it once even if it was sent twice.
+Files come first. A thread reads them and writes to MLflow in batches, so a tracker that is slow, down or read-only
+never harms a trial; what it missed, `mirror_trial` adds later from the same files. Each metric's time is a function of
+the files, so that MLflow, which drops exact repetitions, holds it once even if it was sent twice.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import os
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +36,7 @@ MAX_PARAMS = 100  # parameters in a batch
 MAX_METRICS = 1000  # metrics in a batch
 SECONDS_TO_FINISH = 30.0  # patience with the tracker at the end of a trial
 SECONDS_TO_STOP = 3.0  # and when a signal asks to end
-TRIES = 5  # to connect to a database that another process, perhaps on another machine, is just setting up
+ADVISORY_LOCK = 0x67736265_6E6368  # "gsbench": the number of our lock in a PostgreSQL database
 CURVES = {"metrics.jsonl": "train", "events.jsonl": "events"}
 # What would print, phone home or hang for minutes in a thread beside a training.
 SETTINGS = {
@@ -88,7 +88,7 @@ class Mirror:
                 run.finish(self._status)
         except BusyError:
             log.debug("another process mirrors %s", self.folder)
-        except Exception as error:  # noqa: BLE001 - the mirror must never harm the trial, whatever the tracker raises
+        except Exception as error:  # the mirror must never harm the trial, whatever the tracker raises
             log.warning("tracking: %s; the files are complete, `gsbench sync` mirrors them later", _one_line(error))
             log.debug("tracking failed", exc_info=True)
 
@@ -184,7 +184,9 @@ class TrackedTrial:
         from mlflow.entities import Metric, RunTag
 
         ended = self._time_of({"step": results["iterations"], "seconds": results["seconds"]["train"]})
-        numbers = dict(results["metrics"]) | {key: results[key] for key in ("num_gaussians", "num_init_points", "peak_memory_mb")}
+        numbers = dict(results["metrics"]) | {
+            key: results[key] for key in ("num_gaussians", "num_init_points", "peak_memory_mb")
+        }
         numbers |= {f"seconds_{key}": value for key, value in results["seconds"].items()}
         numbers |= {f"total/{key}": value for key, value in results["events"].items()}
         tags = {"protocol": results["protocol"], "raster": results["raster"]}
@@ -219,10 +221,17 @@ class TrackedTrial:
             "folder": str(self.folder),
         }
         run_id = self.client.create_run(experiment_id, tags=tags, run_name=label).info.run_id
-        params = [Param(key, value[:MAX_VALUE]) for key, value in _flatten(values) if value]
+        params = [Param("arm", f"{values['init']['name']}-{values['densify']['name']}")]  # first in MLflow's charts
+        params += [Param(key, value[:MAX_VALUE]) for key, value in _flatten(values) if value]
         for start in range(0, len(params), MAX_PARAMS):
             self.client.log_batch(run_id, params=params[start : start + MAX_PARAMS], tags=[RunTag("gsbench", "1")])
-        return {"run_id": run_id, "uri": self._uri(), "started": int(time.time() * 1000), "logged": {}, "complete": None}
+        return {
+            "run_id": run_id,
+            "uri": self._uri(),
+            "started": int(time.time() * 1000),
+            "logged": {},
+            "complete": None,
+        }
 
     def _time_of(self, record: dict[str, Any]) -> int:
         """A record's time in ms: the run's start, and the training time or else the iterations since."""
@@ -247,23 +256,26 @@ def connect(uri: str | None, runs: Path) -> MlflowClient:
 
     for logger in ("mlflow", "alembic"):  # importing mlflow has set their levels
         logging.getLogger(logger).setLevel(logging.WARNING)
-    client = mlflow.MlflowClient(tracking_uri=uri or default_uri(runs))
-    with FileLock(runs / ".mlflow.lock"):
-        _first_call(client)
+    address = uri or default_uri(runs)
+    with _set_up_lock(address, runs):
+        client = mlflow.MlflowClient(tracking_uri=address)  # with the first client come the tables
+        client.search_experiments(max_results=1)
     return client
 
 
-def _first_call(client: MlflowClient) -> None:
-    """The call that creates a database's tables; tried again, since another machine may be creating them."""
-    for attempt in range(TRIES):
-        try:
-            client.search_experiments(max_results=1)
-        except Exception:  # noqa: BLE001, PERF203 - SQLAlchemy, alembic and MLflow each raise their own kinds
-            if attempt == TRIES - 1 or str(client.tracking_uri).startswith("http"):
-                raise
-            time.sleep(0.5 * 2**attempt)
-        else:
+@contextmanager
+def _set_up_lock(uri: str, runs: Path) -> Iterator[None]:
+    """Let one process at a time create tables and experiments: on this runs folder, and on a PostgreSQL everywhere."""
+    with FileLock(runs / ".mlflow.lock"):
+        if not uri.startswith("postgresql"):
+            yield
             return
+        import sqlalchemy
+
+        engine = sqlalchemy.create_engine(uri, poolclass=sqlalchemy.pool.NullPool)
+        with engine.connect() as connection:  # closing it frees the lock, as does the death of this process
+            connection.execute(sqlalchemy.text("SELECT pg_advisory_lock(:key)"), {"key": ADVISORY_LOCK})
+            yield
 
 
 def prepare(options: dict[str, Any], runs: Path, experiment: str) -> None:
@@ -280,11 +292,11 @@ def ensure_experiment(client: MlflowClient, name: str, runs: Path) -> str:
     """The id of experiment ``name``, created once under a lock; a deleted one is restored."""
     from mlflow.exceptions import MlflowException
 
-    with FileLock(runs / ".mlflow.lock"):
+    with _set_up_lock(str(client.tracking_uri), runs):
         found = client.get_experiment_by_name(name)
         if found is None:
-            local = str(client.tracking_uri).startswith("sqlite:")
-            location = (runs / "mlartifacts" / name).as_uri() if local else None
+            served = str(client.tracking_uri).startswith(("http:", "https:"))  # then the server says where
+            location = None if served else (runs / "mlartifacts" / name).as_uri()
             with suppress(MlflowException):  # a rival on another machine was first, or what follows says what is wrong
                 return str(client.create_experiment(name, artifact_location=location))
             found = client.get_experiment_by_name(name)

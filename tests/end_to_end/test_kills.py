@@ -135,7 +135,9 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of three MiB; the test is skipped where this user may not mount one."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(disk)], capture_output=True, check=False)
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(disk)], capture_output=True, check=False
+    )
     if mounted.returncode != 0:
         pytest.skip("needs the right to mount a small tmpfs (root)")
     yield disk
@@ -150,7 +152,9 @@ def test_full_disk_ends_the_sweep_in_one_line_and_more_space_mends_it(
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
     lines = [line for line in done.stderr.strip().splitlines() if line.startswith("gsbench:")]
-    assert lines == [f"gsbench: the disk of {small_disk} is full: free some space, and the same command goes on from here"]
+    assert lines == [
+        f"gsbench: the disk of {small_disk} is full: free some space, and the same command goes on from here"
+    ]
     subprocess.run(["mount", "-o", "remount,size=200m", str(small_disk)], check=True)
     done = gsbench(*sweep, "densify=adc", GSBENCH_RUNS=str(small_disk))
     assert done.returncode == 0, done.stderr
@@ -178,8 +182,19 @@ def test_a_failed_trial_does_not_stop_the_others_and_retry_mends_it(gsbench: Run
         "        super().begin(gaussians, context)\n"
     )
     (tmp_path / "conf" / "densify").mkdir(parents=True)
-    (tmp_path / "conf" / "densify" / "mine.yaml").write_text("defaults: [adc, _self_]\n_target_: mine.Mine\nname: mine\n")
-    sweep = ["--config-dir", "conf", "-m", *SMALL, "name=own", "densify=mine,adc", "allow_targets=[mine]", "tracking=none"]
+    (tmp_path / "conf" / "densify" / "mine.yaml").write_text(
+        "defaults: [adc, _self_]\n_target_: mine.Mine\nname: mine\n"
+    )
+    sweep = [
+        "--config-dir",
+        "conf",
+        "-m",
+        *SMALL,
+        "name=own",
+        "densify=mine,adc",
+        "allow_targets=[mine]",
+        "tracking=none",
+    ]
     sweep += ["train.iterations=20", "eval.lpips=[]", "eval.flip=false"]
     runs = str(tmp_path / "runs")
     done = gsbench(*sweep, GSBENCH_RUNS=runs)

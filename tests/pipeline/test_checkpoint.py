@@ -21,7 +21,12 @@ CPU = torch.device("cpu")
 
 def state(step: int) -> dict[str, object]:
     rng = torch.Generator().manual_seed(step)
-    return {"step": step, "tensor": torch.rand(500, generator=rng), "rng": rng.get_state(), "nested": {"list": [1, 2.5, "x", None]}}
+    return {
+        "step": step,
+        "tensor": torch.rand(500, generator=rng),
+        "rng": rng.get_state(),
+        "nested": {"list": [1, 2.5, "x", None]},
+    }
 
 
 def equal(first: object, second: object) -> bool:
@@ -128,7 +133,7 @@ def test_signals_stop_at_once_or_where_it_suits(signum: signal.Signals) -> None:
             signal.raise_signal(signum)
         assert stop.value.exit_code == 128 + signum
         steps = []
-        with pytest.raises(Stopped), deferred():
+        with pytest.raises(Stopped), deferred():  # noqa: PT012
             for step in range(10):
                 if step == 3:
                     signal.raise_signal(signum)

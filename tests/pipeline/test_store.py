@@ -176,7 +176,7 @@ def toy(store: Store, number: int, *options: str) -> subprocess.Popen[str]:
 
 
 def test_killed_at_random_moments_the_work_is_finished_and_right(store: Store) -> None:
-    """SIGKILL a process that builds three results, again and again; what was written stays, nothing torn is published."""
+    """SIGKILL a process that builds three results, again and again; nothing torn is ever published."""
     rng = random.Random(1)
     kills = 0
     for _ in range(100):
@@ -230,7 +230,9 @@ def small_disk(tmp_path: Path):  # type: ignore[no-untyped-def]
     """A file system of one MiB; the test is skipped where this user may not mount one."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], capture_output=True, check=False)
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], capture_output=True, check=False
+    )
     if mounted.returncode != 0:
         pytest.skip("needs the right to mount a small tmpfs (root)")
     yield disk

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gsbench.compose import GROUPS, compose_one, compose_trials, options
+from gsbench.compose import GROUPS, Composed, compose_one, compose_trials, options
 from gsbench.config import check_target, config_hash
 from gsbench.errors import InputError
 from gsbench.launch import parse, run_trials
@@ -68,42 +69,55 @@ def finish(values: dict[str, Any], seconds: float = 100.0, unavailable: dict[str
 # ---- composition
 
 
+@cache
+def experiment(name: str) -> list[Composed]:
+    """Composed once: the paper's tables take seconds."""
+    return compose_trials([f"+experiment={name}"])
+
+
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_yaml_composes(group: str) -> None:
     assert options(group)
     for name in options(group):
-        words = [f"+experiment={name}"] if group == "experiment" else [f"{group}={name}", "scene.path=/somewhere"]
-        trials = compose_trials(words)
-        assert trials
-        if group != "experiment":
-            assert trials[0].values[group]["name"] == name
+        if group == "experiment":
+            assert len(experiment(name)) >= 2
+        else:
+            (trial,) = compose_trials([f"{group}={name}", "scene.path=/somewhere"])
+            assert trial.values[group]["name"] == name
 
 
 def test_paper_experiments_have_the_papers_trials_and_share_them() -> None:
-    table1, table2 = compose_trials(["+experiment=table1"]), compose_trials(["+experiment=table2"])
+    table1, table2 = experiment("table1"), experiment("table2")
     assert (len(table1), len(table2)) == (78, 144)
-    leaves = [{(t.values["scene"]["name"], TrialPaths.of(t.values).folder.name) for t in table} for table in (table1, table2)]
+    leaves = [
+        {(t.values["scene"]["name"], TrialPaths.of(t.values).folder.name) for t in table} for table in (table1, table2)
+    ]
     assert [len(leaf) for leaf in leaves] == [78, 144]
     assert len(leaves[0] | leaves[1]) == 150
-    for trial in table2[::13]:
+    for trial in table2[::35]:
         assert trial.values["densify"]["max_gaussians"] == 3_400_000
         again = compose_one(trial.overrides)
-        assert again.values == trial.values
-        assert again.yaml == trial.yaml
+        assert again.values | {"runs": ""} == trial.values | {"runs": ""}
+        assert again.yaml.splitlines()[8:] == trial.yaml.splitlines()[8:]
 
 
 def test_grid_is_the_product_with_the_command_line_over_the_file() -> None:
     trials = compose_trials(["+experiment=demo", "seed=5,7", "densify=adc"])
     assert [(t.values["densify"]["name"], t.values["seed"]) for t in trials] == [("adc", 5), ("adc", 7)]
     trials = compose_trials(["densify=adc,mcmc", "seed=range(3)", "train.iterations=10"], multirun=True)
-    assert [(t.values["densify"]["name"], t.values["seed"]) for t in trials] == [(d, s) for d in ("adc", "mcmc") for s in range(3)]
+    assert [(t.values["densify"]["name"], t.values["seed"]) for t in trials] == [
+        (d, s) for d in ("adc", "mcmc") for s in range(3)
+    ]
     assert {t.values["train"]["iterations"] for t in trials} == {10}
 
 
 def test_name_seed_and_machine_are_in_no_hash_and_settings_are() -> None:
     hash_of = lambda *words: config_hash(compose_one(words).values)  # noqa: E731
     assert hash_of() == hash_of("name=other", "seed=9", "device=cpu", "threads=1", "launch=local", "tracking=none")
-    others = [hash_of(word) for word in ("densify=adc", "train.iterations=7", "init.seed=3", "scene.width=99", "eval=standard")]
+    others = [
+        hash_of(word)
+        for word in ("densify=adc", "train.iterations=7", "init.seed=3", "scene.width=99", "eval=standard")
+    ]
     assert len({hash_of(), *others}) == 6
 
 
@@ -156,7 +170,17 @@ def test_options_of_the_command_line() -> None:
 
 @pytest.mark.parametrize(
     "target",
-    ["os.system", "subprocess.Popen", "gsbenchevil.Class", "builtins.eval", "gsbench", "", None, "hydra.utils.instantiate", " gsbench.x"],
+    [
+        "os.system",
+        "subprocess.Popen",
+        "gsbenchevil.Class",
+        "builtins.eval",
+        "gsbench",
+        "",
+        None,
+        "hydra.utils.instantiate",
+        " gsbench.x",
+    ],
 )
 def test_foreign_targets_are_refused(target: str | None) -> None:
     with pytest.raises(InputError, match="densify"):
@@ -184,7 +208,9 @@ def test_finished_trial_is_recognised_until_something_changes(runs: Path) -> Non
     assert find_finished(compose_one(["seed=1"]).values) is None
 
 
-@pytest.mark.parametrize("change", ["photo", "new photo", "published", "stage", "results", "no inputs", "weights", "half a file"])
+@pytest.mark.parametrize(
+    "change", ["photo", "new photo", "published", "stage", "results", "no inputs", "weights", "half a file"]
+)
 def test_changes_are_noticed(change: str, runs: Path) -> None:
     values = compose_one([]).values
     finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"} if change == "weights" else None)
@@ -265,8 +291,12 @@ def test_estimate_prefers_the_same_scene_and_densifier_and_scales_with_iteration
     finish(compose_one(["densify=adc", "train.iterations=100"]).values, seconds=10)
     finish(compose_one(["densify=mcmc", "train.iterations=100"]).values, seconds=30)
     estimator = Estimator(runs)
-    assert estimator.estimate(compose_one(["densify=adc", "train.iterations=1000"]).values).seconds == pytest.approx(100)
-    assert estimator.estimate(compose_one(["densify=none", "train.iterations=1000"]).values).seconds == pytest.approx(200)
+    assert estimator.estimate(compose_one(["densify=adc", "train.iterations=1000"]).values).seconds == pytest.approx(
+        100
+    )
+    assert estimator.estimate(compose_one(["densify=none", "train.iterations=1000"]).values).seconds == pytest.approx(
+        200
+    )
 
 
 # ---- running a sweep
@@ -336,7 +366,11 @@ def test_full_disk_ends_the_sweep(fake_trial: Any) -> None:
 
 
 def test_storage_errors_are_recognised(tmp_path: Path) -> None:
-    full = ["[Errno 28] No space left on device", "1200 requested and 304 written", "PytorchStreamWriter failed writing file"]
+    full = [
+        "[Errno 28] No space left on device",
+        "1200 requested and 304 written",
+        "PytorchStreamWriter failed writing file",
+    ]
     for text in full:
         assert isinstance(explain_storage(RuntimeError(text), tmp_path), DiskFullError)
     assert isinstance(explain_storage(OSError(28, "x"), tmp_path), DiskFullError)

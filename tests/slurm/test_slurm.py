@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.end_to_end.conftest import SMALL, environment  # noqa: F401 - a fixture
+from tests.end_to_end.conftest import SMALL
 
 pytestmark = [pytest.mark.slurm, pytest.mark.end_to_end]
 
@@ -31,12 +31,12 @@ class Slow(ADC):
         time.sleep(float(os.environ.get("PAUSE", "0")))
         super().after_step(step, gaussians, rng)
 """
-PAUSE = 0.15  # seconds an iteration: with 300 of them a trial does not fit into Slurm's shortest time limit, a minute
+PAUSE = 0.2  # seconds an iteration: with 300 of them a trial does not fit into Slurm's shortest time limit, a minute
 SWEEP = ["--config-dir", "conf", "-m", *SMALL, "name=cluster", "densify=slow", "allow_targets=[slow]", "tracking=none"]
 CLUSTER = [
     "launch=slurm",
     "launch.timeout_min=1",
-    "launch.signal_seconds=20",
+    "launch.signal_seconds=5",  # Slurm sends it up to half a minute earlier
     "launch.cpus_per_trial=1",
     "launch.gpus_per_trial=0",
     "launch.parallel=2",
@@ -49,7 +49,9 @@ def slurm() -> None:
         pytest.skip("no Slurm here: scripts/slurm_one_node.sh start (root, Debian or Ubuntu) sets one up")
     pytest.importorskip("submitit", reason="needs the extra slurm")
     try:
-        states = subprocess.run(["sinfo", "-h", "-o", "%T"], capture_output=True, text=True, timeout=20, check=True).stdout
+        states = subprocess.run(
+            ["sinfo", "-h", "-o", "%T"], capture_output=True, text=True, timeout=20, check=True
+        ).stdout
     except (subprocess.SubprocessError, OSError) as error:
         pytest.skip(f"Slurm does not answer: {error}")
     if not any(state in states for state in ("idle", "mixed", "allocated")):
@@ -60,14 +62,18 @@ def slurm() -> None:
 def place(tmp_path: Path) -> Path:
     (tmp_path / "slow.py").write_text(SLOW)
     (tmp_path / "conf" / "densify").mkdir(parents=True)
-    (tmp_path / "conf" / "densify" / "slow.yaml").write_text("defaults: [adc, _self_]\n_target_: slow.Slow\nname: slow\n")
+    (tmp_path / "conf" / "densify" / "slow.yaml").write_text(
+        "defaults: [adc, _self_]\n_target_: slow.Slow\nname: slow\n"
+    )
     return tmp_path
 
 
 def start(place: Path, environment: dict[str, str], runs: Path, *words: str, pause: float = 0) -> subprocess.Popen[str]:
     variables = environment | {"GSBENCH_RUNS": str(runs), "PAUSE": str(pause)}
     command = [sys.executable, "-m", "gsbench.cli", *words]
-    return subprocess.Popen(command, cwd=place, env=variables, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    return subprocess.Popen(
+        command, cwd=place, env=variables, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
 
 
 def models(runs: Path) -> dict[str, bytes]:

@@ -10,7 +10,7 @@ import logging
 import os
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 import torch
 
@@ -30,7 +30,7 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> None:
     try:
         with temporary.open("wb") as stream:
             writer = _HashingWriter(stream)
-            torch.save(state, writer)
+            torch.save(state, cast("BinaryIO", writer))  # it only writes and flushes
             stream.write(writer.digest.digest())
             stream.flush()
             os.fsync(stream.fileno())

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from pydantic import TypeAdapter, ValidationError
 
-from gsbench.config import WITHOUT_EFFECT, check_target, closest
+from gsbench.config import WITHOUT_EFFECT, check_target, closest, source_of
 from gsbench.errors import InputError
 
 RESERVED = ("_target_", "name")  # keys of a group that are not options of its class
@@ -56,7 +56,8 @@ def locate(target: str, group: str) -> Any:
 
 def options_of(component: Any) -> dict[str, Any]:
     """Class and options of a component, as they enter a stage's key; those that cannot change a result are left out."""
-    values = {"class": f"{type(component).__module__}.{type(component).__qualname__}"}
+    target = f"{type(component).__module__}.{type(component).__qualname__}"
+    values = {"class": target} | source_of(target)
     if dataclasses.is_dataclass(component):
         fields = [
             field.name for field in dataclasses.fields(component) if field.init and field.name not in WITHOUT_EFFECT

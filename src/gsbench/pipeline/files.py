@@ -19,7 +19,9 @@ TEMPORARY = re.compile(r"^\..+\.tmp(-\d+)?$")  # how gsbench names a file that i
 FULL = (errno.ENOSPC, errno.EDQUOT)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
 # What libraries say without an error number when a write is cut short: numpy's tofile, torch's zip writer, SQLite.
-FULL_TEXT = re.compile(r"No space left|requested and \d+ written|PytorchStreamWriter failed|unexpected pos|disk is full")
+FULL_TEXT = re.compile(
+    r"No space left|requested and \d+ written|PytorchStreamWriter failed|unexpected pos|disk is full"
+)
 NEARLY_NOTHING = 64 * 1024  # bytes free: with less, any failed write is a full disk
 
 

@@ -147,7 +147,7 @@ def _run_local(trials: Sequence[Composed], executor: Executor, parallel: int) ->
 
 
 def _run_slurm(trials: Sequence[Composed], executor: Executor) -> list[Outcome]:
-    """One array job; trials that an earlier, interrupted command has in the queue are waited for, not submitted again."""
+    """One array job; trials that an earlier command left in the queue are waited for, not submitted again."""
     import submitit
 
     folder = Path(executor.folder)
@@ -176,7 +176,9 @@ def _run_slurm(trials: Sequence[Composed], executor: Executor) -> list[Outcome]:
     try:
         return _wait_for_slurm(jobs, trials)
     except KeyboardInterrupt:
-        log.info("the jobs stay in Slurm: the same command waits for them again, `scancel %s` ends them", " ".join(array))
+        log.info(
+            "the jobs stay in Slurm: the same command waits for them again, `scancel %s` ends them", " ".join(array)
+        )
         raise
 
 
@@ -206,7 +208,11 @@ def queued_jobs() -> set[str]:
     """The ids of this user's jobs and array tasks that Slurm has queued or runs; empty without Slurm."""
     try:
         listing = subprocess.run(
-            ["squeue", "--me", "--noheader", "--array", "--format=%i"], capture_output=True, text=True, timeout=60, check=True
+            ["squeue", "--me", "--noheader", "--array", "--format=%i"],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=True,
         )
     except (OSError, subprocess.SubprocessError):
         return set()
@@ -225,11 +231,15 @@ def _collect(job: Job[Outcome], folder: Path, trials: Sequence[Composed]) -> Out
             return value
         last = str(value).strip().splitlines()[-1] if str(value).strip() else kind
         return Outcome(folder, "failed", f"{last}; log: {job.paths.stderr}")
-    return Outcome(folder, "failed", f"the process ended without a result (killed, or out of memory); log: {job.paths.stderr}")
+    return Outcome(
+        folder, "failed", f"the process ended without a result (killed, or out of memory); log: {job.paths.stderr}"
+    )
 
 
 def _job(trial: Composed) -> TrialJob:
-    return TrialJob(trial.values, trial.yaml, [entry for entry in sys.path if entry], os.environ.get("CUDA_VISIBLE_DEVICES"))
+    return TrialJob(
+        trial.values, trial.yaml, [entry for entry in sys.path if entry], os.environ.get("CUDA_VISIBLE_DEVICES")
+    )
 
 
 def _prepare_tracking(values: dict[str, Any]) -> None:

@@ -32,8 +32,8 @@ class BusyError(Exception):
 def hold(path: Path, what: str, wait: bool = True) -> Iterator[None]:
     """Hold the lock ``path`` while the block runs; ``what`` is the work that it guards.
 
-    The system frees the lock when its process ends, however it ends; the file stays. Raises BusyError where another process
-    holds it and ``wait`` is False.
+    The system frees the lock when its process ends, however it ends; the file stays. Raises BusyError where another
+    process holds it and ``wait`` is False.
     """
     lock = FileLock(path)
     try:
@@ -80,7 +80,7 @@ def is_held(path: Path) -> bool:
 
 
 def read_holder(path: Path) -> dict[str, Any]:
-    """What the holder of the lock ``path`` wrote about itself: host, pid, since (s), and its Slurm job; empty if nothing."""
+    """What the holder of the lock ``path`` wrote about itself: host, pid, since (s), Slurm job; empty if nothing."""
     try:
         content = json.loads(_holder_file(path).read_text())
     except (OSError, ValueError):

@@ -15,7 +15,7 @@ Status = Literal["done", "failed", "not run"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """``message`` is why a trial failed or was not run; ``bad_input`` that the user's files or settings are the cause."""
+    """``message`` is why a trial failed, or its metrics; ``bad_input``: the user's files or settings are the cause."""
 
     folder: Path
     status: Status

@@ -39,7 +39,7 @@ TRIAL_GLOB = "*/*/*-seed*"
 
 @dataclass(frozen=True)
 class Planned:
-    """A trial of the plan: its folder, its overrides, the folder in which the command was given, and when (Unix time)."""
+    """A trial of the plan: its folder, its overrides, where the command was given, and when (Unix time)."""
 
     folder: Path
     overrides: tuple[str, ...]
@@ -95,7 +95,9 @@ def _read(home: Path) -> dict[str, Any]:
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{home / PLAN} is damaged ({error}): delete it, and give the sweep's command again") from error
+        raise InputError(
+            f"{home / PLAN} is damaged ({error}): delete it, and give the sweep's command again"
+        ) from error
 
 
 def progress_of_experiment(home: Path) -> list[Progress]:
@@ -162,21 +164,28 @@ class Estimator:
 
     def estimate(self, values: dict[str, Any]) -> Estimate:
         """Seconds for the whole trial with ``values``."""
-        wanted = {"scene": values["scene"]["name"], "init": values["init"]["name"], "densify": values["densify"]["name"]}
+        wanted = {
+            "scene": values["scene"]["name"],
+            "init": values["init"]["name"],
+            "densify": values["densify"]["name"],
+        }
         for keys in (("scene", "init", "densify"), ("scene", "densify"), ("scene",), ("densify",), ()):
             alike = [r for r in self.finished if all(r.get(key) == wanted[key] for key in keys)]
             if alike:
                 iterations = values["train"]["iterations"]
-                times = [
-                    r["seconds"]["train"] * iterations / r["iterations"] + r["seconds"]["evaluate"] for r in alike
-                ]
+                times = [r["seconds"]["train"] * iterations / r["iterations"] + r["seconds"]["evaluate"] for r in alike]
                 return Estimate(statistics.fmean(times), len(alike))
         return Estimate(0.0, 0)
 
 
 def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
     """Lines for ``--dry-run``: each trial with its state, and the time that the unfinished ones will take."""
-    lines, remaining, unknown, counts = [], 0.0, 0, dict.fromkeys(("done", "partial", "missing", "running", "failed"), 0)
+    lines, remaining, unknown, counts = (
+        [],
+        0.0,
+        0,
+        dict.fromkeys(("done", "partial", "missing", "running", "failed"), 0),
+    )
     estimator = Estimator(TrialPaths.of(trials[0].values).runs) if trials else None
     learned = 0
     for trial in trials:

@@ -34,7 +34,9 @@ def progress(title: str) -> Iterator[Report]:
         task = bar.add_task(title, total=None, note="")
 
         def report(phase: str, done: int, total: int, note: str = "") -> None:
-            bar.update(task, description=f"{title}: {phase}", completed=done, total=total, note=note or f"{done}/{total}")
+            bar.update(
+                task, description=f"{title}: {phase}", completed=done, total=total, note=note or f"{done}/{total}"
+            )
 
         yield report
 

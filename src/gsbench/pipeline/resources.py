@@ -27,7 +27,7 @@ def available_threads(parallel: int = 1) -> int:
 
 @contextmanager
 def take_slot(runs: Path, count: int) -> Iterator[int]:
-    """Hold the first free one of ``count`` slots of this machine, so that no more trials run at once, whoever started them."""
+    """Hold the first free one of ``count`` slots of this machine: no more trials run at once, whoever started them."""
     folder = runs / ".slots" / socket.gethostname()
     folder.mkdir(parents=True, exist_ok=True)
     while True:
@@ -55,7 +55,11 @@ def installed_gpus() -> list[str]:
     """The indices of NVIDIA GPUs of this machine, as its driver lists them."""
     try:
         listing = subprocess.run(
-            ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"], capture_output=True, text=True, timeout=60, check=True
+            ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=True,
         )
     except (OSError, subprocess.SubprocessError):
         return []
@@ -63,7 +67,7 @@ def installed_gpus() -> list[str]:
 
 
 def assign_threads(threads: int | str, parallel: int) -> None:
-    """Limit the libraries' threads in this process to ``threads``, or for "auto" to its share. Before torch is loaded."""
+    """Limit the libraries' threads in this process to ``threads``, for "auto" to its share. Before torch is loaded."""
     count = available_threads(parallel) if threads == "auto" else int(threads)
     for variable in THREAD_VARIABLES:
         os.environ[variable] = str(count)

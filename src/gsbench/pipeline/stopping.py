@@ -1,7 +1,7 @@
 """Stopping on a signal: at once, or in a training at the end of its iteration, with a checkpoint.
 
-Signals belong to the process, and so does the state in this module. SIGINT is Ctrl-C; SIGTERM comes from shells and from
-Slurm when a job is preempted or cancelled; SIGUSR2 comes from submitit shortly before a job's time is up.
+Signals belong to the process, and so does the state in this module. SIGINT is Ctrl-C; SIGTERM comes from shells and
+from Slurm when a job is preempted or cancelled; SIGUSR2 comes from submitit shortly before a job's time is up.
 """
 
 from __future__ import annotations
@@ -12,9 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-SIGNALS = tuple(
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR2") if hasattr(signal, name)
-)
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR2") if hasattr(signal, name))
 
 
 class Stopped(KeyboardInterrupt):
@@ -59,7 +57,7 @@ def stop_on_signals() -> Iterator[None]:
 
 
 def take_signals_back() -> None:
-    """Install the handlers again, within `stop_on_signals`: importing pycolmap replaces SIGTERM's by one that only crashes."""
+    """Install the handlers again, within `stop_on_signals`: importing pycolmap replaces that of SIGTERM."""
     if _State.active and threading.current_thread() is threading.main_thread():
         for signum in SIGNALS:
             signal.signal(signum, _on_signal)
@@ -67,7 +65,7 @@ def take_signals_back() -> None:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Within the block a first signal only sets `requested`, a second one stops at once; raises `Stopped` at the end."""
+    """Within the block a first signal only sets `requested`, a second stops at once; raises `Stopped` at the end."""
     take_signals_back()
     _State.deferring += 1
     try:

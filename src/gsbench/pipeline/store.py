@@ -1,7 +1,8 @@
 """A content-addressed store of stage results: the same inputs are never computed twice.
 
-Layout: ``<root>/<stage>/<key>/`` holds a finished result, with ``manifest.json`` written last; ``.<key>.partial/`` is where it
-is built, and what a killed build leaves; ``.<key>.lock`` lets one process build while others wait, and stays (it is empty).
+Layout: ``<root>/<stage>/<key>/`` holds a finished result, with ``manifest.json`` written last; ``.<key>.partial/`` is
+where it is built, and what a killed build leaves; ``.<key>.lock`` lets one process build while others wait, and stays
+(it is empty).
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ LEFTOVER_AGE = 24 * 3600.0  # seconds: temporary files outside the locks are swe
 class Stage:
     """A step of the pipeline. Bump ``version`` by hand when its code changes what it computes.
 
-    ``resumable`` stages find what a killed build left and go on from it; the others start in an empty folder. Files that
-    match ``scratch`` serve the build only: they are removed when the result is complete.
+    ``resumable`` stages find what a killed build left and go on from it; the others start in an empty folder. Files
+    that match ``scratch`` serve the build only: they are removed when the result is complete.
     """
 
     name: str
@@ -58,7 +59,7 @@ class Entry:
 
 
 class Store:
-    """The store below ``root``; ``on_build`` is told of each stage that is built, and of the folder where that happens."""
+    """The store below ``root``; ``on_build`` is told of each stage that is built, and of the folder where."""
 
     def __init__(self, root: Path, on_build: Callable[[Stage, Path], None] = lambda stage, folder: None) -> None:
         self.root, self.on_build = root, on_build
@@ -162,7 +163,7 @@ def write_manifest(folder: Path, stage: Stage, key: str, inputs: dict[str, Any],
 
 
 def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) -> dict[str, Any]:
-    """The manifest of the finished result of ``key`` (else the folder's name); raises ValueError naming what is damaged.
+    """The manifest of the result of ``key`` (else the folder's name); raises ValueError naming what is damaged.
 
     A file whose size and time of change are as recorded counts as sound unless ``thorough``; others are read whole.
     """

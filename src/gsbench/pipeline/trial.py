@@ -51,8 +51,8 @@ log = logging.getLogger(__name__)
 def run_trial(values: dict[str, Any], config_yaml: str, wait: bool = True) -> dict[str, Any]:
     """Run the trial with the resolved configuration ``values``, or find it done; returns what ``results.json`` holds.
 
-    On failure ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again. Where another
-    process runs this trial, waits for it, or raises BusyError if ``wait`` is False.
+    On failure ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again. Where
+    another process runs this trial, waits for it, or raises BusyError if ``wait`` is False.
     """
     take_signals_back()
     paths = TrialPaths.of(values)
@@ -108,13 +108,9 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
         _link(init.path / REPORT_FILE, paths.folder / "init_report.json")
         scene = stages.prepare_scene(store, capture, init, scene_options)
         log.info("%s: %d training and %d test views", paths.label, len(scene.train), len(scene.test))
-        trained = stages.train(
-            store, scene, inputs, init, densifier, rasterizer, train_options, values["seed"], device
-        )
+        trained = stages.train(store, scene, inputs, init, densifier, rasterizer, train_options, values["seed"], device)
         ground_truth = stages.keep_ground_truth(store, scene, inputs, init)
-        evaluated = stages.evaluate(
-            store, scene, init, trained, rasterizer, train_options, eval_options, device
-        )
+        evaluated = stages.evaluate(store, scene, init, trained, rasterizer, train_options, eval_options, device)
         published = _publish(paths.folder, init, trained, evaluated, ground_truth)
         results = _results(values, capture.fingerprint, scene, init, trained, evaluated, rasterizer.name)
         entries = {INIT.name: init, TRAIN.name: trained, GROUND_TRUTH.name: ground_truth, EVALUATE.name: evaluated}

@@ -21,7 +21,9 @@ RESULTS = "results.json"
 FAILED = "failed.json"
 CONFIG = "config.yaml"
 LOG = "log.txt"
-INPUTS = "inputs.json"  # what the results were made of, so that a finished trial is recognised without reading photographs
+INPUTS = (
+    "inputs.json"  # what the results were made of, so that a finished trial is recognised without reading photographs
+)
 BUILDING = "building.json"  # the stage that an unfinished trial is at, and where
 PROGRESS_FILE = "metrics.jsonl"
 LOCK = ".lock"
@@ -91,7 +93,7 @@ def failure_of(folder: Path) -> str:
 
 
 def stage_and_step(folder: Path) -> tuple[str, int]:
-    """The stage that an unfinished trial is at ("" if none has begun), and the last training iteration that it logged."""
+    """The stage that an unfinished trial is at ("" if none has begun), and the last iteration that it logged."""
     building = read_object(folder / BUILDING)
     try:
         with Path(building["folder"], PROGRESS_FILE).open("rb") as stream:
@@ -111,7 +113,7 @@ def record_inputs(
     entries: Mapping[str, Path],
     published: Iterable[Path],
 ) -> None:
-    """Write down what ``find_finished`` needs: source files, stage results by stage name, and files shown in ``folder``."""
+    """Write down what ``find_finished`` needs: source files, stage results by name, files shown in ``folder``."""
     sources = list(sources)
     folders = sorted({path.parent for path in sources})  # their time of change tells of files that came or went
     record = {
@@ -131,8 +133,8 @@ def record_inputs(
 def find_finished(values: dict[str, Any]) -> dict[str, Any] | None:
     """What ``results.json`` holds if the trial is done and nothing that it was made of has changed; else None.
 
-    Quick, since files are compared by size and time of change. A trial that lacks a metric for want of weights counts as
-    not finished, so that weights which arrived since are used.
+    Quick, since files are compared by size and time of change. A trial that lacks a metric for want of weights counts
+    as not finished, so that weights which arrived since are used.
     """
     folder = TrialPaths.of(values).folder
     results, record = read_object(folder / RESULTS), read_object(folder / INPUTS)

@@ -42,7 +42,9 @@ def main(argv: list[str]) -> int:
     from gsbench.cli import runs_dir
 
     parser = argparse.ArgumentParser(prog="gsbench doctor", description="Check this machine and say what is missing.")
-    parser.add_argument("--store", action="store_true", help="also read every stored result whole and name damaged ones")
+    parser.add_argument(
+        "--store", action="store_true", help="also read every stored result whole and name damaged ones"
+    )
     options = parser.parse_args(argv)
     checks: list[Callable[[], Iterator[Finding]]] = [
         check_python,
@@ -184,7 +186,9 @@ def check_store(runs: Path) -> Iterator[Finding]:
                 read_manifest(folder, thorough=True)
                 sound += 1
             except ValueError as error:
-                yield Finding("note", "store", f"{folder}: {error}; delete the folder, and the next run builds it again")
+                yield Finding(
+                    "note", "store", f"{folder}: {error}; delete the folder, and the next run builds it again"
+                )
     yield Finding("ok", "store", f"{sound} results are as they were written")
 
 

@@ -1,4 +1,4 @@
-"""``gsbench explain``: how a table's number came about, or with ``--stale`` why a stage is or would be computed anew."""
+"""``gsbench explain``: how a table's number came about; with ``--stale``, why a stage is computed anew."""
 
 from __future__ import annotations
 

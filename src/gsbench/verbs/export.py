@@ -31,8 +31,12 @@ def main(argv: list[str]) -> int:
         "model that the trial started from.",
     )
     parser.add_argument("trial", nargs="+", metavar="TRIAL", help=f"{ADDRESS}; after the word init: its initial model")
-    parser.add_argument("--to", choices=list(FORMATS), help="; ".join(f"{name}: {text}" for name, text in FORMATS.items()))
-    parser.add_argument("--out", type=Path, required=True, metavar="PATH", help="the file, or for init the folder, to write")
+    parser.add_argument(
+        "--to", choices=list(FORMATS), help="; ".join(f"{name}: {text}" for name, text in FORMATS.items())
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="PATH", help="the file, or for init the folder, to write"
+    )
     options = parser.parse_args(argv)
     is_init = len(options.trial) == 2 and options.trial[0] == "init"
     if len(options.trial) > 1 and not is_init:
@@ -76,9 +80,9 @@ def export_init(entry: Path, out: Path) -> None:
 def splat_bytes(gaussians: Gaussians) -> bytes:
     """antimatter15's layout, 32 bytes a Gaussian, the most important first.
 
-    Position and scale are 3 + 3 float32, colour and opacity 4 bytes (RGBA), the rotation 4 bytes, (w, x, y, z) of the unit
-    quaternion as 128 + 128 q. Importance is opacity times volume, as his ``convert.py`` orders them (viewers may draw the
-    first part of a file only).
+    Position and scale are 3 + 3 float32, colour and opacity 4 bytes (RGBA), the rotation 4 bytes, (w, x, y, z) of the
+    unit quaternion as 128 + 128 q. Importance is opacity times volume, as his ``convert.py`` orders them (viewers may
+    draw the first part of a file only).
     """
     import numpy as np
     import torch
@@ -108,7 +112,13 @@ def compressed_bytes(gaussians: Gaussians) -> bytes:
         raise InputError("--to compressed needs gsplat: pip install gsplat (its CUDA part is not used)") from None
     raw = gaussians.detach()
     return export_splats(
-        raw.means, raw.log_scales, raw.quaternions, raw.opacity_logits, raw.sh_dc[:, None], raw.sh_rest, "ply_compressed"
+        raw.means,
+        raw.log_scales,
+        raw.quaternions,
+        raw.opacity_logits,
+        raw.sh_dc[:, None],
+        raw.sh_rest,
+        "ply_compressed",
     )
 
 

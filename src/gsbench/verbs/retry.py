@@ -29,11 +29,15 @@ def main(argv: list[str]) -> int:
         prog="gsbench retry", description="Run the failed, stopped and missing trials of an experiment again."
     )
     parser.add_argument("experiment")
-    parser.add_argument("changes", nargs="*", metavar="KEY=VALUE", help="settings that make no other trial: launch=slurm …")
+    parser.add_argument(
+        "changes", nargs="*", metavar="KEY=VALUE", help="settings that make no other trial: launch=slurm …"
+    )
     parser.add_argument("--dry-run", action="store_true", help="only list them")
     options = parser.parse_args(argv)
     home = experiment_home(runs_dir(), options.experiment)
-    unfinished = [trial.folder for trial in progress_of_experiment(home) if trial.state in ("failed", "partial", "missing")]
+    unfinished = [
+        trial.folder for trial in progress_of_experiment(home) if trial.state in ("failed", "partial", "missing")
+    ]
     if not unfinished:
         print(f"nothing to retry: all trials of {options.experiment} are done or running")
         return 0
@@ -54,13 +58,17 @@ def main(argv: list[str]) -> int:
 def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[str]) -> Composed:
     """The trial in ``folder``: from its planned overrides, else from the configuration that it wrote."""
     if planned is not None:
-        own = [word for word in planned.overrides if word.split("=")[0] not in {change.split("=")[0] for change in changes}]
+        own = [
+            word for word in planned.overrides if word.split("=")[0] not in {change.split("=")[0] for change in changes}
+        ]
         where = planned.cwd if Path(planned.cwd).is_dir() else os.getcwd()
         if where != os.getcwd():
             os.chdir(where)  # relative paths were meant from there, and the trials are run from there
         trial = compose_one([*own, *changes])
         return Composed(trial.values | {"runs": str(runs)}, trial.yaml, trial.overrides)
     if changes:
-        raise InputError(f"{label_of(folder)} is in no plan, so no setting of it can be changed: run it by its own command")
+        raise InputError(
+            f"{label_of(folder)} is in no plan, so no setting of it can be changed: run it by its own command"
+        )
     values = read_config(folder) | {"runs": str(runs)}
     return Composed(values, yaml.safe_dump(values, sort_keys=False), ())

@@ -1,4 +1,4 @@
-"""``gsbench explain --stale``: which stages of a trial are in the store, and of those that are not, which inputs differ."""
+"""``gsbench explain --stale``: which stages of a trial are in the store, and why the others are not."""
 
 from __future__ import annotations
 
@@ -50,7 +50,9 @@ def explain_stages(values: dict[str, Any], store: Store) -> list[str]:
         elif store.path(stage, key).exists():
             lines.append(f"{stage.name:<13} {key[:12]}  damaged: {_damage(store.path(stage, key))}; it is built again")
         elif store.partial(stage, key).exists():
-            lines.append(f"{stage.name:<13} {key[:12]}  begun; {'it goes on' if stage.resumable else 'it starts again'}")
+            lines.append(
+                f"{stage.name:<13} {key[:12]}  begun; {'it goes on' if stage.resumable else 'it starts again'}"
+            )
         else:
             lines.append(f"{stage.name:<13} {key[:12]}  not in the store")
             lines += [f"    {difference}" for difference in _differences(store, stage, inputs)]
@@ -112,7 +114,10 @@ def _differences(store: Store, stage: Stage, inputs: dict[str, Any]) -> list[str
     if best is None:
         return [f"the store has no result of {stage.name} yet"]
     keys = [key for key in sorted({*best, *wanted}) if best.get(key) != wanted.get(key)]
-    return [f"{key.removeprefix('inputs.')}: {_short(best.get(key))} there, {_short(wanted.get(key))} wanted" for key in keys]
+    return [
+        f"{key.removeprefix('inputs.')}: {_short(best.get(key))} there, {_short(wanted.get(key))} wanted"
+        for key in keys
+    ]
 
 
 def flat(values: Any, prefix: str = "") -> dict[str, str]:

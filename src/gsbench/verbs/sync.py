@@ -21,12 +21,18 @@ def main(argv: list[str]) -> int:
     from gsbench.cli import runs_dir
     from gsbench.eval.results import list_experiments
 
-    parser = argparse.ArgumentParser(prog="gsbench sync", description="Mirror finished and failed trials to MLflow, once.")
+    parser = argparse.ArgumentParser(
+        prog="gsbench sync", description="Mirror finished and failed trials to MLflow, once."
+    )
     parser.add_argument("experiment", nargs="?", help="its name; without one, all")
     parser.add_argument("--uri", help="the tracker, such as http://127.0.0.1:5000; without it, each trial's own")
     options = parser.parse_args(argv)
     runs = runs_dir()
-    homes = [experiment_home(runs, options.experiment)] if options.experiment else [runs / n for n in list_experiments(runs)]
+    homes = (
+        [experiment_home(runs, options.experiment)]
+        if options.experiment
+        else [runs / n for n in list_experiments(runs)]
+    )
     new = known = 0
     for home in homes:
         for folder in sorted(home.glob(TRIAL_GLOB)):
@@ -54,14 +60,17 @@ def _sync_one(folder: Path, runs: Path, uri: str | None) -> bool:
         raise
     except Exception as error:
         text = " ".join(f"{type(error).__name__}: {error}".split())[:300]
-        raise GsbenchError(f"MLflow does not take {label_of(folder)} ({text}); the files are complete: try again") from error
+        raise GsbenchError(
+            f"MLflow does not take {label_of(folder)} ({text}); the files are complete: try again"
+        ) from error
 
 
 def read_config(folder: Path) -> dict[str, Any]:
     """The configuration that a trial wrote; raises InputError where it cannot be read."""
     try:
         values = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
-        values["tracking"]["uri"]  # noqa: B018 - a file that is no configuration of ours shows here
-    except (OSError, yaml.YAMLError, TypeError, KeyError) as error:
+    except (OSError, yaml.YAMLError) as error:
         raise InputError(f"{folder / CONFIG} cannot be read ({error})") from error
-    return dict(values)
+    if not isinstance(values, dict) or not isinstance(values.get("tracking"), dict):
+        raise InputError(f"{folder / CONFIG} is not the configuration of a trial")
+    return values

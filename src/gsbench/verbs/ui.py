@@ -58,7 +58,18 @@ def comparison_url(base: str, uri: str, runs: Path, experiment: str) -> str:
 
 def serve(uri: str, port: int) -> int:
     """Run ``mlflow ui`` with one worker and no job runner (its default takes eight processes and 2 GB)."""
-    command = [sys.executable, "-m", "mlflow", "ui", "--backend-store-uri", uri, "--host", "127.0.0.1", "--port", str(port)]
+    command = [
+        sys.executable,
+        "-m",
+        "mlflow",
+        "ui",
+        "--backend-store-uri",
+        uri,
+        "--host",
+        "127.0.0.1",
+        "--port",
+        str(port),
+    ]
     lean = {
         "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
         "MLFLOW_DISABLE_TELEMETRY": "true",
