@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+import torch
 
 from gsbench.errors import InputError
-from gsbench.init import MODEL_FOLDER, Dataset, Random, read_cloud
+from gsbench.gaussians.ply import read_ply, write_ply
+from gsbench.init import GAUSSIANS_FILE, MODEL_FOLDER, Dataset, Ply, Random, read_cloud
 from gsbench.scene.types import Capture
+from tests.gaussians.helpers import random_gaussians
 
 
 def add_points(model_dir: Path, target: Path, count: int) -> np.ndarray:
@@ -79,3 +82,16 @@ def test_random_needs_cameras(bare_photos: Capture, courtyard: Capture, tmp_path
 def test_no_model_to_read(tmp_path: Path):
     with pytest.raises(InputError, match="no COLMAP model here"):
         read_cloud(tmp_path)
+
+
+def test_a_trained_model_becomes_points_under_the_cameras_and_is_kept_whole(courtyard: Capture, tmp_path: Path) -> None:
+    gaussians = random_gaussians(20, dtype=torch.float32)
+    write_ply(gaussians, tmp_path / "model.ply")
+    report = Ply(path=str(tmp_path / "model.ply")).run(courtyard, tmp_path / "out")
+    assert report.num_points == 20
+    cloud = read_cloud(tmp_path / "out" / MODEL_FOLDER)
+    np.testing.assert_allclose(cloud.points, gaussians.means.double().numpy())
+    kept = read_ply(tmp_path / "out" / GAUSSIANS_FILE)
+    assert torch.equal(kept.log_scales, gaussians.log_scales)
+    with pytest.raises(InputError, match=r"init\.path=nowhere\.ply"):
+        Ply(path="nowhere.ply")

@@ -141,7 +141,7 @@ def test_signals_stop_at_once_or_where_it_suits(signum: signal.Signals) -> None:
                 if requested():
                     break
         assert steps == [0, 1, 2, 3]
-        with stop_on_signals(), pytest.raises(Stopped), deferred():
+        with stop_on_signals(), pytest.raises(Stopped), deferred():  # noqa: PT012
             signal.raise_signal(signum)
             signal.raise_signal(signum)  # a second one does not wait
             raise AssertionError("went on after the second signal")

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from gsbench.errors import InputError
-from gsbench.init.base import InitReport, PointCloud, Progress, no_progress
+from gsbench.init.base import PointCloud
 from gsbench.init.checks import check_integer, check_number
-from gsbench.init.relay import run_with_progress
-from gsbench.init.timer import Timer
+from gsbench.init.placed import PlacedCloud
 from gsbench.scene.types import Capture
+
+if TYPE_CHECKING:
+    import pycolmap
 
 
 @dataclass(frozen=True, kw_only=True)
-class Random:
+class Random(PlacedCloud):
     """Uniform points and colours in a cube around the mean of the training cameras, under the reference cameras.
 
     ``size`` is half the cube's edge in scene extents; 3 and 100,000 points are gsplat's defaults for a random start.
@@ -34,25 +35,15 @@ class Random:
         check_number("size", self.size, 0, exclusive=True)
         check_integer("seed", self.seed, 0, 2**31 - 1)
 
-    def needs_reference(self, capture: Capture) -> bool:
-        """Whether `run` needs a ``reference`` because the capture came without cameras."""
-        return capture.model is None
+    def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
+        from gsbench.init import reconstruct, report
 
-    def run(
-        self,
-        capture: Capture,
-        output_dir: Path,
-        progress: Progress = no_progress,
-        reference: Path | None = None,
-        work_dir: Path | None = None,
-    ) -> InitReport:
-        """Write model and report; ``work_dir`` is not used. ``InputError`` where there are no cameras."""
-        if reference is None and self.needs_reference(capture):
-            raise InputError(
-                f"init=random needs cameras and scene {capture.name} came without: make a reference with init=sfm first"
-            )
-        output_dir.mkdir(parents=True, exist_ok=True)
-        return run_with_progress(_scatter, (self, capture, output_dir, reference), progress, what=self.name)
+        poses = reconstruct.poses_by_name(model)
+        centers = [poses[name][0] for name in capture.train_names if name in poses]
+        extent = report.training_extent(model, capture)
+        if extent == 0:
+            raise InputError(f"init=random: the training cameras of scene {capture.name} stand all at one place")
+        return random_cloud(np.mean(centers, axis=0), self.size * extent, self.count, self.seed)
 
 
 def random_cloud(center: np.ndarray, half_edge: float, count: int, seed: int) -> PointCloud:
@@ -60,36 +51,3 @@ def random_cloud(center: np.ndarray, half_edge: float, count: int, seed: int) ->
     generator = np.random.default_rng(seed)
     points = center + half_edge * generator.uniform(-1.0, 1.0, (count, 3))
     return PointCloud(points, generator.integers(0, 256, (count, 3), dtype=np.uint8))
-
-
-def _scatter(job: tuple[Random, Capture, Path, Path | None], progress: Progress) -> InitReport:
-    import pycolmap
-
-    from gsbench.init import reconstruct, report
-
-    options, capture, output_dir, reference = job
-    timer = Timer()
-    model = reconstruct.load_reference(capture, reference)
-    assert model is not None
-    with timer.phase("draw"):
-        model.delete_all_points2D_and_points3D()
-        poses = reconstruct.poses_by_name(model)
-        centers = [poses[name][0] for name in capture.train_names if name in poses]
-        extent = report.training_extent(model, capture)
-        if extent == 0:
-            raise InputError(f"init=random: the training cameras of scene {capture.name} stand all at one place")
-        cloud = random_cloud(np.mean(centers, axis=0), options.size * extent, options.count, options.seed)
-        for point, color in zip(cloud.points, cloud.colors, strict=True):
-            model.add_point3D(point, pycolmap.Track(), color)
-    result = report.make_report(
-        options.name,
-        "shared",
-        capture,
-        model,
-        1.0,
-        settings=asdict(options),
-        seconds=timer.rounded(),
-        packages=("pycolmap", "numpy"),
-    )
-    report.write_result(model, result, output_dir)
-    return result

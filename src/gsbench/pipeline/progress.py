@@ -42,12 +42,13 @@ def progress(title: str) -> Iterator[Report]:
 
 
 def _lines(title: str) -> Report:
-    last = {"phase": "", "time": 0.0}
+    last_phase, last_time = "", 0.0
 
     def report(phase: str, done: int, total: int, note: str = "") -> None:
+        nonlocal last_phase, last_time
         now = time.monotonic()
-        if phase != last["phase"] or now - float(last["time"]) >= SECONDS_BETWEEN_LINES:
-            last.update(phase=phase, time=now)
+        if phase != last_phase or now - last_time >= SECONDS_BETWEEN_LINES:
+            last_phase, last_time = phase, now
             log.info("%s: %s %d/%d %s", title, phase, done, total, note)
 
     return report

@@ -1,0 +1,294 @@
+"""The command line and its small verbs, without a training."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench import cli
+from gsbench.compose import compose_one, compose_trials
+from gsbench.errors import GsbenchError, InputError
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.ply import read_ply, write_ply
+from gsbench.pipeline.plan import add_to_plan
+from gsbench.pipeline.stage_list import EVALUATE, INIT, TRAIN
+from gsbench.pipeline.stopping import Stopped
+from gsbench.pipeline.store import Store
+from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.verbs import doctor, export, retry, stale, ui
+from tests.gaussians.helpers import random_gaussians
+
+
+@pytest.fixture(autouse=True)
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "runs"
+
+
+# ---- the frame
+
+
+@pytest.mark.parametrize("verb", list(cli.VERBS))
+def test_every_verb_has_help_without_torch(verb: str) -> None:
+    module = importlib.import_module(cli.VERBS[verb][0])
+    with pytest.raises(SystemExit) as done:
+        module.main(["--help"])
+    assert done.value.code == 0
+
+
+def test_help_and_reading_verbs_load_no_torch(runs: Path) -> None:
+    (runs / "x").mkdir(parents=True)
+    code = (
+        "import sys, gsbench.cli as c\n"
+        "c.run(['--help']); c.run(['status']); c.run(['status', 'x']); c.run(['retry', 'x'])\n"
+        "c.run(['-m', 'seed=0,1', '--dry-run'])\n"
+        "sys.exit(any(name in sys.modules for name in ('torch', 'mlflow', 'numba', 'pycolmap')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "2 trials: 2 missing" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (InputError("bad photo"), 2, "gsbench: bad photo\n"),
+        (GsbenchError("went wrong"), 1, "gsbench: went wrong\n"),
+        (Stopped(15), 143, "gsbench: stopped by SIGTERM; the same command goes on from here\n"),
+        (KeyboardInterrupt(), 130, "gsbench: stopped; the same command goes on from here\n"),
+    ],
+)
+def test_errors_become_a_line_and_an_exit_code(
+    error: BaseException, code: int, text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(argv: list[str]) -> int:
+        raise error
+
+    monkeypatch.setattr("gsbench.launch.launch", fail)
+    assert cli.run(["seed=1"]) == code
+    assert capsys.readouterr().err == text
+
+
+def test_unknown_verb_names_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["statsu"]) == 2
+    assert "did you mean status?" in capsys.readouterr().err
+
+
+def test_hydra_shows_the_configuration(capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["--cfg", "job", "train.iterations=77"]) == 0
+    assert "iterations: 77" in capfd.readouterr().out
+
+
+# ---- status and retry
+
+
+def make_experiment(runs: Path) -> list[Path]:
+    trials = compose_trials(["name=x", "densify=adc", "seed=0,1,2"], multirun=True)
+    add_to_plan(trials)
+    folders = [TrialPaths.of(trial.values).folder for trial in trials]
+    folders[0].mkdir(parents=True)
+    (folders[0] / "config.yaml").write_text(trials[0].yaml)
+    (folders[0] / "results.json").write_text(json.dumps({"status": "complete"}))
+    folders[1].mkdir(parents=True)
+    (folders[1] / "config.yaml").write_text(trials[1].yaml)
+    (folders[1] / "failed.json").write_text(json.dumps({"message": "the loss became nan"}))
+    return folders
+
+
+def test_status_lists_what_deserves_attention(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folders = make_experiment(runs)
+    assert cli.run(["status", "x"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[:2]] == ["failed", "missing"]
+    assert "the loss became nan" in lines[0]
+    assert lines[2] == "3 trials: 1 done, 1 missing, 1 failed"
+    assert cli.run(["status", "x", "--json"]) == 1
+    states = {Path(trial["folder"]): trial["state"] for trial in json.loads(capsys.readouterr().out)}
+    assert states == dict(zip(folders, ("done", "failed", "missing"), strict=True))
+    assert cli.run(["status"]) == 0
+    assert capsys.readouterr().out.split() == "x 3 trials: 1 done, 1 missing, 1 failed".split()
+    assert cli.run(["status", "x", "--forget"]) == 0
+    assert cli.run(["status", "x"]) == 1
+    assert capsys.readouterr().out.splitlines()[-1] == "2 trials: 1 done, 1 failed"
+    assert cli.run(["status", "y"]) == 2
+    assert "no experiment 'y'" in capsys.readouterr().err
+
+
+def test_retry_runs_the_unfinished_with_their_own_settings(
+    runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_experiment(runs)
+    ran: list[Any] = []
+    monkeypatch.setattr("gsbench.launch.run_trials", lambda trials: ran.extend(trials) or 0)
+    assert cli.run(["retry", "x", "--dry-run"]) == 0
+    assert "2 trials: 1 missing, 1 failed" in capsys.readouterr().out
+    assert cli.run(["retry", "x", "launch=local", "launch.parallel=3"]) == 0
+    assert [(t.values["densify"]["name"], t.values["seed"]) for t in ran] == [("adc", 1), ("adc", 2)]
+    assert {t.values["launch"]["parallel"] for t in ran} == {3}
+    assert {TrialPaths.of(t.values).runs for t in ran} == {runs}
+
+
+def test_retry_of_a_trial_without_a_plan_takes_its_own_configuration(runs: Path) -> None:
+    folders = make_experiment(runs)
+    (runs / "x" / "plan.json").unlink()
+    again = retry.recompose(folders[1], None, runs, [])
+    assert TrialPaths.of(again.values).folder == folders[1]
+    assert again.values == compose_one(["name=x", "densify=adc", "seed=1"]).values
+
+
+# ---- export
+
+
+def finished_trial(runs: Path, gaussians: Gaussians) -> Path:
+    """A complete trial as the readers of results see it, with its model in the store."""
+    values = compose_one(["name=x", "densify=adc"]).values
+    folder = TrialPaths.of(values).folder
+    folder.mkdir(parents=True)
+    write_ply(gaussians, folder / "point_cloud.ply")
+    (runs / "store" / "init" / "abc" / "sparse" / "0").mkdir(parents=True)
+    (runs / "store" / "init" / "abc" / "sparse" / "0" / "points3D.bin").write_bytes(b"points")
+    results = {
+        "status": "complete",
+        "experiment": "x",
+        "scene": "courtyard",
+        "init": "sfm",
+        "densify": "adc",
+        "raster": "cpu",
+        "protocol": "paper-1",
+        "seed": 0,
+        "iterations": 10,
+        "num_gaussians": len(gaussians),
+        "metrics": {"psnr": 20.0},
+        "unavailable": {},
+        "seconds": {"train": 1.0},
+        "hashes": {"init": "abc"},
+        "versions": {},
+    }
+    (folder / "results.json").write_text(json.dumps(results))
+    return folder
+
+
+@pytest.fixture
+def gaussians() -> Gaussians:
+    return random_gaussians(60, seed=3, dtype=torch.float32)
+
+
+def test_export_of_the_model_and_the_initial_cloud(
+    runs: Path, gaussians: Gaussians, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = finished_trial(runs, gaussians)
+    assert cli.run(["export", "x:courtyard:adc:0", "--out", "new/model.ply"]) == 0
+    assert (tmp_path / "new" / "model.ply").read_bytes() == (folder / "point_cloud.ply").read_bytes()
+    assert cli.run(["export", str(folder), "--out", "model.splat"]) == 0
+    assert (tmp_path / "model.splat").stat().st_size == 32 * len(gaussians)
+    assert cli.run(["export", "init", str(folder), "--out", "model"]) == 0
+    assert (tmp_path / "model" / "sparse" / "0" / "points3D.bin").read_bytes() == b"points"
+    assert cli.run(["export", "init", str(folder), "--out", "model"]) == 2
+    assert cli.run(["export", str(folder), "--out", "model.xyz"]) == 2
+    assert cli.run(["export", "x:courtyard:mcmc", "--out", "model.ply"]) == 2
+    assert cli.run(["export", str(folder), "--out", "/proc/nowhere/model.ply"]) == 2
+    assert "give another --out" in capsys.readouterr().err
+
+
+def test_splat_is_what_gsplat_writes(gaussians: Gaussians) -> None:
+    exporter = pytest.importorskip("gsplat.exporter", reason="needs gsplat (extra dev)")
+    expected = exporter.splat2splat_bytes(
+        gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits, gaussians.sh_dc
+    )
+    records = lambda data: sorted(data[i : i + 32] for i in range(0, len(data), 32))  # noqa: E731
+    ours = export.splat_bytes(gaussians)
+    for mine, theirs in zip(records(ours), records(expected), strict=True):
+        assert mine[:24] == theirs[:24]  # positions and scales
+        difference = np.frombuffer(mine[24:], np.uint8).astype(int) - np.frombuffer(theirs[24:], np.uint8)
+        assert np.abs(difference).max() <= 1  # rounding at the border of two bytes
+    sizes = [struct.unpack_from("<3f", ours, 32 * i + 12) for i in range(len(gaussians))]
+    weights = [x * y * z * ours[32 * i + 27] for i, (x, y, z) in enumerate(sizes)]
+    assert weights[0] >= weights[len(weights) // 2] >= weights[-1]
+
+
+def test_compressed_ply_is_small_and_readable(gaussians: Gaussians, tmp_path: Path) -> None:
+    pytest.importorskip("gsplat.exporter", reason="needs gsplat (extra dev)")
+    write_ply(gaussians, tmp_path / "a.ply")
+    export.export_model(tmp_path / "a.ply", "compressed", tmp_path / "a.compressed.ply")
+    header = (tmp_path / "a.compressed.ply").read_bytes().split(b"end_header")[0].decode()
+    assert "element chunk 1" in header
+    assert f"element vertex {len(gaussians)}" in header
+    assert (tmp_path / "a.compressed.ply").stat().st_size < 0.6 * (tmp_path / "a.ply").stat().st_size
+    assert len(read_ply(tmp_path / "a.ply")) == len(gaussians)
+
+
+# ---- explain --stale, ui, doctor
+
+
+def test_stale_names_the_fields_that_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = Store(tmp_path / "store")
+    asked = [
+        (INIT, {"capture": "c", "options": {"seed": 0}}),
+        (TRAIN, {"densify": {"volume_threshold": 0.5, "stop": 100}, "seed": 0}),
+        (EVALUATE, {"train": "t"}),
+    ]
+    monkeypatch.setattr(stale, "stage_inputs", lambda values, store: asked)
+    store.get(*asked[0], lambda folder: None)
+    store.get(TRAIN, {"densify": {"volume_threshold": 0.03, "stop": 100}, "seed": 0}, lambda folder: None)
+    store.get(TRAIN, {"densify": {"volume_threshold": 0.03, "stop": 90}, "seed": 7}, lambda folder: None)
+    lines = stale.explain_stages({}, store)
+    assert lines[0].split()[0] == "init"
+    assert "in the store" in lines[0]
+    assert "not in the store" in lines[1]
+    assert lines[2] == "    densify.volume_threshold: 0.03 there, 0.5 wanted"
+    assert lines[4] == "    the store has no result of evaluate yet"
+    (store.path(INIT, INIT.key(asked[0][1])) / "manifest.json").write_text("{")
+    assert "damaged: manifest.json is missing or unreadable" in stale.explain_stages({}, store)[0]
+
+
+def test_ui_needs_a_database(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["ui", "x"]) == 2
+    assert "no MLflow database" in capsys.readouterr().err
+
+
+def test_ui_serves_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    commands: list[list[str]] = []
+
+    def run(command: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
+        commands.append(command)
+        assert options["env"]["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(subprocess, "run", run)
+    assert ui.serve("sqlite:///x.db", 1234) == 0
+    assert commands[0][commands[0].index("--host") + 1] == "127.0.0.1"
+
+
+def test_doctor_names_a_torchvision_that_does_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "torchvision.py").write_text("raise RuntimeError('operator torchvision::nms does not exist')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    sys.modules.pop("torchvision", None)
+    (finding,) = doctor.check_torchvision()
+    assert finding.verdict == "bad"
+    assert "nms does not exist" in finding.text
+    assert "pip uninstall torchvision" in finding.text
+
+
+def test_doctor_on_a_runs_folder(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert next(doctor.check_runs(runs)).verdict in ("ok", "note")
+    assert next(doctor.check_runs(Path("/proc/nowhere"))).verdict == "bad"
+    store = Store(runs / "store")
+    entry = store.get(TRAIN, {"x": 1}, lambda folder: (folder / "model").write_text("m"))  # type: ignore[arg-type,return-value]
+    assert [finding.verdict for finding in doctor.check_store(runs)] == ["ok"]
+    stamp = (entry.path / "model").stat().st_mtime_ns
+    (entry.path / "model").write_text("n")
+    os.utime(entry.path / "model", ns=(stamp, stamp))
+    first, last = doctor.check_store(runs)
+    assert "model differs" in first.text
+    assert last.text.startswith("0 results")
