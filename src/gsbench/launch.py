@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import sys
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -104,13 +106,28 @@ def _skip_finished(trials: Sequence[Composed]) -> tuple[list[Outcome], list[Comp
         if folder in seen:  # a sweep may list a value twice
             continue
         seen.add(folder)
-        results = find_finished(trial.values)
+        results = find_finished(trial.values, _unavailable_metrics)
         if results is None:
             unfinished.append(trial)
         else:
             outcomes.append(outcome_of_results(folder, results))
             log.info("%s: was done  %s", outcomes[-1].label, outcomes[-1].message)
     return outcomes, unfinished
+
+
+def _unavailable_metrics(options: dict[str, Any]) -> frozenset[str]:
+    return _unavailable(json.dumps(options, sort_keys=True))
+
+
+@cache
+def _unavailable(options: str) -> frozenset[str]:
+    """The metrics that cannot be computed here and now; weights are looked for, and fetched, once for a sweep."""
+    from gsbench.eval.protocol import Evaluator, get_protocol
+
+    chosen = json.loads(options)
+    weights = None if chosen["weights"] is None else Path(chosen["weights"]).expanduser()
+    protocol, lpips = get_protocol(chosen["protocol"]), tuple(chosen["lpips"])
+    return frozenset(Evaluator(protocol, "cpu", lpips, chosen["flip"], weights, chosen["download"]).unavailable)
 
 
 def summarize(outcomes: Sequence[Outcome], trials: Sequence[Composed]) -> int:

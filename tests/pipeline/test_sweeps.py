@@ -233,10 +233,17 @@ def test_changes_are_noticed(change: str, runs: Path) -> None:
     assert find_finished(values) is None
 
 
-def test_metric_that_was_not_asked_for_does_not_hinder() -> None:
+def test_metric_that_cannot_come_later_does_not_hinder() -> None:
     values = compose_one([]).values
-    finish(values, unavailable={"flip": "not asked for (eval.flip)"})
+    finish(values, unavailable={"flip": "not asked for (eval.flip)", "lpips_alex": "a view is 20x20 px, below 63 px a side"})
     assert find_finished(values) is not None
+
+
+def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do() -> None:
+    values = compose_one([]).values
+    finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"})
+    assert find_finished(values, lambda options: {"lpips_vgg", "flip"}) is not None
+    assert find_finished(values, lambda options: {"flip"}) is None
 
 
 # ---- plan and states

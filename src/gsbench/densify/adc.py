@@ -17,6 +17,8 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 
+PAPER_CAP = 3_400_000  # the paper's, for the baseline and its own rule alike
+
 
 @dataclass
 class ADC(Densifier):
@@ -41,7 +43,7 @@ class ADC(Densifier):
     prune_screen_radius: float | None = None  # px; 3DGS means 20 but zeroes the radii before it looks, so it never acts
     opacity_reset_interval: int = 3000
     opacity_reset_value: float = 0.01
-    max_gaussians: int | None = None
+    max_gaussians: int | None = PAPER_CAP  # None: no limit, as 3DGS
     cap: CapKind = "soft"
 
     initial_count: int = field(init=False, repr=False, compare=False, default=0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -29,7 +29,9 @@ PROGRESS_FILE = "metrics.jsonl"
 LOCK = ".lock"
 TAIL_BYTES = 4096
 INPUTS_VERSION = 1
-NOT_WANTED = "not asked for"  # how an unavailable metric's reason starts where the configuration leaves it out
+# How an unavailable metric's reason starts where nothing that arrives later changes it: the configuration leaves it out,
+# or the pictures are too small for the network. Other reasons are missing weights or packages.
+FOR_GOOD = ("not asked for", "a view is ")
 
 State = Literal["done", "running", "failed", "partial", "missing"]
 
@@ -130,19 +132,20 @@ def record_inputs(
     write_json(folder / INPUTS, record)
 
 
-def find_finished(values: dict[str, Any]) -> dict[str, Any] | None:
+def find_finished(
+    values: dict[str, Any], unavailable_now: Callable[[dict[str, Any]], Collection[str]] = lambda options: ()
+) -> dict[str, Any] | None:
     """What ``results.json`` holds if the trial is done and nothing that it was made of has changed; else None.
 
-    Quick, since files are compared by size and time of change. A trial that lacks a metric for want of weights counts
-    as not finished, so that weights which arrived since are used.
+    Quick, since files are compared by size and time of change. A trial that lacks a metric for want of weights is done
+    only if ``unavailable_now``, called with the ``eval`` settings, says that it would lack it again.
     """
     folder = TrialPaths.of(values).folder
     results, record = read_object(folder / RESULTS), read_object(folder / INPUTS)
     try:
         if results["status"] != "complete" or results["hashes"]["config"] != config_hash(values):
             return None
-        if any(not str(reason).startswith(NOT_WANTED) for reason in results["unavailable"].values()):
-            return None
+        lacking = {key for key, reason in results["unavailable"].items() if not str(reason).startswith(FOR_GOOD)}
         same = (
             record["version"] == INPUTS_VERSION
             and record["config"] == config_hash(values)
@@ -156,6 +159,7 @@ def find_finished(values: dict[str, Any]) -> dict[str, Any] | None:
         if same:
             for path in record["entries"].values():
                 read_manifest(Path(path))
+        same = same and (not lacking or lacking <= set(unavailable_now(values["eval"])))
     except (KeyError, TypeError, AttributeError, ValueError, OSError):
         return None
     return results if same else None
