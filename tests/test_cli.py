@@ -117,7 +117,7 @@ def test_status_lists_what_deserves_attention(runs: Path, capsys: pytest.Capture
     states = {Path(trial["folder"]): trial["state"] for trial in json.loads(capsys.readouterr().out)}
     assert states == dict(zip(folders, ("done", "failed", "missing"), strict=True))
     assert cli.run(["status"]) == 0
-    assert capsys.readouterr().out.split() == "x 3 trials: 1 done, 1 missing, 1 failed".split()
+    assert " ".join(capsys.readouterr().out.split()) == "x 3 trials: 1 done, 1 missing, 1 failed"
     assert cli.run(["status", "x", "--forget"]) == 0
     assert cli.run(["status", "x"]) == 1
     assert capsys.readouterr().out.splitlines()[-1] == "2 trials: 1 done, 1 failed"

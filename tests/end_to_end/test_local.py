@@ -1,4 +1,4 @@
-"""Several trials at once on this machine: slots are kept, a killed one harms no other, and the parent's end stops all."""
+"""Several trials at once on this machine: slots are kept, and a killed trial harms no other."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,16 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     monkeypatch.chdir(tmp_path)
     return tmp_path / "runs"
+
+
+@cache
+def _composed(*words: str) -> Composed:
+    return compose_one(words)
+
+
+def trial_values(*words: str) -> dict[str, Any]:
+    """A configuration, composed once, in this test's runs folder."""
+    return _composed(*words).values | {"runs": os.environ["GSBENCH_RUNS"]}
 
 
 def finish(values: dict[str, Any], seconds: float = 100.0, unavailable: dict[str, str] | None = None) -> dict[str, Any]:
@@ -112,7 +123,7 @@ def test_grid_is_the_product_with_the_command_line_over_the_file() -> None:
 
 
 def test_name_seed_and_machine_are_in_no_hash_and_settings_are() -> None:
-    hash_of = lambda *words: config_hash(compose_one(words).values)  # noqa: E731
+    hash_of = lambda *words: config_hash(trial_values(*words))  # noqa: E731
     assert hash_of() == hash_of("name=other", "seed=9", "device=cpu", "threads=1", "launch=local", "tracking=none")
     others = [
         hash_of(word)
@@ -200,19 +211,19 @@ def test_own_and_allowed_targets_pass() -> None:
 
 
 def test_finished_trial_is_recognised_until_something_changes(runs: Path) -> None:
-    values = compose_one([]).values
+    values = trial_values()
     assert find_finished(values) is None
     results = finish(values)
     assert find_finished(values) == results
     assert state_of(TrialPaths.of(values).folder) == "done"
-    assert find_finished(compose_one(["seed=1"]).values) is None
+    assert find_finished(trial_values("seed=1")) is None
 
 
 @pytest.mark.parametrize(
     "change", ["photo", "new photo", "published", "stage", "results", "no inputs", "weights", "half a file"]
 )
 def test_changes_are_noticed(change: str, runs: Path) -> None:
-    values = compose_one([]).values
+    values = trial_values()
     finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"} if change == "weights" else None)
     folder = TrialPaths.of(values).folder
     if change == "photo":
@@ -234,13 +245,16 @@ def test_changes_are_noticed(change: str, runs: Path) -> None:
 
 
 def test_metric_that_cannot_come_later_does_not_hinder() -> None:
-    values = compose_one([]).values
-    finish(values, unavailable={"flip": "not asked for (eval.flip)", "lpips_alex": "a view is 20x20 px, below 63 px a side"})
+    values = trial_values()
+    finish(
+        values,
+        unavailable={"flip": "not asked for (eval.flip)", "lpips_alex": "a view is 20x20 px, below 63 px a side"},
+    )
     assert find_finished(values) is not None
 
 
 def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do() -> None:
-    values = compose_one([]).values
+    values = trial_values()
     finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"})
     assert find_finished(values, lambda options: {"lpips_vgg", "flip"}) is not None
     assert find_finished(values, lambda options: {"flip"}) is None
@@ -285,7 +299,7 @@ def test_dry_run_tells_states_and_time(runs: Path) -> None:
     trials = compose_trials(["name=x", "densify=adc,volumetric", "seed=0,1"], multirun=True)
     assert describe_plan(trials)[-1].startswith("time: not known")
     finish(trials[0].values, seconds=600)
-    finish(compose_one(["name=other", "densify=adc", "seed=1"]).values, seconds=1200)
+    finish(trial_values("name=other", "densify=adc", "seed=1"), seconds=1200)
     lines = describe_plan(trials, parallel=2)
     assert [line.split()[0] for line in lines[:4]] == ["done", "missing", "missing", "missing"]
     assert "as in other: nothing to compute" in lines[1]
@@ -295,15 +309,11 @@ def test_dry_run_tells_states_and_time(runs: Path) -> None:
 
 
 def test_estimate_prefers_the_same_scene_and_densifier_and_scales_with_iterations(runs: Path) -> None:
-    finish(compose_one(["densify=adc", "train.iterations=100"]).values, seconds=10)
-    finish(compose_one(["densify=mcmc", "train.iterations=100"]).values, seconds=30)
+    finish(trial_values("densify=adc", "train.iterations=100"), seconds=10)
+    finish(trial_values("densify=mcmc", "train.iterations=100"), seconds=30)
     estimator = Estimator(runs)
-    assert estimator.estimate(compose_one(["densify=adc", "train.iterations=1000"]).values).seconds == pytest.approx(
-        100
-    )
-    assert estimator.estimate(compose_one(["densify=none", "train.iterations=1000"]).values).seconds == pytest.approx(
-        200
-    )
+    assert estimator.estimate(trial_values("densify=adc", "train.iterations=1000")).seconds == pytest.approx(100)
+    assert estimator.estimate(trial_values("densify=none", "train.iterations=1000")).seconds == pytest.approx(200)
 
 
 # ---- running a sweep
@@ -333,7 +343,12 @@ def fake_trial(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
     return behaviour, order
 
 
-def sweep() -> list[Any]:
+def sweep() -> list[Composed]:
+    return [replace(trial, values=trial.values | {"runs": os.environ["GSBENCH_RUNS"]}) for trial in _composed_sweep()]
+
+
+@cache
+def _composed_sweep() -> list[Composed]:
     return compose_trials(["name=x", "densify=adc", "seed=0,1,2"], multirun=True)
 
 
