@@ -11,9 +11,10 @@ help: ## show this
 
 install: $(STAMP) ## set up .venv with gsbench and the development tools
 
-demo: $(STAMP) ## baseline against volumetric densification on the courtyard: six trials, then the table
+demo: $(STAMP) ## baseline against volumetric densification on the courtyard: six trials, the table, the report
 	$(BIN)/gsbench +experiment=demo
 	$(BIN)/gsbench tables demo
+	$(BIN)/gsbench report demo
 
 test: $(STAMP) ## run the tests
 	$(BIN)/python -m pytest

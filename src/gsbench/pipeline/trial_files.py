@@ -29,8 +29,8 @@ PROGRESS_FILE = "metrics.jsonl"
 LOCK = ".lock"
 TAIL_BYTES = 4096
 INPUTS_VERSION = 1
-# How an unavailable metric's reason starts where nothing that arrives later changes it: the configuration leaves it out,
-# or the pictures are too small for the network. Other reasons are missing weights or packages.
+# How an unavailable metric's reason starts where nothing that arrives later changes it: the settings leave it out, or
+# the pictures are too small for the network. Other reasons are missing weights or packages.
 FOR_GOOD = ("not asked for", "a view is ")
 
 State = Literal["done", "running", "failed", "partial", "missing"]
