@@ -73,12 +73,18 @@ EOF
 }
 
 stop() {
+  local pids="" file
   grep -qsF "$MARK" "$CONF" || die "this Slurm was not set up by this script"
-  for pid in /run/slurmd.pid /run/slurmctld.pid; do
-    [ ! -e "$pid" ] || kill "$(cat "$pid")" 2>/dev/null || true
+  for file in /run/slurmd.pid /run/slurmctld.pid /run/munge/munged.pid; do
+    [ ! -s "$file" ] || pids="$pids $(cat "$file")"
   done
-  pid=$(pgrep -x munged || true)
-  [ -z "$pid" ] || kill "$pid" || true
+  for pid in $pids; do kill "$pid" 2>/dev/null || true; done
+  for pid in $pids; do
+    for _ in $(seq 100); do
+      kill -0 "$pid" 2>/dev/null || break
+      sleep 0.1
+    done
+  done
 }
 
 case "${1:-}" in
