@@ -182,7 +182,11 @@ def check(config: DictConfig) -> None:
         ("train.background", all(0 <= c <= 1 for c in config.train.background), "three numbers in [0, 1]"),
         ("eval.protocol", config.eval.protocol in ("paper", "standard"), "paper or standard"),
         ("launch", config.launch.name in ("serial", "local", "slurm"), "serial, local or slurm"),
-        ("launch.timeout_min", config.launch.timeout_min is None or config.launch.timeout_min >= 1, "at least 1 or null"),
+        (
+            "launch.timeout_min",
+            config.launch.timeout_min is None or config.launch.timeout_min >= 1,
+            "at least 1 or null",
+        ),
         ("launch.parallel", config.launch.parallel >= 1, "at least 1"),
         ("threads", config.threads == "auto" or _is_positive(config.threads), "auto or a whole number above 0"),
         ("name", _is_folder_name(config.name), "a plain folder name"),

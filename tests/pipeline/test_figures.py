@@ -1,4 +1,4 @@
-"""The overlay draws what it says: one outline, of the right Gaussian, at the right place, in the colour of its cause."""
+"""The overlay draws what it says: one outline, of the right Gaussian, in its place, in the colour of its cause."""
 
 from __future__ import annotations
 

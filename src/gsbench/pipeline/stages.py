@@ -27,8 +27,8 @@ from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Sfm, read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, Initializer
 from gsbench.pipeline.components import options_of
-from gsbench.pipeline.files import write_json
 from gsbench.pipeline.figures import draw_ellipsoids
+from gsbench.pipeline.files import write_json
 from gsbench.pipeline.maps import view_maps
 from gsbench.pipeline.progress import Report, progress
 from gsbench.pipeline.resources import available_threads
