@@ -63,6 +63,7 @@ def write_trial(folder: Path, values: dict[str, Any], records: int = RECORDS, ps
         "protocol": "paper-1",
         "raster": "cpu",
         "hashes": {"config": "abc"},
+        "init_report": {"num_points": 5, "pose_errors": None, "gauge": {"scene_extent": 4.5, "scale_to_reference": None}},
     }
     (folder / "results.json").write_text(json.dumps(results))
 
@@ -96,6 +97,10 @@ def test_all_that_the_files_say_is_mirrored_once(runs: Path) -> None:
     assert run.info.status == "FINISHED"
     assert run.data.metrics["psnr"] == 20.0
     assert run.data.metrics["total/cloned"] == 150
+    assert {key: run.data.metrics[key] for key in run.data.metrics if key.startswith("init/")} == {
+        "init/num_points": 5.0,
+        "init/scene_extent": 4.5,
+    }
     assert run.data.params["densify.name"] == "a_densify"
     assert history(client, run.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
     assert history(client, run.info.run_id, "events/cloned") == [(50, 50.0), (100, 100.0)]

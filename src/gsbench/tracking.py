@@ -12,7 +12,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,6 +37,8 @@ MAX_METRICS = 1000  # metrics in a batch
 SECONDS_TO_FINISH = 30.0  # patience with the tracker at the end of a trial
 SECONDS_TO_STOP = 3.0  # and when a signal asks to end
 ADVISORY_LOCK = 0x67736265_6E6368  # "gsbench": the number of our lock in a PostgreSQL database
+# Of the init's report: is the cloud to be trusted, and what does a volume threshold mean there?
+INIT_FIELDS = ("num_registered", "num_points", "mean_reprojection_error", "mean_track_length", "pose_errors", "gauge")
 CURVES = {"metrics.jsonl": "train", "events.jsonl": "events"}
 # What would print, phone home or hang for minutes in a thread beside a training.
 SETTINGS = {
@@ -189,6 +191,7 @@ class TrackedTrial:
         }
         numbers |= {f"seconds_{key}": value for key, value in results["seconds"].items()}
         numbers |= {f"total/{key}": value for key, value in results["events"].items()}
+        numbers |= {f"init/{key}": value for key, value in _numbers(results.get("init_report", {}), INIT_FIELDS)}
         tags = {"protocol": results["protocol"], "raster": results["raster"]}
         tags |= {f"hash_{key}": value for key, value in results["hashes"].items()}
         self.client.log_batch(
@@ -196,10 +199,10 @@ class TrackedTrial:
             metrics=[Metric(key, float(value), ended, 0) for key, value in numbers.items()],
             tags=[RunTag(key, value) for key, value in tags.items()],
         )
-        for name in ("config.yaml", "results.json", "per_view.csv", "events.jsonl"):
+        for name in ("config.yaml", "results.json", "init_report.json", "per_view.csv", "events.jsonl"):
             if (self.folder / name).exists():
                 self.client.log_artifact(run_id, str(self.folder / name))
-        for kind in ("renders", "ground_truth"):
+        for kind in ("figures", "renders", "ground_truth"):
             for picture in sorted((self.folder / kind).glob("*.png"))[: self.images]:
                 self.client.log_artifact(run_id, str(picture), kind)
         self.client.set_terminated(run_id, "FINISHED")
@@ -321,6 +324,16 @@ def _flatten(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, st
             yield from _flatten(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", str(value)
+
+
+def _numbers(report: dict[str, Any], names: Sequence[str]) -> Iterator[tuple[str, float]]:
+    """The numbers among the fields ``names`` of a report, nested ones included; what is unknown is left out."""
+    for name in names:
+        value = report.get(name)
+        if isinstance(value, dict):
+            yield from _numbers(value, tuple(value))
+        elif isinstance(value, (int, float)) and not isinstance(value, bool):
+            yield name, float(value)
 
 
 def _one_line(error: Exception) -> str:
