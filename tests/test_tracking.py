@@ -63,7 +63,11 @@ def write_trial(folder: Path, values: dict[str, Any], records: int = RECORDS, ps
         "protocol": "paper-1",
         "raster": "cpu",
         "hashes": {"config": "abc"},
-        "init_report": {"num_points": 5, "pose_errors": None, "gauge": {"scene_extent": 4.5, "scale_to_reference": None}},
+        "init_report": {
+            "num_points": 5,
+            "pose_errors": None,
+            "gauge": {"scene_extent": 4.5, "scale_to_reference": None},
+        },
     }
     (folder / "results.json").write_text(json.dumps(results))
 
