@@ -180,9 +180,9 @@ def test_killed_at_random_moments_the_work_is_finished_and_right(store: Store) -
     rng = random.Random(1)
     kills = 0
     for _ in range(100):
-        process = toy(store, 3)
+        process = toy(store, 3, "--slow")  # six seconds of pauses, on any machine: more than three waits
         try:
-            process.wait(rng.uniform(0.2, 0.9))
+            process.wait(rng.uniform(0.4, 1.8))
             break
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)
