@@ -26,6 +26,9 @@ MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood
 SEED = re.compile(r"seed=(\d+)")
 
 
+NO_PLUGINS = "hydra/launcher and hydra/sweeper are not used: choose launch=serial, local or slurm"
+
+
 @dataclass(frozen=True)
 class Composed:
     """The configuration of one trial: resolved values, the same as YAML, and the overrides that give it."""
@@ -49,7 +52,7 @@ def compose_trials(overrides: Sequence[str], multirun: bool = False) -> list[Com
         if not hydra.launcher._target_.endswith(".BasicLauncher") or not hydra.sweeper._target_.endswith(
             ".BasicSweeper"
         ):
-            raise InputError("hydra/launcher and hydra/sweeper are not used: choose launch=serial, local or slurm")
+            raise InputError(NO_PLUGINS)
         is_sweep = multirun or (OmegaConf.select(hydra, "mode") is not None and hydra.mode.name == "MULTIRUN")
         if not is_sweep:
             swept = [word for word in overrides if _is_sweep(word)]
@@ -95,6 +98,8 @@ def _check_words(overrides: Sequence[str]) -> None:
     for word in overrides:
         if "=" not in word and not word.startswith("~"):
             raise InputError(f"{word!r} is not a setting like key=value")
+        if word.lstrip("+~").startswith(("hydra/launcher", "hydra/sweeper")):
+            raise InputError(NO_PLUGINS)
 
 
 def _text(override: Override) -> str:
