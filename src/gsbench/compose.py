@@ -96,6 +96,8 @@ def _sweep(words: Sequence[str]) -> Iterator[Composed]:
 
 def _check_words(overrides: Sequence[str]) -> None:
     for word in overrides:
+        if word.lstrip("+").startswith("experiment") and not word.startswith("+experiment="):
+            raise InputError(f"{word}: write +experiment=NAME (choose: {', '.join(options('experiment'))})")
         if "=" not in word and not word.startswith("~"):
             raise InputError(f"{word!r} is not a setting like key=value")
         if word.lstrip("+~").startswith(("hydra/launcher", "hydra/sweeper")):
@@ -150,7 +152,10 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
         if where and not override:  # in a YAML file, whose folder is the group
             file, parent = f" in {where.group(1)}.yaml", where.group(1).rpartition("/")[0]
         known = _keys_below(parent, overrides)
-        return f"{key} is not a setting{file}{closest(bad, known)} ({parent or 'top level'} has: {', '.join(known)})"
+        own = any(word.startswith(f"{parent}._target_=") for word in overrides)
+        hint = f"; a key that only your class has is added with a plus: +{key}=…" if own else ""
+        near = f"{closest(bad, known)}{hint}"
+        return f"{key} is not a setting{file}{near} ({parent or 'top level'} has: {', '.join(known)})"
     group = re.search(
         r"Could not override '([\w/]+)'\.?\s*(?:Did you mean to override|No match in the defaults list)", text
     )

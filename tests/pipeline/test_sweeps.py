@@ -145,6 +145,8 @@ def test_name_seed_and_machine_are_in_no_hash_and_settings_are() -> None:
         (["eval.lpips=3"], ["eval.lpips=3", "list"]),
         (["seed=0,1"], ["seed=0,1 lists several values", "-m"]),
         (["foo"], ["'foo' is not a setting like key=value"]),
+        (["experiment=table1"], ["+experiment=NAME", "table2"]),
+        (["densify._target_=mine.X", "densify.own=1"], ["densify.own", "+densify.own="]),
         (["hydra/launcher=submitit_slurm"], ["launch=serial, local or slurm"]),
         (["launch.parallel=0"], ["launch.parallel must be at least 1"]),
         (["name=../up"], ["name must be a plain folder name"]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from pathlib import Path
 
 import pytest
@@ -184,3 +185,19 @@ def test_learning_rate_of_the_means_is_log_linear() -> None:
     assert rates.position(15_000) == pytest.approx(1.6e-5)  # the geometric middle
     assert rates.position(30_000) == pytest.approx(1.6e-6)
     assert rates.position(99_000) == pytest.approx(1.6e-6)
+
+
+def test_a_densifier_that_was_never_due_is_told(
+    tiny_scene: Scene,
+    truth: Gaussians,
+    rasterizer: Rasterizer,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(logging.getLogger("gsbench"), "propagate", True)
+    train(tiny_scene, truth, rasterizer, tmp_path / "adc", ADC(start=500), iterations=15)
+    assert "not one refinement was due in 15 iterations" in caplog.text
+    caplog.clear()
+    train(tiny_scene, truth, rasterizer, tmp_path / "none", NoDensifier(), iterations=15)
+    assert "refinement" not in caplog.text

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from gsbench.config import TrainConfig
-from gsbench.densify import Densifier, DensifyContext
+from gsbench.densify import Densifier, DensifyContext, NoDensifier
 from gsbench.densify.volume import log_volume
 from gsbench.errors import TrainingError
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
@@ -123,6 +123,11 @@ class Trainer:
                     log.info("stopping at iteration %d, with a checkpoint", self.step)
                 if last or stop:
                     break
+        if not isinstance(self.densifier, NoDensifier) and (folder / EVENTS).stat().st_size == 0:
+            log.warning(
+                "not one refinement was due in %d iterations: the densifier changed nothing (see train.densify_start, "
+                "now %d)", self.step, options.densify_start,
+            )  # fmt: skip
         return self.gaussians.values.detach()
 
     def _iterate(self, folder: Path) -> tuple[dict[str, Any], dict[str, object] | None]:
