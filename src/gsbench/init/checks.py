@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 
 from gsbench.errors import InputError
@@ -29,8 +28,3 @@ def check_integer(key: str, value: int, low: int, high: float = math.inf) -> Non
     if not isinstance(value, int) or isinstance(value, bool):
         raise InputError(f"init.{key}={value}: must be a whole number")
     check_number(key, value, low, high)
-
-
-def available_cores() -> int:
-    """The CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from gsbench.cores import available_cores
 from gsbench.errors import InputError
 from gsbench.init.base import (
     OWN_GAUGE_FOLDER,
@@ -18,7 +19,7 @@ from gsbench.init.base import (
     Progress,
     no_progress,
 )
-from gsbench.init.checks import available_cores, check_choice, check_integer, check_number
+from gsbench.init.checks import check_choice, check_integer, check_number
 from gsbench.init.pairs import PAIRINGS
 from gsbench.init.relay import run_with_progress
 from gsbench.init.timer import Timer

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gsbench.cores import available_cores
 from gsbench.pipeline.loss import C1, C2, WINDOW_RADIUS, window
-from gsbench.raster.cpu.executor import available_threads
 from gsbench.raster.cpu.jit import inlined, kernel
 from gsbench.raster.cpu.simd import LANES, absolute, fma, lane_sums, load, select, splat, store
 from gsbench.raster.cpu.workspace import ArenaPool, ShardRunner, TensorPool
@@ -219,7 +219,7 @@ class CompiledLoss:
 
     def __init__(self, ssim_weight: float, threads: int | None) -> None:
         self.ssim_weight = ssim_weight
-        self._runner = ShardRunner(threads or available_threads())
+        self._runner = ShardRunner(threads or available_cores())
         self._arenas = ArenaPool()
         self._tensors = TensorPool()
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from gsbench.cores import available_cores
 from gsbench.pipeline.locks import BusyError, hold
 
 SECONDS_BETWEEN_TRIES = 0.5
@@ -21,8 +22,7 @@ def available_threads(parallel: int = 1) -> int:
     slurm = os.environ.get("SLURM_CPUS_PER_TASK", "")
     if slurm.isdigit() and int(slurm) > 0:
         return int(slurm)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // parallel)
+    return max(1, available_cores() // parallel)
 
 
 @contextmanager

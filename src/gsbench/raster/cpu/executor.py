@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gsbench.cores import available_cores
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, RenderOutput
 from gsbench.raster.cpu import layout as at
@@ -29,11 +29,6 @@ GAUSSIAN_SHARDS = 16
 TILE_SHARDS = 8  # each has its own gradient rows: 64 bytes per Gaussian
 
 
-def available_threads() -> int:
-    """The CPUs that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 class CpuRasterizer:
     """float32 on the CPU, compiled by numba at first use; the same bits on every run and for any number of ``threads``.
 
@@ -48,7 +43,7 @@ class CpuRasterizer:
             raise ValueError(f"threads: must be at least 1, got {threads}")
         if CONSTANTS.tile != at.TILE:
             raise ValueError(f"the compiled rasterizer has tiles of {at.TILE} px, the contract {CONSTANTS.tile}")
-        self.threads = threads or available_threads()
+        self.threads = threads or available_cores()
         self._runner = ShardRunner(self.threads)
         self._frames = ArenaPool()
         self._scratch = ArenaPool()
