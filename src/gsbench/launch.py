@@ -25,6 +25,7 @@ from gsbench.pipeline.trial_files import TrialPaths, find_finished
 
 log = logging.getLogger(__name__)
 
+READ = ("colmap", "photos")  # the kinds of scenes that are read from scene.path
 HYDRA_QUERIES = (
     "--cfg",
     "-c",
@@ -50,7 +51,7 @@ def launch(argv: list[str]) -> int:
     overrides, multirun, dry_run = parse(argv)
     trials = compose_trials(overrides, multirun)
     if dry_run:
-        print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
+        print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"]) + missing_folders(trials)))
         return 0
     return run_trials(trials)
 
@@ -60,9 +61,12 @@ def run_trials(trials: Sequence[Composed]) -> int:
     runs = TrialPaths.of(trials[0].values).runs
     with storage_errors(runs), stop_on_signals():
         runs.mkdir(parents=True, exist_ok=True)
-        add_to_plan(trials)
         Store(runs / "store").sweep(STAGES)
         outcomes, unfinished = _skip_finished(trials)
+        here = [trial for trial in unfinished if trial.values["launch"]["name"] != "slurm"]  # nodes have their own disks
+        if missing := missing_folders(here):
+            raise InputError("; ".join(missing))
+        add_to_plan(trials)
         if unfinished:
             if unfinished[0].values["launch"]["name"] == "serial":
                 outcomes += run_serial(unfinished)
@@ -71,6 +75,20 @@ def run_trials(trials: Sequence[Composed]) -> int:
 
                 outcomes += run_jobs(unfinished)
     return summarize(outcomes, trials)
+
+
+def missing_folders(trials: Sequence[Composed]) -> list[str]:
+    """A line for each scene of the trials whose folder of photographs is not there."""
+    from gsbench.scene.readers import existing_folder
+
+    scenes = {(scene["name"], scene["path"]) for scene in (t.values["scene"] for t in trials) if scene["kind"] in READ}
+    lines = []
+    for name, path in sorted(scenes, key=str):
+        try:
+            existing_folder(name, path)
+        except InputError as error:
+            lines.append(str(error))
+    return lines
 
 
 def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:

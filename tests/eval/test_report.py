@@ -264,3 +264,10 @@ def test_swept_settings_become_arms_of_their_own(tmp_path: Path) -> None:
     page = build_report(load_experiment(tmp_path, "exp"))
     assert "sfm-volumetric max_gaussians=10000 against sfm-adc max_gaussians=10000" in page
     assert "of sfm-volumetric at the same Gaussians as sfm-adc" in page
+
+
+def test_arms_that_never_differed_are_called_equal_and_not_undecided(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan(trial_noise=0, residual_noise=0, views=3))
+    page = build_report(load_experiment(tmp_path, "exp"))
+    assert "equal in every metric" in page
+    assert "never acted" in page

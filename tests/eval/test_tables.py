@@ -142,6 +142,28 @@ def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path: Pa
     assert "garden: not compared, no best marked: iterations differ." in table.notes
 
 
+@pytest.mark.parametrize(
+    ("second_budget", "blocked", "compared"),
+    [
+        ({"max_gaussians": None, "cap": None}, (0, 0), True),  # neither cap acted: both grew as they liked
+        ({"max_gaussians": None, "cap": None}, (3, 0), False),
+        ({"max_gaussians": 1000, "cap": "hard"}, (0, 3), False),
+        ({"max_gaussians": 50_000, "cap": "soft"}, (3, 0), True),  # one budget for both
+        ({"max_gaussians": None, "cap": None, "seconds": 60}, (0, 0), False),  # who knows what it would have become
+        ({"max_gaussians": None, "cap": None}, (None, 0), False),  # no count of what was refused
+    ],
+)
+def test_arms_are_compared_under_one_budget_or_under_none_that_acted(
+    tmp_path: Path, second_budget: dict, blocked: tuple[int | None, int], compared: bool
+) -> None:
+    first, second = ({} if count is None else {"blocked_by_cap": count} for count in blocked)
+    one_trial(tmp_path, 0, psnr=27.0, _events=first)
+    one_trial(tmp_path, 0, psnr=28.0, _densify="none", _budget=second_budget, _events=second)
+    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
+    assert [row[3] for row in texts(table)] == ["27.00", "*28.00*" if compared else "28.00"]
+    assert ("garden: not compared, no best marked: budget differ." in table.notes) is not compared
+
+
 def test_the_mean_of_scenes_weighs_scenes_alike(tmp_path: Path) -> None:
     for scene, psnrs in (("a", (20.0, 22.0)), ("b", (30.0, 31.0))):
         for seed, psnr in enumerate(psnrs):

@@ -14,7 +14,7 @@ import pytest
 from gsbench.compose import GROUPS, Composed, compose_one, compose_trials, options
 from gsbench.config import check_target, config_hash
 from gsbench.errors import InputError
-from gsbench.launch import parse, run_trials
+from gsbench.launch import launch, parse, run_trials
 from gsbench.pipeline import serial
 from gsbench.pipeline.files import DiskFullError, explain_storage
 from gsbench.pipeline.locks import BusyError, hold, is_held
@@ -176,6 +176,18 @@ def test_options_of_the_command_line() -> None:
         parse(["--dry-rum"])
     with pytest.raises(InputError, match="no such folder"):
         parse(["--config-dir", "/nowhere"])
+
+
+def test_a_folder_that_is_not_there_stops_a_sweep_before_its_first_trial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / "data"))
+    words = ["-m", "scene=courtyard,garden,truck", "init=dataset", "tracking=none", "train.iterations=1"]
+    with pytest.raises(InputError, match=r"scene garden: .*garden does not exist.*; scene truck: .* does not exist"):
+        launch(words)
+    assert not list((tmp_path / "runs").glob("*/*/*/*-seed*"))  # nothing to clean up after the mend
+    assert launch([*words, "--dry-run"]) == 0
+    assert "scene truck: the folder" in capsys.readouterr().out
 
 
 # ---- a _target_ is code

@@ -80,11 +80,16 @@ def check_averageable(trials: Sequence[Trial], where: str) -> None:
 
 
 def differing_conditions(trials: Sequence[Trial]) -> dict[str, list[str]]:
-    """The conditions in which trials differ, with their values."""
+    """The conditions in which trials differ, with their values.
+
+    Unlike budgets of which none acted are no difference: all of the trials grew as they liked.
+    """
     seen: dict[str, set[str]] = defaultdict(set)
     for trial in trials:
         for key, value in trial.conditions().items():
             seen[key].add(value)
+    if not any(trial.budget_acted for trial in trials):
+        del seen["budget"]
     return {key: sorted(values) for key, values in seen.items() if len(values) > 1}
 
 

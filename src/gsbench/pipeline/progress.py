@@ -42,13 +42,14 @@ def progress(title: str) -> Iterator[Report]:
 
 
 def _lines(title: str) -> Report:
-    last_phase, last_time = "", 0.0
+    last_phase, last_done, last_time = "", -1, 0.0
 
     def report(phase: str, done: int, total: int, note: str = "") -> None:
-        nonlocal last_phase, last_time
+        nonlocal last_phase, last_done, last_time
         now = time.monotonic()
-        if phase != last_phase or now - last_time >= SECONDS_BETWEEN_LINES:
-            last_phase, last_time = phase, now
+        ends = done == total and done != last_done
+        if phase != last_phase or ends or now - last_time >= SECONDS_BETWEEN_LINES:
+            last_phase, last_done, last_time = phase, done, now
             log.info("%s: %s %d/%d %s", title, phase, done, total, note)
 
     return report

@@ -39,9 +39,9 @@ def read_colmap(
     """
     from gsbench.scene.colmap import read_model, registered_names  # here, because photos alone need no pycolmap
 
-    root = _existing_folder(name, path)
-    folder = _subfolder(root, images or "images", "scene.images")
+    root = existing_folder(name, path)
     model_folder = _find_sparse(root, sparse)
+    folder = _subfolder(root, images or "images", "scene.images")
     wanted = registered_names(read_model(model_folder))
     matches = match_names(wanted, list_images(folder))
     missing = [image for image in wanted if image not in matches]
@@ -71,7 +71,7 @@ def read_photos(
 
     Raises `InputError` if the folder is missing or holds fewer than three images.
     """
-    root = _existing_folder(name, path)
+    root = existing_folder(name, path)
     if images is not None:
         folder = _subfolder(root, images, "scene.images")
     else:
@@ -82,6 +82,17 @@ def read_photos(
         name, folder, names, None, False,
         max_images=max_images, test_every=test_every, lists=_read_lists(root, train_list, test_list),
     )  # fmt: skip
+
+
+def existing_folder(name: str, path: Path | str) -> Path:
+    """The folder ``path`` of the scene ``name``; raises `InputError` where it is not set or there is none."""
+    if path is None or str(path) == "":
+        raise InputError(f"scene {name}: scene.path is not set: give the folder of the photos")
+    root = Path(path).expanduser()
+    if not root.is_dir():
+        what = "is a file" if root.exists() else "does not exist"
+        raise InputError(f"scene {name}: the folder {root} {what}: set scene.path, or GSBENCH_DATA for a known scene")
+    return root
 
 
 def list_images(folder: Path) -> list[str]:
@@ -161,16 +172,6 @@ def _read_list(root: Path, file: str | None, key: str) -> list[str] | None:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{key}: {path} cannot be read as text ({error})") from error
     return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
-
-
-def _existing_folder(name: str, path: Path | str) -> Path:
-    if path is None or str(path) == "":
-        raise InputError(f"scene {name}: scene.path is not set: give the folder of the photos")
-    root = Path(path).expanduser()
-    if not root.is_dir():
-        what = "is a file" if root.exists() else "does not exist"
-        raise InputError(f"scene {name}: the folder {root} {what}: set scene.path, or GSBENCH_DATA for a known scene")
-    return root
 
 
 def _subfolder(root: Path, folder: str, key: str) -> Path:

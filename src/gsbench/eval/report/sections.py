@@ -222,6 +222,11 @@ def _headline(verdicts: Sequence[Verdict], first: Arm, second: Arm) -> str:
     if not verdicts:
         return f"{arm_name(second)} and {arm_name(first)} cannot be compared: no metric has paired trials."
     scope = verdicts[0].comparison.scope
+    if all(scene.mean == 0 for verdict in verdicts for scene in verdict.comparison.scenes):
+        return (
+            f"{arm_name(second)} against {arm_name(first)}, on {scope}: equal in every metric, to the last bit. What "
+            "they differ in never acted: look at the events, and at train.densify_start and densify_stop."
+        )
     if all(verdict.comparison.p is None for verdict in verdicts):
         return (
             f"{arm_name(second)} against {arm_name(first)}: no verdict, one trial of each on {scope}; run more seeds."
