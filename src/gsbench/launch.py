@@ -63,7 +63,9 @@ def run_trials(trials: Sequence[Composed]) -> int:
         runs.mkdir(parents=True, exist_ok=True)
         Store(runs / "store").sweep(STAGES)
         outcomes, unfinished = _skip_finished(trials)
-        here = [trial for trial in unfinished if trial.values["launch"]["name"] != "slurm"]  # nodes have their own disks
+        here = [
+            trial for trial in unfinished if trial.values["launch"]["name"] != "slurm"
+        ]  # nodes have their own disks
         if missing := missing_folders(here):
             raise InputError("; ".join(missing))
         add_to_plan(trials)

@@ -75,7 +75,7 @@ def test_missing_and_incomplete_cells_are_marked_with_their_count(tmp_path: Path
     assert rows["courtyard"][0].strip("*").endswith("(2/3)")
     assert rows["garden"][1] == "— (0/3)"
     assert "(2/3)" not in rows["garden"][0]
-    assert "mean of 1 scenes" in rows  # only courtyard has both arms
+    assert "mean of 1 scene" in rows  # only courtyard has both arms
     assert any("Left out (1): exp/courtyard/sfm-adc/c0ffee00-seed0: unfinished" in note for note in table.notes)
 
 
@@ -96,6 +96,7 @@ def test_the_lpips_of_the_protocol_has_a_column_even_when_it_is_missing(tmp_path
     ("key", "values"),
     [
         ("iterations", (7000, 30000)),
+        ("raster", ("cpu", "cuda")),
         ("protocol", ("paper-1", "standard-1")),
         ("resolution", ([400, 300], [800, 600])),
         ("budget", ({"max_gaussians": 1, "cap": "soft"}, {"max_gaussians": 2, "cap": "soft"})),

@@ -21,7 +21,9 @@ ADDRESS = "EXPERIMENT:SCENE:METRIC:ARM, such as table1:garden:lpips:volumetric o
 def main_explain(argv: Sequence[str], runs_dir: Path) -> int:
     """Run the verb; returns the exit code, raises ``InputError`` for bad input."""
     parser = argparse.ArgumentParser(
-        prog="gsbench explain", description="The runs, settings, data and code versions behind a cell of a table."
+        prog="gsbench explain",
+        description="The runs, settings, data and code versions behind a cell of a table.",
+        epilog="gsbench explain --stale FOLDER tells why a stage of a trial is computed anew.",
     )
     parser.add_argument("cell", help=ADDRESS)
     print(explain(parser.parse_args(argv).cell, runs_dir))

@@ -71,6 +71,7 @@ class Trial:
         """What trials must share before their numbers may be averaged, as comparable text."""
         return {
             "protocol": str(self.data["protocol"]),
+            "raster": str(self.data["raster"]),
             "iterations": str(self.data["iterations"]),
             "resolution": _size_text(self.data.get("resolution")),
             "budget": canonical(self.data.get("budget")),

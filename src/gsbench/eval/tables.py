@@ -24,9 +24,9 @@ from gsbench.eval.cells import (
 from gsbench.eval.pairing import BASELINE
 from gsbench.eval.quantities import Quantity, choose_quantities
 from gsbench.eval.results import Experiment, Trial
+from gsbench.words import counted
 
 DEFAULT_ROWS = ("scene", "init", "densify")
-MEAN_OF_SCENES = "mean of {} scenes"
 
 
 @dataclass(frozen=True)
@@ -195,14 +195,14 @@ def _mean_rows(
     bold: set[object] = set()
     for quantity in quantities if comparable else ():
         bold |= best_cells({key: cell for key, cell in cells.items() if key[2] == quantity.key}, quantity)
-    label = MEAN_OF_SCENES.format(usual)
+    label = f"mean of {counted(usual, 'scene')}"
     result = []
     for index, other in enumerate(others):
         entries = []
         for quantity, arm in itertools.product(quantities, arm_keys):
             cell, count = cells[other, arm, quantity.key], counts[quantity.key]
             text = format_cell(cell, quantity) if count else "n/a"
-            text += f" [{count} scenes]" if 0 < count != usual else ""
+            text += f" [{counted(count, 'scene')}]" if 0 < count != usual else ""
             entries.append(Entry(text, (other, arm, quantity.key) in bold, cell))
         result.append(Row((*other[:place], label, *other[place:]), tuple(entries), rule_above=index == 0))
     return result

@@ -57,12 +57,6 @@ def load_checkpoint(folder: Path, device: torch.device) -> dict[str, Any] | None
     return None
 
 
-def remove_checkpoints(folder: Path) -> None:
-    """Drop all checkpoints, when what they were for is safe."""
-    for path in folder.glob(PATTERN):
-        path.unlink()
-
-
 class _HashingWriter:
     """Passes bytes on to ``stream`` and keeps their sha256."""
 

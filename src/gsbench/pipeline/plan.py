@@ -31,6 +31,7 @@ from gsbench.pipeline.trial_files import (
     stage_and_step,
     state_of,
 )
+from gsbench.words import counted, readable_time
 
 PLAN = "plan.json"
 PLAN_VERSION = 1
@@ -208,23 +209,12 @@ def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
         counts[state] += 1
         lines.append(f"{state:<8} {paths.label}{note}")
     summary = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
-    lines.append(f"{len(trials)} trials: {summary}")
+    lines.append(f"{counted(len(trials), 'trial')}: {summary}")
     if counts["done"] < len(trials):
         if unknown:
             lines.append("time: not known, since no finished trial tells how long one takes here")
         else:
             at_once = f", {parallel} at once" if parallel > 1 else ""
             took = readable_time(remaining / parallel)
-            lines.append(f"time: about {took}{at_once}, judged by {learned} finished trials")
+            lines.append(f"time: about {took}{at_once}, judged by {counted(learned, 'finished trial')}")
     return lines
-
-
-def readable_time(seconds: float) -> str:
-    """Seconds as people say them."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    if seconds < 90 * 60:
-        return f"{seconds / 60:.0f} min"
-    if seconds < 36 * 3600:
-        return f"{seconds / 3600:.1f} h"
-    return f"{seconds / 86400:.1f} days"

@@ -8,8 +8,9 @@ import time
 from pathlib import Path
 
 from gsbench.errors import InputError
-from gsbench.pipeline.plan import Progress, forget, progress_of_experiment, readable_time
+from gsbench.pipeline.plan import Progress, forget, progress_of_experiment
 from gsbench.pipeline.trial_files import label_of
+from gsbench.words import counted, readable_time
 
 ORDER = ("failed", "running", "partial", "missing", "done")
 
@@ -31,7 +32,7 @@ def main(argv: list[str]) -> int:
     if options.forget:
         missing = [trial.folder for trial in trials if trial.state == "missing"]
         forget(home, missing)
-        print(f"{len(missing)} trials taken out of the plan")
+        print(f"{counted(len(missing), 'trial')} taken out of the plan")
         return 0
     if options.json:
         print(json.dumps([_as_dict(trial) for trial in trials], indent=1))
@@ -65,7 +66,9 @@ def lines_of(trials: list[Progress], everything: bool) -> list[str]:
 def summary_of(trials: list[Progress]) -> str:
     """How many trials are in which state, in one line."""
     counts = {state: sum(trial.state == state for trial in trials) for state in reversed(ORDER)}
-    return f"{len(trials)} trials: " + ", ".join(f"{count} {state}" for state, count in counts.items() if count)
+    return f"{counted(len(trials), 'trial')}: " + ", ".join(
+        f"{count} {state}" for state, count in counts.items() if count
+    )
 
 
 def _overview(runs: Path) -> int:

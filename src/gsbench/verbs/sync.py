@@ -14,6 +14,7 @@ from gsbench.pipeline.locks import BusyError
 from gsbench.pipeline.plan import TRIAL_GLOB
 from gsbench.pipeline.trial_files import CONFIG, label_of, state_of
 from gsbench.verbs.status import experiment_home
+from gsbench.words import counted
 
 
 def main(argv: list[str]) -> int:
@@ -42,7 +43,7 @@ def main(argv: list[str]) -> int:
                     print(f"mirrored {label_of(folder)}")
                 else:
                     known += 1
-    print(f"{new} trials mirrored, {known} were")
+    print(f"{counted(new, 'trial')} mirrored, {known} were")
     return 0
 
 
