@@ -18,9 +18,10 @@ from gsbench.eval.report.build import build_report, main_report
 from gsbench.eval.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
 from gsbench.eval.report.crops import choose_crops
 from gsbench.eval.report.sections import mean_by_step
+from gsbench.eval.report.sweep_charts import sweep_charts
 from gsbench.eval.report.volumes import log10_volumes, share_above, volume_histogram
 from gsbench.eval.results import Experiment, load_experiment
-from tests.eval.synthetic import TEXTURED, Plan, write_runs
+from tests.eval.synthetic import TEXTURED, Plan, trial_data, write_runs, write_trial
 
 ADC, VOLUMETRIC = ("sfm", "adc"), ("sfm", "volumetric")
 
@@ -271,3 +272,28 @@ def test_arms_that_never_differed_are_called_equal_and_not_undecided(tmp_path: P
     page = build_report(load_experiment(tmp_path, "exp"))
     assert "equal in every metric" in page
     assert "never acted" in page
+
+
+def test_a_sweep_of_one_setting_is_drawn_by_its_values_relative_to_each_scene(tmp_path: Path) -> None:
+    for scene, level in (("courtyard", 30.0), ("garden", 20.0)):
+        for threshold, psnr in ((0.3, 0.0), (0.03, 2.0), (1e6, 1.0)):
+            views = {"psnr": np.array([level + psnr])}
+            data = trial_data(Plan(), scene, "sfm", f"volumetric-{threshold:g}", 0, views)
+            settings = {"densify__volume_threshold": threshold, "densify___target_": "gsbench.densify.Volumetric"}
+            write_trial(tmp_path, data, views, f"{scene[0]}{threshold:g}".encode().hex()[:8].rjust(8, "0"), **settings)
+    charts = sweep_charts(load_experiment(tmp_path, "exp").trials)
+    psnr = next(chart for chart in charts if "PSNR" in chart)
+    words = re.search(r'aria-label="([^"]*)"', psnr)
+    assert words is not None
+    # each scene's mean is one above its lowest value; values stand in order of size, whatever their names
+    assert "courtyard 1 at 0.03, −1 at 0.3, 0 at 1M; garden 1 at 0.03, −1 at 0.3, 0 at 1M" in words.group(1)
+    assert "densify.volume_threshold" in words.group(1)
+
+
+def test_no_chart_by_setting_where_nothing_or_more_than_one_was_varied(tmp_path: Path, runs: Path) -> None:
+    assert sweep_charts(load_experiment(runs, "exp").trials) == []
+    for index, settings in enumerate(({"a__x": 1, "a__y": 1}, {"a__x": 2, "a__y": 2})):
+        views = {"psnr": np.array([20.0])}
+        data = trial_data(Plan(), "garden", "sfm", "volumetric", 0, views)
+        write_trial(tmp_path, data, views, f"{index:08d}", **settings)
+    assert sweep_charts(load_experiment(tmp_path, "exp").trials) == []

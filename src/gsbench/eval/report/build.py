@@ -23,6 +23,7 @@ from gsbench.eval.report.sections import (
     training_charts,
     volume_charts,
 )
+from gsbench.eval.report.sweep_charts import sweep_charts
 from gsbench.eval.report.tradeoff_charts import tradeoff_charts, tradeoff_gaps
 from gsbench.eval.results import Experiment, Trial, load_experiment
 from gsbench.eval.table_formats import to_html
@@ -78,6 +79,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         versus=versus,
         tables=[to_html(table) for table in tables],
         contradictions=inconsistencies(load_paper()) if is_paper else [],
+        sweeps=sweep_charts(trials),
         tradeoffs=tradeoff_charts(trials),
         gaps=tradeoff_gaps(trials, baseline),
         training=training_charts(trials, arms),

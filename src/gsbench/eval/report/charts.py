@@ -42,8 +42,12 @@ def line_chart(
     log_x: bool = False,
     log_y: bool = False,
     marker: tuple[float, str] | None = None,
+    x_names: Sequence[str] = (),
 ) -> str:
-    """Lines over common axes; ``marker`` is a labelled vertical line. What a log axis cannot show is dropped."""
+    """Lines over common axes; ``marker`` is a labelled vertical line. What a log axis cannot show is dropped.
+
+    With ``x_names``, x is the place in that list: values side by side at equal distances.
+    """
     shown = [
         Series(s.name, [p for p in s.points if (p[0] > 0 or not log_x) and (p[1] > 0 or not log_y)]) for s in series
     ]
@@ -52,7 +56,7 @@ def line_chart(
         return ""
     xs = [x for s in shown for x, _ in s.points] + ([marker[0]] if marker else [])
     ys = [y for s in shown for _, y in s.points]
-    x_axis = _Axis(xs, log_x, LEFT, WIDTH - RIGHT)
+    x_axis = _Axis(xs, log_x, LEFT, WIDTH - RIGHT, names=x_names)
     y_axis = _Axis(ys, log_y, HEIGHT - BOTTOM, TOP)
     parts = [_frame(x_axis, y_axis, x_label, y_label)]
     if marker:
@@ -65,12 +69,12 @@ def line_chart(
         parts.append(
             f'<polyline fill="none" stroke="{color}" stroke-width="2" stroke-dasharray="{dash}" points="{path}"/>'
         )
-        if len(one.points) <= TICKS:
+        if len(one.points) <= TICKS or x_names:
             parts += [
                 f'<circle cx="{x_axis.place(x):.1f}" cy="{y_axis.place(y):.1f}" r="3.5" fill="{color}"/>'
                 for x, y in one.points
             ]
-    ends = "; ".join(f"{s.name} from {_point(s.points[0])} to {_point(s.points[-1])}" for s in shown)
+    ends = "; ".join(f"{s.name} {_ends(s.points, x_axis)}" for s in shown)
     return _figure(title, f"{y_label} against {x_label}: {ends}.", parts, HEIGHT, [s.name for s in shown])
 
 
@@ -146,10 +150,18 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
 
 
 class _Axis:
-    """Maps values to pixels, with round tick values."""
+    """Maps values to pixels, with round tick values; with ``names``, a tick for each of them at 0, 1, 2, …"""
 
-    def __init__(self, values: Sequence[float], log: bool, start: float, end: float, ticks: int = TICKS) -> None:
-        self._log, self._start, self._end = log, start, end
+    def __init__(
+        self,
+        values: Sequence[float],
+        log: bool,
+        start: float,
+        end: float,
+        ticks: int = TICKS,
+        names: Sequence[str] = (),
+    ) -> None:
+        self._log, self._start, self._end, self.names = log, start, end, names
         scaled = [self._scale(value) for value in values]
         low, high = min(scaled), max(scaled)
         if high - low < 1e-12:
@@ -159,9 +171,13 @@ class _Axis:
         zero_based = not log and min(values) == 0.0
         self._low, self._high = (low if zero_based else low - margin), high + margin
         self.ticks = self._log_ticks() if log else _round_ticks(self._low, self._high, ticks)
+        if names:
+            self.ticks = [float(place) for place in range(len(names))]
 
     def label(self, tick: float) -> str:
-        """The tick's value with as many digits as tell it from its neighbours."""
+        """The tick's name, or its value with as many digits as tell it from its neighbours."""
+        if self.names:
+            return self.names[int(tick)]
         step = min((b - a for a, b in itertools.pairwise(self.ticks)), default=0.0)
         if self._log or step == 0 or abs(tick) >= THOUSANDS:
             return short_number(tick)
@@ -234,8 +250,12 @@ def _text(x: float, y: float, text: str, anchor: str) -> str:
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{_escape(text)}</text>'
 
 
-def _point(point: tuple[float, float]) -> str:
-    return f"{short_number(point[1])} at {short_number(point[0])}"
+def _ends(points: Sequence[tuple[float, float]], x_axis: _Axis) -> str:
+    """The first and the last point in words; on an axis of names, every point."""
+    if x_axis.names:
+        return ", ".join(f"{short_number(y)} at {x_axis.label(x)}" for x, y in points)
+    (x0, y0), (x1, y1) = points[0], points[-1]
+    return f"from {short_number(y0)} at {short_number(x0)} to {short_number(y1)} at {short_number(x1)}"
 
 
 def short_number(value: float) -> str:
