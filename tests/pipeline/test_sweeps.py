@@ -320,6 +320,10 @@ def test_dry_run_tells_states_and_time(runs: Path) -> None:
     assert lines[4] == "4 trials: 1 done, 3 missing"
     assert lines[5] == "time: about 15 min, 2 at once, judged by 2 finished trials"  # 2 x (600 + 1200) / 2, two at once
     assert same_trial_elsewhere(TrialPaths.of(trials[1].values)) == "other"
+    assert describe_plan(trials[1:2])[1:] == [
+        "1 trial: 1 missing",
+        "time: seconds, since other experiments have the results",
+    ]
 
 
 def test_estimate_prefers_the_same_scene_and_densifier_and_scales_with_iterations(runs: Path) -> None:

@@ -213,6 +213,8 @@ def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
     if counts["done"] < len(trials):
         if unknown:
             lines.append("time: not known, since no finished trial tells how long one takes here")
+        elif learned == 0:
+            lines.append("time: seconds, since other experiments have the results")
         else:
             at_once = f", {parallel} at once" if parallel > 1 else ""
             took = readable_time(remaining / parallel)
