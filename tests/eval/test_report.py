@@ -13,11 +13,11 @@ from plyfile import PlyData
 
 from gsbench.errors import InputError
 from gsbench.eval.errors_by_region import errors_by_region, texture_energy
-from gsbench.eval.pairing import pair_trials
+from gsbench.eval.pairing import ViewCache, pair_trials
 from gsbench.eval.report.build import build_report, main_report
 from gsbench.eval.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
 from gsbench.eval.report.crops import choose_crops
-from gsbench.eval.report.sections import mean_by_step
+from gsbench.eval.report.sections import compare_arms, mean_by_step
 from gsbench.eval.report.sweep_charts import sweep_charts
 from gsbench.eval.report.volumes import log10_volumes, share_above, volume_histogram
 from gsbench.eval.results import Experiment, load_experiment
@@ -297,3 +297,23 @@ def test_no_chart_by_setting_where_nothing_or_more_than_one_was_varied(tmp_path:
         data = trial_data(Plan(), "garden", "sfm", "volumetric", 0, views)
         write_trial(tmp_path, data, views, f"{index:08d}", **settings)
     assert sweep_charts(load_experiment(tmp_path, "exp").trials) == []
+
+
+def test_scenes_that_disagree_are_named_under_a_verdict_that_their_mean_leaves_open(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan(scenes=("courtyard",), effect={"psnr": 2.0}, views=3))
+    write_runs(tmp_path, Plan(scenes=("garden",), effect={"psnr": -2.0}, views=3))
+    write_runs(tmp_path, Plan(scenes=("stump",), views=3))
+    trials = load_experiment(tmp_path, "exp").trials
+    versus = compare_arms(trials, ADC, VOLUMETRIC, ViewCache())
+    assert "no evidence of a difference in PSNR" in versus.headline
+    line = next(line for line in versus.by_scene if line.startswith("PSNR"))
+    assert (
+        line
+        == "PSNR (dB) by scene: better on courtyard, worse on garden: the scenes disagree, so their mean says little"
+    )
+    assert line in build_report(load_experiment(tmp_path, "exp"))
+
+
+def test_no_scene_is_named_where_none_is_decided(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan(trial_noise=0, residual_noise=0, views=3))
+    assert compare_arms(load_experiment(tmp_path, "exp").trials, ADC, VOLUMETRIC, ViewCache()).by_scene == ()

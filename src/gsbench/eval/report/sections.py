@@ -16,7 +16,7 @@ from gsbench.eval.report.charts import ForestRow, Series, bar_chart, forest_plot
 from gsbench.eval.report.crops import Crop, choose_crops
 from gsbench.eval.report.volumes import share_above, volume_histogram
 from gsbench.eval.results import Arm, Trial, read_json_lines
-from gsbench.eval.statistics import Comparison, compare, seeds_needed
+from gsbench.eval.statistics import ALPHA, Comparison, compare, seeds_needed
 from gsbench.eval.tables import change_words, cost_change
 from gsbench.eval.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve
 
@@ -56,6 +56,7 @@ class Versus:
     second: Arm
     verdicts: tuple[Verdict, ...]
     headline: str
+    by_scene: tuple[str, ...]
     costs: tuple[str, ...]
     forests: tuple[str, ...]
     regions: tuple[tuple[RegionErrors, str], ...]
@@ -98,6 +99,7 @@ def compare_arms(trials: Sequence[Trial], first: Arm, second: Arm, views: ViewCa
         second,
         tuple(verdicts),
         _headline(verdicts, first, second),
+        tuple(_by_scene(verdicts)),
         tuple(_costs(own, first, second)),
         tuple(_forest(verdict) for verdict in verdicts),
         tuple(regions),
@@ -241,6 +243,24 @@ def _headline(verdicts: Sequence[Verdict], first: Arm, second: Arm) -> str:
         if names:
             words.append(f"{opening} {', '.join(names)}")
     return f"{arm_name(second)} against {arm_name(first)}, on {scope}: {'; '.join(words)}."
+
+
+def _by_scene(verdicts: Sequence[Verdict]) -> list[str]:
+    """For each metric in which single scenes are decided (p below 5 % after Holm), a line that names them.
+
+    A mean over scenes that disagree hides both sides of what was found.
+    """
+    lines = []
+    for verdict in verdicts:
+        scenes = verdict.comparison.scenes
+        decided = [scene for scene in scenes if scene.p_holm is not None and scene.p_holm < ALPHA]
+        better = [scene.scene for scene in decided if scene.mean * verdict.quantity.direction > 0]
+        worse = [scene.scene for scene in decided if scene.mean * verdict.quantity.direction < 0]
+        found = [f"{word} on {', '.join(names)}" for word, names in (("better", better), ("worse", worse)) if names]
+        if len(scenes) > 1 and found:
+            warning = ": the scenes disagree, so their mean says little" if len(found) > 1 else ""
+            lines.append(f"{verdict.quantity.name} by scene: {', '.join(found)}{warning}")
+    return lines
 
 
 def _costs(trials: Sequence[Trial], first: Arm, second: Arm) -> list[str]:
