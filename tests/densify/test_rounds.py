@@ -29,15 +29,24 @@ def prepared(densifier: Densifier, seed: int, count: int = 60) -> tuple[Trainabl
     densifier.begin(trainable.values.detach(), DensifyContext(EXTENT))
     total, seen = np.zeros(count), np.zeros(count)
     for step in range(1, 4):
-        points = torch.zeros(count, 2, dtype=torch.float64, requires_grad=True)
-        points.grad = torch.from_numpy(rng.exponential(2e-4, (count, 2)))
-        radii = torch.from_numpy(rng.integers(0, 3, count).astype(np.int32))
-        densifier.observe(step, RenderOutput(torch.empty(0), torch.empty(0), radii, points))
+        gradient, radii = observe(densifier, trainable, rng, step)
         for i in range(count):
             if radii[i] > 0:
-                total[i] += np.hypot(*points.grad[i].numpy())
+                total[i] += np.hypot(*gradient[i])
                 seen[i] += 1
     return trainable, np.divide(total, seen, out=np.zeros(count), where=seen > 0)
+
+
+def observe(
+    densifier: Densifier, trainable: TrainableGaussians, rng: np.random.Generator, step: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Show the densifier a made-up render; returns the gradients [N, 2] and radii [N] of the points in it."""
+    count = len(trainable)
+    points = torch.zeros(count, 2, dtype=torch.float64, requires_grad=True)
+    points.grad = torch.from_numpy(rng.exponential(2e-4, (count, 2)))
+    radii = torch.from_numpy(rng.integers(0, 3, count).astype(np.int32))
+    densifier.observe(step, RenderOutput(torch.empty(0), torch.empty(0), radii, points, points.grad))
+    return points.grad.numpy(), radii.numpy()
 
 
 def to_rows(trainable: TrainableGaussians) -> list[restatement.Row]:
@@ -98,6 +107,84 @@ def test_volumetric_round(seed: int, step: int) -> None:
     assert_same(trainable, rows)
     assert expected == {name: getattr(event, name) for name in expected}
     assert event.split_volume > 0
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("step", [600, 3100])
+def test_volumes_may_be_split_before_the_gradient_rule(seed: int, step: int) -> None:
+    densifier = Volumetric(volume_threshold=0.03, volume_order="before_adc")
+    trainable, gradient = prepared(densifier, seed)
+    rows, expected = to_rows(trainable), {}
+    large = np.array([4 / 3 * np.pi * np.exp(row["log_scales"]).prod() > 0.03 for row in rows])
+    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
+    noise = iter(noise_of(seed, [event.split_volume, event.split_gradient]))
+    rows = restatement.volume_growth(rows, 0.03, noise, expected)
+    gradient = np.concatenate([gradient[~large], np.zeros(2 * large.sum())])  # nobody has seen the children yet
+    rows = restatement.adc_growth(rows, gradient, EXTENT, noise, expected)
+    rows = restatement.prune(rows, step, EXTENT, expected)
+    assert_same(trainable, rows)
+    assert expected == {name: getattr(event, name) for name in expected}
+    assert event.split_volume > 0
+    assert event.split_gradient > 0
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("step", [600, 3100])
+def test_volumes_may_be_split_after_pruning(seed: int, step: int) -> None:
+    densifier = Volumetric(volume_threshold=0.003, volume_order="after_prune")
+    trainable, gradient = prepared(densifier, seed)
+    rows, expected = to_rows(trainable), {}
+    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
+    noise = iter(noise_of(seed, [event.split_gradient, event.split_volume]))
+    rows = restatement.adc_growth(rows, gradient, EXTENT, noise, expected)
+    rows = restatement.prune(rows, step, EXTENT, expected)
+    rows = restatement.volume_growth(rows, 0.003, noise, expected)
+    assert_same(trainable, rows)
+    assert expected == {name: getattr(event, name) for name in expected}
+    assert event.split_volume > 0
+    assert event.pruned_opacity > 0
+
+
+SWITCHES: dict[str, list[object]] = {
+    "gradient": ["signed", "absolute"],
+    "threshold_inclusive": [True, False],
+    "split_children": [2, 3],
+    "revised_opacity": [False, True],
+    "prune_screen_radius": [None, 1.0],
+    "max_gaussians": [None, 90],
+    "cap": ["soft", "hard", "curve"],
+    "threshold_mode": ["absolute", "extent_relative", "quantile", "auto"],
+    "condition_of": ["eigenvalues", "scales"],
+    "max_condition": [None, 1.0, 4.0],
+    "split_isotropic": [True, False],
+    "volume_children": [2, 3],
+    "keep_parent": [False, True],
+    "placement": ["sampled", "parent_mean"],
+    "volume_order": ["after_adc", "before_adc", "after_prune"],
+    "volume_interval": [None, 200],
+}
+
+
+@pytest.mark.parametrize("seed", range(80))
+def test_any_combination_of_switches_goes_through_several_rounds(seed: int) -> None:
+    """A pairwise-covering draw of the switches; every round balances, stays finite and keeps to an exact cap."""
+    rng = np.random.default_rng(seed)
+    options = {name: values[rng.integers(len(values))] for name, values in SWITCHES.items()}
+    if options["cap"] == "curve":
+        options["max_gaussians"] = 90
+    densifier = Volumetric(**options)  # type: ignore[arg-type]
+    trainable, _ = prepared(densifier, seed)
+    generator = torch.Generator().manual_seed(seed)
+    for step in (2900, 3000, 3100, 3200):
+        observe(densifier, trainable, rng, step)
+        event = densifier.refine(step, trainable, generator)
+        assert event is not None
+        grown = event.cloned + event.split_gradient + event.split_volume
+        assert event.after == event.before + grown - event.pruned_opacity - event.pruned_size
+        assert event.after == len(trainable) == len(densifier.lineage.ids) == len(densifier.gradient_sum)
+        assert all(torch.isfinite(tensor).all() for tensor in trainable.values.tensors().values())
+        if options["max_gaussians"] is not None and options["cap"] != "soft":
+            assert len(trainable) <= 90
 
 
 def test_every_event_balances() -> None:

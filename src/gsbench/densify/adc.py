@@ -164,7 +164,6 @@ class ADC(Densifier):
             gaussians.overwrite("opacity_logits", logits, where=selected)
         copies = gaussians.values.detach().select(parents)
         self._edit(gaussians, step, append=copies, parents=parents, cause=Cause.CLONE)
-        self._extend_radii(None, len(parents))
         event.cloned += len(parents)
 
     def _split(
@@ -188,7 +187,6 @@ class ADC(Densifier):
             new.opacity_logits = revised_logits(new.opacity_logits)
         keep = None if keep_parent else ~selected
         self._edit(gaussians, step, keep=keep, append=new, parents=parents.repeat(children), cause=cause)
-        self._extend_radii(keep, len(new))
         return len(new) - (0 if keep_parent else len(parents))
 
     def _prune(self, step: int, gaussians: TrainableGaussians, event: RefineEvent) -> None:
@@ -213,10 +211,21 @@ class ADC(Densifier):
         self.visible_count = torch.zeros(num_gaussians, dtype=torch.int32, device=device)  # [N] iterations
         self.max_radii = torch.zeros(num_gaussians, dtype=torch.int32, device=device)  # [N] px
 
-    def _extend_radii(self, keep: Tensor | None, added: int) -> None:
-        """Follow an edit with the radii, which pruning by screen size still needs in the same round."""
-        kept = self.max_radii if keep is None else self.max_radii[keep]
-        self.max_radii = torch.cat([kept, kept.new_zeros(added)])
+    def _edit(
+        self,
+        gaussians: TrainableGaussians,
+        step: int,
+        keep: Tensor | None = None,
+        append: Gaussians | None = None,
+        parents: Tensor | None = None,
+        cause: Cause = Cause.INITIAL,
+    ) -> None:
+        """Edit, and carry the statistics along for the rules that come later in the round; the new have none yet."""
+        super()._edit(gaussians, step, keep, append, parents, cause)
+        added = 0 if append is None else len(append)
+        self.gradient_sum = _carried(self.gradient_sum, keep, added)
+        self.visible_count = _carried(self.visible_count, keep, added)
+        self.max_radii = _carried(self.max_radii, keep, added)
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {
@@ -232,3 +241,9 @@ class ADC(Densifier):
         self.gradient_sum = state["gradient_sum"].clone()
         self.visible_count = state["visible_count"].clone()
         self.max_radii = state["max_radii"].clone()
+
+
+def _carried(statistic: Tensor, keep: Tensor | None, added: int) -> Tensor:
+    """A statistic [N] after an edit: that of the kept, then zeros."""
+    kept = statistic if keep is None else statistic[keep]
+    return torch.cat([kept, kept.new_zeros(added)])
