@@ -27,7 +27,8 @@ def sweep_charts(trials: Sequence[Trial]) -> list[str]:
             continue
         values = {canonical(trial.config.get(setting)): trial.config.get(setting) for trial in group}
         places = {key: place for place, key in enumerate(sorted(values, key=lambda key: _order(values[key])))}
-        title = f"{family[0]}, {setting.rpartition('.')[2]}"
+        arm = ", ".join(str(part).rpartition(".")[2] for part in family if part is not None)
+        title = f"{setting.rpartition('.')[2]} ({arm})"
         for quantity in choose_quantities(group):
             series = [
                 Series(scene, _deviations(own, setting, places, quantity))
