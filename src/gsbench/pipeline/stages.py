@@ -216,13 +216,13 @@ def evaluate(
         (folder / "renders").mkdir(exist_ok=True)
         per_view: dict[str, dict[str, float]] = {}
         with progress("evaluate") as report:
-            for done, view in enumerate(scene.test):
-                report("views", done, len(scene.test))
+            for done, view in enumerate(scene.test, 1):
                 with torch.no_grad():
                     rendered = rasterizer.render(gaussians, view.camera, MAX_SH_DEGREE, background).image
                 image = quantize(rendered).cpu().numpy()  # [H, W, 3] uint8
                 Image.fromarray(image).save(folder / "renders" / png_name(view.name))
                 per_view[view.name] = evaluator.evaluate_view(image, view.image)
+                report("views", done, len(scene.test))
         if options.maps:
             write_maps(folder / "maps", scene, init, gaussians, rasterizer)
             draw_figures(folder / "figures", folder / "renders", scene, trained, gaussians)
