@@ -63,9 +63,8 @@ def run_trials(trials: Sequence[Composed]) -> int:
         runs.mkdir(parents=True, exist_ok=True)
         Store(runs / "store").sweep(STAGES)
         outcomes, unfinished = _skip_finished(trials)
-        here = [
-            trial for trial in unfinished if trial.values["launch"]["name"] != "slurm"
-        ]  # nodes have their own disks
+        # A node of a cluster may have folders that this machine lacks.
+        here = [trial for trial in unfinished if trial.values["launch"]["name"] != "slurm"]
         if missing := missing_folders(here):
             raise InputError("; ".join(missing))
         add_to_plan(trials)

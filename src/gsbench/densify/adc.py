@@ -211,18 +211,8 @@ class ADC(Densifier):
         self.visible_count = torch.zeros(num_gaussians, dtype=torch.int32, device=device)  # [N] iterations
         self.max_radii = torch.zeros(num_gaussians, dtype=torch.int32, device=device)  # [N] px
 
-    def _edit(
-        self,
-        gaussians: TrainableGaussians,
-        step: int,
-        keep: Tensor | None = None,
-        append: Gaussians | None = None,
-        parents: Tensor | None = None,
-        cause: Cause = Cause.INITIAL,
-    ) -> None:
-        """Edit, and carry the statistics along for the rules that come later in the round; the new have none yet."""
-        super()._edit(gaussians, step, keep, append, parents, cause)
-        added = 0 if append is None else len(append)
+    def _carry_statistics(self, keep: Tensor | None, added: int) -> None:
+        """Rules that come later in the round need them; the new have none yet."""
         self.gradient_sum = _carried(self.gradient_sum, keep, added)
         self.visible_count = _carried(self.visible_count, keep, added)
         self.max_radii = _carried(self.max_radii, keep, added)

@@ -77,9 +77,14 @@ class Densifier:
         parents: Tensor | None = None,
         cause: Cause = Cause.INITIAL,
     ) -> None:
-        """Edit Gaussians and lineage together; ``parents`` [A] are the indices, before the edit, of those appended."""
+        """Edit Gaussians, lineage and statistics together; ``parents`` [A] are the indices, before the edit, of those
+        appended."""
         gaussians.edit(keep, append)
         self.lineage.edit(keep, parents, cause, step)
+        self._carry_statistics(keep, 0 if append is None else len(append))
+
+    def _carry_statistics(self, keep: Tensor | None, added: int) -> None:
+        """Follow an edit with what was gathered: that of the Gaussians at the mask ``keep`` [N], then ``added`` new."""
 
 
 class NoDensifier(Densifier):

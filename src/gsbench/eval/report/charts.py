@@ -170,9 +170,10 @@ class _Axis:
         margin = 0.04 * (high - low)
         zero_based = not log and min(values) == 0.0
         self._low, self._high = (low if zero_based else low - margin), high + margin
-        self.ticks = self._log_ticks() if log else _round_ticks(self._low, self._high, ticks)
         if names:
             self.ticks = [float(place) for place in range(len(names))]
+        else:
+            self.ticks = self._log_ticks() if log else _round_ticks(self._low, self._high, ticks)
 
     def label(self, tick: float) -> str:
         """The tick's name, or its value with as many digits as tell it from its neighbours."""
