@@ -26,13 +26,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 from IPython.display import Markdown
 
+from gsbench.analysis.errors_by_region import errors_by_region
+from gsbench.analysis.pairing import ViewCache, pair_arms
+from gsbench.analysis.results import load_experiment
+from gsbench.analysis.statistics import compare, seeds_needed
+from gsbench.analysis.table_formats import to_markdown
+from gsbench.analysis.tables import build_table
 from gsbench.cli import run
-from gsbench.eval.errors_by_region import errors_by_region
-from gsbench.eval.pairing import ViewCache, pair_arms
-from gsbench.eval.results import load_experiment
-from gsbench.eval.statistics import compare, seeds_needed
-from gsbench.eval.table_formats import to_markdown
-from gsbench.eval.tables import build_table
 
 os.environ["GSBENCH_RUNS"] = tempfile.mkdtemp(prefix="gsbench-")
 runs = Path(os.environ["GSBENCH_RUNS"])

@@ -20,7 +20,7 @@ from gsbench.compose import compose_one, compose_trials
 from gsbench.errors import GsbenchError, InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
-from gsbench.pipeline.plan import add_to_plan
+from gsbench.launch.plan import add_to_plan
 from gsbench.pipeline.stage_list import EVALUATE, INIT, TRAIN
 from gsbench.pipeline.stopping import Stopped
 from gsbench.pipeline.store import Store
@@ -75,7 +75,7 @@ def test_errors_become_a_line_and_an_exit_code(
     def fail(argv: list[str]) -> int:
         raise error
 
-    monkeypatch.setattr("gsbench.launch.launch", fail)
+    monkeypatch.setattr("gsbench.launch.command.launch", fail)
     assert cli.run(["seed=1"]) == code
     assert capsys.readouterr().err == text
 
@@ -130,7 +130,7 @@ def test_retry_runs_the_unfinished_with_their_own_settings(
 ) -> None:
     make_experiment(runs)
     ran: list[Any] = []
-    monkeypatch.setattr("gsbench.launch.run_trials", lambda trials: ran.extend(trials) or 0)
+    monkeypatch.setattr("gsbench.launch.command.run_trials", lambda trials: ran.extend(trials) or 0)
     assert cli.run(["retry", "x", "--dry-run"]) == 0
     assert "2 trials: 1 missing, 1 failed" in capsys.readouterr().out
     assert cli.run(["retry", "x", "launch=local", "launch.parallel=3"]) == 0

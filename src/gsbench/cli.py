@@ -82,7 +82,7 @@ def _verb(name: str, argv: list[str]) -> int:
 
 
 def _trials(argv: list[str]) -> int:
-    from gsbench.launch import launch
+    from gsbench.launch.command import launch
 
     return launch(argv)
 

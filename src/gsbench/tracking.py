@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from filelock import FileLock
 
 from gsbench.config import sha256_of
-from gsbench.pipeline.files import write_json
+from gsbench.files import write_json
 from gsbench.pipeline.locks import BusyError, hold
 from gsbench.pipeline.trial_files import FAILED, RESULTS, read_object
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from gsbench.errors import InputError
-from gsbench.pipeline.files import DiskFullError
+from gsbench.files import DiskFullError
 from gsbench.pipeline.store import MANIFEST, Stage, Store, read_manifest
 from tests.pipeline.toy import TOY, expected_text, toy_inputs
 

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, cast
 
 import torch
 
-from gsbench.pipeline.files import CHUNK, sync_to_disk
+from gsbench.files import CHUNK, sync_to_disk
 
 log = logging.getLogger(__name__)
 

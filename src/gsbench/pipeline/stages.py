@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from gsbench.config import EvalConfig, SceneConfig, TrainConfig, sha256_of
 from gsbench.densify import Densifier
 from gsbench.eval.protocol import Evaluator, get_protocol, quantize, summarize
+from gsbench.files import write_json
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
@@ -28,7 +29,6 @@ from gsbench.init import Sfm, read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, Initializer
 from gsbench.pipeline.components import options_of
 from gsbench.pipeline.figures import draw_ellipsoids
-from gsbench.pipeline.files import write_json
 from gsbench.pipeline.maps import view_maps
 from gsbench.pipeline.progress import Report, progress
 from gsbench.pipeline.resources import available_threads

@@ -20,7 +20,7 @@ from typing import Any
 
 from gsbench import __version__
 from gsbench.config import sha256_of
-from gsbench.pipeline.files import remove_temporaries, storage_errors, sync_to_disk, write_json
+from gsbench.files import remove_temporaries, storage_errors, sync_to_disk, write_json
 from gsbench.pipeline.locks import BusyError, hold
 from gsbench.weights import file_sha256
 

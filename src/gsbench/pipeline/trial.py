@@ -19,10 +19,10 @@ import torch
 from gsbench.config import EvalConfig, SceneConfig, TrainConfig, config_hash
 from gsbench.densify.events import sum_events
 from gsbench.errors import GsbenchError
+from gsbench.files import remove_temporaries, storage_errors, write_json, write_text
 from gsbench.init.base import PICTURE_FILE, REPORT_FILE
 from gsbench.pipeline import stages
 from gsbench.pipeline.components import build, select_device
-from gsbench.pipeline.files import remove_temporaries, storage_errors, write_json, write_text
 from gsbench.pipeline.locks import hold
 from gsbench.pipeline.resources import available_threads
 from gsbench.pipeline.stage_list import EVALUATE, GROUND_TRUTH, INIT, TRAIN

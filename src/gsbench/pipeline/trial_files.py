@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsbench.config import config_hash, sha256_of
-from gsbench.pipeline.files import write_json
+from gsbench.files import write_json
 from gsbench.pipeline.locks import is_held
 from gsbench.pipeline.stage_list import STAGES
 from gsbench.pipeline.store import read_manifest

@@ -15,7 +15,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
-from gsbench.pipeline.files import explain_storage
+from gsbench.files import explain_storage
 from gsbench.pipeline.resources import available_threads
 
 Verdict = Literal["ok", "note", "bad"]

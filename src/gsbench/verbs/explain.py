@@ -10,6 +10,6 @@ def main(argv: list[str]) -> int:
         from gsbench.verbs.stale import main_stale
 
         return main_stale([word for word in argv if word != "--stale"], runs_dir())
-    from gsbench.eval.explain import main_explain
+    from gsbench.analysis.explain import main_explain
 
     return main_explain(argv, runs_dir())

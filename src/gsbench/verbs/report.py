@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def main(argv: list[str]) -> int:
+    from gsbench.analysis.report.build import main_report
     from gsbench.cli import runs_dir
-    from gsbench.eval.report.build import main_report
 
     return main_report(argv, runs_dir())

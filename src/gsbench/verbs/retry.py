@@ -12,7 +12,7 @@ import yaml
 
 from gsbench.compose import Composed, compose_one
 from gsbench.errors import InputError
-from gsbench.pipeline.plan import Planned, describe_plan, forget, progress_of_experiment, read_plan
+from gsbench.launch.plan import Planned, describe_plan, forget, progress_of_experiment, read_plan
 from gsbench.pipeline.trial_files import TrialPaths, label_of
 from gsbench.verbs.status import experiment_home
 from gsbench.verbs.sync import read_config
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 def main(argv: list[str]) -> int:
     """The verb: as the sweep's own command, the exit code says whether some trial failed."""
     from gsbench.cli import runs_dir
-    from gsbench.launch import run_trials
+    from gsbench.launch.command import run_trials
 
     parser = argparse.ArgumentParser(
         prog="gsbench retry", description="Run the failed, stopped and missing trials of an experiment again."

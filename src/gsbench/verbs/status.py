@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from gsbench.errors import InputError
-from gsbench.pipeline.plan import Progress, forget, progress_of_experiment
+from gsbench.launch.plan import Progress, forget, progress_of_experiment
 from gsbench.pipeline.trial_files import label_of
 from gsbench.words import counted, readable_time
 
@@ -43,7 +43,7 @@ def main(argv: list[str]) -> int:
 
 def experiment_home(runs: Path, name: str) -> Path:
     """The folder of the experiment ``name``; raises InputError naming those there are."""
-    from gsbench.eval.results import list_experiments
+    from gsbench.analysis.results import list_experiments
 
     if name not in list_experiments(runs):
         raise InputError(f"no experiment {name!r} in {runs}; there: {', '.join(list_experiments(runs)) or 'none yet'}")
@@ -72,7 +72,7 @@ def summary_of(trials: list[Progress]) -> str:
 
 
 def _overview(runs: Path) -> int:
-    from gsbench.eval.results import list_experiments
+    from gsbench.analysis.results import list_experiments
 
     names = list_experiments(runs)
     if not names:

@@ -10,8 +10,8 @@ from typing import Any
 import yaml
 
 from gsbench.errors import GsbenchError, InputError
+from gsbench.launch.plan import TRIAL_GLOB
 from gsbench.pipeline.locks import BusyError
-from gsbench.pipeline.plan import TRIAL_GLOB
 from gsbench.pipeline.trial_files import CONFIG, label_of, state_of
 from gsbench.verbs.status import experiment_home
 from gsbench.words import counted
@@ -19,8 +19,8 @@ from gsbench.words import counted
 
 def main(argv: list[str]) -> int:
     """The verb: 1 if the tracker cannot be reached."""
+    from gsbench.analysis.results import list_experiments
     from gsbench.cli import runs_dir
-    from gsbench.eval.results import list_experiments
 
     parser = argparse.ArgumentParser(
         prog="gsbench sync", description="Mirror finished and failed trials to MLflow, once."

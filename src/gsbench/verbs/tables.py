@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def main(argv: list[str]) -> int:
+    from gsbench.analysis.tables_cli import main_tables
     from gsbench.cli import runs_dir
-    from gsbench.eval.tables_cli import main_tables
 
     return main_tables(argv, runs_dir())

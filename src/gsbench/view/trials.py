@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsbench.analysis.results import Trial, load_experiment
 from gsbench.densify.volume import log_volume
 from gsbench.errors import InputError
-from gsbench.eval.results import Trial, load_experiment
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER, PointCloud

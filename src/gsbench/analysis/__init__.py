@@ -1,0 +1,1 @@
+"""What result files say: cells, statistics, tables, report. Loads no torch."""

@@ -1,0 +1,165 @@
+"""Trials grouped into cells: one mean with its deviation, refused where the trials may not be averaged."""
+
+from __future__ import annotations
+
+import statistics
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+from gsbench.analysis.quantities import Quantity
+from gsbench.analysis.results import Trial, canonical
+from gsbench.errors import InputError
+
+K = TypeVar("K", bound=Hashable)
+
+TRIAL_FIELDS = ("scene", "init", "densify", "seed", "raster", "protocol", "iterations", "experiment")
+# Settings in which trials of one cell may differ: they name the trial or say where it runs, not what is computed.
+IGNORED_SETTINGS = ("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The mean of a quantity over trials, or over scenes of means over trials.
+
+    ``std`` is the sample deviation (n - 1) over trials, None for a single one; over several scenes it is that of the
+    means of scenes, one for each seed that all scenes have. ``count`` of ``expected`` trials have the value; for
+    several scenes it is the smallest count of a scene. ``reason`` says why a value is missing.
+    """
+
+    mean: float | None
+    std: float | None
+    count: int
+    expected: int
+    scenes: int
+    trials: tuple[Trial, ...]
+    reason: str = ""
+
+    @property
+    def complete(self) -> bool:
+        return self.mean is not None and self.count == self.expected
+
+
+def field_value(trial: Trial, name: str) -> str:
+    """A field of a trial, or a dotted key of its configuration, as text; raises ``InputError`` where it has none."""
+    if name in TRIAL_FIELDS:
+        return str(trial.data[name])
+    if name in trial.config:
+        return str(trial.config[name])
+    raise InputError(
+        f"{trial.label} has no setting {name!r}; use {', '.join(TRIAL_FIELDS)} or a key of its config.yaml"
+    )
+
+
+def select_trials(trials: Iterable[Trial], where: Mapping[str, str]) -> list[Trial]:
+    """The trials whose fields have the given values; raises ``InputError`` where none is left."""
+    kept = [trial for trial in trials if all(field_value(trial, key) == value for key, value in where.items())]
+    if not kept:
+        raise InputError(f"no trial has {', '.join(f'{key}={value}' for key, value in where.items())}")
+    return kept
+
+
+def check_averageable(trials: Sequence[Trial], where: str) -> None:
+    """Raise ``InputError``, naming the differing keys, unless the trials are repetitions of the same thing by scene."""
+    by_scene = by_key(trials, lambda trial: trial.scene)
+    for scene, group in by_scene.items():
+        keys = differing_conditions(group) or differing_settings(group)
+        if keys:
+            raise _refusal(f"{where}, scene {scene}" if "scene=" not in where else where, keys, group)
+        seeds = [trial.seed for trial in group]
+        twice = sorted({seed for seed in seeds if seeds.count(seed) > 1})
+        if twice:
+            paths = ", ".join(trial.label for trial in group if trial.seed == twice[0])
+            raise InputError(f"the table cell {where} has seed {twice[0]} twice: {paths}; remove one of the folders")
+    across = differing_conditions([group[0] for group in by_scene.values()])
+    for key in ("resolution", "data"):  # these belong to a scene
+        across.pop(key, None)
+    if across:
+        raise _refusal(where, across, trials)
+
+
+def differing_conditions(trials: Sequence[Trial]) -> dict[str, list[str]]:
+    """The conditions in which trials differ, with their values.
+
+    Unlike budgets of which none acted are no difference: all of the trials grew as they liked.
+    """
+    seen: dict[str, set[str]] = defaultdict(set)
+    for trial in trials:
+        for key, value in trial.conditions().items():
+            seen[key].add(value)
+    if not any(trial.budget_acted for trial in trials):
+        del seen["budget"]
+    return {key: sorted(values) for key, values in seen.items() if len(values) > 1}
+
+
+def differing_settings(trials: Sequence[Trial]) -> dict[str, list[str]]:
+    """The settings in which trials with different configuration hashes differ, those that may differ left out."""
+    if len({trial.config_hash for trial in trials}) == 1:
+        return {}
+    keys = {key for trial in trials for key in trial.config if not key.startswith(IGNORED_SETTINGS)}
+    values = {key: sorted({canonical(trial.config.get(key)) for trial in trials}) for key in sorted(keys)}
+    return {key: found for key, found in values.items() if len(found) > 1}
+
+
+def swept_settings(trials: Iterable[Trial]) -> list[str]:
+    """The settings in which trials of one scene, initialiser and densifier differ, apart from what may differ."""
+    groups = by_key(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values()
+    return sorted({key for group in groups for key in differing_settings(group)})
+
+
+def with_variants(trials: Sequence[Trial]) -> list[Trial]:
+    """The trials, each with its values of the swept settings as its variant, so that they are arms of their own."""
+    swept = swept_settings(trials)
+    if not swept:
+        return list(trials)
+    return [
+        replace(trial, variant=" ".join(f"{key.rpartition('.')[2]}={trial.config.get(key)}" for key in swept))
+        for trial in trials
+    ]
+
+
+def make_cell(trials: Sequence[Trial], quantity: Quantity, scenes: Sequence[str], expected: int) -> Cell:
+    """The cell over ``scenes``, each expected to have ``expected`` trials, of what ``check_averageable`` accepts."""
+    values: dict[str, dict[int, float]] = {scene: {} for scene in scenes}
+    for trial in trials:
+        value = quantity.read(trial)
+        if value is not None:
+            values[trial.scene][trial.seed] = value
+    count = min((len(group) for group in values.values()), default=0)
+    kept = tuple(trials)
+    if count == 0:
+        reasons = [trial.unavailable[quantity.key] for trial in trials if quantity.key in trial.unavailable]
+        reason = reasons[0] if reasons else "no value" if trials else "no trial"
+        return Cell(None, None, 0, expected, len(values), kept, reason)
+    mean = statistics.fmean(statistics.fmean(group.values()) for group in values.values())
+    shared = set.intersection(*(set(group) for group in values.values()))
+    per_seed = [statistics.fmean(group[seed] for group in values.values()) for seed in sorted(shared)]
+    std = statistics.stdev(per_seed) if len(per_seed) > 1 else None
+    return Cell(mean, std, count, expected, len(values), kept)
+
+
+def best_cells(cells: Mapping[K, Cell], quantity: Quantity) -> set[K]:
+    """The keys of the best means after rounding to the quantity's decimals; empty where there is nothing to choose."""
+    means = {key: round(cell.mean, quantity.decimals) for key, cell in cells.items() if cell.mean is not None}
+    if quantity.cost or quantity.direction == 0 or len(means) < 2:
+        return set()
+    best = max(means.values()) if quantity.direction > 0 else min(means.values())
+    return {key for key, mean in means.items() if mean == best}
+
+
+def by_key(trials: Iterable[Trial], key: Callable[[Trial], K]) -> dict[K, list[Trial]]:
+    """Trials grouped by ``key(trial)``, in order of appearance."""
+    groups: dict[K, list[Trial]] = {}
+    for trial in trials:
+        groups.setdefault(key(trial), []).append(trial)
+    return groups
+
+
+def _refusal(where: str, keys: Mapping[str, Sequence[str]], trials: Sequence[Trial]) -> InputError:
+    listed = "; ".join(f"{key}: {' | '.join(values)}" for key, values in keys.items())
+    first = next(iter(keys))
+    return InputError(
+        f"the table cell {where} would average trials that differ in {listed} (such as {trials[0].label} and "
+        f"{trials[-1].label}): choose one with --where {first}=…, or show it with --rows …,{first}"
+    )

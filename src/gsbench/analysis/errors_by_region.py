@@ -1,0 +1,174 @@
+"""Where an arm helps: the errors of two arms' renders, binned by what the ground truth or the scene is like there.
+
+Every pixel gets a property, such as the texture energy of the ground truth; pixels are sorted into equally filled
+bins of it, and the mean error of each arm is taken in each bin, view and trial. Differences are then tested as those of
+any metric are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from gsbench.analysis.cells import by_key
+from gsbench.analysis.pairing import Paired, pair_trials
+from gsbench.analysis.results import Arm, Trial
+from gsbench.analysis.statistics import Comparison, compare
+from gsbench.errors import InputError
+
+BINS = 5
+TEXTURE_SIGMA = 2.0  # px: texture energy is the gradient's square averaged over such a Gaussian
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
+SAMPLES = 200_000  # pixels of a scene from which the bins' edges are taken
+RENDERS, GROUND_TRUTH, MAPS = "renders", "ground_truth", "maps"
+
+Array = NDArray[np.float64]
+# Properties that need more than the ground truth, with the array of ``maps/<view>.npz`` that holds them.
+MAP_PROPERTIES = {
+    "depth": "depth, world units",
+    "distance": "distance to the nearest initial point, world units",
+    "volume": "volume of the Gaussians seen there, cubed world units",
+}
+
+
+@dataclass(frozen=True)
+class RegionErrors:
+    """Mean absolute errors (8-bit levels) of two arms in bins of a property, from its lowest values to its highest.
+
+    ``edges`` are the inner edges of each scene's bins; ``comparisons`` are second arm minus first, one for each bin.
+    """
+
+    property: str
+    first: tuple[float, ...]
+    second: tuple[float, ...]
+    comparisons: tuple[Comparison, ...]
+    edges: dict[str, tuple[float, ...]]
+
+
+def texture_energy(image: NDArray[np.uint8]) -> Array:
+    """Local mean of the squared luminance gradient (8-bit levels squared), [H, W], of an image [H, W, 3] uint8."""
+    from scipy.ndimage import gaussian_filter  # here, since it is slow to import
+
+    luminance = image.astype(np.float64) @ np.array(LUMINANCE)  # [H, W]
+    rows, columns = np.gradient(luminance)
+    return gaussian_filter(rows**2 + columns**2, TEXTURE_SIGMA)
+
+
+def absolute_error(render: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Array:
+    """Mean absolute difference over channels, [H, W], in 8-bit levels."""
+    return np.abs(render.astype(np.float64) - truth.astype(np.float64)).mean(axis=-1)
+
+
+def errors_by_region(
+    trials: Sequence[Trial], first: Arm, second: Arm, property_name: str = "texture", bins: int = BINS
+) -> RegionErrors:
+    """Compare two arms in bins of ``texture`` or of a map (``MAP_PROPERTIES``).
+
+    The maps are those of the first arm's trials, so that both arms are sorted alike. Raises ``InputError``, saying what
+    is missing, where renders or maps are absent.
+    """
+    pairs = pair_trials(trials, first, second)
+    if not pairs:
+        raise InputError("no trials of the two arms share a scene, a seed and their conditions")
+    read_property = _property_reader(property_name)
+    scenes: list[str] = []
+    errors: list[Array] = []
+    edges: dict[str, tuple[float, ...]] = {}
+    for scene, group in by_key([one for one, _ in pairs], lambda trial: trial.scene).items():
+        own = [(one, other) for one, other in pairs if one in group]
+        scene_edges = _edges(group[0], read_property, bins)
+        errors.append(
+            np.array([list(_pair_means(*pair, read_property, scene_edges)) for pair in own])
+        )  # [K, V, 2, bins]
+        scenes.append(scene)
+        edges[scene] = tuple(float(edge) for edge in scene_edges)
+    means, comparisons = [], []
+    for index in range(bins):
+        inside = [array[:, np.isfinite(array[:, :, 0, index]).all(axis=0), :, index] for array in errors]  # [K, V', 2]
+        kept = [(scene, array) for scene, array in zip(scenes, inside, strict=True) if array.size]
+        if not kept:
+            raise InputError(f"{property_name}: bin {index + 1} of {bins} is empty in every scene; ask for fewer bins")
+        means.append(np.mean([array.mean(axis=(0, 1)) for _, array in kept], axis=0))  # [2]
+        differences = tuple(array[:, :, 1] - array[:, :, 0] for _, array in kept)
+        name = f"error in {property_name} bin {index + 1}"
+        paired = Paired(name, tuple(scene for scene, _ in kept), differences, float(means[-1][0]), ())
+        comparisons.append(compare(paired, direction=-1))
+    first_means, second_means = (tuple(float(mean[place]) for mean in means) for place in (0, 1))
+    return RegionErrors(property_name, first_means, second_means, tuple(comparisons), edges)
+
+
+def view_names(trial: Trial) -> list[str]:
+    """The names of the rendered test views, sorted; raises ``InputError`` where there are none."""
+    folder = trial.path / RENDERS
+    names = sorted(path.stem for path in folder.glob("*.png"))
+    if not names:
+        raise InputError(f"{trial.label} holds no {RENDERS}")
+    return names
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """An image as [H, W, 3] uint8; raises ``InputError`` naming a damaged or missing file."""
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"))
+    except (OSError, UnidentifiedImageError, SyntaxError) as error:
+        raise InputError(f"{path} cannot be read as an image ({error})") from None
+
+
+Reader = Callable[[Trial, str, NDArray[np.uint8]], Array]
+
+
+def _property_reader(name: str) -> Reader:
+    if name == "texture":
+        return lambda trial, view, truth: texture_energy(truth)
+    if name in MAP_PROPERTIES:
+        return lambda trial, view, truth: _read_map(trial, view, name, truth.shape[:2])
+    raise InputError(f"unknown property {name!r}; choose texture, {', '.join(MAP_PROPERTIES)}")
+
+
+def _read_map(trial: Trial, view: str, name: str, shape: tuple[int, int]) -> Array:
+    path = trial.path / MAPS / f"{view}.npz"
+    try:
+        with np.load(path) as maps:
+            values = np.asarray(maps[name], dtype=np.float64)
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path} has no map {name!r} ({type(error).__name__})") from None
+    if values.shape != shape:
+        raise InputError(f"{path}: the map {name!r} is {values.shape}, its view {shape}")
+    return values
+
+
+def _edges(trial: Trial, read_property: Reader, bins: int) -> Array:
+    """The inner edges [bins - 1] that cut the finite values over a scene's test views into equal parts."""
+    names = view_names(trial)
+    samples = []
+    for name in names:
+        values = read_property(trial, name, read_image(trial.path / GROUND_TRUTH / f"{name}.png")).ravel()
+        values = values[np.isfinite(values)]
+        samples.append(values[:: max(1, len(values) * len(names) // SAMPLES)])
+    return np.quantile(np.concatenate(samples), np.linspace(0, 1, bins + 1)[1:-1])
+
+
+def _pair_means(one: Trial, other: Trial, read_property: Reader, edges: Array) -> Iterator[tuple[Array, Array]]:
+    """For each view: the mean error of both trials in every bin, [bins] each; a bin without pixels is not a number."""
+    if view_names(one) != view_names(other):
+        raise InputError(f"{one.label} and {other.label} have different renders")
+    for name in view_names(one):
+        truth = read_image(one.path / GROUND_TRUTH / f"{name}.png")
+        values = read_property(one, name, truth)
+        index = np.where(np.isfinite(values), np.searchsorted(edges, values), len(edges) + 1).ravel()
+        counts = np.bincount(index, minlength=len(edges) + 2)[:-1]
+        means = []
+        for trial in (one, other):
+            render = read_image(trial.path / RENDERS / f"{name}.png")
+            if render.shape != truth.shape:
+                raise InputError(f"{trial.label}: the render of {name} has not the size of the ground truth")
+            errors = absolute_error(render, truth).ravel()
+            sums = np.bincount(index, weights=errors, minlength=len(edges) + 2)[:-1]
+            means.append(np.where(counts > 0, sums / np.maximum(counts, 1), np.nan))
+        yield means[0], means[1]

@@ -1,0 +1,121 @@
+"""The verb ``gsbench explain``: how one number of a table came about."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsbench.analysis.cells import Cell, check_averageable, differing_settings, make_cell, swept_settings
+from gsbench.analysis.pairing import BASELINE
+from gsbench.analysis.paper import load_paper
+from gsbench.analysis.paper_tables import PAPER_TABLES, agreement
+from gsbench.analysis.quantities import Quantity, quantity
+from gsbench.analysis.results import Experiment, Trial, load_experiment
+from gsbench.analysis.tables import format_cell
+from gsbench.errors import InputError
+
+ADDRESS = "EXPERIMENT:SCENE:METRIC:ARM, such as table1:garden:lpips:volumetric or demo:courtyard:psnr:sfm-adc"
+
+
+def main_explain(argv: Sequence[str], runs_dir: Path) -> int:
+    """Run the verb; returns the exit code, raises ``InputError`` for bad input."""
+    parser = argparse.ArgumentParser(
+        prog="gsbench explain",
+        description="The runs, settings, data and code versions behind a cell of a table.",
+        epilog="gsbench explain --stale FOLDER tells why a stage of a trial is computed anew.",
+    )
+    parser.add_argument("cell", help=ADDRESS)
+    print(explain(parser.parse_args(argv).cell, runs_dir))
+    return 0
+
+
+def explain(address: str, runs_dir: Path) -> str:
+    """Plain text on the cell at ``address``; raises ``InputError`` where there is no such cell."""
+    parts = address.split(":")
+    if len(parts) != 4 or not all(parts):
+        raise InputError(f"{address!r} is not {ADDRESS}")
+    name, scene, metric, arm = parts
+    experiment = load_experiment(runs_dir, name)
+    trials = _find(experiment, scene, arm)
+    shown = quantity(metric, trials)
+    variants = swept_settings(trials)
+    if variants:
+        raise InputError(f"{address} names several cells, which differ in {', '.join(variants)}")
+    check_averageable(trials, f"scene={scene} {arm}")
+    expected = len(experiment.seeds)
+    cell = make_cell(trials, shown, [scene], expected)
+    lines = [
+        f"{shown.name} of {trials[0].init}-{trials[0].densify} on {scene} in experiment {name}",
+        f"  {format_cell(cell, shown)}: mean ± deviation (n - 1) over {cell.count} of {expected} trials",
+    ]
+    if cell.reason:
+        lines.append(f"  not available: {cell.reason}")
+    lines += _paper_lines(name, scene, trials[0], shown, cell)
+    lines += ["", "Conditions"] + [f"  {key}: {value}" for key, value in trials[0].conditions().items()]
+    lines += _baseline_lines(experiment, trials[0])
+    lines += ["", "Trials"]
+    for trial in trials:
+        lines += _trial_lines(trial, shown)
+    left_out = [line for line in experiment.warnings if line.startswith(f"{name}/{scene}/") and arm in line]
+    if left_out:
+        lines += ["", "Left out", *(f"  {line}" for line in left_out)]
+    return "\n".join(lines)
+
+
+def _find(experiment: Experiment, scene: str, arm: str) -> list[Trial]:
+    """The trials of a scene and an arm, given as ``<init>-<densify>`` or as the densifier alone where that is clear."""
+    of_scene = [trial for trial in experiment.trials if trial.scene == scene]
+    if not of_scene:
+        known = ", ".join(sorted({trial.scene for trial in experiment.trials}))
+        raise InputError(f"experiment {experiment.name!r} has no scene {scene!r}; it has {known}")
+    arms = sorted({(trial.init, trial.densify) for trial in of_scene})
+    chosen = [found for found in arms if arm in (f"{found[0]}-{found[1]}", found[1])]
+    if len(chosen) != 1:
+        names = ", ".join(f"{init}-{densify}" for init, densify in arms)
+        raise InputError(f"{arm!r} names {len(chosen)} arms of {scene}; choose one of {names}")
+    return [trial for trial in of_scene if (trial.init, trial.densify) == chosen[0]]
+
+
+def _paper_lines(name: str, scene: str, trial: Trial, shown: Quantity, cell: Cell) -> list[str]:
+    if name not in PAPER_TABLES or cell.mean is None:
+        return []
+    table = load_paper().table(name)
+    keys = {"gaussians": "gaussians_millions", "train_time": "train_minutes"}
+    in_paper_units = quantity(keys.get(shown.key, shown.key), cell.trials)
+    printed = table.get((scene, trial.init, trial.densify, in_paper_units.key))
+    if printed is None:
+        return []
+    same_units = make_cell(cell.trials, in_paper_units, [scene], cell.expected)
+    assert same_units.mean is not None
+    words = agreement(same_units, printed).name.lower()
+    delta = f"{same_units.mean - printed.value:+.{in_paper_units.decimals + 1}f}"
+    return [f"  the paper prints {printed.text} ({in_paper_units.name}): difference {delta} ({words})"]
+
+
+def _baseline_lines(experiment: Experiment, trial: Trial) -> list[str]:
+    """The settings in which the arm differs from the baseline of the same scene and initialiser."""
+    others = [t for t in experiment.trials if (t.scene, t.init, t.densify) == (trial.scene, trial.init, BASELINE)]
+    if not others or trial.densify == BASELINE:
+        return []
+    base = next((other for other in others if other.seed == trial.seed), others[0])
+    settings = differing_settings([base, trial])
+    lines = ["", f"Settings that differ from {base.init}-{base.densify}"]
+    for key in settings:
+        lines.append(f"  {key}: {base.config.get(key, '(absent)')} -> {trial.config.get(key, '(absent)')}")
+    return lines if settings else []
+
+
+def _trial_lines(trial: Trial, shown: Quantity) -> list[str]:
+    value = shown.read(trial)
+    data = trial.data
+    text = "n/a" if value is None else f"{value:.6g}"
+    counts = f"{data['num_gaussians']:,} Gaussians from {data.get('num_init_points') or 0:,} points"
+    lines = [
+        f"  seed {trial.seed}: {text}",
+        f"    folder    {trial.path}",
+        f"    {data.get('test_views', '?')} test views, raster {data['raster']}, {counts}",
+    ]
+    lines += [f"    {key:<9} {value}" for key, value in data.get("hashes", {}).items()]
+    lines.append("    versions  " + ", ".join(f"{key} {value}" for key, value in data.get("versions", {}).items()))
+    return lines

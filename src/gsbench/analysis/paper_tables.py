@@ -1,0 +1,144 @@
+"""The paper's Tables 1 and 2 from one's own trials, and beside them how far each cell is from the printed one."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from enum import Enum
+
+from gsbench.analysis.cells import Cell
+from gsbench.analysis.paper import (
+    ARM_NAMES,
+    INIT_NAMES,
+    TABLE1_ARMS,
+    TABLE1_QUANTITIES,
+    TABLE2_ARMS,
+    Printed,
+    load_paper,
+)
+from gsbench.analysis.quantities import quantity
+from gsbench.analysis.results import Experiment, Trial
+from gsbench.analysis.tables import Column, Entry, Row, Table, build_table
+from gsbench.errors import InputError
+
+PAPER_TABLES = ("table1", "table2")
+CONFIDENCE = 0.95
+
+
+class Agreement(Enum):
+    """How a measured cell stands to the printed number, from the closest to the farthest."""
+
+    ROUNDING = "="  # the mean lies within half a step of the last printed digit
+    INTERVAL = "≈"  # our t interval meets the range that the printed number stands for
+    DIFFERS = "≠"
+
+
+def paper_tables(
+    experiment: Experiment, name: str, trials: Sequence[Trial] | None = None, metrics: Sequence[str] | None = None
+) -> list[Table]:
+    """The measured table in the paper's layout and the table of differences from the printed numbers."""
+    trials = list(experiment.trials if trials is None else trials)
+    arms, notes = _arms(name, trials)
+    trials = [trial for trial in trials if trial.arm in arms]
+    if not trials:
+        needed = ", ".join(f"init={init} densify={densify}" for init, densify in arms)
+        raise InputError(f"experiment {experiment.name!r} has no trial for {name} ({needed}); use --layout plain")
+    scenes = load_paper().scenes(name)
+    scenes += sorted({trial.scene for trial in trials} - set(scenes))
+    columns = ("densify",) if name == "table1" else ("init", "densify")
+    measured = build_table(
+        experiment,
+        trials,
+        rows=("scene",),
+        columns=columns,
+        metrics=metrics or (TABLE1_QUANTITIES if name == "table1" else ("lpips_vgg_raw",)),
+        title=f"{name.replace('table', 'Table ')}, measured (experiment {experiment.name})",
+        order=([(scene,) for scene in scenes], [arm[-len(columns) :] for arm in arms]),
+        names=ARM_NAMES | INIT_NAMES,
+    )
+    return [measured, _differences(name, measured, arms, trials, notes)]
+
+
+def agreement(cell: Cell, printed: Printed) -> Agreement:
+    """Class a measured cell against a printed number; a single trial has no interval."""
+    assert cell.mean is not None
+    if abs(cell.mean - printed.value) <= printed.half_step:
+        return Agreement.ROUNDING
+    if cell.std is not None:
+        half = t_half_width(cell.std, cell.count)
+        low, high = printed.range
+        if cell.mean - half <= high and cell.mean + half >= low:
+            return Agreement.INTERVAL
+    return Agreement.DIFFERS
+
+
+def t_half_width(std: float, count: int) -> float:
+    """Half the width of Student's 95 % interval of a mean of ``count`` values."""
+    from scipy.special import stdtrit  # here, for a quick start of what needs no interval
+
+    return float(stdtrit(count - 1, 0.5 + CONFIDENCE / 2)) * std / math.sqrt(count)
+
+
+def _arms(name: str, trials: Sequence[Trial]) -> tuple[list[tuple[str, str]], list[str]]:
+    """The (init, densify) arms of a table; where DIM was not run and one other initialiser was, that one stands in."""
+    inits = {trial.init for trial in trials}
+    if name == "table1" and "dim" not in inits and len(inits) == 1:
+        other = inits.pop()
+        note = f"Initial clouds from {other} stand in for the paper's DIM: the columns do not repeat its experiment."
+        return [(other, densify) for _, densify in TABLE1_ARMS], [note]
+    return list(TABLE1_ARMS if name == "table1" else TABLE2_ARMS), []
+
+
+def _differences(
+    name: str, measured: Table, arms: Sequence[tuple[str, str]], trials: Sequence[Trial], notes: Sequence[str]
+) -> Table:
+    paper = load_paper()
+    printed_table = paper.table(name)
+    paper_arms = dict(zip(arms, TABLE1_ARMS if name == "table1" else TABLE2_ARMS, strict=True))
+    keys = list(dict.fromkeys(key for key, _ in measured.keys))
+    compared = [key for key in keys if any(printed[3] == key for printed in printed_table)]
+    quantities = {key: quantity(key, trials) for key in compared}
+    tally: Counter[Agreement] = Counter()
+    rows = []
+    for row in measured.rows:
+        scene = row.labels[0]
+        for place, arm in enumerate(arms):
+            entries = []
+            for key in compared:
+                cell = row.entries[keys.index(key) * len(arms) + place].cell
+                printed = printed_table.get((scene, *paper_arms[arm], key))
+                if printed is None or cell is None or cell.mean is None:
+                    entries += [Entry(printed.text if printed else ""), Entry("—")]
+                    continue
+                found = agreement(cell, printed)
+                tally[found] += 1
+                decimals = max(quantities[key].decimals, len(printed.text.partition(".")[2]))
+                delta = f"{cell.mean - printed.value:+.{decimals}f}".replace("-", "−")
+                entries += [Entry(printed.text), Entry(f"{delta} {found.value}", cell=cell)]
+            if any(entry.cell is not None for entry in entries):
+                rows.append(Row((scene, _arm_name(name, paper_arms[arm])), tuple(entries)))
+    heads = tuple(Column(quantities[key].name, heading) for key in compared for heading in ("paper", "Δ"))
+    total = sum(tally.values())
+    legend = (
+        f"Δ is measured minus printed. Of {total} cells {tally[Agreement.ROUNDING]} are within rounding (=), "
+        f"{tally[Agreement.INTERVAL]} within our {CONFIDENCE:.0%} t interval of the mean (≈), "
+        f"{tally[Agreement.DIFFERS]} differ (≠). The paper "
+        "prints no deviation, so the spread of its own trials is not taken into account; a single trial "
+        "has no interval."
+    )
+    left_out = [key for key in keys if key not in compared]
+    if left_out:
+        notes = [*notes, f"Not compared, since the paper prints no such number: {', '.join(left_out)}."]
+    return Table(
+        f"{name.replace('table', 'Table ')}, difference from the printed values",
+        ("scene", "arm"),
+        heads,
+        tuple(rows),
+        (legend, *notes),
+        tuple((key, heading) for key in compared for heading in ("paper", "delta")),
+    )
+
+
+def _arm_name(name: str, arm: tuple[str, str]) -> str:
+    return ARM_NAMES[arm[1]] if name == "table1" else f"{INIT_NAMES[arm[0]]} + {ARM_NAMES[arm[1]]}"

@@ -1,0 +1,112 @@
+"""Putting the report together: one HTML file that needs no network, no script to be read, and no other file."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+
+from jinja2 import Environment, StrictUndefined
+
+from gsbench.analysis.cells import by_key, with_variants
+from gsbench.analysis.errors_by_region import read_image
+from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs
+from gsbench.analysis.paper import inconsistencies, load_paper
+from gsbench.analysis.paper_tables import PAPER_TABLES, paper_tables
+from gsbench.analysis.report.crops import data_uri
+from gsbench.analysis.report.sections import (
+    compare_arms,
+    event_charts,
+    provenance,
+    training_charts,
+    volume_charts,
+)
+from gsbench.analysis.report.sweep_charts import sweep_charts
+from gsbench.analysis.report.tradeoff_charts import tradeoff_charts, tradeoff_gaps
+from gsbench.analysis.results import Experiment, Trial, load_experiment
+from gsbench.analysis.table_formats import to_html
+from gsbench.analysis.tables import build_table
+from gsbench.errors import InputError
+
+FIGURES = "figures"  # a trial's pictures for the report, such as ellipsoid overlays and initial clouds
+REPORT_NAME = "report.html"
+
+
+def main_report(argv: Sequence[str], runs_dir: Path) -> int:
+    """The verb ``gsbench report``; returns the exit code, raises ``InputError`` for bad input."""
+    parser = argparse.ArgumentParser(
+        prog="gsbench report", description="One HTML file with the evidence of an experiment."
+    )
+    parser.add_argument("experiment")
+    parser.add_argument("--out", type=Path, metavar="FILE", help=f"default: {REPORT_NAME} in the experiment's folder")
+    parser.add_argument("--baseline", default=BASELINE, help=f"the densifier that others are held against ({BASELINE})")
+    options = parser.parse_args(argv)
+    experiment = load_experiment(runs_dir, options.experiment)
+    path = options.out or experiment.folder / REPORT_NAME
+    text = build_report(experiment, options.baseline)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.name}.tmp")
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot write {path} ({error.strerror}); give another --out") from None
+    print(path)
+    return 0
+
+
+def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
+    """The report as HTML, with every densifier held against ``baseline``; a pure function of the experiment's files."""
+    trials = with_variants(experiment.trials)
+    arms = sorted({trial.arm for trial in trials})
+    views = ViewCache()
+    versus = [compare_arms(trials, first, second, views) for first, second in choose_pairs(arms, baseline)]
+    is_paper = experiment.name in PAPER_TABLES
+    tables = paper_tables(experiment, experiment.name) if is_paper else [build_table(experiment)]
+    volumes, volume_notes = volume_charts(trials, arms)
+    rows = provenance(trials)
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["signed"] = _signed
+    return environment.from_string(_resource("template.html.j2")).render(
+        name=experiment.name,
+        style=_resource("style.css"),
+        script=_resource("script.js"),
+        arms=[arm_name(arm) for arm in arms],
+        scenes=sorted({trial.scene for trial in trials}),
+        seeds=experiment.seeds,
+        trials=trials,
+        versus=versus,
+        tables=[to_html(table) for table in tables],
+        contradictions=inconsistencies(load_paper()) if is_paper else [],
+        sweeps=sweep_charts(trials),
+        tradeoffs=tradeoff_charts(trials),
+        gaps=tradeoff_gaps(trials, baseline),
+        training=training_charts(trials, arms),
+        events=event_charts(trials, arms),
+        volumes=volumes,
+        volume_notes=volume_notes,
+        figures=trial_figures(trials),
+        provenance=rows,
+        columns=list(dict.fromkeys(key for row in rows for key in row)),
+        warnings=experiment.warnings,
+    )
+
+
+def trial_figures(trials: Sequence[Trial]) -> list[tuple[str, str]]:
+    """(caption, data URI) of the pictures that trials left for the report; one seed of each scene and arm."""
+    found = []
+    for group in by_key(trials, lambda trial: (trial.scene, trial.arm)).values():
+        trial = group[0]
+        for path in sorted((trial.path / FIGURES).glob("*.png")):
+            caption = f"{path.stem.replace('_', ' ')}: {trial.scene}, {trial.init}-{trial.densify}, seed {trial.seed}"
+            found.append((caption, data_uri(read_image(path))))
+    return found
+
+
+def _resource(name: str) -> str:
+    return files("gsbench.analysis.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _signed(value: float | None, decimals: int) -> str:
+    return "unknown" if value is None else f"{value:+.{decimals}f}".replace("-", "−")

@@ -1,0 +1,341 @@
+"""What the report says and draws, section by section, from result files only."""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gsbench.analysis.cells import by_key
+from gsbench.analysis.errors_by_region import MAP_PROPERTIES, RegionErrors, errors_by_region
+from gsbench.analysis.pairing import ViewCache, arm_name, pair_arms, pair_trials
+from gsbench.analysis.quantities import Quantity, choose_quantities
+from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart, short_number
+from gsbench.analysis.report.crops import Crop, choose_crops
+from gsbench.analysis.report.volumes import share_above, volume_histogram
+from gsbench.analysis.results import Arm, Trial, read_json_lines
+from gsbench.analysis.statistics import ALPHA, Comparison, compare, seeds_needed
+from gsbench.analysis.tables import change_words, cost_change
+from gsbench.analysis.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve
+from gsbench.errors import InputError
+
+CROPS = 4  # places of each kind
+EVENTS_FILE, HISTOGRAMS_FILE = "events.jsonl", "volume_histograms.jsonl"
+# The smallest differences worth resolving, by metric: about what papers on densification claim as an improvement.
+WORTHWHILE = {"psnr": 0.1, "ssim": 0.005, "flip": 0.005}
+WORTHWHILE_LPIPS = 0.005
+COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time"}
+EVENT_CAUSES = ("cloned", "split_gradient", "split_volume", "added", "relocated", "pruned_opacity", "pruned_size")
+CURVES = (  # key of metrics.jsonl, title, y axis
+    ("num_gaussians", "Gaussians during training", "Gaussians"),
+    ("loss", "Training loss (of single views, averaged over trials)", "loss"),
+    ("psnr", "PSNR of test views during training", "PSNR (dB)"),
+)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One metric's comparison with what it takes to read it."""
+
+    quantity: Quantity
+    comparison: Comparison
+    worthwhile: float
+    seeds: int | None  # that would resolve the worthwhile difference; None: unknown or beyond reach
+
+    @property
+    def symbol(self) -> str:
+        return {"better": "▲", "worse": "▼"}.get(self.comparison.verdict, "●")
+
+
+@dataclass(frozen=True)
+class Versus:
+    """Everything about one pair of arms."""
+
+    first: Arm
+    second: Arm
+    verdicts: tuple[Verdict, ...]
+    headline: str
+    by_scene: tuple[str, ...]
+    costs: tuple[str, ...]
+    forests: tuple[str, ...]
+    regions: tuple[tuple[RegionErrors, str], ...]
+    gained: tuple[Crop, ...]
+    lost: tuple[Crop, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def title(self) -> str:
+        return f"{arm_name(self.second)} against {arm_name(self.first)}"
+
+
+def compare_arms(trials: Sequence[Trial], first: Arm, second: Arm, views: ViewCache) -> Versus:
+    """Verdicts, costs, forest plots, regions and crops of two arms; what cannot be had is said in the notes."""
+    notes: list[str] = []
+    verdicts = []
+    own = [trial for trial in trials if trial.arm in (first, second)]
+    for quantity in choose_quantities(own):
+        if quantity.cost or quantity.direction == 0:
+            continue
+        try:
+            comparison = compare(pair_arms(own, first, second, quantity.key, views), quantity.direction)
+        except InputError as error:
+            reasons = [t.unavailable[quantity.key] for t in own if quantity.key in t.unavailable]
+            notes.append(f"{quantity.name}: {reasons[0] if reasons else error}")
+            continue
+        verdicts.append(_verdict(quantity, comparison))
+        notes += [f"{quantity.name}: {line}" for line in comparison.left_out]
+    pairs = pair_trials(own, first, second)
+    gained, lost, faults = choose_crops(pairs, CROPS)
+    regions = []
+    for name in ("texture", *MAP_PROPERTIES):
+        try:
+            found = errors_by_region(own, first, second, name)
+            regions.append((found, _region_chart(found, first, second)))
+        except InputError as error:
+            notes.append(f"Errors by {name}: not shown, {error}")
+    return Versus(
+        first,
+        second,
+        tuple(verdicts),
+        _headline(verdicts, first, second),
+        tuple(_by_scene(verdicts)),
+        tuple(_costs(own, first, second)),
+        tuple(_forest(verdict) for verdict in verdicts),
+        tuple(regions),
+        tuple(gained),
+        tuple(lost),
+        tuple(dict.fromkeys([*notes, *faults])),
+    )
+
+
+def training_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
+    """Curves by arm, averaged over scenes and seeds at the steps that all trials have."""
+    charts = []
+    for key, title, y_label in CURVES:
+        series = []
+        for arm in arms:
+            own = [trial for trial in trials if trial.arm == arm]
+            points = mean_by_step([_rows(trial, "metrics.jsonl", key) for trial in own])
+            series.append(Series(arm_name(arm), points))
+        charts.append(line_chart(title, series, "iteration", y_label))
+    return [chart for chart in charts if chart]
+
+
+def event_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
+    """Events by cause: totals of every arm, and over the iterations of each arm."""
+    totals = []
+    for arm in arms:
+        logged = [trial.data.get("events") or {} for trial in trials if trial.arm == arm]
+        totals.append(
+            (arm_name(arm), {c: statistics.fmean(float(events.get(c, 0)) for events in logged) for c in EVENT_CAUSES})
+        )
+    causes = [cause for cause in EVENT_CAUSES if any(counts[cause] for _, counts in totals)]
+    if not causes:
+        return []
+    labels = [cause.replace("_", " ") for cause in causes]
+    bars = [(name, [counts[cause] for cause in causes]) for name, counts in totals]
+    charts = [bar_chart("Refinement by cause, mean of a trial", labels, bars, "Gaussians"), _origin_chart(trials, arms)]
+    for arm in arms:
+        own = [trial for trial in trials if trial.arm == arm]
+        series = [
+            Series(label, mean_by_step([_rows(trial, EVENTS_FILE, cause) for trial in own]))
+            for cause, label in zip(causes, labels, strict=True)
+        ]
+        charts.append(line_chart(f"Refinement over time: {arm_name(arm)}", series, "iteration", "Gaussians"))
+    return [chart for chart in charts if chart]
+
+
+def _origin_chart(trials: Sequence[Trial], arms: Sequence[Arm]) -> str:
+    """What made the Gaussians that are left at the end, as the mean of a trial."""
+    origins = {arm: [trial.data.get("causes") or {} for trial in trials if trial.arm == arm] for arm in arms}
+    causes = list(dict.fromkeys(cause for logged in origins.values() for counts in logged for cause in counts))
+    means = {
+        arm: [statistics.fmean(float(counts.get(cause, 0)) for counts in logged) for cause in causes]
+        for arm, logged in origins.items()
+    }
+    shown = [index for index in range(len(causes)) if any(row[index] for row in means.values())]
+    if not shown:
+        return ""
+    bars = [(arm_name(arm), [row[index] for index in shown]) for arm, row in means.items()]
+    labels = [causes[index].replace("_", " ") for index in shown]
+    return bar_chart("What made the final Gaussians, mean of a trial", labels, bars, "Gaussians")
+
+
+def volume_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> tuple[list[str], list[str]]:
+    """(charts, notes): histograms of the Gaussians' volumes, final by arm and at earlier iterations where logged."""
+    notes: list[str] = []
+    final = []
+    threshold = _threshold(trials)
+    for arm in arms:
+        own = [trial for trial in trials if trial.arm == arm]
+        try:
+            final.append(Series(arm_name(arm), volume_histogram(own)))
+            if threshold:
+                notes.append(f"{arm_name(arm)}: {share_above(own, threshold):.2%} of volumes exceed {threshold:g}.")
+        except InputError as error:
+            notes.append(f"{arm_name(arm)}: no histogram, {error}")
+    marker = (threshold, f"V_th {threshold:g}") if threshold else None
+    title = "Volumes of the trained Gaussians"
+    charts = [line_chart(title, final, "volume (cubed scene units)", "share", log_x=True, log_y=True, marker=marker)]
+    for arm in arms:
+        own = [trial for trial in trials if trial.arm == arm]
+        series = [Series(f"iteration {step}", points) for step, points in _logged_histograms(own).items()]
+        title = f"Volumes during training: {arm_name(arm)}"
+        charts.append(
+            line_chart(title, series, "volume (cubed scene units)", "share", log_x=True, log_y=True, marker=marker)
+        )
+    return [chart for chart in charts if chart], notes
+
+
+def mean_by_step(curves: Sequence[Sequence[tuple[float, float]]]) -> list[tuple[float, float]]:
+    """The mean curve over the steps that every non-empty curve has."""
+    filled = [dict(curve) for curve in curves if curve]
+    if not filled:
+        return []
+    shared = sorted(set.intersection(*(set(curve) for curve in filled)))
+    return [(step, statistics.fmean(curve[step] for curve in filled)) for step in shared]
+
+
+def provenance(trials: Sequence[Trial]) -> list[dict[str, str]]:
+    """One row a trial: where it lies, what it came from, with which versions."""
+    return [
+        {
+            "trial": trial.label,
+            "raster": str(trial.data["raster"]),
+            "protocol": str(trial.data["protocol"]),
+            "iterations": str(trial.data["iterations"]),
+            **{f"{key} hash": str(value)[:12] for key, value in trial.data.get("hashes", {}).items()},
+            "versions": ", ".join(f"{key} {value}" for key, value in trial.data.get("versions", {}).items()),
+        }
+        for trial in trials
+    ]
+
+
+def _verdict(quantity: Quantity, comparison: Comparison) -> Verdict:
+    worthwhile = WORTHWHILE.get(quantity.key, WORTHWHILE_LPIPS)
+    seeds = None
+    if comparison.seed_deviation is not None:
+        seeds = seeds_needed(comparison.seed_deviation, len(comparison.scenes), worthwhile)
+    return Verdict(quantity, comparison, worthwhile, seeds)
+
+
+def _headline(verdicts: Sequence[Verdict], first: Arm, second: Arm) -> str:
+    if not verdicts:
+        return f"{arm_name(second)} and {arm_name(first)} cannot be compared: no metric has paired trials."
+    scope = verdicts[0].comparison.scope
+    if all(scene.mean == 0 for verdict in verdicts for scene in verdict.comparison.scenes):
+        return (
+            f"{arm_name(second)} against {arm_name(first)}, on {scope}: equal in every metric, to the last bit. What "
+            "they differ in never acted: look at the events, and at train.densify_start and densify_stop."
+        )
+    if all(verdict.comparison.p is None for verdict in verdicts):
+        return (
+            f"{arm_name(second)} against {arm_name(first)}: no verdict, one trial of each on {scope}; run more seeds."
+        )
+    words = []
+    for word, opening in (
+        ("better", "better in"),
+        ("worse", "worse in"),
+        ("no evidence", "no evidence of a difference in"),
+    ):
+        names = [v.quantity.name for v in verdicts if v.comparison.verdict == word]
+        if names:
+            words.append(f"{opening} {', '.join(names)}")
+    return f"{arm_name(second)} against {arm_name(first)}, on {scope}: {'; '.join(words)}."
+
+
+def _by_scene(verdicts: Sequence[Verdict]) -> list[str]:
+    """For each metric in which single scenes are decided (p below 5 % after Holm), a line that names them.
+
+    A mean over scenes that disagree hides both sides of what was found.
+    """
+    lines = []
+    for verdict in verdicts:
+        scenes = verdict.comparison.scenes
+        decided = [scene for scene in scenes if scene.p_holm is not None and scene.p_holm < ALPHA]
+        better = [scene.scene for scene in decided if scene.mean * verdict.quantity.direction > 0]
+        worse = [scene.scene for scene in decided if scene.mean * verdict.quantity.direction < 0]
+        found = [f"{word} on {', '.join(names)}" for word, names in (("better", better), ("worse", worse)) if names]
+        if len(scenes) > 1 and found:
+            warning = ": the scenes disagree, so their mean says little" if len(found) > 1 else ""
+            lines.append(f"{verdict.quantity.name} by scene: {', '.join(found)}{warning}")
+    return lines
+
+
+def _costs(trials: Sequence[Trial], first: Arm, second: Arm) -> list[str]:
+    arms = [[trial for trial in trials if trial.arm == arm] for arm in (first, second)]
+    lines = []
+    for name, key in (("Gaussians", "gaussians"), ("Training time", "seconds")):
+        change = cost_change(arms[0], arms[1], COST_READERS[key])
+        if change is not None:
+            lines.append(f"{name} {change_words(*change)}")
+        gap = curve_gap(*(training_curve(own, key, "psnr") for own in arms))
+        if gap is not None:
+            lines.append(_gap_words(gap, COST_LABELS[key]))
+    return lines
+
+
+def _gap_words(gap: CurveGap, cost: str) -> str:
+    amount = f"{gap.gap:+.2f}".replace("-", "−")
+    span = f"{short_number(gap.low)} to {short_number(gap.high)}"
+    return f"PSNR at equal {cost} during training {amount} dB on average ({span})"
+
+
+def _forest(verdict: Verdict) -> str:
+    comparison = verdict.comparison
+    rows = [
+        ForestRow(s.scene, s.mean, s.interval.low if s.interval else None, s.interval.high if s.interval else None)
+        for s in comparison.scenes
+    ]
+    if len(rows) > 1:
+        interval = comparison.interval
+        bounds = (interval.low, interval.high) if interval else (None, None)
+        rows.append(ForestRow("mean of scenes", comparison.mean, *bounds))
+    better = "right of zero is better" if verdict.quantity.direction > 0 else "left of zero is better"
+    return forest_plot(f"{verdict.quantity.name}: {better}", rows, "difference", verdict.quantity.direction)
+
+
+def _region_chart(errors: RegionErrors, first: Arm, second: Arm) -> str:
+    labels = ["lowest", *[""] * (len(errors.first) - 2), "highest"]
+    series = [(arm_name(first), errors.first), (arm_name(second), errors.second)]
+    what = MAP_PROPERTIES.get(errors.property, "texture energy of the ground truth")
+    return bar_chart(f"Error by {what}", labels, series, "error (8-bit levels)")
+
+
+def _rows(trial: Trial, name: str, key: str) -> list[tuple[float, float]]:
+    return [
+        (float(row["step"]), float(row[key]))
+        for row in read_json_lines(trial.path / name)
+        if _is_number(row.get("step")) and _is_number(row.get(key))
+    ]
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float)
+
+
+def _logged_histograms(trials: Sequence[Trial]) -> dict[int, list[tuple[float, float]]]:
+    """Pooled counts of ``volume_histograms.jsonl`` by iteration, as (volume at the bin's centre, share)."""
+    pooled: dict[int, Counter[float]] = {}
+    for trial in trials:
+        for row in read_json_lines(trial.path / HISTOGRAMS_FILE):
+            edges, counts = row.get("log10_edges", []), row.get("counts", [])
+            for low, high, count in zip(edges, edges[1:], counts, strict=False):
+                pooled.setdefault(int(row["step"]), Counter())[10 ** ((low + high) / 2)] += count
+    return {
+        step: [(volume, count / total) for volume, count in sorted(bins.items()) if count]
+        for step, bins in sorted(pooled.items())
+        if (total := sum(bins.values()))
+    }
+
+
+def _threshold(trials: Sequence[Trial]) -> float | None:
+    """The volume threshold in scene units, where every arm that has one has this one."""
+    settings = [group[0].config for group in by_key(trials, lambda trial: trial.arm).values()]
+    found = {
+        config["densify.volume_threshold"]
+        for config in settings
+        if config.get("densify.threshold_mode", "absolute") == "absolute" and "densify.volume_threshold" in config
+    }
+    return float(found.pop()) if len(found) == 1 and all(map(_is_number, found)) else None

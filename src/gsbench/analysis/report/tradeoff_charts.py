@@ -1,0 +1,59 @@
+"""The report's charts of quality against cost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gsbench.analysis.pairing import BASELINE, arm_name
+from gsbench.analysis.quantities import Quantity, quantity
+from gsbench.analysis.report.charts import Series, line_chart, short_number
+from gsbench.analysis.results import Arm, Trial
+from gsbench.analysis.tradeoffs import Curve, curve_gap, family_curve
+
+COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time (s)"}
+
+
+def tradeoff_charts(trials: Sequence[Trial]) -> list[str]:
+    """One chart for each pair of main metric and cost; a densifier's variants are the points of its line."""
+    charts = []
+    for metric in _main_metrics(trials):
+        for cost, label in COST_LABELS.items():
+            curves = _curves(trials, metric, cost)
+            series = [
+                Series(arm_name(family), list(zip(curve.cost.tolist(), curve.quality.tolist(), strict=True)))
+                for family, curve in curves.items()
+            ]
+            charts.append(line_chart(f"{metric.name} against {label}", series, label, metric.heading, log_x=True))
+    return [chart for chart in charts if chart]
+
+
+def tradeoff_gaps(trials: Sequence[Trial], baseline: str = BASELINE) -> list[str]:
+    """The area between every densifier's curve and the baseline's, in words, where both have several points."""
+    lines = []
+    for metric in _main_metrics(trials):
+        for cost, label in COST_LABELS.items():
+            curves = _curves(trials, metric, cost)
+            for (init, densify), curve in curves.items():
+                first = curves.get((init, baseline))
+                gap = curve_gap(first, curve) if first is not None and densify != baseline else None
+                if gap is not None:
+                    amount = f"{gap.gap:+.{metric.decimals + 1}f}".replace("-", "−")
+                    arms = f"{init}-{densify} at the same {label} as {init}-{baseline}"
+                    scale = f"from {short_number(gap.low)} to {short_number(gap.high)}, log scale"
+                    lines.append(f"{metric.name} of {arms}: {amount} on average ({scale}).")
+    return lines
+
+
+def _main_metrics(trials: Sequence[Trial]) -> list[Quantity]:
+    """PSNR, and the first perceptual metric that is at hand, beginning with the protocol's LPIPS."""
+    for name in ("lpips", "lpips_vgg", "lpips_alex", "lpips_squeeze", "flip"):
+        perceptual = quantity(name, trials)
+        if all(perceptual.read(trial) is not None for trial in trials):
+            return [quantity("psnr", trials), perceptual]
+    return [quantity("psnr", trials)]
+
+
+def _curves(trials: Sequence[Trial], metric: Quantity, cost: str) -> dict[Arm, Curve]:
+    families = sorted({(trial.init, trial.densify) for trial in trials})
+    curves = {family: family_curve(trials, family, metric, cost) for family in families}
+    return {family: curve for family, curve in curves.items() if len(curve.cost)}

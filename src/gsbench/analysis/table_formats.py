@@ -1,0 +1,173 @@
+"""Writing a table as Markdown, CSV, LaTeX (booktabs) or HTML."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import itertools
+import re
+from collections.abc import Callable
+
+from gsbench.analysis.tables import Column, Entry, Table
+
+
+def to_markdown(table: Table) -> str:
+    """A GitHub-flavoured Markdown table under its title, with notes as a list."""
+    heads = [*table.row_headings, *(_flat_heading(column) for column in table.columns)]
+    lines = [f"### {table.title}", "", _markdown_row(heads)]
+    lines.append(_markdown_row([":---"] * len(table.row_headings) + ["---:"] * len(table.columns)))
+    for row in table.rows:
+        cells = [f"**{_pipe(e.text)}**" if e.bold else _pipe(e.text) for e in row.entries]
+        lines.append(_markdown_row([*map(_pipe, row.labels), *cells]))
+    lines += ["", *(f"- {note}" for note in table.notes)]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def to_csv(table: Table) -> str:
+    """One line for each cell, in full precision, with the folders of its trials."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(
+        [*table.row_headings, "quantity", "column", "mean", "std", "count", "expected", "best", "text", "trials"]
+    )
+    for row in table.rows:
+        for (quantity, arm), entry in zip(table.keys, row.entries, strict=True):
+            writer.writerow([*row.labels, quantity, arm, *_numbers(entry), int(entry.bold), entry.text, _trials(entry)])
+    return buffer.getvalue()
+
+
+def to_latex(table: Table) -> str:
+    """A ``table`` environment in booktabs style; the document needs ``\\usepackage{booktabs}``."""
+    width = len(table.row_headings)
+    spec = "l" * width + "r" * len(table.columns)
+    lines = [
+        "% needs \\usepackage{booktabs}",
+        "\\begin{table}",
+        "\\centering",
+        f"\\caption{{{escape_latex(table.title)}}}",
+        f"\\begin{{tabular}}{{{spec}}}",
+        "\\toprule",
+    ]
+    groups = _column_groups(table)
+    if any(name for name, _ in groups):
+        cells, rules, start = [""] * width, [], width + 1
+        for name, size in groups:
+            cells.append(f"\\multicolumn{{{size}}}{{c}}{{{escape_latex(name)}}}")
+            rules.append(f"\\cmidrule(lr){{{start}-{start + size - 1}}}")
+            start += size
+        lines += [" & ".join(cells) + " \\\\", " ".join(rules)]
+    heads = [*table.row_headings, *(column.heading for column in table.columns)]
+    lines += [" & ".join(map(escape_latex, heads)) + " \\\\", "\\midrule"]
+    for row in table.rows:
+        if row.rule_above:
+            lines.append("\\midrule")
+        cells = [f"\\textbf{{{escape_latex(e.text)}}}" if e.bold else escape_latex(e.text) for e in row.entries]
+        lines.append(" & ".join([*map(escape_latex, row.labels), *cells]) + " \\\\")
+    lines += ["\\bottomrule", "\\end{tabular}"]
+    if table.notes:
+        notes = "\\\\\n".join(escape_latex(note) for note in table.notes)
+        lines.append(f"\\par\\smallskip\\begin{{minipage}}{{\\linewidth}}\\footnotesize\n{notes}\n\\end{{minipage}}")
+    lines.append("\\end{table}")
+    return "\n".join(lines) + "\n"
+
+
+def to_html(table: Table) -> str:
+    """A ``<figure>`` with the table, its caption and notes; no styles of its own."""
+    parts = [f'<figure class="table"><table>\n<caption>{html.escape(table.title)}</caption>\n<thead>\n']
+    groups = _column_groups(table)
+    grouped = any(name for name, _ in groups)
+    if grouped:
+        heads = "".join(f'<th scope="colgroup" colspan="{size}">{html.escape(name)}</th>' for name, size in groups)
+        span = f'<td colspan="{len(table.row_headings)}"></td>'
+        parts.append(f"<tr>{span}{heads}</tr>\n")
+    labels = "".join(f'<th class="name" scope="col">{html.escape(name)}</th>' for name in table.row_headings)
+    heads = "".join(f'<th scope="col">{html.escape(column.heading)}</th>' for column in table.columns)
+    parts.append(f"<tr>{labels}{heads}</tr>\n</thead>\n<tbody>\n")
+    for row in table.rows:
+        labels = "".join(f'<th scope="row">{html.escape(label)}</th>' for label in row.labels)
+        cells = "".join(f"<td>{_html_text(entry)}</td>" for entry in row.entries)
+        rule = ' class="rule"' if row.rule_above else ""
+        parts.append(f"<tr{rule}>{labels}{cells}</tr>\n")
+    parts.append("</tbody>\n</table>\n")
+    if table.notes:
+        notes = "".join(f"<li>{html.escape(note)}</li>" for note in table.notes)
+        parts.append(f"<figcaption><ul>{notes}</ul></figcaption>\n")
+    return "".join(parts) + "</figure>\n"
+
+
+def to_html_page(table: Table) -> str:
+    """The table as a page of its own."""
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(table.title)}</title>\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<style>{PAGE_STYLE}</style></head>\n<body>\n{to_html(table)}</body></html>\n"
+    )
+
+
+FORMATS: dict[str, tuple[str, Callable[[Table], str]]] = {  # name -> file suffix, writer
+    "md": ("md", to_markdown),
+    "csv": ("csv", to_csv),
+    "latex": ("tex", to_latex),
+    "html": ("html", to_html_page),
+}
+
+PAGE_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; margin: 1rem; color: #1c1e21; background: #fff }
+figure.table { margin: 0; overflow-x: auto }
+table { border-collapse: collapse } caption { text-align: left; font-weight: 600; padding-bottom: .5rem }
+th, td { padding: .3rem .7rem; text-align: right; white-space: nowrap }
+th[scope=row], th.name { text-align: left } th[scope=row] { font-weight: normal }
+thead tr:last-child th { border-bottom: 1px solid #888 } tr.rule > * { border-top: 1px solid #888 }
+th[scope=colgroup] { text-align: center } figcaption { font-size: .85rem; color: #555 }
+"""
+
+_LATEX = {
+    "\\": "\\textbackslash{}", "&": "\\&", "%": "\\%", "$": "\\$", "#": "\\#", "_": "\\_", "{": "\\{", "}": "\\}",
+    "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "<": "$<$", ">": "$>$", "|": "$|$",
+    "±": "$\\pm$", "↑": "$\\uparrow$", "↓": "$\\downarrow$", "—": "---", "–": "--", "−": "$-$", "…": "\\ldots{}",
+    "×": "$\\times$", "≈": "$\\approx$", "≠": "$\\neq$", "≤": "$\\leq$", "≥": "$\\geq$", "Δ": "$\\Delta$",
+    "·": "$\\cdot$", "²": "$^2$", "“": "``", "”": "''", "‘": "`", "’": "'",
+}  # fmt: skip
+_LATEX_PATTERN = re.compile("|".join(re.escape(character) for character in _LATEX))
+
+
+def escape_latex(text: str) -> str:
+    """Text as LaTeX source; a character that plain LaTeX does not know becomes a question mark."""
+    escaped = _LATEX_PATTERN.sub(lambda match: _LATEX[match[0]], text)
+    return escaped.encode("latin-1", "replace").decode("latin-1")
+
+
+def _column_groups(table: Table) -> list[tuple[str, int]]:
+    """Neighbouring columns of one group, as (name, number of columns)."""
+    return [
+        (name, len(list(group))) for name, group in itertools.groupby(table.columns, key=lambda column: column.group)
+    ]
+
+
+def _flat_heading(column: Column) -> str:
+    return f"{column.group} {column.heading}".strip()
+
+
+def _markdown_row(cells: list[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _pipe(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def _html_text(entry: Entry) -> str:
+    text = html.escape(entry.text)
+    return f"<strong>{text}</strong>" if entry.bold else text
+
+
+def _numbers(entry: Entry) -> list[object]:
+    cell = entry.cell
+    if cell is None:
+        return ["", "", "", ""]
+    return ["" if cell.mean is None else cell.mean, "" if cell.std is None else cell.std, cell.count, cell.expected]
+
+
+def _trials(entry: Entry) -> str:
+    return " ".join(trial.label for trial in entry.cell.trials) if entry.cell else ""

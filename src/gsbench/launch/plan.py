@@ -1,0 +1,222 @@
+"""The plan of an experiment: every trial that was ever asked for under its name, so that what is missing can be named.
+
+``<runs>/<experiment>/plan.json`` maps a trial's folder to the overrides that describe it. Loads no torch.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsbench.compose import Composed
+from gsbench.errors import InputError
+from gsbench.files import write_json
+from gsbench.pipeline.locks import hold, read_holder
+from gsbench.pipeline.trial_files import (
+    CONFIG,
+    FAILED,
+    LOCK,
+    RESULTS,
+    State,
+    TrialPaths,
+    failure_of,
+    find_finished,
+    read_object,
+    stage_and_step,
+    state_of,
+)
+from gsbench.words import counted, readable_time
+
+PLAN = "plan.json"
+PLAN_VERSION = 1
+TRIAL_GLOB = "*/*/*-seed*"
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A trial of the plan: its folder, its overrides, where the command was given, and when (Unix time)."""
+
+    folder: Path
+    overrides: tuple[str, ...]
+    cwd: str
+    time: float
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A trial's state with what people want to know of it: since when (Unix time), and a note."""
+
+    folder: Path
+    state: State
+    since: float | None
+    note: str
+
+
+def add_to_plan(trials: Sequence[Composed]) -> None:
+    """Write the trials into the plans of their experiments; those that were there stay."""
+    by_plan: dict[Path, dict[str, Any]] = {}
+    for trial in trials:
+        paths = TrialPaths.of(trial.values)
+        home = paths.runs / trial.values["name"]
+        entry = {"overrides": list(trial.overrides), "cwd": os.getcwd(), "time": time.time()}
+        by_plan.setdefault(home, {})[paths.folder.relative_to(home).as_posix()] = entry
+    for home, entries in by_plan.items():
+        home.mkdir(parents=True, exist_ok=True)
+        with hold(home / f".{PLAN}.lock", "the plan"):
+            known = _read(home)
+            write_json(home / PLAN, {"version": PLAN_VERSION, "trials": known | entries})
+
+
+def forget(home: Path, folders: Iterable[Path]) -> None:
+    """Drop trials from the plan of the experiment in ``home``."""
+    doomed = {folder.relative_to(home).as_posix() for folder in folders}
+    with hold(home / f".{PLAN}.lock", "the plan"):
+        kept = {name: entry for name, entry in _read(home).items() if name not in doomed}
+        write_json(home / PLAN, {"version": PLAN_VERSION, "trials": kept})
+
+
+def read_plan(home: Path) -> list[Planned]:
+    """The planned trials of the experiment in ``home``; none if it has no plan."""
+    return [
+        Planned(home / name, tuple(entry["overrides"]), entry["cwd"], float(entry["time"]))
+        for name, entry in sorted(_read(home).items())
+    ]
+
+
+def _read(home: Path) -> dict[str, Any]:
+    try:
+        plan = json.loads((home / PLAN).read_text(encoding="utf-8"))
+        return dict(plan["trials"])
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{home / PLAN} is damaged ({error}): delete it, and give the sweep's command again"
+        ) from error
+
+
+def progress_of_experiment(home: Path) -> list[Progress]:
+    """The state of every trial of the experiment in ``home``, planned or found there."""
+    planned = {trial.folder: trial.time for trial in read_plan(home)}
+    found = {path for path in home.glob(TRIAL_GLOB) if path.is_dir() and (path / CONFIG).exists()}
+    return [progress_of(folder, planned.get(folder)) for folder in sorted({*planned, *found})]
+
+
+def progress_of(folder: Path, planned: float | None = None) -> Progress:
+    """The state of the trial in ``folder``; ``planned`` is when it was asked for."""
+    state = state_of(folder)
+    if state == "done":
+        return Progress(folder, state, _changed(folder / RESULTS), "")
+    if state == "failed":
+        return Progress(folder, state, _changed(folder / FAILED), failure_of(folder))
+    if state == "running":
+        holder = read_holder(folder / LOCK)
+        job = f", Slurm job {holder['slurm']}" if holder.get("slurm") else ""
+        where = f"process {holder.get('pid', '?')} on {holder.get('host', '?')}{job}"
+        return Progress(folder, state, holder.get("since"), f"{_reached(folder)} {where}".strip())
+    if state == "partial":
+        return Progress(folder, state, _changed(folder / CONFIG), f"stopped {_reached(folder)}".strip())
+    return Progress(folder, state, planned, "never started")
+
+
+def _reached(folder: Path) -> str:
+    stage, step = stage_and_step(folder)
+    return f"in {stage}" + (f" at iteration {step}" if stage == "train" and step else "") if stage else ""
+
+
+def _changed(path: Path) -> float | None:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return None
+
+
+def same_trial_elsewhere(paths: TrialPaths) -> str | None:
+    """The other experiment, if any, that has finished the same trial: its stages are reused, not computed again."""
+    for results in paths.runs.glob(f"*/*/*/{paths.folder.name}/{RESULTS}"):
+        if results.parent != paths.folder and read_object(results).get("status") == "complete":
+            return results.relative_to(paths.runs).parts[0]
+    return None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Expected seconds of work, and of how many finished trials that is learned (0: nothing is known)."""
+
+    seconds: float
+    learned_from: int
+
+
+class Estimator:
+    """Tells a trial's time from finished ones: most alike first (same scene and densifier), per iteration."""
+
+    def __init__(self, runs: Path) -> None:
+        self.finished: list[dict[str, Any]] = []
+        for path in runs.glob(f"*/{TRIAL_GLOB}/{RESULTS}"):
+            results = read_object(path)
+            if results.get("status") == "complete" and results.get("iterations"):
+                self.finished.append(results)
+
+    def estimate(self, values: dict[str, Any]) -> Estimate:
+        """Seconds for the whole trial with ``values``."""
+        wanted = {
+            "scene": values["scene"]["name"],
+            "init": values["init"]["name"],
+            "densify": values["densify"]["name"],
+        }
+        for keys in (("scene", "init", "densify"), ("scene", "densify"), ("scene",), ("densify",), ()):
+            alike = [r for r in self.finished if all(r.get(key) == wanted[key] for key in keys)]
+            if alike:
+                iterations = values["train"]["iterations"]
+                times = [r["seconds"]["train"] * iterations / r["iterations"] + r["seconds"]["evaluate"] for r in alike]
+                return Estimate(statistics.fmean(times), len(alike))
+        return Estimate(0.0, 0)
+
+
+def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
+    """Lines for ``--dry-run``: each trial with its state, and the time that the unfinished ones will take."""
+    lines, remaining, unknown, counts = (
+        [],
+        0.0,
+        0,
+        dict.fromkeys(("done", "partial", "missing", "running", "failed"), 0),
+    )
+    estimator = Estimator(TrialPaths.of(trials[0].values).runs) if trials else None
+    learned = 0
+    for trial in trials:
+        paths = TrialPaths.of(trial.values)
+        state: str = state_of(paths.folder)
+        note = ""
+        if state == "done" and find_finished(trial.values) is None:
+            note = "  will be checked: something that it was made of has changed, or a metric is missing"
+        elif state != "done":
+            shared = same_trial_elsewhere(paths)
+            if shared is not None:
+                note = f"  as in {shared}: nothing to compute"
+            else:
+                assert estimator is not None
+                estimate = estimator.estimate(trial.values)
+                done = stage_and_step(paths.folder)[1] / trial.values["train"]["iterations"]
+                remaining += estimate.seconds * (1 - min(1.0, done))
+                learned = max(learned, estimate.learned_from)
+                unknown += estimate.learned_from == 0
+        counts[state] += 1
+        lines.append(f"{state:<8} {paths.label}{note}")
+    summary = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
+    lines.append(f"{counted(len(trials), 'trial')}: {summary}")
+    if counts["done"] < len(trials):
+        if unknown:
+            lines.append("time: not known, since no finished trial tells how long one takes here")
+        elif learned == 0:
+            lines.append("time: seconds, since other experiments have the results")
+        else:
+            at_once = f", {parallel} at once" if parallel > 1 else ""
+            took = readable_time(remaining / parallel)
+            lines.append(f"time: about {took}{at_once}, judged by {counted(learned, 'finished trial')}")
+    return lines

@@ -1,0 +1,43 @@
+"""One trial after the other, in this process."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+from gsbench.compose import Composed
+from gsbench.launch.outcome import Outcome, outcome_of_error, outcome_of_results
+from gsbench.pipeline.locks import BusyError
+from gsbench.pipeline.trial_files import TrialPaths
+
+log = logging.getLogger(__name__)
+
+
+def run_serial(trials: Sequence[Composed]) -> list[Outcome]:
+    """Run the trials; one that another process is at comes last, so that two sweeps share the work."""
+    outcomes: list[Outcome] = []
+    busy: list[Composed] = []
+    for trial in trials:
+        try:
+            outcomes.append(run_one(trial, wait=len(trials) == 1))
+        except BusyError as error:
+            log.info("%s; later", error)
+            busy.append(trial)
+            continue
+        if outcomes[-1].fatal:
+            return outcomes
+    outcomes += [run_one(trial, wait=True) for trial in busy]
+    return outcomes
+
+
+def run_one(trial: Composed, wait: bool) -> Outcome:
+    """Run one trial; only BusyError, and what ends the program, is raised."""
+    folder = TrialPaths.of(trial.values).folder
+    try:
+        from gsbench.pipeline.trial import run_trial  # here, because a sweep that is done needs no torch
+
+        return outcome_of_results(folder, run_trial(trial.values, trial.yaml, wait))
+    except BusyError:
+        raise
+    except Exception as error:  # noqa: BLE001 - a failed trial does not stop the others
+        return outcome_of_error(folder, error)

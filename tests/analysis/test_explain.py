@@ -1,0 +1,64 @@
+"""`gsbench explain`: every number of a cell leads to its trials."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gsbench.analysis.explain import explain, main_explain
+from gsbench.errors import InputError
+from tests.analysis.synthetic import Plan, write_runs
+
+
+def test_a_cell_names_its_trials_hashes_and_versions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = write_runs(tmp_path, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
+    assert main_explain(["table1:garden:lpips:volumetric"], tmp_path) == 0
+    text = capsys.readouterr().out
+    for path in paths:
+        assert (str(path) in text) == ("volumetric" in str(path))
+    for expected in (
+        "LPIPS VGG raw of dim-volumetric on garden",
+        "over 3 of 3 trials",
+        "the paper prints 0.12",
+        "data-garden",
+        "torch 2.13.0",
+        "protocol: paper-1",
+        "resolution: 400x300",
+        "iterations: 2000",
+    ):
+        assert expected in text
+
+
+def test_the_settings_that_make_the_difference_are_shown(tmp_path: Path) -> None:
+    for path in write_runs(tmp_path, Plan(scenes=("garden",))):
+        if "volumetric" in str(path):
+            path.rename(path.with_name(path.name.replace("c0ffee00", "deadbeef")))
+    text = explain("exp:garden:psnr:sfm-volumetric", tmp_path)
+    assert "Settings that differ from sfm-adc\n  densify.name: adc -> volumetric" in text
+
+
+def test_what_is_missing_is_said(tmp_path: Path) -> None:
+    paths = write_runs(tmp_path, Plan(scenes=("garden",)))
+    (paths[0] / "results.json").unlink()
+    text = explain("exp:garden:psnr:adc", tmp_path)
+    assert "over 2 of 3 trials" in text
+    assert "Left out\n  exp/garden/sfm-adc/c0ffee00-seed0: unfinished" in text
+    assert "not available: weights file alexnet.pth not found" in explain("exp:garden:lpips_alex:adc", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("exp:garden:psnr", "is not EXPERIMENT:SCENE:METRIC:ARM"),
+        ("nope:garden:psnr:adc", "no experiment 'nope'"),
+        ("exp:kitchen:psnr:adc", "has no scene 'kitchen'; it has garden"),
+        ("exp:garden:psnr:mcmc", "names 0 arms of garden; choose one of dim-adc, dim-volumetric, sfm-adc"),
+        ("exp:garden:psnr:adc", "names 2 arms"),
+        ("exp:garden:quality:sfm-adc", "unknown metric 'quality'"),
+    ],
+)
+def test_bad_addresses_are_explained(tmp_path: Path, address: str, words: str) -> None:
+    write_runs(tmp_path, Plan(scenes=("garden",), inits=("sfm", "dim")))
+    with pytest.raises(InputError, match=words):
+        explain(address, tmp_path)

@@ -1,0 +1,154 @@
+"""The paper as data: its numbers against its own text, and the classing of cells."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gsbench.analysis.cells import Cell
+from gsbench.analysis.paper import TABLE1_QUANTITIES, Printed, inconsistencies, load_paper, pairs_of
+from gsbench.analysis.paper_tables import Agreement, agreement, paper_tables, t_half_width
+from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.analysis.tables import build_table
+from gsbench.analysis.tables_cli import main_tables
+from gsbench.errors import InputError
+from tests.analysis.synthetic import Plan, write_runs
+
+
+def cell(mean: float, std: float | None = None, count: int = 3) -> Cell:
+    return Cell(mean, std, count, 3, 1, ())
+
+
+@pytest.mark.shared
+def test_the_data_are_those_of_the_printed_tables(shared: Path) -> None:
+    """Every number of the tables in the paper's text, row by row, with its printed digits."""
+    paper, text = load_paper(), (shared / "paper.md").read_text()
+    rows = [[c.strip().strip("*") for c in line.strip("|").split("|")] for line in text.splitlines() if "|" in line]
+    name = {"Tree-hill": "treehill", "Dr.Johnson": "drjohnson"}
+    table1 = [row for row in rows if len(row) == 12 and re.fullmatch(r"[\d.]+", row[1])]
+    assert len(table1) == 13
+    for row in table1:
+        scene = name.get(row[-1], row[-1].lower())
+        keys = [(scene, "dim", arm, q) for q in TABLE1_QUANTITIES for arm in ("adc", "volumetric")]
+        assert [paper.table1[key].text for key in keys] == row[1:11]
+    table2 = [row for row in rows if len(row) == 5 and re.fullmatch(r"[\d.]+", row[1])]
+    assert len(table2) == 12
+    for row in table2:
+        scene = name.get(row[0], row[0].lower())
+        arms = (("sfm", "adc"), ("dim", "adc"), ("sfm", "volumetric"), ("dim", "volumetric"))
+        assert [paper.table2[scene, init, arm, "lpips_vgg_raw"].text for init, arm in arms] == row[1:]
+
+
+def test_the_printed_average_is_the_ratio_of_totals() -> None:
+    pairs = pairs_of(load_paper(), "gaussians_millions").values()
+    assert 100 * (sum(b for _, b in pairs) / sum(a for a, _ in pairs) - 1) == pytest.approx(30.33, abs=0.005)
+
+
+def test_the_known_inconsistencies_are_found() -> None:
+    text = "\n".join(inconsistencies(load_paper()))
+    for expected in (
+        "Gaussians: +30.3% as a ratio of totals, +47.9% as the mean of scenes",
+        "Training time: +43.0% as a ratio of totals, +55.2% as the mean of scenes",
+        "PSNR: mean of 13 scenes 26.105 (3DGS), 26.161 (ours); ours is better in 7",
+        "kitchen, stump, drjohnson",
+        "bicycle Ours 0.22/0.226, stump Ours 0.23/0.224, playroom 3DGS 0.31/0.304, drjohnson 3DGS 0.44/0.449",
+        "Table 2 omits train",
+        "truck, Ours: LPIPS 0.359 from SfM and 0.115 from DIM",
+        "a factor of 2.06",
+    ):
+        assert expected in text
+
+
+def test_a_printed_number_stands_for_its_rounding_range() -> None:
+    assert Printed("0.27").half_step == pytest.approx(0.005)
+    assert Printed("0.270").range == pytest.approx((0.2695, 0.2705))
+
+
+@pytest.mark.parametrize(
+    ("measured", "expected"),
+    [
+        (cell(0.124), Agreement.ROUNDING),  # rounds to 0.12
+        (cell(0.126), Agreement.DIFFERS),  # a single trial has no interval
+        (cell(0.130, 0.002), Agreement.DIFFERS),  # 0.130 - 4.303 * 0.002 / sqrt(3) = 0.12503 > 0.125
+        (cell(0.130, 0.0021), Agreement.INTERVAL),  # 0.130 - 4.303 * 0.0021 / sqrt(3) = 0.12478
+        (cell(0.110, 0.0021), Agreement.INTERVAL),
+        (cell(0.200, 0.001), Agreement.DIFFERS),
+    ],
+)
+def test_agreement(measured: Cell, expected: Agreement) -> None:
+    assert agreement(measured, Printed("0.12")) is expected
+
+
+def test_the_interval_is_students() -> None:
+    # Tabulated two-sided 95 % quantiles: 12.706 for 1 degree of freedom, 4.303 for 2.
+    assert t_half_width(1.0, 2) == pytest.approx(12.706 / 2**0.5, abs=1e-3)
+    assert t_half_width(1.0, 3) == pytest.approx(4.303 / 3**0.5, abs=1e-3)
+
+
+def test_table1_has_the_papers_rows_and_marks_what_was_not_run(make_experiment: Callable[..., Experiment]) -> None:
+    experiment = make_experiment(experiment="table1", inits=("dim",), scenes=("garden", "bonsai"))
+    measured, difference = paper_tables(experiment, "table1")
+    assert [row.labels[0] for row in measured.rows[:-1]] == load_paper().scenes("table1")
+    assert measured.rows[-1].labels == ("mean of 2 scenes",)
+    by_scene = {row.labels[0]: row for row in measured.rows}
+    assert by_scene["stump"].entries[0].text == "— (0/3)"
+    assert {row.labels for row in difference.rows} == {(s, a) for s in ("garden", "bonsai") for a in ("3DGS", "Ours")}
+    psnr = by_scene["garden"].entries[2].cell
+    shown = next(row for row in difference.rows if row.labels == ("garden", "3DGS")).entries[3].text
+    assert shown.split()[0].replace("−", "-") == f"{psnr.mean - 27.06:+.2f}"
+
+
+def test_table1_names_a_stand_in_for_the_papers_initialiser(make_experiment: Callable[..., Experiment]) -> None:
+    experiment = make_experiment(experiment="table1", inits=("sfm",), scenes=("garden",))
+    _, difference = paper_tables(experiment, "table1")
+    assert any("from sfm stand in for the paper's DIM" in note for note in difference.notes)
+
+
+def test_table2_has_the_papers_columns(make_experiment: Callable[..., Experiment]) -> None:
+    experiment = make_experiment(experiment="table2", inits=("dim", "sfm"), scenes=("garden",))
+    measured, _ = paper_tables(experiment, "table2")
+    assert [c.heading for c in measured.columns] == ["SfM + 3DGS", "DIM + 3DGS", "SfM + Ours", "DIM + Ours"]
+
+
+def test_another_lpips_is_not_compared_with_the_papers(make_experiment: Callable[..., Experiment]) -> None:
+    experiment = make_experiment(experiment="table1", inits=("dim",), scenes=("garden",))
+    _, difference = paper_tables(experiment, "table1", metrics=["psnr", "flip"])
+    assert [column.group for column in difference.columns] == ["PSNR (dB)", "PSNR (dB)"]
+    assert any("no such number: flip" in note for note in difference.notes)
+
+
+def test_an_experiment_without_the_papers_arms_is_refused(make_experiment: Callable[..., Experiment]) -> None:
+    experiment = make_experiment(densifiers=("none",), scenes=("garden",))
+    with pytest.raises(InputError, match="no trial for table2"):
+        paper_tables(experiment, "table2")
+    assert build_table(experiment).rows
+
+
+def test_the_verb_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs = tmp_path / "runs"
+    write_runs(runs, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
+    assert main_tables(["table1"], runs) == 0
+    out = capsys.readouterr().out
+    assert "### Table 1, measured" in out
+    assert "### Table 1, difference" in out
+    assert main_tables(["table1", "--format", "latex", "--out", str(tmp_path / "out")], runs) == 0
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["table1-difference.tex", "table1.tex"]
+    assert main_tables(["table1", "--rows", "scene,densify", "--metrics", "psnr", "--format", "csv"], runs) == 0
+    assert main_tables(["paper"], runs) == 0
+    assert "ratio of totals" in capsys.readouterr().out
+
+
+def test_the_verb_names_bad_options_and_left_out_trials(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_runs(tmp_path, Plan())[0]
+    (path / "results.json").write_text("{")
+    with pytest.raises(InputError, match="no trial has iterations=7"):
+        main_tables(["exp", "--where", "iterations=7"], tmp_path)
+    assert "left out: exp/courtyard/sfm-adc/c0ffee00-seed0: damaged" in capsys.readouterr().err
+    with pytest.raises(InputError, match="KEY=VALUE"):
+        main_tables(["exp", "--where", "iterations"], tmp_path)
+    with pytest.raises(InputError, match="scene stands in --rows and --columns"):
+        main_tables(["exp", "--rows", "scene", "--columns", "scene"], tmp_path)
+    assert load_experiment(tmp_path, "exp").trials

@@ -1,0 +1,319 @@
+"""The report: it stands alone, says the verdict first, needs neither mouse nor eyes, and shows the right places."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ElementTree
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from gsbench.analysis.errors_by_region import errors_by_region, texture_energy
+from gsbench.analysis.pairing import ViewCache, pair_trials
+from gsbench.analysis.report.build import build_report, main_report
+from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
+from gsbench.analysis.report.crops import choose_crops
+from gsbench.analysis.report.sections import compare_arms, mean_by_step
+from gsbench.analysis.report.sweep_charts import sweep_charts
+from gsbench.analysis.report.volumes import log10_volumes, share_above, volume_histogram
+from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.errors import InputError
+from tests.analysis.synthetic import TEXTURED, Plan, trial_data, write_runs, write_trial
+
+ADC, VOLUMETRIC = ("sfm", "adc"), ("sfm", "volumetric")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scenes with pictures, in which "volumetric" has a clearly better LPIPS and nothing else differs."""
+    folder = tmp_path_factory.mktemp("runs")
+    write_runs(folder, Plan(effect={"lpips_vgg_raw": -0.05}, views=3, pictures=True, random_seed=1))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def experiment(runs: Path) -> Experiment:
+    return load_experiment(runs, "exp")
+
+
+@pytest.fixture(scope="module")
+def page(experiment: Experiment) -> str:
+    return build_report(experiment)
+
+
+class Elements(HTMLParser):
+    """Collects tags with attributes and checks that they close in order."""
+
+    VOID = ("meta", "link", "img", "input", "br")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag, f"{tag} closes out of order at {self.getpos()}"
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attrs for name, attrs in self.found if name == tag]
+
+
+def test_the_page_is_well_formed_and_needs_nothing_else(page: str) -> None:
+    elements = Elements(page)
+    assert elements.open == []
+    for tag, attribute in (("img", "src"), ("link", "href"), ("script", "src"), ("iframe", "src")):
+        assert all((attrs.get(attribute) or "data:").startswith("data:") for attrs in elements.all(tag))
+    assert not re.search(r"url\(|@import|https?://|fetch\(|XMLHttp", page)
+
+
+def test_it_can_be_read_without_eyes_and_used_without_a_mouse(page: str) -> None:
+    elements = Elements(page)
+    assert elements.all("html") == [{"lang": "en"}]
+    assert all(attrs.get("alt") for attrs in elements.all("img"))
+    pictures = [attrs for attrs in elements.all("svg") if attrs.get("aria-hidden") != "true"]
+    assert len(pictures) > 10
+    assert all(attrs.get("role") == "img" and attrs.get("aria-label") for attrs in pictures)
+    sliders = elements.all("input")
+    assert len(sliders) == 8
+    assert all(attrs["type"] == "range" and attrs["aria-label"] for attrs in sliders)
+    assert all(attrs.get("tabindex") == "0" for attrs in elements.all("div") if attrs.get("class") == "scroll")
+    anchors = {attrs["href"].removeprefix("#") for attrs in elements.all("a")}
+    assert anchors <= {attrs.get("id") for _, attrs in elements.found}
+    ids = [attrs["id"] for _, attrs in elements.found if "id" in attrs]
+    assert len(ids) == len(set(ids))
+
+
+def test_the_verdict_comes_first(page: str) -> None:
+    headings = re.findall(r"<h2[^>]*>([^<]+)", page)
+    assert headings[:2] == ["Verdict", "Tables"]
+    assert "sfm-volumetric against sfm-adc, on these scenes: better in LPIPS VGG raw; no evidence" in page
+    assert "LPIPS Alex" not in page.split("</section>")[0].split("<tbody>")[1]  # not run: no row
+
+
+def test_the_same_files_give_the_same_page(experiment: Experiment, page: str) -> None:
+    assert build_report(experiment) == page
+
+
+def test_every_trial_is_traceable(experiment: Experiment, page: str) -> None:
+    assert all(trial.label in page for trial in experiment.trials)
+    assert "pycolmap 4.2.1" in page
+
+
+def test_errors_are_sorted_by_texture(experiment: Experiment) -> None:
+    """The made-up renders of "volumetric" are sharper in the grass and wrong in a smooth corner."""
+    found = errors_by_region(experiment.trials, ADC, VOLUMETRIC)
+    verdicts = [comparison.verdict for comparison in found.comparisons]
+    assert verdicts[0] == "worse"
+    assert verdicts[-1] == "better"
+    assert found.second[-1] < 0.6 * found.first[-1]
+
+
+def test_texture_energy_is_the_squared_gradient() -> None:
+    ramp = np.repeat(np.arange(40, dtype=np.uint8)[None, :, None] * 3, 30, axis=0).repeat(3, axis=2)
+    energy = texture_energy(ramp)  # a slope of 3 levels a pixel everywhere
+    assert energy[15, 20] == pytest.approx(9.0)
+    assert texture_energy(np.full((9, 9, 3), 7, dtype=np.uint8)).max() == 0
+
+
+def test_a_map_sorts_the_errors_where_it_is_at_hand(experiment: Experiment) -> None:
+    with pytest.raises(InputError, match=r"view000\.npz has no map 'depth'"):
+        errors_by_region(experiment.trials, ADC, VOLUMETRIC, "depth")
+    depth = np.ones((120, 160))
+    depth[:, TEXTURED] = 2.0
+    for trial in experiment.trials:
+        (trial.path / "maps").mkdir()
+        for view in range(3):
+            np.savez(trial.path / "maps" / f"view{view:03d}.npz", depth=depth)
+    found = errors_by_region(experiment.trials, ADC, VOLUMETRIC, "depth", bins=2)
+    assert [comparison.verdict for comparison in found.comparisons] == ["worse", "better"]
+    with pytest.raises(InputError, match="unknown property 'hue'"):
+        errors_by_region(experiment.trials, ADC, VOLUMETRIC, "hue")
+
+
+def test_crops_lie_where_the_arms_differ_most(experiment: Experiment) -> None:
+    gained, lost, faults = choose_crops(pair_trials(experiment.trials, ADC, VOLUMETRIC), 4)
+    assert faults == []
+    assert {crop.scene for crop in gained} == {"courtyard", "garden"}
+    for crop in gained:
+        assert crop.box[2] > TEXTURED.start  # reaches into the grass
+        assert crop.first_error - crop.second_error > 2
+    for crop in lost:
+        assert crop.box[:2] == (0, 0)
+        assert crop.second_error - crop.first_error == pytest.approx(20, abs=1.5)
+
+
+def test_missing_or_damaged_pictures_are_named(tmp_path: Path) -> None:
+    paths = write_runs(tmp_path, Plan(views=2, pictures=True))
+    (paths[0] / "renders" / "view001.png").write_bytes(b"\x89PNG\r\n\x1a\nhalf")
+    (paths[1] / "point_cloud.ply").write_bytes(b"ply\nformat ascii 1.0\n")
+    experiment = load_experiment(tmp_path, "exp")
+    text = build_report(experiment)
+    assert "view001.png cannot be read as an image" in text
+    assert "is not a readable 3DGS PLY" in text
+
+
+def test_volumes_are_those_of_the_ellipsoids(experiment: Experiment) -> None:
+    path = experiment.trials[0].path / "point_cloud.ply"
+    vertices = PlyData.read(path)["vertex"]
+    scales = np.exp(np.stack([vertices[f"scale_{axis}"] for axis in range(3)]).astype(np.float64))
+    volumes = 4 / 3 * np.pi * scales.prod(axis=0)
+    assert log10_volumes(path) == pytest.approx(np.log10(volumes), abs=1e-6)
+    trials = experiment.trials[:1]
+    assert sum(share for _, share in volume_histogram(trials)) == pytest.approx(1)
+    assert share_above(trials, 1e-4) == pytest.approx(np.mean(volumes > 1e-4))
+
+
+def test_a_truncated_point_cloud_is_refused(tmp_path: Path, experiment: Experiment) -> None:
+    content = (experiment.trials[0].path / "point_cloud.ply").read_bytes()
+    (tmp_path / "half.ply").write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match="of 2000 vertices"):
+        log10_volumes(tmp_path / "half.ply")
+
+
+def test_mean_curves_use_common_steps() -> None:
+    assert mean_by_step([[(1, 2.0), (2, 4.0), (3, 9.0)], [(2, 6.0), (1, 0.0)], []]) == [(1, 1.0), (2, 5.0)]
+
+
+CHARTS = {
+    "lines": lambda title: line_chart(
+        title, [Series("a", [(1, 1), (10, 5)]), Series("b", [(2, 3)])], "x", "y", log_x=True
+    ),
+    "flat": lambda title: line_chart(title, [Series("a", [(5, 1), (5, 1)])], "x", "y", marker=(5, "here")),
+    "bars": lambda title: bar_chart(title, ["p", "q"], [("a", [1, 2]), ("b", [0, -1])], "count"),
+    "forest": lambda title: forest_plot(
+        title, [ForestRow("s", 0.1, -0.1, 0.3), ForestRow("t", 0.2, None, None)], "d", 1
+    ),
+}
+
+
+@pytest.mark.parametrize("chart", list(CHARTS))
+def test_charts_are_well_formed_and_stay_inside(chart: str) -> None:
+    figure = ElementTree.fromstring(CHARTS[chart]("<&>"))
+    svg = next(element for element in figure if element.tag == "svg")
+    _, _, width, height = map(float, svg.attrib["viewBox"].split())
+    for element in svg.iter():
+        for name, limit in (("x", width), ("cx", width), ("x1", width), ("y", height), ("cy", height), ("y1", height)):
+            if name in element.attrib:
+                assert 0 <= float(element.attrib[name]) <= limit
+    assert svg.attrib["aria-label"].startswith("<&>")
+
+
+def test_a_line_chart_puts_values_where_they_belong() -> None:
+    figure = ElementTree.fromstring(line_chart("t", [Series("a", [(0, 0), (5, 10), (10, 0)])], "x", "y"))
+    points = [tuple(map(float, p.split(","))) for p in next(figure.iter("polyline")).attrib["points"].split()]
+    (x0, y0), (x1, y1), (x2, y2) = points
+    assert x1 - x0 == pytest.approx(x2 - x1, abs=0.2)
+    assert y0 == y2 > y1  # up is smaller in SVG
+
+
+def test_nothing_to_draw_is_an_empty_string() -> None:
+    assert line_chart("t", [Series("a", [])], "x", "y") == ""
+    assert line_chart("t", [Series("a", [(0, 1)])], "x", "y", log_x=True) == ""
+    assert forest_plot("t", [], "x", 1) == ""
+
+
+def test_the_verb_writes_the_file(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main_report(["exp", "--out", str(tmp_path / "sub" / "r.html")], runs) == 0
+    assert (tmp_path / "sub" / "r.html").read_text().startswith("<!doctype html>")
+    assert str(tmp_path / "sub" / "r.html") in capsys.readouterr().out
+    assert [path.name for path in (tmp_path / "sub").iterdir()] == ["r.html"]
+
+
+def test_one_trial_of_each_arm_is_no_verdict(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan(seeds=(0,), scenes=("garden",), effect={"psnr": 9.0}))
+    page = build_report(load_experiment(tmp_path, "exp"))
+    assert "no verdict, one trial of each on this scene; run more seeds" in page
+    assert "▲ better" not in page
+
+
+def test_a_single_arm_and_bare_results_still_make_a_report(tmp_path: Path) -> None:
+    for path in write_runs(tmp_path, Plan(densifiers=("adc",), seeds=(0,), scenes=("garden",))):
+        for name in ("events.jsonl", "metrics.jsonl", "config.yaml"):
+            (path / name).unlink()
+    text = build_report(load_experiment(tmp_path, "exp"))
+    assert "Only one arm was run" in text
+    assert "No point clouds at hand" in text
+
+
+def test_swept_settings_become_arms_of_their_own(tmp_path: Path) -> None:
+    for cap, config_hash in ((10_000, "aaaaaaaa"), (20_000, "bbbbbbbb")):
+        plan = Plan(gaussians={"adc": cap, "volumetric": cap}, scenes=("garden",))
+        for path in write_runs(tmp_path / str(cap), plan):
+            target = (
+                tmp_path / path.relative_to(tmp_path / str(cap)).parent / f"{config_hash}-{path.name.split('-')[1]}"
+            )
+            target.parent.mkdir(parents=True, exist_ok=True)
+            text = (
+                (path / "config.yaml")
+                .read_text()
+                .replace('"volume_threshold"', f'"max_gaussians": {cap}, "volume_threshold"')
+            )
+            (path / "config.yaml").write_text(text)
+            path.rename(target)
+    page = build_report(load_experiment(tmp_path, "exp"))
+    assert "sfm-volumetric max_gaussians=10000 against sfm-adc max_gaussians=10000" in page
+    assert "of sfm-volumetric at the same Gaussians as sfm-adc" in page
+
+
+def test_arms_that_never_differed_are_called_equal_and_not_undecided(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan(trial_noise=0, residual_noise=0, views=3))
+    page = build_report(load_experiment(tmp_path, "exp"))
+    assert "equal in every metric" in page
+    assert "never acted" in page
+
+
+def test_a_sweep_of_one_setting_is_drawn_by_its_values_relative_to_each_scene(tmp_path: Path) -> None:
+    for scene, level in (("courtyard", 30.0), ("garden", 20.0)):
+        for threshold, psnr in ((0.3, 0.0), (0.03, 2.0), (1e6, 1.0)):
+            views = {"psnr": np.array([level + psnr])}
+            data = trial_data(Plan(), scene, "sfm", f"volumetric-{threshold:g}", 0, views)
+            settings = {"densify__volume_threshold": threshold, "densify___target_": "gsbench.densify.Volumetric"}
+            write_trial(tmp_path, data, views, f"{scene[0]}{threshold:g}".encode().hex()[:8].rjust(8, "0"), **settings)
+    charts = sweep_charts(load_experiment(tmp_path, "exp").trials)
+    psnr = next(chart for chart in charts if "PSNR" in chart)
+    words = re.search(r'aria-label="([^"]*)"', psnr)
+    assert words is not None
+    # each scene's mean is one above its lowest value; values stand in order of size, whatever their names
+    assert "courtyard 1 at 0.03, −1 at 0.3, 0 at 1M; garden 1 at 0.03, −1 at 0.3, 0 at 1M" in words.group(1)
+    assert "densify.volume_threshold" in words.group(1)
+
+
+def test_no_chart_by_setting_where_nothing_or_more_than_one_was_varied(tmp_path: Path, runs: Path) -> None:
+    assert sweep_charts(load_experiment(runs, "exp").trials) == []
+    for index, settings in enumerate(({"a__x": 1, "a__y": 1}, {"a__x": 2, "a__y": 2})):
+        views = {"psnr": np.array([20.0])}
+        data = trial_data(Plan(), "garden", "sfm", "volumetric", 0, views)
+        write_trial(tmp_path, data, views, f"{index:08d}", **settings)
+    assert sweep_charts(load_experiment(tmp_path, "exp").trials) == []
+
+
+def test_scenes_that_disagree_are_named_under_a_verdict_that_their_mean_leaves_open(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan(scenes=("courtyard",), effect={"psnr": 2.0}, views=3))
+    write_runs(tmp_path, Plan(scenes=("garden",), effect={"psnr": -2.0}, views=3))
+    write_runs(tmp_path, Plan(scenes=("stump",), views=3))
+    trials = load_experiment(tmp_path, "exp").trials
+    versus = compare_arms(trials, ADC, VOLUMETRIC, ViewCache())
+    assert "no evidence of a difference in PSNR" in versus.headline
+    line = next(line for line in versus.by_scene if line.startswith("PSNR"))
+    assert (
+        line
+        == "PSNR (dB) by scene: better on courtyard, worse on garden: the scenes disagree, so their mean says little"
+    )
+    assert line in build_report(load_experiment(tmp_path, "exp"))
+
+
+def test_no_scene_is_named_where_none_is_decided(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan(trial_noise=0, residual_noise=0, views=3))
+    assert compare_arms(load_experiment(tmp_path, "exp").trials, ADC, VOLUMETRIC, ViewCache()).by_scene == ()

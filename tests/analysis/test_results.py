@@ -1,0 +1,130 @@
+"""Reading result files: what is sound is read, everything else is named and left out."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gsbench.analysis.results import list_experiments, load_experiment, read_json_lines, read_views
+from gsbench.errors import InputError
+from tests.analysis.synthetic import Plan, write_runs
+
+
+def rewrite(path: Path, **changes: object) -> None:
+    data = json.loads((path / "results.json").read_text())
+    (path / "results.json").write_text(json.dumps(data | changes))
+
+
+def test_every_complete_trial_is_read(tmp_path: Path) -> None:
+    paths = write_runs(tmp_path, Plan())
+    experiment = load_experiment(tmp_path, "exp")
+    assert {trial.path for trial in experiment.trials} == set(paths)
+    assert experiment.warnings == ()
+    assert experiment.seeds == (0, 1, 2)
+
+
+def test_hydra_and_report_files_beside_the_trials_do_not_disturb(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan())
+    (tmp_path / "exp" / ".hydra").mkdir()
+    (tmp_path / "exp" / "report.html").write_text("")
+    (tmp_path / "exp" / "multirun.yaml").write_text("")
+    assert load_experiment(tmp_path, "exp").warnings == ()
+
+
+DAMAGES = {
+    "half a file": (lambda path: (path / "results.json").write_text('{"status": "comp'), "not JSON"),
+    "binary": (lambda path: (path / "results.json").write_bytes(b"\xff\xfe\x00"), "cannot be read"),
+    "a list": (lambda path: (path / "results.json").write_text("[]"), "not an object"),
+    "nan": (lambda path: rewrite(path, metrics={"psnr": float("nan")}), "metrics.psnr is nan"),
+    "text for a number": (lambda path: rewrite(path, metrics={"psnr": "27"}), "metrics.psnr is '27'"),
+    "no seconds": (lambda path: rewrite(path, seconds=None), "lacks 'seconds'"),
+    "no count": (lambda path: rewrite(path, num_gaussians=None), "num_gaussians"),
+    "no protocol": (lambda path: rewrite(path, protocol=None), "lacks 'protocol'"),
+    "still running": (lambda path: rewrite(path, status="running"), "unfinished"),
+    "another scene": (lambda path: rewrite(path, scene="kitchen"), "foreign, its results.json is of scene 'kitchen'"),
+    "another experiment": (lambda path: rewrite(path, experiment="other"), "of experiment 'other'"),
+    "another arm": (lambda path: rewrite(path, densify="none"), "of arm 'sfm-none'"),
+    "another seed": (lambda path: rewrite(path, seed=7), "of seed 7"),
+    "a copy under another name": (lambda path: path.rename(path.with_name("copy of run")), "not named"),
+    "nothing yet": (lambda path: (path / "results.json").unlink(), "unfinished, no results.json yet"),
+}
+
+
+@pytest.mark.parametrize("damage", list(DAMAGES))
+def test_a_trial_that_cannot_be_used_is_named_and_left_out(tmp_path: Path, damage: str) -> None:
+    paths = write_runs(tmp_path, Plan())
+    spoil, words = DAMAGES[damage]
+    spoil(paths[4])
+    experiment = load_experiment(tmp_path, "exp")
+    assert len(experiment.trials) == len(paths) - 1
+    assert len(experiment.warnings) == 1
+    assert words in experiment.warnings[0]
+    assert str(paths[4].parent.relative_to(tmp_path)) in experiment.warnings[0]
+
+
+def test_a_failed_trial_says_why(tmp_path: Path) -> None:
+    path = write_runs(tmp_path, Plan())[0]
+    (path / "results.json").unlink()
+    (path / "failed.json").write_text(
+        json.dumps({"error": "TrainingError", "message": "the loss is not finite at 812"})
+    )
+    assert load_experiment(tmp_path, "exp").warnings == (
+        "exp/courtyard/sfm-adc/c0ffee00-seed0: failed, the loss is not finite at 812",
+    )
+
+
+def test_an_unknown_experiment_names_the_known_ones(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan())
+    (tmp_path / "store").mkdir()
+    assert list_experiments(tmp_path) == ["exp"]
+    with pytest.raises(InputError, match="there: exp"):
+        load_experiment(tmp_path, "demo")
+    with pytest.raises(InputError, match="none yet"):
+        load_experiment(tmp_path / "nowhere", "demo")
+
+
+def test_an_experiment_without_a_usable_trial_is_an_error(tmp_path: Path) -> None:
+    for path in write_runs(tmp_path, Plan(scenes=("garden",), seeds=(0,))):
+        (path / "results.json").unlink()
+    with pytest.raises(InputError, match="no complete trial among 2 folders"):
+        load_experiment(tmp_path, "exp")
+
+
+def test_views_must_average_to_the_metrics_of_their_trial(tmp_path: Path) -> None:
+    path = write_runs(tmp_path, Plan(seeds=(0,), scenes=("garden",)))[0]
+    trial = next(trial for trial in load_experiment(tmp_path, "exp").trials if trial.path == path)
+    views = read_views(trial)
+    assert len(views) == 6
+    assert set(views["view000"]) == {"psnr", "ssim", "lpips_vgg_raw", "flip"}
+    lines = (path / "per_view.csv").read_text().splitlines()
+    (path / "per_view.csv").write_text("\n".join(lines[:-2]) + "\n")
+    with pytest.raises(InputError, match="does not average"):
+        read_views(trial)
+    (path / "per_view.csv").unlink()
+    with pytest.raises(InputError, match="missing or damaged"):
+        read_views(trial)
+
+
+def test_json_lines_end_at_a_damaged_line(tmp_path: Path) -> None:
+    (tmp_path / "m.jsonl").write_text('{"step": 1}\n{"step": 2}\n{"st')
+    assert read_json_lines(tmp_path / "m.jsonl") == [{"step": 1}, {"step": 2}]
+    assert read_json_lines(tmp_path / "absent.jsonl") == []
+
+
+def test_thousands_of_trials_take_seconds(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan(scenes=[f"s{k}" for k in range(50)], seeds=range(20), views=1))
+    started = time.perf_counter()
+    assert len(load_experiment(tmp_path, "exp").trials) == 2000
+    assert time.perf_counter() - started < 5  # about 0.3 s on a quiet machine
+
+
+def test_reading_and_tabulating_load_no_torch() -> None:
+    modules = "tables_cli, explain, statistics, tradeoffs, errors_by_region, report.build"
+    imports = "; ".join(f"import gsbench.analysis.{module}" for module in modules.split(", "))
+    code = f"import sys; {imports}; sys.exit('torch' in sys.modules or 'mlflow' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,285 @@
+"""Tables: the numbers in the cells, what is refused, what is marked, and the formats."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import shutil
+import statistics
+import subprocess
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.analysis.table_formats import escape_latex, to_csv, to_html, to_html_page, to_latex, to_markdown
+from gsbench.analysis.tables import Table, build_table, cost_change
+from gsbench.errors import InputError
+from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
+
+Make = Callable[..., Experiment]
+
+
+def one_trial(
+    runs: Path, seed: int, config_hash: str = "c0ffee00", settings: dict | None = None, **values: object
+) -> Path:
+    """A trial of one scene with metrics given in ``values`` (psnr=…), or other keys of results.json (_iterations=…)."""
+    metrics = {key: value for key, value in values.items() if not key.startswith("_")}
+    plan = Plan()
+    views = {key: np.array([value]) for key, value in metrics.items()}
+    densify = str(values.get("_densify", "adc"))
+    scene = str(values.get("_scene", "garden"))
+    data = trial_data(plan, scene, "sfm", densify, seed, views)
+    data |= {key[1:]: value for key, value in values.items() if key.startswith("_")}
+    return write_trial(runs, data, views, config_hash, **(settings or {}))
+
+
+def texts(table: Table) -> list[list[str]]:
+    return [[*row.labels, *(f"*{e.text}*" if e.bold else e.text for e in row.entries)] for row in table.rows]
+
+
+def test_a_cell_is_mean_and_sample_deviation_over_trials(tmp_path: Path) -> None:
+    for seed, psnr in enumerate((27.0, 27.1, 27.5)):
+        one_trial(tmp_path, seed, psnr=psnr)
+    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
+    # mean 27.2, deviation sqrt((0.04 + 0.01 + 0.09) / 2) = 0.2646
+    assert texts(table) == [["garden", "sfm", "adc", "27.20 ± 0.26"]]
+
+
+def test_the_best_is_bold_and_ties_after_rounding_are_both_best(tmp_path: Path) -> None:
+    for densify, psnr, flip in (("adc", 27.001, 0.1), ("none", 26.0, 0.3), ("volumetric", 26.996, 0.05)):
+        one_trial(tmp_path, 0, _densify=densify, psnr=psnr, flip=flip)
+    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr", "flip", "gaussians"])
+    assert [row[3:5] for row in texts(table)] == [["*27.00*", "0.100"], ["26.00", "0.300"], ["*27.00*", "*0.050*"]]
+    assert not any(row.entries[2].bold for row in table.rows)  # a count is a cost, not a merit
+
+
+def test_bold_is_by_scene_not_by_table(make_experiment: Make) -> None:
+    table = build_table(make_experiment(effect={"psnr": 1.0}), metrics=["psnr"])
+    bold = {row.labels[:3] for row in table.rows if row.entries[0].bold}
+    assert bold == {(s, "sfm", "volumetric") for s in ("courtyard", "garden", "mean of 2 scenes")}
+
+
+def test_missing_and_incomplete_cells_are_marked_with_their_count(tmp_path: Path) -> None:
+    paths = write_runs(tmp_path, Plan())
+    (paths[0] / "results.json").unlink()  # courtyard, adc, seed 0
+    for path in paths[9:]:  # garden, volumetric
+        shutil.rmtree(path)
+    table = build_table(load_experiment(tmp_path, "exp"), rows=["scene"], columns=["densify"], metrics=["psnr"])
+    rows = {row[0]: row[1:] for row in texts(table)}
+    assert rows["courtyard"][0].strip("*").endswith("(2/3)")
+    assert rows["garden"][1] == "— (0/3)"
+    assert "(2/3)" not in rows["garden"][0]
+    assert "mean of 1 scene" in rows  # only courtyard has both arms
+    assert any("Left out (1): exp/courtyard/sfm-adc/c0ffee00-seed0: unfinished" in note for note in table.notes)
+
+
+def test_an_unavailable_metric_is_na_with_its_reason(make_experiment: Make) -> None:
+    table = build_table(make_experiment(), metrics=["lpips_alex"])
+    assert {row.entries[0].text for row in table.rows} == {"n/a"}
+    assert "LPIPS Alex: n/a, weights file alexnet.pth not found." in table.notes
+
+
+def test_the_lpips_of_the_protocol_has_a_column_even_when_it_is_missing(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, psnr=27.0)
+    table = build_table(load_experiment(tmp_path, "exp"))
+    assert [column.heading for column in table.columns][1] == "LPIPS VGG raw ↓"
+    assert table.rows[0].entries[1].text == "n/a"
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [
+        ("iterations", (7000, 30000)),
+        ("raster", ("cpu", "cuda")),
+        ("protocol", ("paper-1", "standard-1")),
+        ("resolution", ([400, 300], [800, 600])),
+        ("budget", ({"max_gaussians": 1, "cap": "soft"}, {"max_gaussians": 2, "cap": "soft"})),
+        ("hashes", ({"data": "a"}, {"data": "b"})),
+    ],
+)
+def test_a_cell_never_mixes_conditions(tmp_path: Path, key: str, values: tuple) -> None:
+    for seed, value in enumerate(values):
+        one_trial(tmp_path, seed, psnr=27.0, **{f"_{key}": value})
+    named = "data" if key == "hashes" else key
+    with pytest.raises(InputError, match=f"differ in {named}: "):
+        build_table(load_experiment(tmp_path, "exp"))
+
+
+def test_a_cell_never_mixes_settings(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
+    one_trial(tmp_path, 1, "bbbbbbbb", {"densify__volume_threshold": 0.1}, psnr=28.0)
+    experiment = load_experiment(tmp_path, "exp")
+    with pytest.raises(InputError, match=r"differ in densify\.volume_threshold: 0\.03 \| 0\.1"):
+        build_table(experiment, rows=["scene", "densify"])
+    assert build_table(experiment).row_headings[-1] == "densify.volume_threshold"  # by default it becomes a row
+    table = build_table(experiment, rows=["scene", "densify.volume_threshold"], metrics=["psnr"])
+    assert [row.labels for row in table.rows] == [("garden", "0.03"), ("garden", "0.1")]
+
+
+def test_settings_that_only_say_where_a_trial_ran_do_not_matter(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
+    one_trial(tmp_path, 1, "bbbbbbbb", {"tracking__name": "off", "scene__path": "/elsewhere"}, psnr=28.0)
+    assert texts(build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"]))[0][3] == "27.50 ± 0.71"
+
+
+def test_one_seed_twice_is_refused(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
+    one_trial(tmp_path, 0, "bbbbbbbb", psnr=27.0)
+    with pytest.raises(InputError, match="seed 0 twice"):
+        build_table(load_experiment(tmp_path, "exp"))
+
+
+def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, psnr=27.0)
+    one_trial(tmp_path, 0, psnr=28.0, _densify="volumetric", _iterations=7000)
+    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
+    assert [row[3] for row in texts(table)] == ["27.00", "28.00"]
+    assert "garden: not compared, no best marked: iterations differ." in table.notes
+
+
+@pytest.mark.parametrize(
+    ("second_budget", "blocked", "compared"),
+    [
+        ({"max_gaussians": None, "cap": None}, (0, 0), True),  # neither cap acted: both grew as they liked
+        ({"max_gaussians": None, "cap": None}, (3, 0), False),
+        ({"max_gaussians": 1000, "cap": "hard"}, (0, 3), False),
+        ({"max_gaussians": 50_000, "cap": "soft"}, (3, 0), True),  # one budget for both
+        ({"max_gaussians": None, "cap": None, "seconds": 60}, (0, 0), False),  # who knows what it would have become
+        ({"max_gaussians": None, "cap": None}, (None, 0), False),  # no count of what was refused
+    ],
+)
+def test_arms_are_compared_under_one_budget_or_under_none_that_acted(
+    tmp_path: Path, second_budget: dict, blocked: tuple[int | None, int], compared: bool
+) -> None:
+    first, second = ({} if count is None else {"blocked_by_cap": count} for count in blocked)
+    one_trial(tmp_path, 0, psnr=27.0, _events=first)
+    one_trial(tmp_path, 0, psnr=28.0, _densify="none", _budget=second_budget, _events=second)
+    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
+    assert [row[3] for row in texts(table)] == ["27.00", "*28.00*" if compared else "28.00"]
+    assert ("garden: not compared, no best marked: budget differ." in table.notes) is not compared
+
+
+def test_the_mean_of_scenes_weighs_scenes_alike(tmp_path: Path) -> None:
+    for scene, psnrs in (("a", (20.0, 22.0)), ("b", (30.0, 31.0))):
+        for seed, psnr in enumerate(psnrs):
+            one_trial(tmp_path, seed, psnr=psnr, _scene=scene)
+    experiment = load_experiment(tmp_path, "exp")
+    mean, std = (21.0 + 30.5) / 2, statistics.stdev([25.0, 26.5])  # by seed: (20+30)/2, (22+31)/2
+    for table in (
+        build_table(experiment, metrics=["psnr"]),
+        build_table(experiment, rows=["densify"], metrics=["psnr"]),
+    ):
+        assert table.rows[-1].entries[0].text == f"{mean:.2f} ± {std:.2f}"
+
+
+def test_costs_are_averaged_by_both_rules(make_experiment: Make, tmp_path: Path) -> None:
+    for scene, adc, volumetric in (("a", 1_000_000, 2_000_000), ("b", 3_000_000, 3_000_000)):
+        one_trial(tmp_path, 0, psnr=20.0, _scene=scene, _num_gaussians=adc)
+        one_trial(tmp_path, 0, psnr=20.0, _scene=scene, _num_gaussians=volumetric, _densify="volumetric")
+    trials = load_experiment(tmp_path, "exp").trials
+    arms = [[trial for trial in trials if trial.densify == name] for name in ("adc", "volumetric")]
+    change = cost_change(*arms, lambda trial: trial.data["num_gaussians"])
+    assert change == pytest.approx((5 / 4 - 1, 0.5, 2))  # totals 4M -> 5M; ratios 2 and 1
+    notes = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"]).notes
+    assert any("+25.0% as a ratio of totals, +50.0% as the mean of 2 scenes" in note for note in notes)
+
+
+def test_unknown_names_are_refused(make_experiment: Make) -> None:
+    experiment = make_experiment()
+    with pytest.raises(InputError, match="unknown metric 'pnsr'"):
+        build_table(experiment, metrics=["pnsr"])
+    with pytest.raises(InputError, match=r"no setting 'densify\.grad_tresh'"):
+        build_table(experiment, rows=["scene", "densify.grad_tresh"])
+
+
+def test_markdown(make_experiment: Make) -> None:
+    text = to_markdown(build_table(make_experiment(), rows=["scene"], columns=["densify"]))
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    assert lines[0].startswith("| scene | PSNR (dB) ↑ adc | PSNR (dB) ↑ volumetric |")
+    assert len({line.count("|") for line in lines}) == 1
+    assert len(lines) == 2 + 2 + 1
+    assert "**" in text
+
+
+def test_csv_has_a_line_for_each_cell_in_full_precision(make_experiment: Make) -> None:
+    experiment = make_experiment()
+    rows = list(csv.DictReader(io.StringIO(to_csv(build_table(experiment, metrics=["psnr", "gaussians"])))))
+    first = next(row for row in rows if row["scene"] == "courtyard" and row["quantity"] == "psnr")
+    values = [t.metrics["psnr"] for t in experiment.trials if (t.scene, t.densify) == ("courtyard", "adc")]
+    assert float(first["mean"]) == pytest.approx(statistics.fmean(values), abs=1e-12)
+    assert float(first["std"]) == pytest.approx(statistics.stdev(values), abs=1e-12)
+    assert first["trials"].split()[0] == "exp/courtyard/sfm-adc/c0ffee00-seed0"
+    assert len(rows) == (4 + 2) * 2
+
+
+class Balance(HTMLParser):
+    """Counts cells by row and checks that tags close in order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.rows: list[int] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in ("meta", "br"):
+            self.open.append(tag)
+        if tag == "tr":
+            self.rows.append(0)
+        if tag in ("td", "th"):
+            self.rows[-1] += int(dict(attrs).get("colspan") or 1)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_html_is_well_formed_and_escaped(make_experiment: Make) -> None:
+    experiment = make_experiment()
+    parser = Balance()
+    parser.feed(to_html_page(build_table(experiment, rows=["scene", "init"], columns=["densify"])))
+    assert parser.open == []
+    assert len(set(parser.rows)) == 1
+    assert "&lt;b&gt;" in to_html(build_table(experiment, title="<b>"))
+
+
+def test_latex_escapes_what_is_special() -> None:
+    assert escape_latex("a_b & 5 % ± 1 → #1") == "a\\_b \\& 5 \\% $\\pm$ 1 ? \\#1"
+
+
+def has_latex() -> bool:
+    """Whether pdflatex and booktabs are installed."""
+    if shutil.which("pdflatex") is None or shutil.which("kpsewhich") is None:
+        return False
+    return subprocess.run(["kpsewhich", "booktabs.sty"], capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.skipif(not has_latex(), reason="pdflatex with booktabs is not installed")
+def test_latex_compiles(make_experiment: Make, tmp_path: Path) -> None:
+    experiment = make_experiment()
+    (experiment.trials[0].path / "results.json").write_text("{")
+    experiment = load_experiment(tmp_path, "exp")
+    tables = [build_table(experiment), build_table(experiment, rows=["scene"], columns=["init", "densify"])]
+    body = "\n".join(to_latex(table) for table in tables)
+    source = "\\documentclass{article}\n\\usepackage{booktabs}\n\\begin{document}\n" + body + "\\end{document}\n"
+    (tmp_path / "table.tex").write_text(source)
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "table.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
+    assert done.returncode == 0, done.stdout.decode("latin-1")[-2000:]
+    assert (tmp_path / "table.pdf").is_file()
+
+
+def test_latex_has_as_many_cells_as_columns(make_experiment: Make) -> None:
+    source = to_latex(build_table(make_experiment(), rows=["scene"], columns=["densify"]))
+    width = len(re.search(r"begin\{tabular\}\{(\w+)\}", source)[1])
+    body = source.split("\\midrule")[1]
+    assert {len(re.split(r"(?<!\\)&", line)) for line in body.splitlines() if line.endswith("\\\\")} == {width}
+
+
+def test_results_written_by_hand_are_plain_json(make_experiment: Make) -> None:
+    trial = make_experiment().trials[0]
+    assert json.loads((trial.path / "results.json").read_text())["metrics"] == trial.metrics

@@ -1,0 +1,429 @@
+"""Composition, plan, states and finished trials: what needs no training."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsbench.compose import GROUPS, Composed, compose_one, compose_trials, options
+from gsbench.config import check_target, config_hash
+from gsbench.errors import InputError
+from gsbench.files import DiskFullError, explain_storage
+from gsbench.launch import serial
+from gsbench.launch.command import launch, parse, run_trials
+from gsbench.launch.outcome import Outcome
+from gsbench.launch.plan import (
+    Estimator,
+    add_to_plan,
+    describe_plan,
+    forget,
+    progress_of_experiment,
+    read_plan,
+    same_trial_elsewhere,
+)
+from gsbench.pipeline.locks import BusyError, hold, is_held
+from gsbench.pipeline.stage_list import TRAIN
+from gsbench.pipeline.store import Store
+from gsbench.pipeline.trial_files import TrialPaths, find_finished, record_inputs, state_of
+
+
+@pytest.fixture(autouse=True)
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "runs"
+
+
+@cache
+def _composed(*words: str) -> Composed:
+    return compose_one(words)
+
+
+def trial_values(*words: str) -> dict[str, Any]:
+    """A configuration, composed once, in this test's runs folder."""
+    return _composed(*words).values | {"runs": os.environ["GSBENCH_RUNS"]}
+
+
+def finish(values: dict[str, Any], seconds: float = 100.0, unavailable: dict[str, str] | None = None) -> dict[str, Any]:
+    """Make the files of a finished trial, with one stage result in the store and one source file."""
+    paths = TrialPaths.of(values)
+    paths.folder.mkdir(parents=True, exist_ok=True)
+    source = paths.runs.parent / "photos" / "a.jpg"
+    source.parent.mkdir(exist_ok=True)
+    if not source.exists():
+        source.write_bytes(b"photo")
+    entry = Store(paths.runs / "store").get(TRAIN, {"x": 1}, lambda folder: (folder / "model").write_text("m"))  # type: ignore[arg-type,return-value]
+    (paths.folder / "table.csv").write_text("a,b")
+    (paths.folder / "config.yaml").write_text("")
+    results = {
+        "status": "complete",
+        "scene": values["scene"]["name"],
+        "init": values["init"]["name"],
+        "densify": values["densify"]["name"],
+        "iterations": values["train"]["iterations"],
+        "metrics": {"psnr": 20.5},
+        "unavailable": unavailable or {},
+        "seconds": {"init": 1.0, "train": seconds, "evaluate": 0.0},
+        "hashes": {"config": config_hash(values)},
+    }
+    record_inputs(paths.folder, values, results, [source], {"train": entry.path}, [paths.folder / "table.csv"])
+    (paths.folder / "results.json").write_text(json.dumps(results))
+    return results
+
+
+# ---- composition
+
+
+@cache
+def experiment(name: str) -> list[Composed]:
+    """Composed once: the paper's tables take seconds."""
+    return compose_trials([f"+experiment={name}"])
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_every_yaml_composes(group: str) -> None:
+    assert options(group)
+    for name in options(group):
+        if group == "experiment":
+            assert len(experiment(name)) >= 2
+        else:
+            (trial,) = compose_trials([f"{group}={name}", "scene.path=/somewhere"])
+            assert trial.values[group]["name"] == name
+
+
+def test_paper_experiments_have_the_papers_trials_and_share_them() -> None:
+    table1, table2 = experiment("table1"), experiment("table2")
+    assert (len(table1), len(table2)) == (78, 144)
+    leaves = [
+        {(t.values["scene"]["name"], TrialPaths.of(t.values).folder.name) for t in table} for table in (table1, table2)
+    ]
+    assert [len(leaf) for leaf in leaves] == [78, 144]
+    assert len(leaves[0] | leaves[1]) == 150
+    for trial in table2[::35]:
+        assert trial.values["densify"]["max_gaussians"] == 3_400_000
+        again = compose_one(trial.overrides)
+        assert again.values | {"runs": ""} == trial.values | {"runs": ""}
+        assert again.yaml.splitlines()[8:] == trial.yaml.splitlines()[8:]
+
+
+def test_grid_is_the_product_with_the_command_line_over_the_file() -> None:
+    trials = compose_trials(["+experiment=demo", "seed=5,7", "densify=adc"])
+    assert [(t.values["densify"]["name"], t.values["seed"]) for t in trials] == [("adc", 5), ("adc", 7)]
+    trials = compose_trials(["densify=adc,mcmc", "seed=range(3)", "train.iterations=10"], multirun=True)
+    assert [(t.values["densify"]["name"], t.values["seed"]) for t in trials] == [
+        (d, s) for d in ("adc", "mcmc") for s in range(3)
+    ]
+    assert {t.values["train"]["iterations"] for t in trials} == {10}
+
+
+def test_name_seed_and_machine_are_in_no_hash_and_settings_are() -> None:
+    hash_of = lambda *words: config_hash(trial_values(*words))  # noqa: E731
+    assert hash_of() == hash_of("name=other", "seed=9", "device=cpu", "threads=1", "launch=local", "tracking=none")
+    others = [
+        hash_of(word)
+        for word in ("densify=adc", "train.iterations=7", "init.seed=3", "scene.width=99", "eval=standard")
+    ]
+    assert len({hash_of(), *others}) == 6
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["densify.grad_threshold=1"], ["densify.grad_threshold is not a setting", "did you mean gradient_threshold"]),
+        (["densify=volumetrik"], ["densify=volumetrik does not exist", "did you mean volumetric", "adc"]),
+        (["densfy=adc"], ["densfy is not a setting", "did you mean densify"]),
+        (["+experiment=tabel1"], ["tabel1 does not exist", "did you mean table1"]),
+        (["train.iterations=many"], ["train.iterations=many", "Integer"]),
+        (["train.iterations=0"], ["train.iterations must be at least 1", "got 0"]),
+        (["raster=gpu"], ["raster=gpu does not exist", "cuda"]),
+        (["eval.lpips=3"], ["eval.lpips=3", "list"]),
+        (["seed=0,1"], ["seed=0,1 lists several values", "-m"]),
+        (["foo"], ["'foo' is not a setting like key=value"]),
+        (["experiment=table1"], ["+experiment=NAME", "table2"]),
+        (["densify._target_=mine.X", "densify.own=1"], ["densify.own", "+densify.own="]),
+        (["hydra/launcher=submitit_slurm"], ["launch=serial, local or slurm"]),
+        (["launch.parallel=0"], ["launch.parallel must be at least 1"]),
+        (["name=../up"], ["name must be a plain folder name"]),
+        (["scene=photos"], ["scene.path is not set"]),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else None,
+)
+def test_mistakes_are_one_line_with_what_is_allowed(words: list[str], parts: list[str]) -> None:
+    with pytest.raises(InputError) as caught:
+        compose_trials(words)
+    assert "\n" not in str(caught.value)
+    for part in parts:
+        assert part in str(caught.value)
+
+
+def test_mistake_in_a_users_yaml_names_the_file(tmp_path: Path) -> None:
+    (tmp_path / "own" / "train").mkdir(parents=True)
+    (tmp_path / "own" / "train" / "mine.yaml").write_text("defaults: [paper, _self_]\nname: mine\niteratons: 5\n")
+    words, _, _ = parse(["--config-dir", "own", "train=mine"])
+    with pytest.raises(InputError, match=r"iteratons is not a setting in train/mine.*iterations"):
+        compose_trials(words)
+
+
+def test_options_of_the_command_line() -> None:
+    assert parse(["-m", "a=1,2", "--dry-run"]) == (["a=1,2"], True, True)
+    with pytest.raises(InputError, match="--dry-rum is not an option"):
+        parse(["--dry-rum"])
+    with pytest.raises(InputError, match="no such folder"):
+        parse(["--config-dir", "/nowhere"])
+
+
+def test_a_folder_that_is_not_there_stops_a_sweep_before_its_first_trial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / "data"))
+    words = ["-m", "scene=courtyard,garden,truck", "init=dataset", "tracking=none", "train.iterations=1"]
+    with pytest.raises(InputError, match=r"scene garden: .*garden does not exist.*; scene truck: .* does not exist"):
+        launch(words)
+    assert not list((tmp_path / "runs").glob("*/*/*/*-seed*"))  # nothing to clean up after the mend
+    assert launch([*words, "--dry-run"]) == 0
+    assert "scene truck: the folder" in capsys.readouterr().out
+
+
+# ---- a _target_ is code
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system",
+        "subprocess.Popen",
+        "gsbenchevil.Class",
+        "builtins.eval",
+        "gsbench",
+        "",
+        None,
+        "hydra.utils.instantiate",
+        " gsbench.x",
+    ],
+)
+def test_foreign_targets_are_refused(target: str | None) -> None:
+    with pytest.raises(InputError, match="densify"):
+        check_target(target, "densify", [])
+
+
+def test_own_and_allowed_targets_pass() -> None:
+    check_target("gsbench.densify.ADC", "densify", [])
+    check_target("mine.sub.Class", "densify", ["mine"])
+    check_target("mine.sub.Class", "densify", ["mine."])
+    check_target("mine.sub.Class", "densify", ["mine.sub.Class"])
+    with pytest.raises(InputError, match=r"allow_targets=\[minefield\]"):
+        check_target("minefield.Class", "densify", ["mine"])
+
+
+# ---- finished trials
+
+
+def test_finished_trial_is_recognised_until_something_changes(runs: Path) -> None:
+    values = trial_values()
+    assert find_finished(values) is None
+    results = finish(values)
+    assert find_finished(values) == results
+    assert state_of(TrialPaths.of(values).folder) == "done"
+    assert find_finished(trial_values("seed=1")) is None
+
+
+@pytest.mark.parametrize(
+    "change", ["photo", "new photo", "published", "stage", "results", "no inputs", "weights", "half a file"]
+)
+def test_changes_are_noticed(change: str, runs: Path) -> None:
+    values = trial_values()
+    finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"} if change == "weights" else None)
+    folder = TrialPaths.of(values).folder
+    if change == "photo":
+        (runs.parent / "photos" / "a.jpg").write_bytes(b"other")
+    elif change == "new photo":
+        os.utime(runs.parent / "photos", ns=(1, 1))
+    elif change == "published":
+        (folder / "table.csv").unlink()
+    elif change == "stage":
+        (model,) = (runs / "store" / "train").glob("*/model")
+        model.write_text("n")
+    elif change == "results":
+        (folder / "results.json").write_text((folder / "results.json").read_text().replace("20.5", "30.5"))
+    elif change == "no inputs":
+        (folder / "inputs.json").unlink()
+    elif change == "half a file":
+        (folder / "results.json").write_text((folder / "results.json").read_text()[:100])
+    assert find_finished(values) is None
+
+
+def test_metric_that_cannot_come_later_does_not_hinder() -> None:
+    values = trial_values()
+    finish(
+        values,
+        unavailable={"flip": "not asked for (eval.flip)", "lpips_alex": "a view is 20x20 px, below 63 px a side"},
+    )
+    assert find_finished(values) is not None
+
+
+def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do() -> None:
+    values = trial_values()
+    finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"})
+    assert find_finished(values, lambda options: {"lpips_vgg", "flip"}) is not None
+    assert find_finished(values, lambda options: {"flip"}) is None
+
+
+# ---- plan and states
+
+
+def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs: Path) -> None:
+    trials = compose_trials(["name=x", "densify=adc", "seed=0,1,2,3"], multirun=True)
+    add_to_plan(trials[:2])
+    add_to_plan(trials)
+    folders = [TrialPaths.of(trial.values).folder for trial in trials]
+    assert [trial.folder for trial in read_plan(runs / "x")] == folders
+    assert compose_one(read_plan(runs / "x")[1].overrides).values == trials[1].values
+    finish(trials[0].values)
+    folders[1].mkdir(parents=True)
+    (folders[1] / "config.yaml").touch()
+    (folders[1] / "failed.json").write_text(json.dumps({"message": "no luck\nsecond line"}))
+    folders[2].mkdir(parents=True)
+    (folders[2] / "config.yaml").touch()
+    with hold(folders[2] / ".lock", "a trial"):
+        states = [(trial.state, trial.note) for trial in progress_of_experiment(runs / "x")]
+    assert states[0] == ("done", "")
+    assert states[1] == ("failed", "no luck")
+    assert states[2][0] == "running"
+    assert f"process {os.getpid()}" in states[2][1]
+    assert states[3] == ("missing", "never started")
+    assert progress_of_experiment(runs / "x")[2].state == "partial"
+    forget(runs / "x", [folders[3]])
+    assert len(progress_of_experiment(runs / "x")) == 3
+
+
+def test_damaged_plan_is_named(runs: Path) -> None:
+    (runs / "x").mkdir(parents=True)
+    (runs / "x" / "plan.json").write_text("{")
+    with pytest.raises(InputError, match=r"plan\.json is damaged"):
+        read_plan(runs / "x")
+
+
+def test_dry_run_tells_states_and_time(runs: Path) -> None:
+    trials = compose_trials(["name=x", "densify=adc,volumetric", "seed=0,1"], multirun=True)
+    assert describe_plan(trials)[-1].startswith("time: not known")
+    finish(trials[0].values, seconds=600)
+    finish(trial_values("name=other", "densify=adc", "seed=1"), seconds=1200)
+    lines = describe_plan(trials, parallel=2)
+    assert [line.split()[0] for line in lines[:4]] == ["done", "missing", "missing", "missing"]
+    assert "as in other: nothing to compute" in lines[1]
+    assert lines[4] == "4 trials: 1 done, 3 missing"
+    assert lines[5] == "time: about 15 min, 2 at once, judged by 2 finished trials"  # 2 x (600 + 1200) / 2, two at once
+    assert same_trial_elsewhere(TrialPaths.of(trials[1].values)) == "other"
+    assert describe_plan(trials[1:2])[1:] == [
+        "1 trial: 1 missing",
+        "time: seconds, since other experiments have the results",
+    ]
+
+
+def test_estimate_prefers_the_same_scene_and_densifier_and_scales_with_iterations(runs: Path) -> None:
+    finish(trial_values("densify=adc", "train.iterations=100"), seconds=10)
+    finish(trial_values("densify=mcmc", "train.iterations=100"), seconds=30)
+    estimator = Estimator(runs)
+    assert estimator.estimate(trial_values("densify=adc", "train.iterations=1000")).seconds == pytest.approx(100)
+    assert estimator.estimate(trial_values("densify=none", "train.iterations=1000")).seconds == pytest.approx(200)
+
+
+# ---- running a sweep
+
+
+@pytest.fixture
+def fake_trial(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
+    """Replace the trial by one that does what ``behaviour[seed]`` says, and records the order."""
+    behaviour: dict[int, Exception] = {}
+    order: list[int] = []
+
+    def run_one(trial: Any, wait: bool) -> Outcome:
+        seed = trial.values["seed"]
+        error = behaviour.get(seed)
+        if isinstance(error, BusyError) and not wait:
+            raise error
+        order.append(seed)
+        folder = TrialPaths.of(trial.values).folder
+        if error is not None and not isinstance(error, BusyError):
+            from gsbench.launch.outcome import outcome_of_error
+
+            return outcome_of_error(folder, error)
+        finish(trial.values)
+        return Outcome(folder, "done", "psnr 1")
+
+    monkeypatch.setattr(serial, "run_one", run_one)
+    return behaviour, order
+
+
+def sweep() -> list[Composed]:
+    return [replace(trial, values=trial.values | {"runs": os.environ["GSBENCH_RUNS"]}) for trial in _composed_sweep()]
+
+
+@cache
+def _composed_sweep() -> list[Composed]:
+    return compose_trials(["name=x", "densify=adc", "seed=0,1,2"], multirun=True)
+
+
+def test_failed_trial_does_not_stop_the_others(fake_trial: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    behaviour, order = fake_trial
+    behaviour[1] = RuntimeError("broken")
+    assert run_trials(sweep()) == 1
+    assert order == [0, 1, 2]
+    assert "failed: courtyard/sfm-adc seed 1" in capsys.readouterr().err
+    order.clear()
+    del behaviour[1]
+    assert run_trials(sweep()) == 0
+    assert order == [1]
+
+
+def test_busy_trial_comes_last(fake_trial: Any) -> None:
+    behaviour, order = fake_trial
+    behaviour[0] = BusyError("another process is at it")
+    assert run_trials(sweep()) == 0
+    assert order == [1, 2, 0]
+
+
+def test_exit_code_2_only_if_all_failed_for_bad_input(fake_trial: Any) -> None:
+    behaviour, _ = fake_trial
+    behaviour.update({seed: InputError("no photos") for seed in range(3)})
+    assert run_trials(sweep()) == 2
+    behaviour[2] = RuntimeError("crash")
+    assert run_trials(sweep()) == 1
+
+
+def test_full_disk_ends_the_sweep(fake_trial: Any) -> None:
+    behaviour, order = fake_trial
+    behaviour[0] = DiskFullError("the disk is full")
+    with pytest.raises(Exception, match="the disk is full"):
+        run_trials(sweep())
+    assert order == [0]
+
+
+def test_storage_errors_are_recognised(tmp_path: Path) -> None:
+    full = [
+        "[Errno 28] No space left on device",
+        "1200 requested and 304 written",
+        "PytorchStreamWriter failed writing file",
+    ]
+    for text in full:
+        assert isinstance(explain_storage(RuntimeError(text), tmp_path), DiskFullError)
+    assert isinstance(explain_storage(OSError(28, "x"), tmp_path), DiskFullError)
+    assert isinstance(explain_storage(PermissionError(13, "x", "/some/file"), tmp_path), InputError)
+    assert explain_storage(RuntimeError("shape mismatch"), tmp_path) is None
+    assert explain_storage(FileNotFoundError(2, "x"), tmp_path) is None
+
+
+def test_lock_is_seen_and_freed(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    assert not is_held(path)
+    with hold(path, "work"):
+        assert is_held(path)
+        with pytest.raises(BusyError, match=rf"work: process {os.getpid()}"), hold(path, "work", wait=False):
+            raise AssertionError("taken twice")
+    assert not is_held(path)
