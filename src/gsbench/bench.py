@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsbench.errors import InputError
+from gsbench.memory import peak_memory_mb
 
 if TYPE_CHECKING:
     import torch
@@ -249,18 +250,7 @@ def _measure_memory(raster: str, width: int, height: int, count: int, ply: Path 
 def _peak_memory(stepper: _Stepper) -> float:
     for _ in range(WARM_UP_STEPS + 1):
         stepper.step()
-    if stepper.device.type == "cuda":
-        import torch
-
-        return torch.cuda.max_memory_allocated() / 2**20
-    status = Path("/proc/self/status")
-    if status.is_file():  # ru_maxrss would begin at what the parent process had when it started this one
-        peak = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
-        return int(peak.split()[1]) / 1024
-    import resource
-
-    unit = 1 if sys.platform == "darwin" else 1024  # bytes in ru_maxrss
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+    return peak_memory_mb(stepper.device)
 
 
 def _table(rows: list[dict[str, Any]]) -> str:

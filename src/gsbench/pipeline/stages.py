@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import logging
-import re
-import resource
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import PackageNotFoundError, version
@@ -27,6 +24,7 @@ from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Sfm, read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, Initializer
+from gsbench.memory import peak_memory_mb, reset_peak_memory
 from gsbench.pipeline.components import options_of
 from gsbench.pipeline.figures import draw_ellipsoids
 from gsbench.pipeline.maps import view_maps
@@ -41,8 +39,6 @@ from gsbench.scene.images import Resample, read_image
 from gsbench.scene.load import PrincipalPoint, load_scene
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Capture, Scene
-
-log = logging.getLogger(__name__)
 
 PLY_FILE = "point_cloud.ply"
 TRAINING_FILE = "training.json"
@@ -278,30 +274,6 @@ def scene_inputs(capture: Capture, options: SceneConfig) -> dict[str, Any]:
         "resample": options.resample,
         "principal_point": options.principal_point,
     }
-
-
-def reset_peak_memory(device: torch.device) -> None:
-    """Start a new measurement of peak memory, where the platform can (Linux, CUDA)."""
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
-        return
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        log.debug("peak memory cannot be reset here: it counts from the start of the process")
-
-
-def peak_memory_mb(device: torch.device) -> float:
-    """Peak memory since ``reset_peak_memory``: of the GPU there, else resident memory of this process; MiB."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device) / 2**20
-    status = Path("/proc/self/status")
-    if status.exists():
-        found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text())
-        if found:
-            return int(found.group(1)) / 2**10
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def versions() -> dict[str, str]:

@@ -1,0 +1,118 @@
+"""On what a result was computed: what may change its last digits although code, settings and seed are equal.
+
+Compiled kernels, torch and the linear algebra libraries choose their instructions by the processor; fused and wider
+ones round differently. So results are equal to the bit on one kind of machine, and close on two (see
+docs/reproducibility.md).
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import torch
+
+CPU_INFO = Path("/proc/cpuinfo")
+CPU_NAME_KEYS = ("model name", "Processor", "cpu model", "Model", "cpu")  # x86, old ARM, MIPS, Raspberry Pi, POWER
+# What x86-64-v2 to -v4 ask for beyond the level below, as far as it tells processors apart (x86-64 psABI, table 3.1);
+# names are LLVM's.
+X86_LEVELS = {
+    "x86-64-v2": ("cx16", "sahf", "popcnt", "sse3", "sse4.1", "sse4.2", "ssse3"),
+    "x86-64-v3": ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"),
+    "x86-64-v4": ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"),
+}
+SECONDS_FOR_SYSCTL = 10
+
+
+def describe_machine(device: torch.device) -> dict[str, str]:
+    """What results name as their machine: ``cpu``, ``architecture``, ``kernels``, ``torch``, ``device``.
+
+    ``kernels`` is the processor type that the compiled kernels are made for, and its instruction set; ``torch`` the
+    instruction set that torch uses; ``device`` the GPU's name, or "cpu".
+    """
+    import torch
+
+    return {
+        "cpu": cpu_name(),
+        "architecture": platform.machine(),
+        "kernels": kernel_target(),
+        "torch": torch.backends.cpu.get_cpu_capability(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
+    }
+
+
+def kind_of_machine(record: Mapping[str, Any]) -> str:
+    """One phrase for a record of `describe_machine`; results with equal phrases may be compared to the bit."""
+    cpu = f"{record['cpu']} ({record['kernels']}, torch {record['torch']})"
+    return cpu if record["device"] == "cpu" else f"{record['device']}, {cpu}"
+
+
+@functools.cache
+def cpu_name() -> str:
+    """The processor's name as its system gives it; its architecture where it gives none."""
+    name = {"linux": _linux_name, "darwin": _mac_name, "win32": _windows_name}.get(sys.platform, str)()
+    return " ".join((name or platform.processor() or platform.machine() or "unknown").split())
+
+
+def _linux_name() -> str:
+    try:
+        lines = CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return ""
+    entries: dict[str, str] = {}
+    for line in lines:
+        key, _, value = line.partition(":")
+        entries.setdefault(key.strip(), value.strip())
+    named = next((entries[key] for key in CPU_NAME_KEYS if entries.get(key)), "")
+    if named or "CPU part" not in entries:
+        return named
+    return f"ARM implementer {entries.get('CPU implementer', '?')} part {entries['CPU part']}"  # 64-bit ARM has no name
+
+
+def _mac_name() -> str:
+    try:
+        asked = subprocess.run(
+            ["sysctl", "-n", "machdep.cpu.brand_string"],
+            capture_output=True,
+            text=True,
+            timeout=SECONDS_FOR_SYSCTL,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return asked.stdout
+
+
+def _windows_name() -> str:
+    return os.environ.get("PROCESSOR_IDENTIFIER", "")
+
+
+def kernel_target() -> str:
+    """What numba compiles for, this processor unless ``NUMBA_CPU_NAME`` is set: LLVM's name and the x86-64 level."""
+    import llvmlite.binding
+    import numba
+
+    config: Any = numba.config  # its settings are made at run time
+    name = config.CPU_NAME or llvmlite.binding.get_host_cpu_name()
+    chosen = config.CPU_FEATURES
+    features = llvmlite.binding.get_host_cpu_features().flatten() if chosen is None else chosen  # "+sse2,-avx512f,…"
+    if platform.machine().lower() not in ("x86_64", "amd64"):
+        return str(name)
+    return f"{name}, {x86_level({feature[1:] for feature in features.split(',') if feature.startswith('+')})}"
+
+
+def x86_level(features: set[str]) -> str:
+    """The highest x86-64 micro-architecture level whose features (LLVM's names) are all there."""
+    level = "x86-64-v1"
+    for name, wanted in X86_LEVELS.items():
+        if not features.issuperset(wanted):
+            break
+        level = name
+    return level
