@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-import importlib.util
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from gsbench.errors import InputError
+from gsbench.source import source_of
 
 ALLOWED_TARGETS = ("gsbench.",)  # a ``_target_`` is code: only these prefixes, and those in ``allow_targets``
 
@@ -230,23 +230,6 @@ def config_hash(values: dict[str, Any]) -> str:
             if "_target_" in group:
                 kept[key] |= source_of(group["_target_"])
     return sha256_of(kept)
-
-
-def source_of(target: str) -> dict[str, str]:
-    """``{"source": sha256}`` of the file that defines a user's own class, which has no version that we could bump.
-
-    Empty for gsbench's own classes, and where there is no such file (importing it will say what is wrong).
-    """
-    module = target.rpartition(".")[0]
-    if target.startswith(ALLOWED_TARGETS):
-        return {}
-    try:
-        found = importlib.util.find_spec(module)
-    except (ImportError, ValueError):
-        return {}
-    if found is None or found.origin is None or not Path(found.origin).is_file():
-        return {}
-    return {"source": hashlib.sha256(Path(found.origin).read_bytes()).hexdigest()}
 
 
 def sha256_of(values: Any) -> str:

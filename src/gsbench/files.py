@@ -49,6 +49,15 @@ def write_text(path: Path, text: str) -> None:
         raise
 
 
+def read_object(path: Path) -> dict[str, Any]:
+    """The object in a JSON file; empty where there is none that can be read."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
 def sync_to_disk(path: Path) -> None:
     """Wait until a file or folder is on the disk, where the system can say so."""
     with suppress(OSError):

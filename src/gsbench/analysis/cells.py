@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import statistics
-from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+from gsbench.analysis.differences import (
+    describe_code,
+    differing_code,
+    differing_conditions,
+    differing_settings,
+    differing_unrecorded_code,
+)
 from gsbench.analysis.quantities import Quantity
-from gsbench.analysis.results import Trial, canonical
+from gsbench.analysis.results import Trial
 from gsbench.errors import InputError
 
 K = TypeVar("K", bound=Hashable)
 
 TRIAL_FIELDS = ("scene", "init", "densify", "seed", "raster", "protocol", "iterations", "experiment")
-# Settings in which trials of one cell may differ: they name the trial or say where it runs, not what is computed.
-IGNORED_SETTINGS = ("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path")
 
 
 @dataclass(frozen=True)
@@ -62,11 +66,15 @@ def select_trials(trials: Iterable[Trial], where: Mapping[str, str]) -> list[Tri
 
 def check_averageable(trials: Sequence[Trial], where: str) -> None:
     """Raise ``InputError``, naming the differing keys, unless the trials are repetitions of the same thing by scene."""
+    if code := differing_code(trials):
+        raise _code_refusal(where, code, trials[0].experiment)
     by_scene = by_key(trials, lambda trial: trial.scene)
     for scene, group in by_scene.items():
         keys = differing_conditions(group) or differing_settings(group)
         if keys:
             raise _refusal(f"{where}, scene {scene}" if "scene=" not in where else where, keys, group)
+        if code := differing_unrecorded_code(group):
+            raise _code_refusal(where, code, trials[0].experiment)
         seeds = [trial.seed for trial in group]
         twice = sorted({seed for seed in seeds if seeds.count(seed) > 1})
         if twice:
@@ -77,29 +85,6 @@ def check_averageable(trials: Sequence[Trial], where: str) -> None:
         across.pop(key, None)
     if across:
         raise _refusal(where, across, trials)
-
-
-def differing_conditions(trials: Sequence[Trial]) -> dict[str, list[str]]:
-    """The conditions in which trials differ, with their values.
-
-    Unlike budgets of which none acted are no difference: all of the trials grew as they liked.
-    """
-    seen: dict[str, set[str]] = defaultdict(set)
-    for trial in trials:
-        for key, value in trial.conditions().items():
-            seen[key].add(value)
-    if not any(trial.budget_acted for trial in trials):
-        del seen["budget"]
-    return {key: sorted(values) for key, values in seen.items() if len(values) > 1}
-
-
-def differing_settings(trials: Sequence[Trial]) -> dict[str, list[str]]:
-    """The settings in which trials with different configuration hashes differ, those that may differ left out."""
-    if len({trial.config_hash for trial in trials}) == 1:
-        return {}
-    keys = {key for trial in trials for key in trial.config if not key.startswith(IGNORED_SETTINGS)}
-    values = {key: sorted({canonical(trial.config.get(key)) for trial in trials}) for key in sorted(keys)}
-    return {key: found for key, found in values.items() if len(found) > 1}
 
 
 def swept_settings(trials: Iterable[Trial]) -> list[str]:
@@ -154,6 +139,14 @@ def by_key(trials: Iterable[Trial], key: Callable[[Trial], K]) -> dict[K, list[T
     for trial in trials:
         groups.setdefault(key(trial), []).append(trial)
     return groups
+
+
+def _code_refusal(where: str, code: Mapping[str, Mapping[str, Sequence[Trial]]], experiment: str) -> InputError:
+    listed = "; ".join(describe_code(part, versions) for part, versions in code.items())
+    return InputError(
+        f"the table cell {where} would average trials made by different versions of {listed}: `gsbench status "
+        f"{experiment}` names the superseded ones, `gsbench status {experiment} --forget-superseded` removes them"
+    )
 
 
 def _refusal(where: str, keys: Mapping[str, Sequence[str]], trials: Sequence[Trial]) -> InputError:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.analysis.cells import by_key, check_averageable, differing_conditions
+from gsbench.analysis.cells import by_key, check_averageable
+from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.results import Arm, Trial, read_views
 from gsbench.errors import InputError
 

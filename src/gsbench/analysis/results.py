@@ -20,8 +20,10 @@ from typing import Any
 import yaml
 
 from gsbench.errors import InputError
+from gsbench.files import read_object
 
 RESULTS, FAILED, CONFIG, PER_VIEW = "results.json", "failed.json", "config.yaml", "per_view.csv"
+INPUTS = "inputs.json"
 NOT_EXPERIMENTS = {"store", "mlartifacts"}  # what else lies in the runs folder
 TRIAL_FOLDER = re.compile(r"(?P<hash>[0-9a-f]{8})-seed(?P<seed>\d+)")
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
@@ -67,6 +69,24 @@ class Trial:
             return {}
         return flatten(content) if isinstance(content, dict) else {}
 
+    @cached_property
+    def code(self) -> dict[str, str]:
+        """The versions of the code that made the trial, as far as they were recorded.
+
+        ``code of <class>`` is the hash of the file that defines a user's own class, ``stage <name>`` the version of
+        one of gsbench's stages. Trials made before these stood in ``results.json`` have the stages in another file.
+        """
+        recorded = self.data.get("code", {})
+        stages = recorded.get("stages") or read_object(self.path / INPUTS).get("stages") or {}
+        return {f"code of {target}": str(digest) for target, digest in recorded.get("sources", {}).items()} | {
+            f"stage {name}": str(version) for name, version in stages.items()
+        }
+
+    @property
+    def finished(self) -> float:
+        """When the trial was finished, Unix time."""
+        return (self.path / RESULTS).stat().st_mtime
+
     def conditions(self) -> dict[str, str]:
         """What trials must share before their numbers may be averaged, as comparable text."""
         return {
@@ -107,6 +127,19 @@ def load_experiment(runs_dir: Path, name: str) -> Experiment:
     if not name or not folder.is_dir():
         known = ", ".join(list_experiments(runs_dir)) or "none yet"
         raise InputError(f"no experiment {name!r} in {runs_dir}; there: {known}")
+    experiment = read_experiment(folder)
+    if not experiment.trials:
+        warnings = experiment.warnings
+        first = f" (first: {warnings[0]})" if warnings else ""
+        raise InputError(
+            f"experiment {name!r} has no complete trial among {len(warnings)} folders{first}; run it first"
+        )
+    return experiment
+
+
+def read_experiment(folder: Path) -> Experiment:
+    """Every trial of the experiment in ``folder``, which may have none yet."""
+    runs_dir = folder.parent
     trials: list[Trial] = []
     warnings: list[str] = []
     for place in _trial_folders(folder):
@@ -114,13 +147,8 @@ def load_experiment(runs_dir: Path, name: str) -> Experiment:
             trials.append(read_trial(Path(place), runs_dir))
         except _UnusableError as reason:
             warnings.append(f"{os.path.relpath(place, runs_dir)}: {reason}")
-    if not trials:
-        first = f" (first: {warnings[0]})" if warnings else ""
-        raise InputError(
-            f"experiment {name!r} has no complete trial among {len(warnings)} folders{first}; run it first"
-        )
     trials.sort(key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash))
-    return Experiment(name, folder, tuple(trials), tuple(sorted(warnings)))
+    return Experiment(folder.name, folder, tuple(trials), tuple(sorted(warnings)))
 
 
 def list_experiments(runs_dir: Path) -> list[str]:

@@ -16,11 +16,11 @@ from gsbench.analysis.cells import (
     best_cells,
     by_key,
     check_averageable,
-    differing_conditions,
     field_value,
     make_cell,
     swept_settings,
 )
+from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Experiment, Trial

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import statistics
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from gsbench.compose import Composed
 from gsbench.errors import InputError
@@ -50,10 +51,13 @@ class Planned:
 
 @dataclass(frozen=True)
 class Progress:
-    """A trial's state with what people want to know of it: since when (Unix time), and a note."""
+    """A trial's state with what people want to know of it: since when (Unix time), and a note.
+
+    A trial that is done is ``superseded`` where the code that made it is no longer the present one.
+    """
 
     folder: Path
-    state: State
+    state: State | Literal["superseded"]
     since: float | None
     note: str
 
@@ -79,6 +83,18 @@ def forget(home: Path, folders: Iterable[Path]) -> None:
     with hold(home / f".{PLAN}.lock", "the plan"):
         kept = {name: entry for name, entry in _read(home).items() if name not in doomed}
         write_json(home / PLAN, {"version": PLAN_VERSION, "trials": kept})
+
+
+def remove(home: Path, folders: Iterable[Path]) -> None:
+    """Delete the folders of trials and drop them from the plan of the experiment in ``home``.
+
+    What the stages computed stays in the store: where the old code comes back, its trials are only put together again.
+    """
+    folders = list(folders)
+    for folder in folders:
+        (folder / RESULTS).unlink(missing_ok=True)  # first, so that no part of a trial is ever taken for all of it
+        shutil.rmtree(folder)
+    forget(home, folders)
 
 
 def read_plan(home: Path) -> list[Planned]:

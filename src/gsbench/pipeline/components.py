@@ -5,13 +5,17 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
+import logging
 from typing import Any
 
 import torch
 from pydantic import TypeAdapter, ValidationError
 
-from gsbench.config import WITHOUT_EFFECT, check_target, closest, source_of
+from gsbench.config import WITHOUT_EFFECT, check_target, closest
 from gsbench.errors import InputError
+from gsbench.source import has_changed_since_import, source_of
+
+log = logging.getLogger(__name__)
 
 RESERVED = ("_target_", "name")  # keys of a group that are not options of its class
 
@@ -49,9 +53,12 @@ def locate(target: str, group: str) -> Any:
     """The class at the import path ``package.module.Class``."""
     module, _, name = target.rpartition(".")
     try:
-        return getattr(importlib.import_module(module), name)
+        found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise InputError(f"{group}._target_={target} cannot be imported ({error})") from error
+    if has_changed_since_import(target):  # the first call also notes the file as it is now, while it is what runs
+        log.warning("the file of %s has changed since it was imported: this process goes on with what it was", target)
+    return found
 
 
 def options_of(component: Any) -> dict[str, Any]:

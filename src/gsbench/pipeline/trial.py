@@ -25,7 +25,7 @@ from gsbench.pipeline import stages
 from gsbench.pipeline.components import build, select_device
 from gsbench.pipeline.locks import hold
 from gsbench.pipeline.resources import available_threads
-from gsbench.pipeline.stage_list import EVALUATE, GROUND_TRUTH, INIT, TRAIN
+from gsbench.pipeline.stage_list import EVALUATE, GROUND_TRUTH, INIT, STAGES, TRAIN
 from gsbench.pipeline.stopping import take_signals_back
 from gsbench.pipeline.store import Entry, Stage, Store
 from gsbench.pipeline.trainer import EVENTS, HISTOGRAMS, METRICS
@@ -43,6 +43,7 @@ from gsbench.pipeline.trial_files import (
 from gsbench.raster import create_rasterizer, resolve_name
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture
+from gsbench.source import sources_of
 from gsbench.tracking import Mirror
 
 log = logging.getLogger(__name__)
@@ -179,6 +180,7 @@ def _results(
             "train": trained.key,
             "evaluate": evaluated.key,
         },
+        "code": {"sources": sources_of(values), "stages": {stage.name: stage.version for stage in STAGES}},
         "versions": stages.versions(),
     }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsbench.config import config_hash, sha256_of
-from gsbench.files import write_json
+from gsbench.files import read_object, write_json
 from gsbench.pipeline.locks import is_held
 from gsbench.pipeline.stage_list import STAGES
 from gsbench.pipeline.store import read_manifest
@@ -76,15 +75,6 @@ def state_of(folder: Path) -> State:
     if (folder / FAILED).exists():
         return "failed"
     return "partial" if (folder / CONFIG).exists() else "missing"
-
-
-def read_object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; empty where there is none that can be read."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
 
 
 def failure_of(folder: Path) -> str:

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
+from gsbench.analysis.results import Trial, read_experiment
+from gsbench.analysis.superseded import find_superseded
 from gsbench.errors import InputError
-from gsbench.launch.plan import Progress, forget, progress_of_experiment
+from gsbench.launch.plan import Progress, forget, progress_of_experiment, read_plan, remove
 from gsbench.pipeline.trial_files import label_of
+from gsbench.source import source_of
 from gsbench.words import counted, readable_time
 
-ORDER = ("failed", "running", "partial", "missing", "done")
+ORDER = ("failed", "running", "partial", "missing", "superseded", "done")
 
 
 def main(argv: list[str]) -> int:
@@ -24,11 +29,23 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--all", action="store_true", help="list the finished trials too")
     parser.add_argument("--json", action="store_true", help="a list of objects instead of lines")
     parser.add_argument("--forget", action="store_true", help="take trials that were never started out of the plan")
+    parser.add_argument(
+        "--forget-superseded",
+        action="store_true",
+        help="delete the folders of trials that older code made; what their stages computed stays in the store",
+    )
     options = parser.parse_args(argv)
     if options.experiment is None:
         return _overview(runs_dir())
     home = experiment_home(runs_dir(), options.experiment)
-    trials = progress_of_experiment(home)
+    trials = progress_with_superseded(home)
+    if options.forget_superseded:
+        superseded = [trial for trial in trials if trial.state == "superseded"]
+        remove(home, [trial.folder for trial in superseded])
+        for trial in superseded:
+            print(f"removed {trial.folder}: {trial.note}")
+        print(f"{counted(len(superseded), 'superseded trial')} removed")
+        return 0
     if options.forget:
         missing = [trial.folder for trial in trials if trial.state == "missing"]
         forget(home, missing)
@@ -38,7 +55,36 @@ def main(argv: list[str]) -> int:
         print(json.dumps([_as_dict(trial) for trial in trials], indent=1))
     else:
         print("\n".join(lines_of(trials, options.all)))
-    return 0 if all(trial.state in ("done", "running") for trial in trials) else 1
+    return 0 if all(trial.state in ("done", "running", "superseded") for trial in trials) else 1
+
+
+def progress_with_superseded(home: Path) -> list[Progress]:
+    """The state of every trial of the experiment in ``home``, of finished ones also whether their code is the present.
+
+    A user's class is looked up where the trial was asked for: another folder may have another file of that name.
+    """
+    places = {trial.folder: trial.cwd for trial in read_plan(home)}
+
+    def present(target: str, trial: Trial) -> str | None:
+        return present_source(target, places[trial.path]) if trial.path in places else None
+
+    reasons = find_superseded(read_experiment(home).trials, present)
+    return [
+        replace(trial, state="superseded", note=reasons[trial.folder])
+        if trial.state == "done" and trial.folder in reasons
+        else trial
+        for trial in progress_of_experiment(home)
+    ]
+
+
+def present_source(target: str, folder: str) -> str | None:
+    """The hash of the file of a user's class as it is found from ``folder``; None where it is not."""
+    saved = list(sys.path)
+    sys.path.insert(0, folder)
+    try:
+        return source_of(target).get("source")
+    finally:
+        sys.path[:] = saved
 
 
 def experiment_home(runs: Path, name: str) -> Path:
@@ -78,7 +124,7 @@ def _overview(runs: Path) -> int:
     if not names:
         print(f"no experiment in {runs} yet")
     for name in names:
-        print(f"{name:<20} {summary_of(progress_of_experiment(runs / name))}")
+        print(f"{name:<20} {summary_of(progress_with_superseded(runs / name))}")
     return 0
 
 

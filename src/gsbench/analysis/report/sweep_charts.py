@@ -5,7 +5,8 @@ from __future__ import annotations
 import statistics
 from collections.abc import Mapping, Sequence
 
-from gsbench.analysis.cells import by_key, differing_settings
+from gsbench.analysis.cells import by_key
+from gsbench.analysis.differences import differing_settings
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.report.charts import Series, line_chart, short_number
 from gsbench.analysis.results import Trial, canonical

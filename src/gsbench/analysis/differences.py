@@ -1,0 +1,98 @@
+"""In what trials differ: the conditions, the settings, and the versions of the code that made them."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+
+from gsbench.analysis.results import Trial, canonical
+from gsbench.source import OWN, SHOWN
+
+Versions = dict[str, list[Trial]]  # version -> the trials that it made
+
+# Settings in which trials of one cell may differ: they name the trial or say where it runs, not what is computed.
+IGNORED_SETTINGS = ("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path")
+CODE = "code of "  # how the keys of ``Trial.code`` start that are a user's own classes
+CLASSES = ("init._target_", "densify._target_")
+
+
+def differing_conditions(trials: Sequence[Trial]) -> dict[str, list[str]]:
+    """The conditions in which trials differ, with their values; the code that made them is one.
+
+    Unlike budgets of which none acted are no difference: all of the trials grew as they liked.
+    """
+    seen: dict[str, set[str]] = defaultdict(set)
+    for trial in trials:
+        for key, value in trial.conditions().items():
+            seen[key].add(value)
+    for part, versions in differing_code(trials).items():
+        seen[part] = {short_version(version) for version in versions}
+    if not any(trial.budget_acted for trial in trials):
+        del seen["budget"]
+    return {key: sorted(values) for key, values in seen.items() if len(values) > 1}
+
+
+def differing_settings(trials: Sequence[Trial]) -> dict[str, list[str]]:
+    """The settings in which trials with different configuration hashes differ, those that may differ left out."""
+    if len({trial.config_hash for trial in trials}) == 1:
+        return {}
+    keys = {key for trial in trials for key in trial.config if not key.startswith(IGNORED_SETTINGS)}
+    values = {key: sorted({canonical(trial.config.get(key)) for trial in trials}) for key in sorted(keys)}
+    return {key: found for key, found in values.items() if len(found) > 1}
+
+
+def differing_code(trials: Iterable[Trial]) -> dict[str, Versions]:
+    """The classes and stages of which the trials used several versions, as far as versions were recorded."""
+    found: dict[str, Versions] = defaultdict(lambda: defaultdict(list))
+    for trial in trials:
+        for part, version in trial.code.items():
+            found[part][version].append(trial)
+    return {part: dict(versions) for part, versions in found.items() if len(versions) > 1}
+
+
+def differing_unrecorded_code(trials: Sequence[Trial]) -> dict[str, Versions]:
+    """The same for trials with equal settings, made before versions were recorded.
+
+    The hash in a folder's name is of the settings and of the file of a user's own class. Where the settings are equal
+    and the hashes are not, it was the file that changed.
+    """
+    versions: Versions = defaultdict(list)
+    for trial in trials:
+        versions[f"configuration {trial.config_hash}"].append(trial)
+    if len(versions) < 2 or all("code" in trial.data for trial in trials):
+        return {}
+    classes = {str(trial.config.get(key)) for trial in trials for key in CLASSES if key in trial.config}
+    own = sorted(name for name in classes if not name.startswith(OWN))
+    paths = {trial.config.get("scene.path") for trial in trials}  # the one setting that is hashed and yet ignored
+    return {CODE + " or ".join(own): dict(versions)} if own and len(paths) == 1 else {}
+
+
+def describe_code(part: str, versions: Mapping[str, Sequence[Trial]]) -> str:
+    """``mine.Patient: 3fa9c1d2 (garden seeds 0, 1; 2026-11-21 18:40) | …``, the oldest version first."""
+    ordered = sorted(versions.items(), key=lambda item: max(trial.finished for trial in item[1]))
+    texts = [f"{short_version(version)} ({_places(own)}; {_when(own)})" for version, own in ordered]
+    return f"{part.removeprefix(CODE)}: {' | '.join(texts)}"
+
+
+def short_version(version: str) -> str:
+    """A version as people see it: the start of a hash, or the whole of what is no hash."""
+    return version if " " in version else version[:SHOWN]
+
+
+def _places(trials: Sequence[Trial]) -> str:
+    """``garden seeds 0, 1; room seed 0``"""
+    seeds: dict[str, list[int]] = defaultdict(list)
+    for trial in trials:
+        seeds[trial.scene].append(trial.seed)
+    return "; ".join(
+        f"{scene} {'seed' if len(found) == 1 else 'seeds'} {', '.join(map(str, sorted(found)))}"
+        for scene, found in sorted(seeds.items())
+    )
+
+
+def _when(trials: Sequence[Trial]) -> str:
+    """When the trials were finished: a minute, or the first and the last."""
+    times = sorted(trial.finished for trial in trials)
+    minutes = [time.strftime("%Y-%m-%d %H:%M", time.localtime(finished)) for finished in times]
+    return minutes[0] if minutes[0] == minutes[-1] else f"{minutes[0]} to {minutes[-1]}"

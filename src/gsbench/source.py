@@ -1,0 +1,71 @@
+"""Which version of a user's own code made a result: the hash of the file that defines a class. Loads no torch."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import sys
+from collections.abc import Iterator, Mapping
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from typing import Any
+
+OWN = "gsbench."  # classes below it have no hash: versions of gsbench's stages stand for them
+SHOWN = 8  # characters of a hash that people see
+
+_as_imported: dict[str, tuple[ModuleSpec, str]] = {}  # the hash that a module's file had when it was imported
+
+
+def source_of(target: str) -> dict[str, str]:
+    """``{"source": sha256}`` of the file that defines a user's own class, which has no version that we could bump.
+
+    Of a module that this process has imported, it is the file as it was then: that is the code that runs, whatever has
+    become of the file since. Empty for gsbench's own classes, and where there is no such file (importing it will say
+    what is wrong).
+    """
+    if target.startswith(OWN):
+        return {}
+    spec = _spec(target)
+    if spec is None or spec.origin is None or not Path(spec.origin).is_file():
+        return {}
+    known = _as_imported.get(spec.name)
+    if known is not None and known[0] is spec:
+        return {"source": known[1]}
+    digest = _hash(spec.origin)
+    if spec.name in sys.modules:
+        _as_imported[spec.name] = (spec, digest)
+    return {"source": digest}
+
+
+def has_changed_since_import(target: str) -> bool:
+    """Whether the file of a class is no longer the one that this process has imported, and therefore runs."""
+    spec, source = _spec(target), source_of(target)
+    return bool(source) and spec is not None and _hash(str(spec.origin)) != source["source"]
+
+
+def sources_of(values: Mapping[str, Any]) -> dict[str, str]:
+    """``{class: sha256}`` for every user's own class that a configuration names by ``_target_``, at any depth."""
+    return {target: found["source"] for target in sorted(set(_targets(values))) if (found := source_of(target))}
+
+
+def _targets(values: Any) -> Iterator[str]:
+    if isinstance(values, Mapping):
+        if isinstance(values.get("_target_"), str):
+            yield values["_target_"]
+        for value in values.values():
+            yield from _targets(value)
+    elif isinstance(values, list | tuple):
+        for value in values:
+            yield from _targets(value)
+
+
+def _hash(path: str) -> str:
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+def _spec(target: str) -> ModuleSpec | None:
+    """Where Python finds, or has found, the module of a class."""
+    try:
+        return importlib.util.find_spec(target.rpartition(".")[0])
+    except (ImportError, ValueError):
+        return None
