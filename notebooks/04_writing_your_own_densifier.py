@@ -53,20 +53,18 @@ settings += ["eval.lpips=[]", "eval.flip=false", "tracking=none"]
 # %%
 # %%writefile tightening.py
 from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Ge
 
 from gsbench.densify import ADC
-from gsbench.densify.base import require
 
 
 @dataclass
 class Tightening(ADC):
     """ADC whose gradient threshold rises linearly, to ``final_factor`` times its value at ``stop``."""
 
-    final_factor: float = 3.0
-
-    def __post_init__(self):
-        super().__post_init__()
-        require(self.final_factor >= 1, "final_factor", self.final_factor, "at least 1")
+    final_factor: Annotated[float, Ge(1)] = 3.0
 
     def _grow_by_gradient(self, step, gaussians, rng, event):
         progress = (step - self.start) / (self.stop - self.start)
@@ -88,7 +86,7 @@ run(["densify=adc", *common])
 run([*own, *common])
 
 # %% [markdown]
-# Settings are checked. A wrong value is one line that names the key, and exit code 2:
+# Settings are checked against their annotations. A wrong value is one line that names the key, and exit code 2:
 
 # %%
 run([*own[:-1], "+densify.final_factor=0.5", *common, "name=wrong"])

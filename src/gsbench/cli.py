@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gsbench.errors import GsbenchError, InputError
+from gsbench.words import closest
 
 DONE, TRIAL_FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
@@ -71,8 +72,6 @@ def runs_dir() -> Path:
 
 def _verb(name: str, argv: list[str]) -> int:
     if name not in VERBS:
-        from gsbench.config import closest
-
         raise InputError(
             f"{name!r} is neither a verb nor a setting like key=value{closest(name, list(VERBS))} "
             f"(verbs: {', '.join(VERBS)})"

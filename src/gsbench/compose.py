@@ -18,8 +18,9 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gsbench.config import check, closest, conf_dir, plain, register_schemas
+from gsbench.config import check, conf_dir, plain, register_schemas
 from gsbench.errors import InputError
+from gsbench.words import closest
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")
 MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood

@@ -3,7 +3,6 @@ packages."""
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
 from dataclasses import dataclass, field
@@ -235,12 +234,6 @@ def config_hash(values: dict[str, Any]) -> str:
 def sha256_of(values: Any) -> str:
     """sha256 of canonical JSON: sorted keys, no spaces, floats by repr."""
     return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
-def closest(word: str, choices: list[str]) -> str:
-    """' did you mean X?' where one choice is near, else ''."""
-    near = difflib.get_close_matches(word, choices, n=1)
-    return f"; did you mean {near[0]}?" if near else ""
 
 
 def _is_positive(value: Any) -> bool:

@@ -1,6 +1,9 @@
-"""Numbers as people say them."""
+"""Numbers as people say them, and the nearest right word for a wrong one."""
 
 from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
 
 
 def counted(count: int, noun: str) -> str:
@@ -17,3 +20,9 @@ def readable_time(seconds: float) -> str:
     if seconds < 36 * 3600:
         return f"{seconds / 3600:.1f} h"
     return f"{seconds / 86400:.1f} days"
+
+
+def closest(word: str, choices: Iterable[str]) -> str:
+    """'; did you mean X?' where one choice is near, else ''."""
+    near = difflib.get_close_matches(word, list(choices), n=1)
+    return f"; did you mean {near[0]}?" if near else ""

@@ -288,11 +288,11 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"extractor": "sift_kornia"}, "init.extractor=sift_kornia: allowed are superpoint, aliked, disk"),
-            ({"matcher": "superglue"}, "init.matcher=superglue"),
+            ({"extractor": "sift_kornia"}, "init.extractor must be 'superpoint', 'aliked' or 'disk', got 'sift_kornia'"),
+            ({"matcher": "superglue"}, "init.matcher must be .* got 'superglue'"),
             ({"extractor": "aliked", "aliked_model": "t16"}, "init.matcher=lightglue has no weights"),
-            ({"filter_threshold": -1}, "init.filter_threshold=-1"),
-            ({"max_keypoints": 0}, "init.max_keypoints=0"),
+            ({"filter_threshold": -1}, r"init.filter_threshold must be a number in \[0, 1\], got -1"),
+            ({"max_keypoints": 0}, "init.max_keypoints must be a whole number above 0, got 0"),
         ],
     )
     def test_settings_are_checked_by_name(self, options: dict[str, object], message: str):

@@ -219,14 +219,14 @@ def test_too_few_photos(courtyard: Capture, tmp_path: Path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"poses": "both"}, "init.poses=both: allowed are shared, own"),
-        ({"camera_model": "THIN_PRISM"}, "init.camera_model=THIN_PRISM: allowed are"),
-        ({"pairs": "all"}, "init.pairs=all"),
-        ({"max_ratio": 1.5}, "init.max_ratio=1.5: must be a number above 0 and at most 1"),
-        ({"max_image_size": 0}, "init.max_image_size=0: must be a number at least 32"),
-        ({"threads": 0}, "init.threads=0"),
-        ({"seed": 0.5}, "init.seed=0.5: must be a whole number"),
-        ({"focal_length": float("nan")}, "init.focal_length=nan"),
+        ({"poses": "both"}, "init.poses must be 'shared' or 'own', got 'both'"),
+        ({"camera_model": "THIN_PRISM"}, "init.camera_model must be 'SIMPLE_PINHOLE', .* or 'OPENCV_FISHEYE', got 'THIN_PRISM'"),
+        ({"pairs": "all"}, "init.pairs must be .* got 'all'"),
+        ({"max_ratio": 1.5}, r"init.max_ratio must be a number in \(0, 1\], got 1.5"),
+        ({"max_image_size": 0}, "init.max_image_size must be a whole number of at least 32, got 0"),
+        ({"threads": 0}, "init.threads must be a whole number above 0 or 'auto', got 0"),
+        ({"seed": 0.5}, "init.seed must be a whole number in .*, got 0.5"),
+        ({"focal_length": float("nan")}, "init.focal_length must be a number above 0 or null, got nan"),
     ],
 )
 def test_settings_are_checked_by_name(options: dict[str, object], message: str):

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import Ge, Interval
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import Densifier, DensifyContext, require
-from gsbench.densify.budget import CapKind, admit, allowance, limit_at
+from gsbench.densify.base import Densifier, DensifyContext
+from gsbench.densify.budget import CapKind, admit, allowance, check_room, limit_at
 from gsbench.densify.events import Cause, RefineEvent
 from gsbench.densify.operations import revised_logits, split
+from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
+from gsbench.settings import OpenFraction
 
 PAPER_CAP = 3_400_000  # the paper's, for the baseline and its own rule alike
 
@@ -28,22 +32,22 @@ class ADC(Densifier):
     which a Gaussian was visible.
     """
 
-    start: int = 500  # refine where start < step < stop and step % interval == 0
+    start: NonNegativeInt = 500  # refine where start < step < stop and step % interval == 0
     stop: int = 15_000
-    interval: int = 100
+    interval: PositiveInt = 100
     gradient: Literal["signed", "absolute"] = "signed"  # absolute: AbsGS, arXiv 2404.10484
-    gradient_threshold: float = 2e-4
+    gradient_threshold: PositiveFloat = 2e-4
     threshold_inclusive: bool = True  # >= as 3DGS; False: > as gsplat
-    split_size: float = 0.01  # largest scale above it: split, else clone ("percent_dense")
-    split_children: int = 2
-    split_shrink: float = 1.6  # children's scales are divided by it (0.8 x 2)
+    split_size: PositiveFloat = 0.01  # largest scale above it: split, else clone ("percent_dense")
+    split_children: Annotated[int, Ge(2)] = 2
+    split_shrink: Annotated[float, Ge(1)] = 1.6  # children's scales are divided by it (0.8 x 2)
     revised_opacity: bool = False  # children of clones and splits share their parent's opacity (arXiv 2404.06109)
-    prune_opacity: float = 0.005
-    prune_size: float = 0.1  # after the first opacity reset
-    prune_screen_radius: float | None = None  # px; 3DGS means 20 but zeroes the radii before it looks, so it never acts
-    opacity_reset_interval: int = 3000
-    opacity_reset_value: float = 0.01
-    max_gaussians: int | None = PAPER_CAP  # None: no limit, as 3DGS
+    prune_opacity: Annotated[float, Interval(ge=0, lt=1)] = 0.005
+    prune_size: PositiveFloat = 0.1  # after the first opacity reset
+    prune_screen_radius: PositiveFloat | None = None  # px; 3DGS means 20 but zeroes the radii first, so it never acts
+    opacity_reset_interval: PositiveInt = 3000
+    opacity_reset_value: OpenFraction = 0.01
+    max_gaussians: PositiveInt | None = PAPER_CAP  # None: no limit, as 3DGS
     cap: CapKind = "soft"
 
     initial_count: int = field(init=False, repr=False, compare=False, default=0)
@@ -52,40 +56,19 @@ class ADC(Densifier):
     max_radii: Tensor = field(init=False, repr=False, compare=False)  # [N] px
 
     def __post_init__(self) -> None:
-        require(self.start >= 0, "start", self.start, "at least 0")
-        require(self.stop > self.start, "stop", self.stop, f"above densify.start ({self.start})")
-        require(self.interval >= 1, "interval", self.interval, "at least 1")
-        require(self.gradient in ("signed", "absolute"), "gradient", self.gradient, "signed or absolute")
-        require(self.gradient_threshold > 0, "gradient_threshold", self.gradient_threshold, "above 0")
-        require(self.split_size > 0, "split_size", self.split_size, "above 0")
-        require(self.split_children >= 2, "split_children", self.split_children, "at least 2")
-        require(self.split_shrink >= 1, "split_shrink", self.split_shrink, "at least 1")
-        require(0 <= self.prune_opacity < 1, "prune_opacity", self.prune_opacity, "in [0, 1)")
-        require(self.prune_size > 0, "prune_size", self.prune_size, "above 0")
-        radius = self.prune_screen_radius
-        require(radius is None or radius > 0, "prune_screen_radius", radius, "above 0 or null")
-        require(self.opacity_reset_interval >= 1, "opacity_reset_interval", self.opacity_reset_interval, "at least 1")
-        require(0 < self.opacity_reset_value < 1, "opacity_reset_value", self.opacity_reset_value, "in (0, 1)")
-        require(
-            self.max_gaussians is None or self.max_gaussians >= 1, "max_gaussians", self.max_gaussians, "at least 1"
-        )
-        require(self.cap in ("soft", "hard", "curve"), "cap", self.cap, "soft, hard or curve")
-        require(
-            self.cap != "curve" or self.max_gaussians is not None, "max_gaussians", None, "set for densify.cap=curve"
-        )
+        super().__post_init__()
+        if self.stop <= self.start:
+            raise InputError(f"densify.stop must be above densify.start ({self.start}), got {self.stop}")
+        if self.cap == "curve" and self.max_gaussians is None:
+            raise InputError("densify.max_gaussians must be set for densify.cap=curve")
 
     @property
     def needs_absolute_gradient(self) -> bool:  # type: ignore[override]
         return self.gradient == "absolute"
 
     def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
-        limit = self.max_gaussians
-        require(
-            limit is None or limit >= len(gaussians),
-            "max_gaussians",
-            limit,
-            f"at least the size of the initial cloud ({len(gaussians)})",
-        )
+        if self.max_gaussians is not None:
+            check_room(self.max_gaussians, len(gaussians))
         super().begin(gaussians, context)
         self.initial_count = len(gaussians)
         self._forget_statistics(len(gaussians), gaussians.means.device)

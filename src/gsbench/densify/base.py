@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from gsbench.densify.events import Cause, Lineage, RefineEvent
-from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
+from gsbench.settings import check_settings
 
 
 @dataclass(frozen=True)
@@ -27,14 +27,18 @@ class DensifyContext:
 class Densifier:
     """Base of all densifiers, and the one that never changes the Gaussians (``densify=none``).
 
-    A subclass is a dataclass of hyper-parameters. In every iteration the trainer calls ``regularizer`` before the
-    backward pass, ``observe`` after it, then ``refine``, then the optimiser step, then ``after_step``. Mutable state
-    is in ``context``, ``lineage`` and what ``state_dict`` of a subclass adds.
+    A subclass is a dataclass of hyper-parameters, whose annotations say what is allowed. In every iteration the trainer
+    calls ``regularizer`` before the backward pass, ``observe`` after it, then ``refine``, then the optimiser step, then
+    ``after_step``. Mutable state is in ``context``, ``lineage`` and what ``state_dict`` of a subclass adds.
     """
 
     context: DensifyContext
     lineage: Lineage
     needs_absolute_gradient: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the hyper-parameters against their annotations; a subclass adds the rules between them."""
+        check_settings(self, "densify")
 
     def prepare(self, gaussians: Gaussians) -> Gaussians:
         """The Gaussians that the training starts with, from those of the initial cloud."""
@@ -89,9 +93,3 @@ class Densifier:
 
 class NoDensifier(Densifier):
     """``densify=none``: the initial Gaussians are only optimised."""
-
-
-def require(condition: bool, key: str, value: object, rule: str) -> None:
-    """Raise InputError naming the hyper-parameter ``key`` unless ``condition`` holds."""
-    if not condition:
-        raise InputError(f"densify.{key} must be {rule}, got {value!r}")

@@ -7,7 +7,17 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from gsbench.errors import InputError
+
 CapKind = Literal["soft", "hard", "curve"]
+
+
+def check_room(max_gaussians: int, num_initial: int) -> None:
+    """Raise InputError where the initial cloud has more Gaussians than an arm may ever have."""
+    if max_gaussians < num_initial:
+        raise InputError(
+            f"densify.max_gaussians must be at least the size of the initial cloud ({num_initial}), got {max_gaussians}"
+        )
 
 
 def limit_at(step: int, start: int, stop: int, initial: int, max_gaussians: int | None, cap: CapKind) -> int | None:

@@ -8,12 +8,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import Densifier, DensifyContext, require
+from gsbench.densify.base import Densifier, DensifyContext
+from gsbench.densify.budget import check_room
 from gsbench.densify.events import Cause, RefineEvent
+from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.settings import OpenFraction
 
 MAX_COPIES = 51  # of one Gaussian in a relocation (the authors' table of binomials ends there)
 GATE_STEEPNESS = 100.0  # of the sigmoid that keeps noise off opaque Gaussians
@@ -26,31 +30,23 @@ class MCMC(Densifier):
     Copies share opacity and size so that the picture stays the same (eq. 9 of the paper). The cap is always exact.
     """
 
-    start: int = 500
+    start: NonNegativeInt = 500
     stop: int = 25_000
-    interval: int = 100
-    max_gaussians: int = 1_000_000
+    interval: PositiveInt = 100
+    max_gaussians: PositiveInt = 1_000_000
     cap: Literal["hard"] = "hard"
-    growth: float = 0.05  # of the present count, at each refinement
-    min_opacity: float = 0.005  # dead at and below it
-    noise_rate: float = 5e5  # times the learning rate of the means
-    opacity_weight: float = 0.01  # of the mean opacity, in the loss
-    scale_weight: float = 0.01  # of the mean scale, in the loss
-    initial_opacity: float = 0.5
-    initial_scale: float = 0.1  # of the distance to the neighbours
+    growth: NonNegativeFloat = 0.05  # of the present count, at each refinement
+    min_opacity: OpenFraction = 0.005  # dead at and below it
+    noise_rate: NonNegativeFloat = 5e5  # times the learning rate of the means
+    opacity_weight: NonNegativeFloat = 0.01  # of the mean opacity, in the loss
+    scale_weight: NonNegativeFloat = 0.01  # of the mean scale, in the loss
+    initial_opacity: OpenFraction = 0.5
+    initial_scale: PositiveFloat = 0.1  # of the distance to the neighbours
 
     def __post_init__(self) -> None:
-        require(self.start >= 0, "start", self.start, "at least 0")
-        require(self.stop > self.start, "stop", self.stop, f"above densify.start ({self.start})")
-        require(self.interval >= 1, "interval", self.interval, "at least 1")
-        require(self.max_gaussians >= 1, "max_gaussians", self.max_gaussians, "at least 1")
-        require(self.growth >= 0, "growth", self.growth, "at least 0")
-        require(0 < self.min_opacity < 1, "min_opacity", self.min_opacity, "in (0, 1)")
-        require(self.noise_rate >= 0, "noise_rate", self.noise_rate, "at least 0")
-        require(self.opacity_weight >= 0, "opacity_weight", self.opacity_weight, "at least 0")
-        require(self.scale_weight >= 0, "scale_weight", self.scale_weight, "at least 0")
-        require(0 < self.initial_opacity < 1, "initial_opacity", self.initial_opacity, "in (0, 1)")
-        require(self.initial_scale > 0, "initial_scale", self.initial_scale, "above 0")
+        super().__post_init__()
+        if self.stop <= self.start:
+            raise InputError(f"densify.stop must be above densify.start ({self.start}), got {self.stop}")
 
     def prepare(self, gaussians: Gaussians) -> Gaussians:
         changed = {
@@ -60,12 +56,7 @@ class MCMC(Densifier):
         return Gaussians(**(gaussians.tensors() | changed))
 
     def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
-        require(
-            len(gaussians) <= self.max_gaussians,
-            "max_gaussians",
-            self.max_gaussians,
-            f"at least the size of the initial cloud ({len(gaussians)})",
-        )
+        check_room(self.max_gaussians, len(gaussians))
         super().begin(gaussians, context)
 
     def regularizer(self, gaussians: Gaussians) -> Tensor:

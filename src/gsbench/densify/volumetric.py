@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from gsbench.densify.adc import ADC
-from gsbench.densify.base import require
 from gsbench.densify.budget import admit
 from gsbench.densify.events import Cause, RefineEvent
 from gsbench.densify.volume import ConditionOf, child_log_scales, log_volume
+from gsbench.errors import InputError
 from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.settings import OpenFraction
 
 ThresholdMode = Literal["absolute", "extent_relative", "quantile", "auto"]
 TUKEY_FENCE = 1.5  # interquartile ranges above the third quartile (Tukey 1977)
@@ -36,45 +39,27 @@ class Volumetric(ADC):
     where no volume stands out. ``volume_start``, ``volume_stop`` and ``volume_interval`` default to those of ADC.
     """
 
-    volume_threshold: float = 0.03
+    volume_threshold: PositiveFloat = 0.03
     threshold_mode: ThresholdMode = "absolute"
-    volume_quantile: float = 0.9978  # 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03
+    volume_quantile: OpenFraction = 0.9978  # 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03
     condition_of: ConditionOf = "eigenvalues"  # what kappa divides: eigenvalues (eq. 7) or scales
-    max_condition: float | None = None  # limits kappa, so that children of needles do not vanish
+    max_condition: Annotated[float, Ge(1)] | None = None  # limits kappa, so that children of needles do not vanish
     split_isotropic: bool = True  # False: leave those whose children would be above the threshold again
-    volume_children: int = 2
+    volume_children: Annotated[int, Ge(2)] = 2
     keep_parent: bool = False
     placement: Literal["sampled", "parent_mean"] = "sampled"
     volume_order: Literal["after_adc", "before_adc", "after_prune"] = "after_adc"
-    volume_start: int | None = None
-    volume_stop: int | None = None
-    volume_interval: int | None = None
+    volume_start: NonNegativeInt | None = None
+    volume_stop: NonNegativeInt | None = None
+    volume_interval: PositiveInt | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        modes = ("absolute", "extent_relative", "quantile", "auto")
-        orders = ("after_adc", "before_adc", "after_prune")
-        require(self.volume_threshold > 0, "volume_threshold", self.volume_threshold, "above 0")
-        require(self.threshold_mode in modes, "threshold_mode", self.threshold_mode, " or ".join(modes))
-        require(0 < self.volume_quantile < 1, "volume_quantile", self.volume_quantile, "in (0, 1)")
-        require(
-            self.condition_of in ("eigenvalues", "scales"), "condition_of", self.condition_of, "eigenvalues or scales"
-        )
-        limit = self.max_condition
-        require(limit is None or limit >= 1, "max_condition", limit, "at least 1 or null")
-        require(self.volume_children >= 2, "volume_children", self.volume_children, "at least 2")
-        placements = ("sampled", "parent_mean")
-        require(self.placement in placements, "placement", self.placement, " or ".join(placements))
-        require(self.volume_order in orders, "volume_order", self.volume_order, " or ".join(orders))
-        require(self.volume_start is None or self.volume_start >= 0, "volume_start", self.volume_start, "at least 0")
-        require(self.volume_stop is None or self.volume_stop >= 0, "volume_stop", self.volume_stop, "at least 0")
-        every = self.volume_interval
-        require(
-            every is None or (every >= 1 and every % self.interval == 0),
-            "volume_interval",
-            every,
-            f"a multiple of densify.interval ({self.interval})",
-        )
+        if self.volume_interval is not None and self.volume_interval % self.interval:
+            raise InputError(
+                f"densify.volume_interval must be a multiple of densify.interval ({self.interval}), "
+                f"got {self.volume_interval}"
+            )
 
     def _grow_and_prune(
         self, step: int, gaussians: TrainableGaussians, rng: torch.Generator, event: RefineEvent

@@ -6,9 +6,10 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
 from gsbench.scene.types import Capture
@@ -18,7 +19,8 @@ OWN_GAUGE_FOLDER = Path("sparse_own_gauge", "0")  # the same model as its own ma
 REPORT_FILE = "report.json"
 GAUSSIANS_FILE = "gaussians.ply"  # optional: the Gaussians to start from, where there is more than points
 PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
-POSES = ("shared", "own")
+Poses = Literal["shared", "own"]
+Seed = Annotated[int, Interval(ge=0, le=2**31 - 1)]  # COLMAP takes no larger one
 
 
 class Progress(Protocol):

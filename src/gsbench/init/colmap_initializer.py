@@ -8,22 +8,26 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from annotated_types import Ge, Interval
+from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.cores import available_cores
 from gsbench.errors import InputError
 from gsbench.init.base import (
     OWN_GAUGE_FOLDER,
-    POSES,
     InitReport,
+    Poses,
     Progress,
+    Seed,
     no_progress,
 )
-from gsbench.init.checks import check_choice, check_integer, check_number
-from gsbench.init.pairs import PAIRINGS
+from gsbench.init.pairs import Pairing
 from gsbench.init.relay import run_with_progress
 from gsbench.init.timer import Timer
 from gsbench.scene.types import Capture
+from gsbench.settings import check_settings
 
 if TYPE_CHECKING:
     import pycolmap
@@ -32,10 +36,11 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-CAMERA_SHARING = ("single", "per_folder", "per_image")
-CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
-INTRINSICS = ("estimate", "reference")
+CameraSharing = Literal["single", "per_folder", "per_image"]
+CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+Intrinsics = Literal["estimate", "reference"]
 MIN_IMAGES = 3  # two views have no third that could contradict a wrong geometry
+MIN_DETECTION_SIZE = 32  # px: below it no detector finds anything
 LOG_FILE = "colmap.log"
 WORK_FOLDER = "work"
 
@@ -89,38 +94,24 @@ class ColmapInitializer(ABC):
     name: ClassVar[str]
     is_own_reference: ClassVar[bool] = False  # with poses=shared and no reference: estimate the poses here
 
-    poses: str = "shared"
+    poses: Poses = "shared"
     align: bool = True
-    camera: str = "single"
-    camera_model: str = "SIMPLE_RADIAL"
-    focal_length: float | None = None
-    intrinsics: str = "estimate"
-    pairs: str = "exhaustive"
-    overlap: int = 10
-    neighbors: int = 20
-    min_inliers: int = 15
-    min_model_size: int = 3
+    camera: CameraSharing = "single"
+    camera_model: CameraModel = "SIMPLE_RADIAL"
+    focal_length: PositiveFloat | None = None
+    intrinsics: Intrinsics = "estimate"
+    pairs: Pairing = "exhaustive"
+    overlap: Annotated[int, Interval(ge=1, le=60)] = 10
+    neighbors: PositiveInt = 20
+    min_inliers: Annotated[int, Ge(7)] = 15  # a fundamental matrix takes seven
+    min_model_size: Annotated[int, Ge(2)] = 3
     two_view_tracks: bool = False
-    seed: int = 0
-    threads: int | Literal["auto"] = "auto"
-    mapper_threads: int = 1
+    seed: Seed = 0
+    threads: PositiveInt | Literal["auto"] = "auto"
+    mapper_threads: PositiveInt = 1
 
     def __post_init__(self) -> None:
-        check_choice("poses", self.poses, POSES)
-        check_choice("camera", self.camera, CAMERA_SHARING)
-        check_choice("camera_model", self.camera_model, CAMERA_MODELS)
-        check_choice("intrinsics", self.intrinsics, INTRINSICS)
-        check_choice("pairs", self.pairs, PAIRINGS)
-        if self.focal_length is not None:
-            check_number("focal_length", self.focal_length, 0, exclusive=True)
-        check_integer("overlap", self.overlap, 1, 60)
-        check_integer("neighbors", self.neighbors, 1)
-        check_integer("min_inliers", self.min_inliers, 7)  # a fundamental matrix takes seven
-        check_integer("min_model_size", self.min_model_size, 2)
-        check_integer("seed", self.seed, 0, 2**31 - 1)
-        if self.threads != "auto":
-            check_integer("threads", self.threads, 1)
-        check_integer("mapper_threads", self.mapper_threads, 1)
+        check_settings(self, "init")
 
     def needs_reference(self, capture: Capture) -> bool:
         """Whether `run` needs a ``reference`` because the capture came without cameras."""

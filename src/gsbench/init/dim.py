@@ -6,24 +6,27 @@ import logging
 from abc import abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar, Literal
+
+from annotated_types import Ge, Interval
+from pydantic import NonNegativeFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.init.base import Progress
-from gsbench.init.checks import check_choice, check_integer, check_number
-from gsbench.init.colmap_initializer import ColmapInitializer, DatabaseTask, Preparation
+from gsbench.init.colmap_initializer import MIN_DETECTION_SIZE, ColmapInitializer, DatabaseTask, Preparation
 from gsbench.init.feature_settings import FeatureSettings
 from gsbench.init.network_weights import ALIKED_WEIGHTS, EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS, SUPERPOINT_LICENCE
 from gsbench.init.relay import run_with_progress
 from gsbench.init.timer import Timer
 from gsbench.scene.types import Capture
+from gsbench.settings import Fraction
 from gsbench.weights import find_all_weights
 
 logger = logging.getLogger(__name__)
 
-DEEP_EXTRACTORS = ("superpoint", "aliked", "disk")
-MATCHERS = ("lightglue", "mutual_nearest")
-ALIKED_MODELS = ("n16", "n16rot", "n32", "t16")
+Extractor = Literal["superpoint", "aliked", "disk"]
+Matcher = Literal["lightglue", "mutual_nearest"]
+AlikedModel = Literal["n16", "n16rot", "n32", "t16"]
 # detection scores are not comparable between extractors; these are deep-image-matching's (superpoint) and the authors'
 KEYPOINT_THRESHOLDS = {"superpoint": 0.0005, "aliked": 0.2, "disk": 0.0}
 NMS_RADII = {"superpoint": 3, "aliked": 2, "disk": 2}  # px
@@ -37,16 +40,10 @@ class FeatureInitializer(ColmapInitializer):
     image and by pair, so a killed run goes on there.
     """
 
-    max_keypoints: int = 2048
-    max_image_size: int = 1600
-    max_ratio: float = 0.95
+    max_keypoints: PositiveInt = 2048
+    max_image_size: Annotated[int, Ge(MIN_DETECTION_SIZE)] = 1600
+    max_ratio: Annotated[float, Interval(gt=0, le=1)] = 0.95
     device: str = "cpu"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_integer("max_keypoints", self.max_keypoints, 1)
-        check_integer("max_image_size", self.max_image_size, 32)
-        check_number("max_ratio", self.max_ratio, 0, 1, exclusive=True)
 
     @abstractmethod
     def feature_settings(self) -> FeatureSettings:
@@ -92,25 +89,17 @@ class Dim(FeatureInitializer):
 
     name: ClassVar[str] = "dim"
 
-    extractor: str = "superpoint"
-    matcher: str = "lightglue"
-    keypoint_threshold: float | None = None
-    nms_radius: int | None = None
-    aliked_model: str = "n16"
-    filter_threshold: float = 0.1
+    extractor: Extractor = "superpoint"
+    matcher: Matcher = "lightglue"
+    keypoint_threshold: NonNegativeFloat | None = None
+    nms_radius: Annotated[int, Interval(ge=1, le=50)] | None = None
+    aliked_model: AlikedModel = "n16"
+    filter_threshold: Fraction = 0.1
     weights: str | Path | None = None
     download: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice("extractor", self.extractor, DEEP_EXTRACTORS)
-        check_choice("matcher", self.matcher, MATCHERS)
-        check_choice("aliked_model", self.aliked_model, ALIKED_MODELS)
-        check_number("filter_threshold", self.filter_threshold, 0, 1)
-        if self.keypoint_threshold is not None:
-            check_number("keypoint_threshold", self.keypoint_threshold, 0)
-        if self.nms_radius is not None:
-            check_integer("nms_radius", self.nms_radius, 1, 50)
         if self.extractor == "aliked" and self.matcher == "lightglue" and self.aliked_model == "t16":
             raise InputError("init.matcher=lightglue has no weights for init.aliked_model=t16: use mutual_nearest")
 
@@ -151,7 +140,7 @@ class SiftKornia(FeatureInitializer):
 
     name: ClassVar[str] = "sift_kornia"
 
-    max_keypoints: int = 8192
+    max_keypoints: PositiveInt = 8192
 
     def feature_settings(self) -> FeatureSettings:
         return FeatureSettings(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Pair = tuple[int, int]
 
-PAIRINGS = ("exhaustive", "sequential", "spatial")
+Pairing = Literal["exhaustive", "sequential", "spatial"]
 EARTH_RADIUS_M = 6_371_000.0
 _GPS_IFD = 0x8825  # EXIF tags
 _GPS_LATITUDE_REF, _GPS_LATITUDE, _GPS_LONGITUDE_REF, _GPS_LONGITUDE, _GPS_ALTITUDE = 1, 2, 3, 4, 6

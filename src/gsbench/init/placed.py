@@ -12,6 +12,7 @@ from gsbench.init.base import InitReport, PointCloud, Progress, no_progress
 from gsbench.init.relay import run_with_progress
 from gsbench.init.timer import Timer
 from gsbench.scene.types import Capture
+from gsbench.settings import check_settings
 
 if TYPE_CHECKING:
     import pycolmap
@@ -21,6 +22,9 @@ class PlacedCloud(ABC):
     """Base of `Random` and `Ply`: the reference's cameras, and a cloud that the subclass, a dataclass, makes."""
 
     name: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        check_settings(self, "init")
 
     def needs_reference(self, capture: Capture) -> bool:
         """Whether `run` needs a ``reference`` because the capture came without cameras."""

@@ -26,9 +26,10 @@ class Ply(PlacedCloud):
 
     name: ClassVar[str] = "ply"
 
-    path: str
+    path: str | Path
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.file.is_file():
             raise InputError(f"init.path={self.path} is no file: name a PLY of Gaussians, as a trial's point_cloud.ply")
 

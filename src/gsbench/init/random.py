@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
+from annotated_types import Interval
+from pydantic import PositiveFloat
 
 from gsbench.errors import InputError
-from gsbench.init.base import PointCloud
-from gsbench.init.checks import check_integer, check_number
+from gsbench.init.base import PointCloud, Seed
 from gsbench.init.placed import PlacedCloud
 from gsbench.scene.types import Capture
 
@@ -26,14 +27,9 @@ class Random(PlacedCloud):
 
     name: ClassVar[str] = "random"
 
-    count: int = 100_000
-    size: float = 3.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_integer("count", self.count, 1, 10_000_000)
-        check_number("size", self.size, 0, exclusive=True)
-        check_integer("seed", self.seed, 0, 2**31 - 1)
+    count: Annotated[int, Interval(ge=1, le=10_000_000)] = 100_000
+    size: PositiveFloat = 3.0
+    seed: Seed = 0
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
         from gsbench.init import reconstruct, report

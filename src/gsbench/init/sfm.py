@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
+
+from annotated_types import Ge, Interval
+from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.init.base import Progress
-from gsbench.init.checks import check_integer, check_number
-from gsbench.init.colmap_initializer import ColmapInitializer, DatabaseTask
+from gsbench.init.colmap_initializer import MIN_DETECTION_SIZE, ColmapInitializer, DatabaseTask
 from gsbench.init.timer import Timer
 
 DEFAULT_PEAK_THRESHOLD = 0.02 / 3  # COLMAP's defaults
@@ -28,23 +30,14 @@ class Sfm(ColmapInitializer):
     name: ClassVar[str] = "sfm"
     is_own_reference: ClassVar[bool] = True
 
-    max_image_size: int = 1600
-    max_num_features: int = 8192
-    peak_threshold: float = DEFAULT_PEAK_THRESHOLD
-    edge_threshold: float = DEFAULT_EDGE_THRESHOLD
-    first_octave: int = -1
-    max_ratio: float = 0.8
+    max_image_size: Annotated[int, Ge(MIN_DETECTION_SIZE)] = 1600
+    max_num_features: PositiveInt = 8192
+    peak_threshold: PositiveFloat = DEFAULT_PEAK_THRESHOLD
+    edge_threshold: PositiveFloat = DEFAULT_EDGE_THRESHOLD
+    first_octave: Annotated[int, Interval(ge=-1, le=5)] = -1
+    max_ratio: Annotated[float, Interval(gt=0, le=1)] = 0.8
     cross_check: bool = True
     guided_matching: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_integer("max_image_size", self.max_image_size, 32)
-        check_integer("max_num_features", self.max_num_features, 1)
-        check_number("peak_threshold", self.peak_threshold, 0, exclusive=True)
-        check_number("edge_threshold", self.edge_threshold, 0, exclusive=True)
-        check_integer("first_octave", self.first_octave, -1, 5)
-        check_number("max_ratio", self.max_ratio, 0, 1, exclusive=True)
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> None:
         from gsbench.init.colmap_database import database_counts
@@ -67,6 +60,6 @@ class SfmDense(Sfm):
     name: ClassVar[str] = "sfm_dense"
     is_own_reference: ClassVar[bool] = False
 
-    max_num_features: int = 16384
-    peak_threshold: float = DENSE_PEAK_THRESHOLD
-    edge_threshold: float = DENSE_EDGE_THRESHOLD
+    max_num_features: PositiveInt = 16384
+    peak_threshold: PositiveFloat = DENSE_PEAK_THRESHOLD
+    edge_threshold: PositiveFloat = DENSE_EDGE_THRESHOLD

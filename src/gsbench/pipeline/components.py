@@ -9,15 +9,16 @@ import logging
 from typing import Any
 
 import torch
-from pydantic import TypeAdapter, ValidationError
 
-from gsbench.config import WITHOUT_EFFECT, check_target, closest
+from gsbench.config import WITHOUT_EFFECT, check_target
 from gsbench.errors import InputError
+from gsbench.settings import checked, unknown_setting
 from gsbench.source import has_changed_since_import, source_of
 
 log = logging.getLogger(__name__)
 
 RESERVED = ("_target_", "name")  # keys of a group that are not options of its class
+METHODS = {"init": ("needs_reference", "run"), "densify": ("prepare", "begin", "observe", "refine", "after_step")}
 
 
 def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
@@ -30,32 +31,38 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     check_target(target, group, allow_targets)
     cls = locate(target, group)
     options = {key: value for key, value in values.items() if key not in RESERVED}
-    known = [name for name in inspect.signature(cls).parameters if name != "self"]
-    for key in options:
-        if key not in known:
-            raise InputError(
-                f"{group}.{key} is not an option of {target}{closest(key, known)} (options: {', '.join(known)})"
-            )
+    if dataclasses.is_dataclass(cls):
+        options = checked(cls, options, group)
+    else:
+        _check_names(cls, options, group)
     try:
-        if dataclasses.is_dataclass(cls):
-            return TypeAdapter(cls).validate_python(options)
         return cls(**options)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join([group, *map(str, first["loc"])])
-        message = first["msg"].removeprefix("Value error, ")
-        raise InputError(message if message.startswith(f"{group}.") else f"{where}: {message}") from error
+    except InputError:
+        raise
     except (TypeError, ValueError) as error:
         raise InputError(f"{group}: {error}") from error
 
 
-def locate(target: str, group: str) -> Any:
-    """The class at the import path ``package.module.Class``."""
+def _check_names(cls: Any, options: dict[str, Any], group: str) -> None:
+    """Raise InputError for an option that the constructor of ``cls`` does not take."""
+    parameters = inspect.signature(cls).parameters
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+        return
+    for key in options:
+        if key not in parameters:
+            raise InputError(unknown_setting(f"{group}.{key}", key, parameters))
+
+
+def locate(target: str, group: str) -> type:
+    """The class at the import path ``package.module.Class``, which must be one that ``group`` can use."""
     module, _, name = target.rpartition(".")
     try:
         found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise InputError(f"{group}._target_={target} cannot be imported ({error})") from error
+    except Exception as error:  # importing a user's file runs it: it may raise anything
+        raise InputError(f"{group}._target_={target} cannot be imported ({type(error).__name__}: {error})") from error
+    lacking = [method for method in METHODS[group] if not callable(getattr(found, method, None))]
+    if not isinstance(found, type) or lacking:
+        raise InputError(f"{group}._target_={target} is not a class for {group}: it has no {', '.join(lacking)}()")
     if has_changed_since_import(target):  # the first call also notes the file as it is now, while it is what runs
         log.warning("the file of %s has changed since it was imported: this process goes on with what it was", target)
     return found

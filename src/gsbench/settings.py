@@ -1,0 +1,165 @@
+"""Settings are dataclasses whose annotations say what is allowed; this module holds values against them.
+
+A field's rule stands at the field: its type, bounds (`annotated_types`, or pydantic's ``PositiveInt`` and its like), a
+``Literal`` of choices. pydantic checks it, `describe` puts it into words. Numbers must be finite unless a class's own
+default is not. Rules between fields belong into the ``__post_init__`` of their class.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import reprlib
+import sys
+import types
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from annotated_types import DocInfo, GroupedMetadata, Interval
+from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
+
+from gsbench.errors import InputError
+from gsbench.words import closest
+
+Fraction = Annotated[float, Interval(ge=0, le=1)]
+OpenFraction = Annotated[float, Interval(gt=0, lt=1)]
+
+CONFIG = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True, coerce_numbers_to_str=True)
+PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", dict: "a mapping {key: value}"}
+
+
+def check_settings(settings: Any, group: str) -> None:
+    """Hold every option of the dataclass object ``settings`` against its annotation, and convert it (``1e3`` to 1000).
+
+    Raises InputError that names ``group`` and the field, what is allowed, and what was given.
+    """
+    given = {field.name: getattr(settings, field.name) for field in option_fields(type(settings))}
+    for name, value in checked(type(settings), given, group).items():
+        object.__setattr__(settings, name, value)  # the dataclass may be frozen
+
+
+def checked(cls: type, values: Mapping[str, Any], group: str) -> dict[str, Any]:
+    """``values``, options of the dataclass ``cls``, converted to what its annotations say.
+
+    Raises InputError for the first that is unknown or not allowed; its text starts with ``group``'s name and a dot
+    (nothing for the root, ``""``).
+    """
+    prefix = f"{group}." if group else ""
+    known = {field.name: field for field in option_fields(cls)}
+    result = {}
+    for name, value in values.items():
+        if name not in known:
+            raise InputError(unknown_setting(f"{prefix}{name}", name, known))
+        result[name] = _converted(value, known[name], cls, f"{prefix}{name}")
+    return result
+
+
+def unknown_setting(key: str, name: str, known: Iterable[str]) -> str:
+    """The words for a ``key`` whose last part ``name`` is none of the ``known``."""
+    known = list(known)
+    return f"{key} is not a setting{closest(name, known)} (there are: {', '.join(known) or 'none'})"
+
+
+def option_fields(cls: type) -> list[dataclasses.Field[Any]]:
+    """The fields of a dataclass that its constructor takes."""
+    return [field for field in dataclasses.fields(cls) if field.init]
+
+
+def describe(hint: Any) -> str:
+    """An annotation in words, as they stand after "must be".
+
+    >>> describe(Annotated[int, Gt(0)] | None)
+    'a whole number above 0 or null'
+    >>> describe(Literal["soft", "hard", "curve"])
+    "'soft', 'hard' or 'curve'"
+    """
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _describe_annotated(arguments[0], list(_flatten(arguments[1:])))
+    if origin is Literal:
+        return _one_of([repr(choice) for choice in arguments])
+    if origin in (Union, types.UnionType):
+        return _one_of(["null" if choice is type(None) else describe(choice) for choice in arguments])
+    if origin is list:
+        return f"a list, each {describe(arguments[0])}"
+    if origin is tuple:
+        return f"a list of {len(arguments)}, each {describe(arguments[0])}"
+    plain = origin or hint
+    return PLAIN.get(plain, f"of type {getattr(plain, '__name__', plain)}")
+
+
+def _converted(value: Any, field: dataclasses.Field[Any], cls: type, key: str) -> Any:
+    hint, adapter = _adapters(cls)[field.name]
+    try:
+        result = adapter.validate_python(value)
+        if not _has_switch_for_number(value, result):
+            return result
+        reason = ""
+    except ValidationError as error:
+        if value is field.default or (isinstance(value, float) and value == field.default):
+            return value  # the author of a class may know better than the annotation
+        first = error.errors()[0]
+        reason = f": {first['ctx']['error']}" if first["type"] in ("value_error", "assertion_error") else ""
+    raise InputError(f"{key} must be {describe(hint)}, got {_shown(value)}{reason}")
+
+
+def _has_switch_for_number(given: Any, result: Any) -> bool:
+    """Whether a ``true`` became a number, which pydantic lets pass."""
+    if isinstance(given, Sequence) and not isinstance(given, str):
+        return any(map(_has_switch_for_number, given, result))
+    return isinstance(given, bool) and not isinstance(result, bool)
+
+
+@cache
+def _adapters(cls: type) -> dict[str, tuple[Any, TypeAdapter[Any]]]:
+    result = {}
+    for field in option_fields(cls):
+        hint = _hint(cls, field.name)
+        try:
+            result[field.name] = hint, TypeAdapter(hint, config=CONFIG)
+        except PydanticUserError:  # a type that brings a configuration of its own, such as a nested dataclass
+            result[field.name] = hint, TypeAdapter(hint)
+    return result
+
+
+def _hint(cls: type, name: str) -> Any:
+    """The annotation of a field with its constraints; Any where it names what only type checkers import."""
+    owner = next(base for base in cls.__mro__ if name in inspect.get_annotations(base))
+    holder = types.SimpleNamespace(__annotations__={name: inspect.get_annotations(owner)[name]})
+    scope = vars(sys.modules[owner.__module__]) if owner.__module__ in sys.modules else {}
+    try:
+        return get_type_hints(holder, globalns=scope, include_extras=True)[name]
+    except NameError:
+        return Any
+
+
+def _describe_annotated(base: Any, rules: list[Any]) -> str:
+    said = next((rule.documentation for rule in rules if isinstance(rule, DocInfo)), None)
+    if said is not None:
+        return str(said)
+    bounds = {
+        bound: getattr(rule, bound) for rule in rules for bound in ("gt", "ge", "lt", "le") if hasattr(rule, bound)
+    }
+    low, high = bounds.get("gt", bounds.get("ge")), bounds.get("lt", bounds.get("le"))
+    words = describe(base)
+    if low is not None and high is not None:
+        return f"{words} in {'(' if 'gt' in bounds else '['}{low}, {high}{')' if 'lt' in bounds else ']'}"
+    if low is not None:
+        return f"{words} {'above' if 'gt' in bounds else 'of at least'} {low}"
+    if high is not None:
+        return f"{words} {'below' if 'lt' in bounds else 'of at most'} {high}"
+    return words
+
+
+def _flatten(metadata: Iterable[Any]) -> Iterable[Any]:
+    for rule in metadata:
+        yield from rule if isinstance(rule, GroupedMetadata) else getattr(rule, "metadata", [rule])
+
+
+def _one_of(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+
+
+def _shown(value: Any) -> str:
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else reprlib.repr(value)

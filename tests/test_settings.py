@@ -1,0 +1,163 @@
+"""Values are held against the annotations of dataclasses, gsbench's and a user's, in a line that names the key."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import pytest
+from annotated_types import Ge, Interval, Predicate, doc
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import PositiveFloat, PositiveInt
+
+from gsbench.densify import ADC, MCMC, Volumetric
+from gsbench.errors import InputError
+from gsbench.init import Dim, Random, Sfm
+from gsbench.settings import check_settings, checked, describe
+
+if TYPE_CHECKING:
+    from decimal import Decimal
+
+
+@dataclass
+class Options:
+    count: PositiveInt = 1
+    rate: PositiveFloat = 0.5
+    share: Annotated[float, Interval(ge=0, lt=1)] = 0.5
+    kind: Literal["soft", "hard"] = "soft"
+    limit: Annotated[int, Ge(2)] | None = None
+    color: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    steps: list[PositiveInt] = field(default_factory=list)
+    label: str = ""
+    digits: Annotated[str, Predicate(str.isdigit), doc("digits only")] = "0"
+    flag: bool = False
+    plain: int = 3
+    farthest: float = math.inf
+    folder: Path = Path()
+    foreign: Decimal | None = None  # what only type checkers import is not checked
+    state: int = field(init=False, default=-1)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "words"),
+    [
+        ("count", 0, "options.count must be a whole number above 0, got 0"),
+        ("count", 1.5, "options.count must be a whole number above 0, got 1.5"),
+        ("count", True, "options.count must be a whole number above 0, got true"),
+        ("count", None, "options.count must be a whole number above 0, got null"),
+        ("count", [1], "options.count must be a whole number above 0, got [1]"),
+        ("rate", math.inf, "options.rate must be a number above 0, got inf"),
+        ("rate", math.nan, "options.rate must be a number above 0, got nan"),
+        ("rate", "fast", "options.rate must be a number above 0, got 'fast'"),
+        ("share", 1, "options.share must be a number in [0, 1), got 1"),
+        ("kind", "curve", "options.kind must be 'soft' or 'hard', got 'curve'"),
+        ("limit", 1, "options.limit must be a whole number of at least 2 or null, got 1"),
+        ("color", [0, 0], "options.color must be a list of 3, each a number, got [0, 0]"),
+        ("color", [0, 0, True], "options.color must be a list of 3, each a number, got [0, 0, True]"),
+        ("steps", [3, -1], "options.steps must be a list, each a whole number above 0, got [3, -1]"),
+        ("label", {"a": 1}, "options.label must be a text, got {'a': 1}"),
+        ("digits", "x", "options.digits must be digits only, got 'x'"),
+        ("flag", "maybe", "options.flag must be true or false, got 'maybe'"),
+        ("plain", "x", "options.plain must be a whole number, got 'x'"),
+        ("folder", 3.5, "options.folder must be of type Path, got 3.5"),
+    ],
+)
+def test_words_for_what_is_not_allowed(name: str, given: Any, words: str) -> None:
+    with pytest.raises(InputError) as error:
+        checked(Options, {name: given}, "options")
+    assert str(error.value) == words
+
+
+def test_values_are_converted_to_their_type() -> None:
+    given = {"count": 1e3, "rate": 2, "color": [0, 1, 2], "label": 7, "flag": "yes", "folder": "a"}
+    result = checked(Options, given, "options")
+    assert result == {"count": 1000, "rate": 2.0, "color": (0, 1, 2), "label": "7", "flag": True, "folder": Path("a")}
+    assert [type(result[name]) for name in ("count", "rate", "label")] == [int, float, str]
+
+
+def test_the_authors_default_may_be_what_no_user_may_give() -> None:
+    assert checked(Options, {"farthest": math.inf}, "options") == {"farthest": math.inf}
+    with pytest.raises(InputError, match="farthest must be a number, got -inf"):
+        checked(Options, {"farthest": -math.inf}, "options")
+
+
+def test_unknown_keys_name_the_nearest() -> None:
+    with pytest.raises(
+        InputError, match=r"^options\.cuont is not a setting; did you mean count\? \(there are: count, "
+    ):
+        checked(Options, {"cuont": 1}, "options")
+    with pytest.raises(InputError, match=r"options\.state is not a setting"):
+        checked(Options, {"state": 1}, "options")
+
+
+@pytest.mark.parametrize(
+    ("make", "key"),
+    [
+        (lambda: ADC(start=-1), "densify.start"),
+        (lambda: ADC(stop=500), "densify.stop"),
+        (lambda: ADC(prune_opacity=math.nan), "densify.prune_opacity"),
+        (lambda: ADC(gradient="both"), "densify.gradient"),  # type: ignore[arg-type]
+        (lambda: ADC(cap="curve", max_gaussians=None), "densify.max_gaussians"),
+        (lambda: Volumetric(volume_interval=150), "densify.volume_interval"),
+        (lambda: Volumetric(split_size=0), "densify.split_size"),
+        (lambda: MCMC(growth=-0.1), "densify.growth"),
+        (lambda: Sfm(peak_threshold=-1), "init.peak_threshold"),
+        (lambda: Sfm(seed=2**31), "init.seed"),
+        (lambda: Dim(extractor="sift"), "init.extractor"),  # type: ignore[arg-type]
+        (lambda: Dim(extractor="aliked", aliked_model="t16"), "init.aliked_model"),
+        (lambda: Random(count=0), "init.count"),
+    ],
+)
+def test_library_callers_get_the_same_errors(make: Any, key: str) -> None:
+    with pytest.raises(InputError, match=key):
+        make()
+
+
+@dataclass
+class Own(ADC):
+    """A user's class: its own fields carry no rule but their type, and its author knows nothing of this module."""
+
+    patience: int = 5
+
+
+def test_a_users_own_fields_are_checked_by_their_type() -> None:
+    assert Own(patience=7).patience == 7
+    for wrong in ({"patience": "long"}, {"interval": 0}):
+        with pytest.raises(InputError, match=f"densify.{next(iter(wrong))}"):
+            Own(**wrong)  # type: ignore[arg-type]
+
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@given(st.sampled_from([one.name for one in dataclasses.fields(Options) if one.init]), ANYTHING)
+def test_any_value_is_taken_or_refused_in_one_line(name: str, value: Any) -> None:
+    options = dataclasses.replace(Options(), **{name: value})
+    refusal = ""
+    try:
+        check_settings(options, "options")
+    except InputError as error:
+        refusal = str(error)
+    if refusal:
+        assert refusal.startswith(f"options.{name} must be ")
+        assert len(refusal.splitlines()) == 1
+        return
+    number = getattr(options, name)
+    if isinstance(number, float):
+        assert math.isfinite(number) or number == Options.farthest
+    check_settings(options, "options")  # what was taken once is taken again, unchanged
+    assert getattr(options, name) == number
+
+
+def test_annotations_in_words() -> None:
+    assert describe(PositiveInt | Literal["auto"]) == "a whole number above 0 or 'auto'"
+    assert describe(Annotated[float, Interval(le=2)]) == "a number of at most 2"
+    assert describe(dict[str, Any]) == "a mapping {key: value}"
