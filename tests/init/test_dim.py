@@ -288,7 +288,7 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"extractor": "sift_kornia"}, "init.extractor must be 'superpoint', 'aliked' or 'disk', got 'sift_kornia'"),
+            ({"extractor": "sift"}, "init.extractor must be 'superpoint', 'aliked' or 'disk', got 'sift'"),
             ({"matcher": "superglue"}, "init.matcher must be .* got 'superglue'"),
             ({"extractor": "aliked", "aliked_model": "t16"}, "init.matcher=lightglue has no weights"),
             ({"filter_threshold": -1}, r"init.filter_threshold must be a number in \[0, 1\], got -1"),

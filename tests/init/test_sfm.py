@@ -220,7 +220,7 @@ def test_too_few_photos(courtyard: Capture, tmp_path: Path):
     ("options", "message"),
     [
         ({"poses": "both"}, "init.poses must be 'shared' or 'own', got 'both'"),
-        ({"camera_model": "THIN_PRISM"}, "init.camera_model must be 'SIMPLE_PINHOLE', .* or 'OPENCV_FISHEYE', got 'THIN_PRISM'"),
+        ({"camera_model": "THIN_PRISM"}, "init.camera_model must be 'SIMPLE_PINHOLE', .*, got 'THIN_PRISM'"),
         ({"pairs": "all"}, "init.pairs must be .* got 'all'"),
         ({"max_ratio": 1.5}, r"init.max_ratio must be a number in \(0, 1\], got 1.5"),
         ({"max_image_size": 0}, "init.max_image_size must be a whole number of at least 32, got 0"),
@@ -230,5 +230,5 @@ def test_too_few_photos(courtyard: Capture, tmp_path: Path):
     ],
 )
 def test_settings_are_checked_by_name(options: dict[str, object], message: str):
-    with pytest.raises(InputError, match=message.replace("(", r"\(")):
+    with pytest.raises(InputError, match=message):
         Sfm(**options)
