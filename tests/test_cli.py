@@ -21,11 +21,13 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.launch.plan import add_to_plan
-from gsbench.pipeline.stage_list import EVALUATE, INIT, TRAIN
+from gsbench.pipeline.stages import EVALUATE, INIT, TRAIN
+from gsbench.pipeline.stale import explain_steps
+from gsbench.pipeline.step import Step
 from gsbench.pipeline.stopping import Stopped
 from gsbench.pipeline.store import Store
 from gsbench.pipeline.trial_files import TrialPaths
-from gsbench.verbs import doctor, export, retry, stale, ui
+from gsbench.verbs import doctor, export, retry, ui
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -231,25 +233,28 @@ def test_compressed_ply_is_small_and_readable(gaussians: Gaussians, tmp_path: Pa
 # ---- explain --stale, ui, doctor
 
 
-def test_stale_names_the_fields_that_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stale_names_the_fields_that_differ(tmp_path: Path) -> None:
     store = Store(tmp_path / "store")
+
+    def nothing(folder: Path) -> None:
+        pass
+
     asked = [
-        (INIT, {"capture": "c", "options": {"seed": 0}}),
-        (TRAIN, {"densify": {"volume_threshold": 0.5, "stop": 100}, "seed": 0}),
-        (EVALUATE, {"train": "t"}),
+        Step(INIT, {"capture": "c", "options": {"seed": 0}}, nothing),
+        Step(TRAIN, {"densify": {"volume_threshold": 0.5, "stop": 100}, "seed": 0}, nothing),
+        Step(EVALUATE, {"train": "t"}, nothing),
     ]
-    monkeypatch.setattr(stale, "stage_inputs", lambda values, store: asked)
-    store.get(*asked[0], lambda folder: None)
-    store.get(TRAIN, {"densify": {"volume_threshold": 0.03, "stop": 100}, "seed": 0}, lambda folder: None)
-    store.get(TRAIN, {"densify": {"volume_threshold": 0.03, "stop": 90}, "seed": 7}, lambda folder: None)
-    lines = stale.explain_stages({}, store)
+    store.get(asked[0])
+    store.get(Step(TRAIN, {"densify": {"volume_threshold": 0.03, "stop": 100}, "seed": 0}, nothing))
+    store.get(Step(TRAIN, {"densify": {"volume_threshold": 0.03, "stop": 90}, "seed": 7}, nothing))
+    lines = explain_steps(asked, store)
     assert lines[0].split()[0] == "init"
     assert "in the store" in lines[0]
     assert "not in the store" in lines[1]
     assert lines[2] == "    densify.volume_threshold: 0.03 there, 0.5 wanted"
     assert lines[4] == "    the store has no result of evaluate yet"
-    (store.path(INIT, INIT.key(asked[0][1])) / "manifest.json").write_text("{")
-    assert "damaged: manifest.json is missing or unreadable" in stale.explain_stages({}, store)[0]
+    (store.path(asked[0]) / "manifest.json").write_text("{")
+    assert "damaged: manifest.json is missing or unreadable" in explain_steps(asked, store)[0]
 
 
 def test_ui_needs_a_database(capsys: pytest.CaptureFixture[str]) -> None:
@@ -284,7 +289,7 @@ def test_doctor_on_a_runs_folder(runs: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert next(doctor.check_runs(runs)).verdict in ("ok", "note")
     assert next(doctor.check_runs(Path("/proc/nowhere"))).verdict == "bad"
     store = Store(runs / "store")
-    entry = store.get(TRAIN, {"x": 1}, lambda folder: (folder / "model").write_text("m"))  # type: ignore[arg-type,return-value]
+    entry = store.get(Step(TRAIN, {"x": 1}, lambda folder: (folder / "model").write_text("m")))  # type: ignore[arg-type,return-value]
     assert [finding.verdict for finding in doctor.check_store(runs)] == ["ok"]
     stamp = (entry.path / "model").stat().st_mtime_ns
     (entry.path / "model").write_text("n")

@@ -6,13 +6,13 @@ Nothing here loads torch, so that ``--help`` and the verbs that only read files 
 from __future__ import annotations
 
 import importlib
-import logging
 import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 from gsbench.errors import GsbenchError, InputError
+from gsbench.logs import set_up_logging
 from gsbench.words import closest
 
 DONE, TRIAL_FAILED, BAD_INPUT = 0, 1, 2
@@ -30,7 +30,6 @@ VERBS = {
     "view": ("gsbench.verbs.view", "look at trained models in the browser: one, or two side by side"),
     "doctor": ("gsbench.verbs.doctor", "check this machine and say what is missing"),
 }
-log = logging.getLogger("gsbench")
 
 
 def main() -> None:
@@ -103,17 +102,6 @@ def _help() -> int:
         print(f"  {name:<10} {text}")
     print("\n" + options_text())
     return DONE
-
-
-def set_up_logging() -> None:
-    """Show what gsbench logs, from INFO on, on stderr."""
-    if not log.handlers:
-        handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("%(message)s"))
-        handler.setLevel(logging.INFO)
-        log.addHandler(handler)
-        log.setLevel(logging.DEBUG)
-        log.propagate = False
 
 
 if __name__ == "__main__":

@@ -29,24 +29,44 @@ class DiskFullError(GsbenchError):
     """The disk of the runs folder is full: no trial can go on (exit code 1)."""
 
 
+@contextmanager
+def atomic(path: Path, sync: bool = True) -> Iterator[Path]:
+    """Give the block a temporary path beside ``path`` to write; published under its name by a rename when it ends well.
+
+    A reader sees the old file or the new one, never a part. What an error leaves is removed; what a kill leaves is
+    hidden, and `remove_temporaries` finds it. ``sync``: wait until the content is on the disk before it is published.
+    """
+    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
+    temporary.unlink(missing_ok=True)
+    try:
+        yield temporary
+        if sync:
+            with temporary.open("rb+") as stream:
+                os.fsync(stream.fileno())  # where writing is delayed, here a full disk is noticed
+        os.replace(temporary, path)
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)  # os.replace leaves it where both are links to one file
+
+
 def write_json(path: Path, values: Any) -> None:
-    """Write JSON so that a reader sees the old file or the new one, never a part. NaN and infinity are refused."""
+    """Write JSON, whole or not at all. NaN and infinity are refused."""
     write_text(path, json.dumps(values, indent=1, allow_nan=False) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file so that a reader sees the old file or the new one, never a part."""
-    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
-    try:
-        with temporary.open("w", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except OSError:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
+    """Write a text file, whole or not at all."""
+    with atomic(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Show ``source`` as ``target`` too, as a hard link where the file system has them; replaces what is there."""
+    with atomic(target, sync=False) as temporary:
+        try:
+            os.link(source, temporary)
+        except OSError:
+            shutil.copyfile(source, temporary)
 
 
 def read_object(path: Path) -> dict[str, Any]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-import tempfile
 import urllib.request
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsbench.errors import InputError
+from gsbench.files import atomic
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -182,22 +182,14 @@ def _download(spec: WeightsFile, folder: Path) -> Path:
     """Fetch ``spec`` into ``folder``; the file appears under its name only when it is whole and checked."""
     assert spec.url is not None
     folder.mkdir(parents=True, exist_ok=True)
-    handle, temporary_name = tempfile.mkstemp(dir=folder, prefix=f".{spec.names[0]}.")
-    temporary = Path(temporary_name)
-    try:
-        with (
-            os.fdopen(handle, "wb") as file,
-            urllib.request.urlopen(spec.url, timeout=DOWNLOAD_TIMEOUT_SECONDS) as response,
-        ):
-            shutil.copyfileobj(response, file)
+    target = folder / spec.names[0]
+    with atomic(target) as temporary:
+        with temporary.open("wb") as file, urllib.request.urlopen(spec.url, timeout=DOWNLOAD_TIMEOUT_SECONDS) as source:
+            shutil.copyfileobj(source, file)
         fault = _checksum_fault(temporary, spec)
         if fault is not None:
             raise MissingWeights(f"the download of {spec.names[0]} from {spec.url} is damaged: try again ({fault})")
-        target = folder / spec.names[0]
-        temporary.replace(target)
-        return target
-    finally:
-        temporary.unlink(missing_ok=True)
+    return target
 
 
 def _unreadable(path: Path, why: str) -> MissingWeights:

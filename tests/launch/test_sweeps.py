@@ -28,7 +28,8 @@ from gsbench.launch.plan import (
     same_trial_elsewhere,
 )
 from gsbench.pipeline.locks import BusyError, hold, is_held
-from gsbench.pipeline.stage_list import TRAIN
+from gsbench.pipeline.stages import TRAIN
+from gsbench.pipeline.step import Step
 from gsbench.pipeline.store import Store
 from gsbench.pipeline.trial_files import TrialPaths, find_finished, record_inputs, state_of
 
@@ -58,7 +59,9 @@ def finish(values: dict[str, Any], seconds: float = 100.0, unavailable: dict[str
     source.parent.mkdir(exist_ok=True)
     if not source.exists():
         source.write_bytes(b"photo")
-    entry = Store(paths.runs / "store").get(TRAIN, {"x": 1}, lambda folder: (folder / "model").write_text("m"))  # type: ignore[arg-type,return-value]
+    entry = Store(paths.runs / "store").get(
+        Step(TRAIN, {"x": 1}, lambda folder: (folder / "model").write_text("m"))  # type: ignore[arg-type,return-value]
+    )
     (paths.folder / "table.csv").write_text("a,b")
     (paths.folder / "config.yaml").write_text("")
     results = {

@@ -15,7 +15,8 @@ import pytest
 
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError
-from gsbench.pipeline.store import MANIFEST, Stage, Store, read_manifest
+from gsbench.pipeline.step import Stage, Step
+from gsbench.pipeline.store import MANIFEST, Store, read_manifest
 from tests.pipeline.toy import TOY, expected_text, toy_inputs
 
 LETTERS = Stage("letters", 1)
@@ -37,8 +38,8 @@ def store(tmp_path: Path) -> Store:
 
 
 def test_second_request_is_not_built(store: Store) -> None:
-    first = store.get(LETTERS, {"x": 1}, write_letters)
-    second = store.get(LETTERS, {"x": 1}, refuse)
+    first = store.get(Step(LETTERS, {"x": 1}, write_letters))
+    second = store.get(Step(LETTERS, {"x": 1}, refuse))
     assert not first.cached
     assert second.cached
     assert second.path == first.path
@@ -62,25 +63,25 @@ def test_every_input_and_the_version_make_another_key(store: Store) -> None:
 @pytest.mark.parametrize("name", ["a.txt", "sub/b.bin", MANIFEST])
 @pytest.mark.parametrize("damage", ["flip", "truncate", "delete"])
 def test_damage_is_named_and_mended(store: Store, name: str, damage: str, caplog: pytest.LogCaptureFixture) -> None:
-    path = store.get(LETTERS, {"x": 1}, write_letters).path / name
+    path = store.get(Step(LETTERS, {"x": 1}, write_letters)).path / name
     content = bytearray(path.read_bytes())
     content[len(content) // 3] ^= 4
     if damage == "delete":
         path.unlink()
     else:
         path.write_bytes(content if damage == "flip" else content[: len(content) // 2])
-    assert store.find(LETTERS, {"x": 1}) is None
-    mended = store.get(LETTERS, {"x": 1}, write_letters)
+    assert store.find(Step(LETTERS, {"x": 1}, refuse)) is None
+    mended = store.get(Step(LETTERS, {"x": 1}, write_letters))
     assert not mended.cached
     assert (mended.path / "sub" / "b.bin").read_bytes() == bytes(range(256))
     message = " ".join(record.getMessage() for record in caplog.records)
     assert "damaged" in message
     assert name in message
-    assert store.get(LETTERS, {"x": 1}, refuse).cached
+    assert store.get(Step(LETTERS, {"x": 1}, refuse)).cached
 
 
 def test_every_flipped_bit_of_a_manifest_is_noticed_or_harmless(store: Store) -> None:
-    folder = store.get(LETTERS, {"x": 1}, write_letters).path
+    folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
     sound = (folder / MANIFEST).read_bytes()
     rng = random.Random(0)
     for _ in range(300):
@@ -97,7 +98,7 @@ def test_every_flipped_bit_of_a_manifest_is_noticed_or_harmless(store: Store) ->
 
 
 def test_damage_that_keeps_size_and_time_is_found_by_a_thorough_look(store: Store) -> None:
-    folder = store.get(LETTERS, {"x": 1}, write_letters).path
+    folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
     state = (folder / "a.txt").stat()
     (folder / "a.txt").write_text("alphA")
     os.utime(folder / "a.txt", ns=(state.st_atime_ns, state.st_mtime_ns))
@@ -107,9 +108,9 @@ def test_damage_that_keeps_size_and_time_is_found_by_a_thorough_look(store: Stor
 
 
 def test_a_copy_of_the_store_is_believed_by_content(store: Store, tmp_path: Path) -> None:
-    folder = store.get(LETTERS, {"x": 1}, write_letters).path
+    folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
     os.utime(folder / "a.txt", ns=(1, 1))  # what copying does
-    assert store.get(LETTERS, {"x": 1}, refuse).cached
+    assert store.get(Step(LETTERS, {"x": 1}, refuse)).cached
 
 
 def test_failed_build_is_not_published_and_starts_afresh(store: Store) -> None:
@@ -118,9 +119,9 @@ def test_failed_build_is_not_published_and_starts_afresh(store: Store) -> None:
         raise RuntimeError("no")
 
     with pytest.raises(RuntimeError, match="no"):
-        store.get(LETTERS, {"x": 1}, fail)
-    assert store.find(LETTERS, {"x": 1}) is None
-    assert not (store.get(LETTERS, {"x": 1}, write_letters).path / "half.txt").exists()
+        store.get(Step(LETTERS, {"x": 1}, fail))
+    assert store.find(Step(LETTERS, {"x": 1}, refuse)) is None
+    assert not (store.get(Step(LETTERS, {"x": 1}, write_letters)).path / "half.txt").exists()
 
 
 def test_resumable_build_finds_what_was_left_without_temporaries(store: Store) -> None:
@@ -133,28 +134,28 @@ def test_resumable_build_finds_what_was_left_without_temporaries(store: Store) -
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        store.get(stage, {}, half)
+        store.get(Step(stage, {}, half))
 
     def rest(folder: Path) -> None:
         assert {path.name for path in folder.iterdir()} == {"half.txt", "work.scratch"}
         (folder / "rest.txt").write_text("rest")
 
-    entry = store.get(stage, {}, rest)
+    entry = store.get(Step(stage, {}, rest))
     assert {path.name for path in entry.path.iterdir()} == {"half.txt", "rest.txt", MANIFEST}
     assert set(read_manifest(entry.path)["outputs"]) == {"half.txt", "rest.txt"}
 
 
 def test_killed_between_manifest_and_rename_is_only_published(store: Store) -> None:
-    entry = store.get(LETTERS, {"x": 1}, write_letters)
+    entry = store.get(Step(LETTERS, {"x": 1}, write_letters))
     os.replace(entry.path, store.partial(LETTERS, entry.key))
-    again = store.get(LETTERS, {"x": 1}, refuse)
+    again = store.get(Step(LETTERS, {"x": 1}, refuse))
     assert again.seconds == entry.seconds
-    assert store.find(LETTERS, {"x": 1}) is not None
+    assert store.find(Step(LETTERS, {"x": 1}, refuse)) is not None
 
 
 def test_sweep_removes_leftovers_and_leaves_what_serves(store: Store) -> None:
     long = Stage("long", 1, resumable=True)
-    entry = store.get(long, {"x": 1}, write_letters)
+    entry = store.get(Step(long, {"x": 1}, write_letters))
     stale = store.partial(long, entry.key)
     useful = store.partial(long, "1" * 64)
     useless = store.partial(LETTERS, "2" * 64)
@@ -167,7 +168,7 @@ def test_sweep_removes_leftovers_and_leaves_what_serves(store: Store) -> None:
     assert not stale.exists()
     assert not useless.exists()
     assert not half_removed.exists()
-    assert store.get(long, {"x": 1}, refuse).cached
+    assert store.get(Step(long, {"x": 1}, refuse)).cached
 
 
 def toy(store: Store, number: int, *options: str) -> subprocess.Popen[str]:
@@ -189,13 +190,13 @@ def test_killed_at_random_moments_the_work_is_finished_and_right(store: Store) -
             process.wait()
             kills += 1
         for number in range(3):
-            entry = store.find(TOY, toy_inputs(number))
+            entry = store.find(Step(TOY, toy_inputs(number), refuse))
             if entry is not None:
                 assert (entry.path / "lines.txt").read_text() == expected_text(number)
     assert process.returncode == 0
     assert kills >= 3
     for number in range(3):
-        entry = store.get(TOY, toy_inputs(number), refuse)
+        entry = store.get(Step(TOY, toy_inputs(number), refuse))
         assert (entry.path / "lines.txt").read_text() == expected_text(number)
     left = {path.name for path in (store.root / "toy").iterdir() if not path.name.endswith(".lock")}
     assert left == {TOY.key(toy_inputs(number)) for number in range(3)}
@@ -222,7 +223,7 @@ def test_killed_rival_frees_its_lock(store: Store) -> None:
     first.wait()
     out, _ = second.communicate(timeout=60)
     assert out.strip() == "built"
-    assert (store.path(TOY, key) / "lines.txt").read_text() == expected_text(0)
+    assert (store.folder(TOY, key) / "lines.txt").read_text() == expected_text(0)
 
 
 @pytest.fixture
@@ -242,24 +243,24 @@ def small_disk(tmp_path: Path):  # type: ignore[no-untyped-def]
 
 def test_full_disk_is_one_line_and_corrupts_nothing(small_disk: Path) -> None:
     store = Store(small_disk / "store")
-    sound = store.get(LETTERS, {"x": 1}, write_letters)
+    sound = store.get(Step(LETTERS, {"x": 1}, write_letters))
 
     def big(folder: Path) -> None:
         (folder / "big.bin").write_bytes(bytes(2 << 20))
 
     with pytest.raises(DiskFullError, match=r"is full: free some space") as caught:
-        store.get(LETTERS, {"x": 2}, big)
+        store.get(Step(LETTERS, {"x": 2}, big))
     assert "\n" not in str(caught.value)
-    assert store.find(LETTERS, {"x": 2}) is None
-    assert store.get(LETTERS, {"x": 1}, refuse).path == sound.path
+    assert store.find(Step(LETTERS, {"x": 2}, refuse)) is None
+    assert store.get(Step(LETTERS, {"x": 1}, refuse)).path == sound.path
     store.sweep([LETTERS])
-    assert not store.get(LETTERS, {"x": 2}, write_letters).cached
+    assert not store.get(Step(LETTERS, {"x": 2}, write_letters)).cached
 
 
 def test_read_only_store_serves_what_it_has_and_says_so(small_disk: Path) -> None:
     store = Store(small_disk / "store")
-    store.get(LETTERS, {"x": 1}, write_letters)
+    store.get(Step(LETTERS, {"x": 1}, write_letters))
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
-    assert store.get(LETTERS, {"x": 1}, refuse).cached
+    assert store.get(Step(LETTERS, {"x": 1}, refuse)).cached
     with pytest.raises(InputError, match="may not be written to"):
-        store.get(LETTERS, {"x": 2}, write_letters)
+        store.get(Step(LETTERS, {"x": 2}, write_letters))

@@ -12,7 +12,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gsbench.pipeline.store import Stage, Store
+from gsbench.pipeline.step import Stage, Step
+from gsbench.pipeline.store import Store
 
 TOY = Stage("toy", 1, resumable=True, scratch=("*.progress",))
 LINES = 40
@@ -46,7 +47,9 @@ def main(argv: list[str]) -> int:
     cached = []
     for number in range(int(argv[1])):
         pause = 0.05 if "--slow" in argv else 0.01
-        cached.append(store.get(TOY, toy_inputs(number), lambda folder, n=number, p=pause: build(folder, n, p)).cached)
+        cached.append(
+            store.get(Step(TOY, toy_inputs(number), lambda folder, n=number, p=pause: build(folder, n, p))).cached
+        )
     print("found" if all(cached) else "built")
     return 0
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from gsbench.errors import InputError
+from gsbench.files import atomic
 from gsbench.gaussians.model import NUM_SH_REST, Gaussians
 
 NUM_REST = 3 * NUM_SH_REST  # f_rest is stored channel by channel: 15 of red, 15 of green, 15 of blue
@@ -39,9 +39,8 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
         dim=1,
     ).numpy()  # [N, 62]
     vertices = np.ascontiguousarray(table, dtype="<f4").view([(name, "<f4") for name in COLUMNS]).reshape(len(raw))
-    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
-    os.replace(temporary, path)
+    with atomic(path, sync=False) as temporary:
+        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
 
 
 def read_ply(path: Path, device: torch.device | str = "cpu") -> Gaussians:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import zipfile
 from collections.abc import Mapping
 from functools import cache
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.errors import GsbenchError
+from gsbench.files import atomic
 from gsbench.init.features import Features
 
 KEY_DIGITS = 24
@@ -58,9 +58,7 @@ class FeatureStore:
 
     def write_features(self, name: str, features: Features) -> None:
         """Store the features of the image ``name``."""
-        path = self.features_path(name)
-        temporary = path.with_suffix(f".{os.getpid()}.tmp")
-        with temporary.open("wb") as file:
+        with atomic(self.features_path(name), sync=False) as temporary, temporary.open("wb") as file:
             np.savez(
                 file,
                 keypoints=features.keypoints,
@@ -68,7 +66,6 @@ class FeatureStore:
                 scores=features.scores,
                 sizes=np.array([*features.network_size, *features.file_size]),
             )
-        temporary.replace(path)
 
     def read_matches(self, first: str, second: str) -> NDArray[np.uint32] | None:
         """The stored matches [M, 2] of a pair; None where there are none, or a damaged file."""
@@ -80,11 +77,8 @@ class FeatureStore:
 
     def write_matches(self, first: str, second: str, matches: NDArray[np.uint32]) -> None:
         """Store the matches [M, 2] of a pair."""
-        path = self.matches_path(first, second)
-        temporary = path.with_suffix(f".{os.getpid()}.tmp")
-        with temporary.open("wb") as file:
+        with atomic(self.matches_path(first, second), sync=False) as temporary, temporary.open("wb") as file:
             np.save(file, matches)
-        temporary.replace(path)
 
     def require_features(self, name: str) -> Features:
         """The stored features, which must be there."""

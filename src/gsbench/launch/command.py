@@ -18,7 +18,7 @@ from gsbench.files import storage_errors
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan, describe_plan
 from gsbench.launch.serial import run_serial
-from gsbench.pipeline.stage_list import STAGES
+from gsbench.pipeline.stages import STAGES
 from gsbench.pipeline.stopping import stop_on_signals
 from gsbench.pipeline.store import Store
 from gsbench.pipeline.trial_files import TrialPaths, find_finished

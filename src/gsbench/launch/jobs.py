@@ -51,7 +51,7 @@ class TrialJob:
 
     def __call__(self) -> Outcome:
         sys.path[:] = [*self.path, *(entry for entry in sys.path if entry not in self.path)]
-        from gsbench.cli import set_up_logging
+        from gsbench.logs import set_up_logging
 
         set_up_logging()
         launch = self.values["launch"]

@@ -10,13 +10,13 @@ import os
 import shutil
 import statistics
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from gsbench.compose import Composed
-from gsbench.errors import InputError
+from gsbench.errors import GsbenchError, InputError
 from gsbench.files import write_json
 from gsbench.pipeline.locks import hold, read_holder
 from gsbench.pipeline.trial_files import (
@@ -195,6 +195,25 @@ class Estimator:
         return Estimate(0.0, 0)
 
 
+def _stage_finder(trials: Sequence[Composed]) -> Callable[[dict[str, Any]], list[str]]:
+    """A function that tells which stages of a trial are in the store; loads torch only where there is such a store."""
+    store = TrialPaths.of(trials[0].values).runs / "store" if trials else None
+    if store is None or not store.is_dir():
+        return lambda values: []
+    from gsbench.pipeline.store import Store
+    from gsbench.pipeline.wiring import StepFinder
+
+    finder = StepFinder(Store(store))
+
+    def built(values: dict[str, Any]) -> list[str]:
+        try:
+            return finder.built_stages(values)
+        except GsbenchError:  # what is missing here is named elsewhere, or known where the trial will run
+            return []
+
+    return built
+
+
 def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
     """Lines for ``--dry-run``: each trial with its state, and the time that the unfinished ones will take."""
     lines, remaining, unknown, counts = (
@@ -205,6 +224,7 @@ def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
     )
     estimator = Estimator(TrialPaths.of(trials[0].values).runs) if trials else None
     learned = 0
+    built_stages = _stage_finder(trials)
     for trial in trials:
         paths = TrialPaths.of(trial.values)
         state: str = state_of(paths.folder)
@@ -221,6 +241,8 @@ def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
                 done = stage_and_step(paths.folder)[1] / trial.values["train"]["iterations"]
                 remaining += estimate.seconds * (1 - min(1.0, done))
                 learned = max(learned, estimate.learned_from)
+                if built := built_stages(trial.values):
+                    note = f"  the store has its {', '.join(built)}"
                 unknown += estimate.learned_from == 0
         counts[state] += 1
         lines.append(f"{state:<8} {paths.label}{note}")

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 import torch
 
-from gsbench.files import CHUNK, sync_to_disk
+from gsbench.files import CHUNK, atomic, sync_to_disk
 
 log = logging.getLogger(__name__)
 
@@ -26,19 +24,10 @@ DIGEST_BYTES = hashlib.sha256().digest_size
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> None:
     """Write ``state`` (tensors and plain values) as the checkpoint of ``step``, then drop all but the last two."""
     path = folder / f"checkpoint-{step:08d}.pt"
-    temporary = folder / f".{path.name}.tmp"
-    try:
-        with temporary.open("wb") as stream:
-            writer = _HashingWriter(stream)
-            torch.save(state, cast("BinaryIO", writer))  # it only writes and flushes
-            stream.write(writer.digest.digest())
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
+    with atomic(path) as temporary, temporary.open("wb") as stream:
+        writer = _HashingWriter(stream)
+        torch.save(state, cast("BinaryIO", writer))  # it only writes and flushes
+        stream.write(writer.digest.digest())
     sync_to_disk(folder)
     for old in sorted(folder.glob(PATTERN))[:-KEPT]:
         old.unlink()

@@ -22,30 +22,13 @@ from gsbench import __version__
 from gsbench.config import sha256_of
 from gsbench.files import remove_temporaries, storage_errors, sync_to_disk, write_json
 from gsbench.pipeline.locks import BusyError, hold
+from gsbench.pipeline.step import Stage, Step
 from gsbench.weights import file_sha256
 
 log = logging.getLogger(__name__)
 
 MANIFEST = "manifest.json"
 LEFTOVER_AGE = 24 * 3600.0  # seconds: temporary files outside the locks are swept when older
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A step of the pipeline. Bump ``version`` by hand when its code changes what it computes.
-
-    ``resumable`` stages find what a killed build left and go on from it; the others start in an empty folder. Files
-    that match ``scratch`` serve the build only: they are removed when the result is complete.
-    """
-
-    name: str
-    version: int
-    resumable: bool = False
-    scratch: tuple[str, ...] = ()
-
-    def key(self, inputs: dict[str, Any]) -> str:
-        """sha256 of canonical JSON of the stage and all that it reads, upstream keys included."""
-        return sha256_of({"stage": self.name, "version": self.version, "inputs": inputs})
 
 
 @dataclass(frozen=True)
@@ -64,47 +47,52 @@ class Store:
     def __init__(self, root: Path, on_build: Callable[[Stage, Path], None] = lambda stage, folder: None) -> None:
         self.root, self.on_build = root, on_build
 
-    def path(self, stage: Stage, key: str) -> Path:
+    def folder(self, stage: Stage, key: str) -> Path:
+        """Where the finished result of ``stage`` under ``key`` lies."""
         return self.root / stage.name / key
 
+    def path(self, step: Step) -> Path:
+        """Where the result of ``step`` lies once it is finished."""
+        return self.folder(step.stage, step.key)
+
     def partial(self, stage: Stage, key: str) -> Path:
+        """Where it is built."""
         return self.root / stage.name / f".{key}.partial"
 
-    def find(self, stage: Stage, inputs: dict[str, Any]) -> Entry | None:
-        """The finished and sound result for ``inputs``, or None."""
+    def find(self, step: Step) -> Entry | None:
+        """The finished and sound result of ``step``, or None."""
         try:
-            return self._read(self.path(stage, stage.key(inputs)))
+            return self._read(self.path(step))
         except ValueError:
             return None
 
-    def get(self, stage: Stage, inputs: dict[str, Any], build: Callable[[Path], None]) -> Entry:
-        """The result for ``inputs``, computed by ``build(folder)`` unless it is there; published by an atomic rename.
+    def get(self, step: Step) -> Entry:
+        """The result of ``step``, built unless it is there; published by an atomic rename.
 
         A damaged result is named and built again. Raises DiskFullError, or InputError where the store is read-only.
         """
-        found = self.find(stage, inputs)
+        found = self.find(step)
         if found is not None:
             return found
-        key = stage.key(inputs)
-        final = self.path(stage, key)
+        final = self.path(step)
         with storage_errors(self.root.parent):
             final.parent.mkdir(parents=True, exist_ok=True)
-            with hold(final.parent / f".{key}.lock", f"{stage.name} {key[:8]}"):
+            with hold(final.parent / f".{step.key}.lock", f"{step.stage.name} {step.key[:8]}"):
                 if final.exists():
                     try:
                         return self._read(final)
                     except ValueError as error:
                         log.warning("store: %s is damaged (%s) and is built again", final, error)
                         _remove(final)
-                return self._build(stage, key, inputs, build)
+                return self._build(step)
 
     def _read(self, path: Path) -> Entry:
         return Entry(path, path.name, float(read_manifest(path)["seconds"]), cached=True)
 
-    def _build(self, stage: Stage, key: str, inputs: dict[str, Any], build: Callable[[Path], None]) -> Entry:
-        """Build or finish the partial folder and publish it; the caller holds the lock of ``key``."""
-        final, partial = self.path(stage, key), self.partial(stage, key)
-        seconds = _finished_seconds(partial, key)
+    def _build(self, step: Step) -> Entry:
+        """Build or finish the partial folder and publish it; the caller holds the lock of the step's key."""
+        final, partial, stage = self.path(step), self.partial(step.stage, step.key), step.stage
+        seconds = _finished_seconds(partial, step.key)
         if seconds is None:
             if partial.exists() and not stage.resumable:
                 _remove(partial)
@@ -113,22 +101,22 @@ class Store:
             (partial / MANIFEST).unlink(missing_ok=True)
             self.on_build(stage, partial)
             started = time.perf_counter()
-            build(partial)
+            step.build(partial)
             seconds = time.perf_counter() - started
-            write_manifest(partial, stage, key, inputs, seconds)
+            write_manifest(partial, step, seconds)
         for pattern in stage.scratch:
             for path in partial.rglob(pattern):
                 path.unlink()
         os.replace(partial, final)
         sync_to_disk(final.parent)
-        return Entry(final, key, seconds, cached=False)
+        return Entry(final, step.key, seconds, cached=False)
 
     def sweep(self, stages: Iterable[Stage]) -> None:
         """Remove what killed processes left and nobody goes on with; what a living process holds is left alone."""
         for stage in stages:
             for partial in (self.root / stage.name).glob(".*.partial"):
                 key = partial.name[1 : -len(".partial")]
-                if not stage.resumable or self.path(stage, key).exists():
+                if not stage.resumable or self.folder(stage, key).exists():
                     with suppress(BusyError, OSError), hold(partial.with_name(f".{key}.lock"), key, wait=False):
                         _remove(partial)
             for doomed in (self.root / stage.name).glob(".*.removed"):
@@ -139,9 +127,9 @@ class Store:
                     shutil.rmtree(work, ignore_errors=True)
 
 
-def write_manifest(folder: Path, stage: Stage, key: str, inputs: dict[str, Any], seconds: float) -> None:
+def write_manifest(folder: Path, step: Step, seconds: float) -> None:
     """Record what made ``folder`` and a checksum of every file in it, after all of them are on the disk."""
-    scratch = {path for pattern in stage.scratch for path in folder.rglob(pattern)}
+    scratch = {path for pattern in step.stage.scratch for path in folder.rglob(pattern)}
     outputs = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path not in scratch:
@@ -150,10 +138,10 @@ def write_manifest(folder: Path, stage: Stage, key: str, inputs: dict[str, Any],
             recorded = {"size": state.st_size, "mtime_ns": state.st_mtime_ns, "sha256": file_sha256(path)}
             outputs[path.relative_to(folder).as_posix()] = recorded
     manifest = {
-        "stage": stage.name,
-        "version": stage.version,
-        "key": key,
-        "inputs": inputs,
+        "stage": step.stage.name,
+        "version": step.stage.version,
+        "key": step.key,
+        "inputs": step.inputs,
         "outputs": outputs,
         "seconds": seconds,
         "gsbench": __version__,

@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import os
-import shutil
 import time
 import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pycolmap  # noqa: F401 - here, so that what its import does to signals can be undone
 import torch
 
-from gsbench.config import EvalConfig, SceneConfig, TrainConfig, config_hash
-from gsbench.densify.events import sum_events
 from gsbench.errors import GsbenchError
-from gsbench.files import remove_temporaries, storage_errors, write_json, write_text
+from gsbench.files import link_or_copy, remove_temporaries, storage_errors, write_json, write_text
 from gsbench.init.base import PICTURE_FILE, REPORT_FILE
-from gsbench.pipeline import stages
-from gsbench.pipeline.components import build, select_device
+from gsbench.logs import log_to
 from gsbench.pipeline.locks import hold
-from gsbench.pipeline.resources import available_threads
-from gsbench.pipeline.stage_list import EVALUATE, GROUND_TRUTH, INIT, STAGES, TRAIN
+from gsbench.pipeline.results import results_of
+from gsbench.pipeline.stages import EVALUATE, GROUND_TRUTH, INIT, TRAIN
+from gsbench.pipeline.step import Stage
+from gsbench.pipeline.steps.evaluate import PER_VIEW_FILE
+from gsbench.pipeline.steps.train import LINEAGE_FILE, PLY_FILE
 from gsbench.pipeline.stopping import take_signals_back
-from gsbench.pipeline.store import Entry, Stage, Store
+from gsbench.pipeline.store import Entry, Store
 from gsbench.pipeline.trainer import EVENTS, HISTOGRAMS, METRICS
 from gsbench.pipeline.trial_files import (
     BUILDING,
@@ -40,13 +37,14 @@ from gsbench.pipeline.trial_files import (
     read_object,
     record_inputs,
 )
-from gsbench.raster import create_rasterizer, resolve_name
+from gsbench.pipeline.wiring import Parts, Trial
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture
-from gsbench.source import sources_of
 from gsbench.tracking import Mirror
 
 log = logging.getLogger(__name__)
+
+PUBLISHED_TRAINING = (PLY_FILE, LINEAGE_FILE, METRICS, EVENTS, HISTOGRAMS)
 
 
 def run_trial(values: dict[str, Any], config_yaml: str, wait: bool = True) -> dict[str, Any]:
@@ -59,7 +57,7 @@ def run_trial(values: dict[str, Any], config_yaml: str, wait: bool = True) -> di
     paths = TrialPaths.of(values)
     with storage_errors(paths.runs):
         paths.folder.mkdir(parents=True, exist_ok=True)
-        with hold(paths.lock, paths.label, wait), _log_to(paths.folder / LOG):
+        with hold(paths.lock, paths.label, wait), log_to(paths.folder / LOG):
             finished = find_finished(values)
             if finished is not None:
                 log.info("%s: was done", paths.label)
@@ -83,15 +81,9 @@ def _record_failure(error: Exception, values: dict[str, Any], paths: TrialPaths)
 
 
 def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[str, Any]:
-    device = select_device(values["device"])
-    threads = available_threads(values["launch"]["parallel"]) if values["threads"] == "auto" else values["threads"]
-    torch.set_num_threads(threads)
-    rasterizer = create_rasterizer(resolve_name(values["raster"]["name"], device), device, threads)
-    densifier = build("densify", values["densify"], values["allow_targets"])
-    initializer = build("init", values["init"], values["allow_targets"])
-    scene_options = SceneConfig(**values["scene"])
-    train_options = TrainConfig(**values["train"])
-    eval_options = EvalConfig(**values["eval"])
+    """Build every step, show its files in the trial's folder, write the results."""
+    parts = Parts.of(values)
+    torch.set_num_threads(parts.threads)
     mirror = Mirror(values["tracking"], paths.runs, paths.folder, values)
 
     def announce(stage: Stage, folder: Path) -> None:
@@ -102,22 +94,20 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
     store = Store(paths.runs / "store", announce)
     write_text(paths.folder / CONFIG, config_yaml)
     (paths.folder / FAILED).unlink(missing_ok=True)
+    trial = Trial(parts, store)
+    entries: dict[str, Entry] = {}
     with mirror:
-        capture = stages.read_capture(store, scene_options)
-        inputs = stages.scene_inputs(capture, scene_options)
-        init = stages.initialize(store, capture, initializer)
-        _link(init.path / REPORT_FILE, paths.folder / "init_report.json")
-        scene = stages.prepare_scene(store, capture, init, scene_options)
+        for step in trial.steps():
+            entries[step.stage.name] = entry = store.get(step)
+            if step.stage is INIT:
+                link_or_copy(entry.path / REPORT_FILE, paths.folder / "init_report.json")
+        scene = trial.views.scene
         log.info("%s: %d training and %d test views", paths.label, len(scene.train), len(scene.test))
-        trained = stages.train(store, scene, inputs, init, densifier, rasterizer, train_options, values["seed"], device)
-        ground_truth = stages.keep_ground_truth(store, scene, inputs, init)
-        evaluated = stages.evaluate(store, scene, init, trained, rasterizer, train_options, eval_options, device)
-        published = _publish(paths.folder, init, trained, evaluated, ground_truth)
-        results = _results(values, capture.fingerprint, scene, init, trained, evaluated, rasterizer.name)
-        entries = {INIT.name: init, TRAIN.name: trained, GROUND_TRUTH.name: ground_truth, EVALUATE.name: evaluated}
-        where = {name: entry.path for name, entry in entries.items()}
+        results = results_of(values, trial.capture.fingerprint, scene, parts.rasterizer.name, entries)
         again = read_object(paths.folder / RESULTS) == results
-        record_inputs(paths.folder, values, results, source_files(capture, store), where, published)
+        published = _publish(paths.folder, entries)
+        made_of = {stage.name: entries[stage.name].path for stage in (INIT, TRAIN, GROUND_TRUTH, EVALUATE)}
+        record_inputs(paths.folder, values, results, source_files(trial.capture, store), made_of, published)
         if not again:
             write_json(paths.folder / RESULTS, results)
         (paths.folder / BUILDING).unlink(missing_ok=True)
@@ -134,113 +124,18 @@ def source_files(capture: Capture, store: Store) -> list[Path]:
     return images + ([] if capture.model is None else [path.resolve() for path in model_files(capture.model)])
 
 
-def _results(
-    values: dict[str, Any],
-    fingerprint: str,
-    scene: Any,
-    init: Entry,
-    trained: Entry,
-    evaluated: Entry,
-    raster: str,
-) -> dict[str, Any]:
-    training = json.loads((trained.path / stages.TRAINING_FILE).read_text())
-    metrics = json.loads((evaluated.path / stages.METRICS_FILE).read_text())
-    events = [json.loads(line) for line in (trained.path / EVENTS).read_text().splitlines()]
-    views = [*scene.train, *scene.test]
-    sizes = sorted({(view.camera.width, view.camera.height) for view in views}, reverse=True)
-    return {
-        "status": "complete",
-        "experiment": values["name"],
-        "scene": values["scene"]["name"],
-        "init": values["init"]["name"],
-        "densify": values["densify"]["name"],
-        "seed": values["seed"],
-        "raster": raster,
-        "protocol": evaluated_protocol(evaluated),
-        "iterations": training["iterations"],
-        "metrics": metrics["metrics"],
-        "unavailable": metrics["unavailable"],
-        "num_init_points": training["num_init_points"],
-        "num_gaussians": training["num_gaussians"],
-        "causes": training["causes"],
-        "scene_extent": training["scene_extent"],
-        "seconds": {"init": init.seconds, "train": training["seconds"], "evaluate": evaluated.seconds},
-        "peak_memory_mb": training["peak_memory_mb"],
-        "budget": {key: values["densify"].get(key) for key in ("max_gaussians", "cap")}
-        | {"seconds": values["train"]["max_seconds"]},
-        "train_views": len(scene.train),
-        "test_views": len(scene.test),
-        "resolution": list(sizes[0]),
-        "events": sum_events(events),
-        "init_report": json.loads((init.path / REPORT_FILE).read_text()),
-        "hashes": {
-            "config": config_hash(values),
-            "data": fingerprint,
-            "init": init.key,
-            "train": trained.key,
-            "evaluate": evaluated.key,
-        },
-        "code": {"sources": sources_of(values), "stages": {stage.name: stage.version for stage in STAGES}},
-        "versions": stages.versions(),
-    }
-
-
-def evaluated_protocol(evaluated: Entry) -> str:
-    """The protocol's id, from the manifest of an evaluation."""
-    return str(json.loads((evaluated.path / "manifest.json").read_text())["inputs"]["protocol"])
-
-
-def _publish(folder: Path, init: Entry, trained: Entry, evaluated: Entry, ground_truth: Entry) -> list[Path]:
-    """Show the stages' files in the trial's folder, as hard links where the file system has them; returns the links."""
-    names = (stages.PLY_FILE, stages.LINEAGE_FILE, METRICS, EVENTS, HISTOGRAMS)
-    links = {folder / name: trained.path / name for name in names if (trained.path / name).exists()}
-    links[folder / stages.PER_VIEW_FILE] = evaluated.path / stages.PER_VIEW_FILE
-    sources = {
-        "renders": evaluated.path / "renders",
-        "ground_truth": ground_truth.path,
-        "maps": evaluated.path / "maps",
-        "figures": evaluated.path / "figures",
-    }
-    for target, source in sources.items():
+def _publish(folder: Path, entries: Mapping[str, Entry]) -> list[Path]:
+    """Show the steps' files in the trial's folder; returns what is shown."""
+    init, trained, evaluated = (entries[stage.name].path for stage in (INIT, TRAIN, EVALUATE))
+    links = {folder / name: trained / name for name in PUBLISHED_TRAINING if (trained / name).exists()}
+    links[folder / PER_VIEW_FILE] = evaluated / PER_VIEW_FILE
+    pictures = {name: evaluated / name for name in ("renders", "maps", "figures")}
+    for name, source in (pictures | {"ground_truth": entries[GROUND_TRUTH.name].path}).items():
         files = sorted([*source.glob("*.png"), *source.glob("*.npz")])
-        links |= {folder / target / file.name: file for file in files}
-    if (init.path / PICTURE_FILE).exists():
-        links[folder / "figures" / "initial_cloud.png"] = init.path / PICTURE_FILE
+        links |= {folder / name / file.name: file for file in files}
+    if (init / PICTURE_FILE).exists():
+        links[folder / "figures" / "initial_cloud.png"] = init / PICTURE_FILE
     for link, file in links.items():
         link.parent.mkdir(exist_ok=True)
-        _link(file, link)
+        link_or_copy(file, link)
     return list(links)
-
-
-def _link(source: Path, target: Path) -> None:
-    temporary = target.with_name(f".{target.name}.tmp-{os.getpid()}")
-    temporary.unlink(missing_ok=True)
-    try:
-        os.link(source, temporary)
-    except OSError:
-        shutil.copyfile(source, temporary)
-    os.replace(temporary, target)
-    temporary.unlink(missing_ok=True)  # os.replace leaves it where both are links to one file
-
-
-class _QuietFileHandler(logging.FileHandler):
-    """Keeps silent where it cannot write: on a full disk the trial's own error says so."""
-
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
-        return
-
-
-@contextmanager
-def _log_to(path: Path) -> Iterator[None]:
-    """Write everything that gsbench logs, tracebacks included, to ``path`` as well."""
-    handler = _QuietFileHandler(path, encoding="utf-8")
-    handler.setLevel(logging.DEBUG)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    logger = logging.getLogger("gsbench")
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        with suppress(OSError):
-            handler.close()

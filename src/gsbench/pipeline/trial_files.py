@@ -10,10 +10,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
+import yaml
+
 from gsbench.config import config_hash, sha256_of
+from gsbench.errors import InputError
 from gsbench.files import read_object, write_json
 from gsbench.pipeline.locks import is_held
-from gsbench.pipeline.stage_list import STAGES
+from gsbench.pipeline.stages import STAGES
 from gsbench.pipeline.store import read_manifest
 
 RESULTS = "results.json"
@@ -75,6 +78,17 @@ def state_of(folder: Path) -> State:
     if (folder / FAILED).exists():
         return "failed"
     return "partial" if (folder / CONFIG).exists() else "missing"
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """The configuration that a trial wrote; raises InputError where it cannot be read."""
+    try:
+        values = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise InputError(f"{folder / CONFIG} cannot be read ({error})") from error
+    if not isinstance(values, dict) or not isinstance(values.get("tracking"), dict):
+        raise InputError(f"{folder / CONFIG} is not the configuration of a trial")
+    return values
 
 
 def failure_of(folder: Path) -> str:

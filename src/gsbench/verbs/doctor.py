@@ -176,7 +176,7 @@ def check_weights() -> Iterator[Finding]:
 
 def check_store(runs: Path) -> Iterator[Finding]:
     """Every stored result, read whole."""
-    from gsbench.pipeline.stage_list import STAGES
+    from gsbench.pipeline.stages import STAGES
     from gsbench.pipeline.store import read_manifest
 
     sound = 0

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsbench.errors import InputError
+from gsbench.files import atomic
 
 if TYPE_CHECKING:
     from gsbench.gaussians.model import Gaussians
@@ -133,9 +133,5 @@ def _format_of(out: Path) -> str:
 
 
 def _write(out: Path, write: Callable[[Path], object]) -> None:
-    temporary = out.with_name(f".{out.name}.tmp-{os.getpid()}")
-    try:
+    with atomic(out, sync=False) as temporary:
         write(temporary)
-        os.replace(temporary, out)
-    finally:
-        temporary.unlink(missing_ok=True)

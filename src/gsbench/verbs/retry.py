@@ -13,9 +13,8 @@ import yaml
 from gsbench.compose import Composed, compose_one
 from gsbench.errors import InputError
 from gsbench.launch.plan import Planned, describe_plan, forget, progress_of_experiment, read_plan
-from gsbench.pipeline.trial_files import TrialPaths, label_of
+from gsbench.pipeline.trial_files import TrialPaths, label_of, read_config
 from gsbench.verbs.status import experiment_home
-from gsbench.verbs.sync import read_config
 
 log = logging.getLogger(__name__)
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
 
-import yaml
-
-from gsbench.errors import GsbenchError, InputError
+from gsbench.errors import GsbenchError
 from gsbench.launch.plan import TRIAL_GLOB
 from gsbench.pipeline.locks import BusyError
-from gsbench.pipeline.trial_files import CONFIG, label_of, state_of
+from gsbench.pipeline.trial_files import label_of, read_config, state_of
 from gsbench.verbs.status import experiment_home
 from gsbench.words import counted
 
@@ -64,14 +61,3 @@ def _sync_one(folder: Path, runs: Path, uri: str | None) -> bool:
         raise GsbenchError(
             f"MLflow does not take {label_of(folder)} ({text}); the files are complete: try again"
         ) from error
-
-
-def read_config(folder: Path) -> dict[str, Any]:
-    """The configuration that a trial wrote; raises InputError where it cannot be read."""
-    try:
-        values = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise InputError(f"{folder / CONFIG} cannot be read ({error})") from error
-    if not isinstance(values, dict) or not isinstance(values.get("tracking"), dict):
-        raise InputError(f"{folder / CONFIG} is not the configuration of a trial")
-    return values

@@ -15,7 +15,9 @@ from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER, PointCloud
-from gsbench.pipeline.stages import INIT, LINEAGE_FILE, PLY_FILE, png_name
+from gsbench.pipeline.stages import INIT
+from gsbench.pipeline.steps.ground_truth import png_name
+from gsbench.pipeline.steps.train import LINEAGE_FILE, PLY_FILE
 from gsbench.pipeline.store import Store
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import PINHOLE_MODELS, pinhole_camera, points_of, read_model
@@ -81,7 +83,7 @@ def load_viewed(trial: Trial, device: torch.device) -> ViewedTrial:
     """Read what the viewer draws of ``trial``; raises InputError naming the file that is missing or damaged."""
     gaussians = read_ply(trial.path / PLY_FILE, device)
     runs = trial.path.parents[3]
-    model_dir = Store(runs / "store").path(INIT, str(trial.data["hashes"]["init"])) / MODEL_FOLDER
+    model_dir = Store(runs / "store").folder(INIT, str(trial.data["hashes"]["init"])) / MODEL_FOLDER
     if not model_dir.is_dir():
         raise InputError(f"{model_dir} is gone, which has the cameras of {trial.label}: run this trial again")
     background = trial.config.get("train.background", (0.0, 0.0, 0.0))

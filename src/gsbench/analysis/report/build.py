@@ -28,6 +28,7 @@ from gsbench.analysis.results import Experiment, Trial, load_experiment
 from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
+from gsbench.files import write_text
 
 FIGURES = "figures"  # a trial's pictures for the report, such as ellipsoid overlays and initial clouds
 REPORT_NAME = "report.html"
@@ -47,9 +48,7 @@ def main_report(argv: Sequence[str], runs_dir: Path) -> int:
     text = build_report(experiment, options.baseline)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.tmp")
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
+        write_text(path, text)
     except OSError as error:
         raise InputError(f"cannot write {path} ({error.strerror}); give another --out") from None
     print(path)

@@ -1,0 +1,92 @@
+"""What ``results.json`` of a finished trial holds, from the results of its steps."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from gsbench.config import config_hash
+from gsbench.densify.events import sum_events
+from gsbench.init.base import REPORT_FILE
+from gsbench.pipeline.stages import EVALUATE, INIT, STAGES, TRAIN
+from gsbench.pipeline.steps.evaluate import METRICS_FILE
+from gsbench.pipeline.steps.train import TRAINING_FILE
+from gsbench.pipeline.store import MANIFEST, Entry
+from gsbench.pipeline.trainer import EVENTS
+from gsbench.scene.types import Scene
+from gsbench.source import sources_of
+
+PACKAGES = ("gsbench", "torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")  # on whose versions a result depends
+
+
+def results_of(
+    values: dict[str, Any], fingerprint: str, scene: Scene, raster: str, entries: Mapping[str, Entry]
+) -> dict[str, Any]:
+    """The results of the trial with the configuration ``values``; ``entries`` are those of its steps, by stage.
+
+    ``fingerprint`` is that of the photographs, ``raster`` the executor that rendered.
+    """
+    init, trained, evaluated = entries[INIT.name], entries[TRAIN.name], entries[EVALUATE.name]
+    training = _read(trained.path / TRAINING_FILE)
+    metrics = _read(evaluated.path / METRICS_FILE)
+    events = [json.loads(line) for line in (trained.path / EVENTS).read_text().splitlines()]
+    sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]}, reverse=True)
+    return {
+        "status": "complete",
+        "experiment": values["name"],
+        "scene": values["scene"]["name"],
+        "init": values["init"]["name"],
+        "densify": values["densify"]["name"],
+        "seed": values["seed"],
+        "raster": raster,
+        "protocol": _read(evaluated.path / MANIFEST)["inputs"]["protocol"],
+        "iterations": training["iterations"],
+        "metrics": metrics["metrics"],
+        "unavailable": metrics["unavailable"],
+        "num_init_points": training["num_init_points"],
+        "num_gaussians": training["num_gaussians"],
+        "causes": training["causes"],
+        "scene_extent": training["scene_extent"],
+        "seconds": {"init": init.seconds, "train": training["seconds"], "evaluate": evaluated.seconds},
+        "peak_memory_mb": training["peak_memory_mb"],
+        "budget": {
+            "max_gaussians": values["densify"].get("max_gaussians"),
+            "cap": values["densify"].get("cap"),
+            "seconds": values["train"]["max_seconds"],
+        },
+        "train_views": len(scene.train),
+        "test_views": len(scene.test),
+        "resolution": list(sizes[0]),
+        "events": sum_events(events),
+        "init_report": _read(init.path / REPORT_FILE),
+        "hashes": {
+            "config": config_hash(values),
+            "data": fingerprint,
+            "init": init.key,
+            "train": trained.key,
+            "evaluate": evaluated.key,
+        },
+        "code": {"sources": sources_of(values), "stages": {stage.name: stage.version for stage in STAGES}},
+        "machine": training.get("machine"),  # None of a training before it was recorded
+        "versions": versions(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    found = {"python": sys.version.split()[0]}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _read(path: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return content

@@ -1,0 +1,48 @@
+"""The photographs of a trial: the user's own, or the procedural courtyard, which a step renders first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from gsbench.config import SceneConfig, sha256_of
+from gsbench.pipeline.progress import progress
+from gsbench.pipeline.stages import CAPTURE
+from gsbench.pipeline.step import Step
+from gsbench.scene.courtyard import render_courtyard
+from gsbench.scene.readers import read_colmap, read_photos
+from gsbench.scene.types import Capture
+
+
+def capture_step(options: SceneConfig) -> Step | None:
+    """The step that makes the photographs; None for a scene that is read from the user's folder."""
+    if options.kind != "courtyard":
+        return None
+    inputs = {name: getattr(options, name) for name in ("views", "width", "height", "seed")}
+
+    def build(folder: Path) -> None:
+        with progress("scene") as report:
+            render_courtyard(folder, progress=lambda done, total: report("courtyard", done, total), **inputs)
+
+    return Step(CAPTURE, inputs, build)
+
+
+def read_capture(options: SceneConfig, made: Path | None) -> Capture:
+    """The photographs of ``options``, selected and split; ``made`` is the folder that ``capture_step`` filled."""
+    selection: dict[str, Any] = {
+        "max_images": options.max_images,
+        "test_every": options.test_every,
+        "train_list": options.train_list,
+        "test_list": options.test_list,
+    }
+    if made is not None:
+        return read_colmap(options.name, made, exact_poses=True, **selection)
+    path = Path(str(options.path)).expanduser()
+    if options.kind == "photos":
+        return read_photos(options.name, path, images=options.images, **selection)
+    return read_colmap(options.name, path, images=options.images, sparse=options.sparse, **selection)
+
+
+def split_of(capture: Capture) -> str:
+    """A hash of which views are held out."""
+    return sha256_of(list(capture.test_names))

@@ -1,0 +1,112 @@
+"""Evaluation: the test views rendered at 8 bits and measured by the protocol; the metrics read what the PNGs hold."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from scipy.spatial import cKDTree
+
+from gsbench.config import EvalConfig
+from gsbench.eval.protocol import Evaluator, get_protocol, quantize, summarize
+from gsbench.files import write_json
+from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
+from gsbench.gaussians.ply import read_ply
+from gsbench.init import read_cloud
+from gsbench.init.base import MODEL_FOLDER
+from gsbench.pipeline.figures import draw_ellipsoids
+from gsbench.pipeline.maps import view_maps
+from gsbench.pipeline.progress import progress
+from gsbench.pipeline.stages import EVALUATE
+from gsbench.pipeline.step import Step
+from gsbench.pipeline.steps.ground_truth import png_name
+from gsbench.pipeline.steps.train import LINEAGE_FILE, PLY_FILE
+from gsbench.pipeline.steps.views import Views
+from gsbench.raster import Rasterizer
+from gsbench.scene.types import Scene
+
+PER_VIEW_FILE = "per_view.csv"
+METRICS_FILE = "metrics.json"
+FIGURE_VOLUME = 0.03  # the paper's V_th, for baseline and idea alike
+
+
+def evaluate_step(
+    views: Views,
+    trained: Step,
+    rasterizer: Rasterizer,
+    evaluator: Evaluator,
+    background: tuple[float, float, float],
+    maps: bool,
+    device: torch.device,
+) -> Step:
+    """Render and measure the model of ``trained``; ``maps`` also keeps what the report needs to say where it helps."""
+    inputs = {
+        "train": trained.key,
+        "protocol": evaluator.protocol.id,
+        "unavailable": sorted(evaluator.unavailable),  # so that weights that arrive later are used
+        "maps": maps,
+    }
+
+    def build(folder: Path) -> None:
+        training, scene = views.store.path(trained), views.scene
+        gaussians = read_ply(training / PLY_FILE, device)
+        color = torch.tensor(list(background), device=device)  # [3]
+        (folder / "renders").mkdir(exist_ok=True)
+        per_view: dict[str, dict[str, float]] = {}
+        with progress("evaluate") as report:
+            for done, view in enumerate(scene.test, 1):
+                with torch.no_grad():
+                    rendered = rasterizer.render(gaussians, view.camera, MAX_SH_DEGREE, color).image
+                image = quantize(rendered).cpu().numpy()  # [H, W, 3] uint8
+                Image.fromarray(image).save(folder / "renders" / png_name(view.name))
+                per_view[view.name] = evaluator.evaluate_view(image, view.image)
+                report("views", done, len(scene.test))
+        if maps:
+            write_maps(folder / "maps", scene, views.store.path(views.init), gaussians, rasterizer)
+            draw_figures(folder / "figures", folder / "renders", scene, training, gaussians)
+        write_per_view(folder / PER_VIEW_FILE, per_view)
+        metrics = {"metrics": summarize(per_view, evaluator.unavailable), "unavailable": evaluator.unavailable}
+        write_json(folder / METRICS_FILE, metrics)
+
+    return Step(EVALUATE, inputs, build)
+
+
+def make_evaluator(options: EvalConfig, device: torch.device | str = "cpu") -> Evaluator:
+    """The evaluator that the settings ``eval`` describe; looks for its networks' weights."""
+    weights = None if options.weights is None else Path(options.weights).expanduser()
+    protocol = get_protocol(options.protocol)
+    return Evaluator(protocol, device, tuple(options.lpips), options.flip, weights, options.download)
+
+
+def write_maps(folder: Path, scene: Scene, init: Path, gaussians: Gaussians, rasterizer: Rasterizer) -> None:
+    """One ``<view>.npz`` for each test view (see ``view_maps``)."""
+    folder.mkdir(exist_ok=True)
+    points = cKDTree(read_cloud(init / MODEL_FOLDER).points)
+    for view in scene.test:
+        maps: dict[str, Any] = view_maps(rasterizer, gaussians, view.camera, points)
+        np.savez_compressed(folder / Path(png_name(view.name)).with_suffix(".npz"), **maps)
+
+
+def draw_figures(folder: Path, renders: Path, scene: Scene, training: Path, gaussians: Gaussians) -> None:
+    """The voluminous Gaussians of the model, drawn over its first test view."""
+    folder.mkdir(exist_ok=True)
+    with np.load(training / LINEAGE_FILE) as lineage:
+        causes = torch.from_numpy(lineage["causes"][lineage["ids"]])  # [N]
+    for view in scene.test[:1]:
+        render = np.asarray(Image.open(renders / png_name(view.name)))
+        picture = draw_ellipsoids(render, gaussians, causes, view.camera, FIGURE_VOLUME)
+        picture.save(folder / "ellipsoids.png")
+
+
+def write_per_view(path: Path, per_view: dict[str, dict[str, float]]) -> None:
+    """One row a view, in order; a metric that a view lacks is left empty."""
+    names = sorted({name for row in per_view.values() for name in row})
+    with path.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, ["view", *names])
+        writer.writeheader()
+        for view, row in per_view.items():
+            writer.writerow({"view": view} | {name: repr(value) for name, value in row.items()})

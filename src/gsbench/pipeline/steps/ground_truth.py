@@ -1,0 +1,26 @@
+"""The test photographs as they are compared with, once for all trials that share them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from PIL import Image
+
+from gsbench.pipeline.stages import GROUND_TRUTH
+from gsbench.pipeline.step import Step
+from gsbench.pipeline.steps.views import Views
+
+
+def ground_truth_step(views: Views) -> Step:
+    """Keep the test views as PNG files."""
+
+    def build(folder: Path) -> None:
+        for view in views.scene.test:
+            Image.fromarray(view.image).save(folder / png_name(view.name))
+
+    return Step(GROUND_TRUTH, {"scene": views.inputs, "init": views.init.key}, build)
+
+
+def png_name(view_name: str) -> str:
+    """File name for the picture of a view; sub-folders become part of the name."""
+    return Path(view_name).with_suffix(".png").as_posix().replace("/", "__")

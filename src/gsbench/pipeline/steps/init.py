@@ -1,0 +1,46 @@
+"""Cameras and the first cloud: a COLMAP model and its report, shared by all trials with the same options."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import version
+from pathlib import Path
+
+from gsbench.init.base import MODEL_FOLDER, Initializer
+from gsbench.pipeline.components import options_of
+from gsbench.pipeline.progress import Report, progress
+from gsbench.pipeline.resources import available_threads
+from gsbench.pipeline.stages import INIT
+from gsbench.pipeline.step import Step
+from gsbench.pipeline.steps.capture import split_of
+from gsbench.pipeline.store import Store
+from gsbench.scene.images import read_image
+from gsbench.scene.types import Capture
+
+
+def init_step(store: Store, capture: Capture, initializer: Initializer, reference: Step | None = None) -> Step:
+    """The initialiser's step; ``reference`` is the one whose cameras stand in for those that did not come."""
+    inputs = {
+        "capture": capture.fingerprint,
+        "test": split_of(capture),
+        "exact_poses": capture.exact_poses,
+        "options": options_of(initializer),
+        "content": initializer.content() if hasattr(initializer, "content") else None,
+        "reference": None if reference is None else reference.key,
+        "pycolmap": version("pycolmap"),
+    }
+
+    def build(folder: Path) -> None:
+        with progress("init") as report:
+            check_readable(capture, report)
+            cameras = None if reference is None else store.path(reference) / MODEL_FOLDER
+            initializer.run(capture, folder, report, reference=cameras)
+
+    return Step(INIT, inputs, build)
+
+
+def check_readable(capture: Capture, report: Report) -> None:
+    """Decode every photograph once, so that a damaged file is named before hours of work. Raises InputError."""
+    with ThreadPoolExecutor(max_workers=available_threads()) as pool:
+        for done, _ in enumerate(pool.map(lambda name: read_image(capture.images / name).shape, capture.image_names)):
+            report("photographs", done + 1, len(capture.image_names))

@@ -1,0 +1,87 @@
+"""Training: the model, its lineage, metrics and events."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsbench.config import TrainConfig
+from gsbench.densify import Densifier
+from gsbench.files import write_json
+from gsbench.gaussians.initial import gaussians_from_cloud
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.ply import read_ply, write_ply
+from gsbench.init import read_cloud
+from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
+from gsbench.machine import describe_machine
+from gsbench.memory import peak_memory_mb, reset_peak_memory
+from gsbench.pipeline.components import options_of
+from gsbench.pipeline.progress import progress
+from gsbench.pipeline.stages import TRAIN
+from gsbench.pipeline.step import Step
+from gsbench.pipeline.steps.views import Views
+from gsbench.pipeline.trainer import Status, Trainer
+from gsbench.raster import Rasterizer
+
+PLY_FILE = "point_cloud.ply"
+TRAINING_FILE = "training.json"
+LINEAGE_FILE = "lineage.npz"
+# Options that cannot change the model.
+WITHOUT_EFFECT = ("name", "log_every", "checkpoint_every", "checkpoint_minutes", "volume_histogram")
+
+
+def train_step(
+    views: Views, densifier: Densifier, rasterizer: Rasterizer, options: TrainConfig, seed: int, device: torch.device
+) -> Step:
+    """Train on the training views, from the cloud of the initialiser."""
+    inputs = {
+        "scene": views.inputs,
+        "init": views.init.key,
+        "densify": options_of(densifier),
+        "raster": rasterizer.name,
+        "train": {key: value for key, value in dataclasses.asdict(options).items() if key not in WITHOUT_EFFECT},
+        "seed": seed,
+    }
+
+    def build(folder: Path) -> None:
+        scene = views.scene
+        initial = initial_gaussians(views.store.path(views.init), device)
+        trainer = Trainer(scene, initial, densifier, rasterizer, options, seed)
+        reset_peak_memory(device)
+        with progress("train") as report:
+
+            def show(status: Status) -> None:
+                speed = f"{status.iterations_per_second:.1f} it/s"
+                note = f"loss {status.loss:.4f} | {status.num_gaussians:,} Gaussians | {speed}"
+                report("iteration", status.step, options.iterations, note)
+
+            gaussians = trainer.run(folder, show)
+        write_ply(gaussians, folder / PLY_FILE)
+        lineage: dict[str, Any] = {name: tensor.numpy() for name, tensor in densifier.lineage.state_dict().items()}
+        np.savez_compressed(folder / LINEAGE_FILE, **lineage)
+        summary = {
+            "iterations": trainer.step,
+            "num_init_points": len(initial),
+            "num_gaussians": len(gaussians),
+            "causes": densifier.lineage.causes_of_living(),
+            "scene_extent": scene.extent,
+            "seconds": trainer.seconds,
+            "peak_memory_mb": peak_memory_mb(device),
+            "machine": describe_machine(device),
+        }
+        write_json(folder / TRAINING_FILE, summary)
+
+    return Step(TRAIN, inputs, build)
+
+
+def initial_gaussians(init: Path, device: torch.device) -> Gaussians:
+    """What the training starts from: the Gaussians that the initialiser left in the folder ``init``, or one for each of
+    its points."""
+    if (init / GAUSSIANS_FILE).exists():
+        return read_ply(init / GAUSSIANS_FILE, device)
+    cloud = read_cloud(init / MODEL_FOLDER)
+    return gaussians_from_cloud(cloud.points, cloud.colors, device)

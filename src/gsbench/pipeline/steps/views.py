@@ -1,0 +1,50 @@
+"""The views of a trial at their final size: no step of their own, since they are quick to prepare and large to keep."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, cast
+
+from gsbench.config import SceneConfig
+from gsbench.init.base import MODEL_FOLDER
+from gsbench.pipeline.progress import progress
+from gsbench.pipeline.step import Step
+from gsbench.pipeline.steps.capture import split_of
+from gsbench.pipeline.store import Store
+from gsbench.scene.images import Resample
+from gsbench.scene.load import PrincipalPoint, load_scene
+from gsbench.scene.types import Capture, Scene
+
+
+class Views:
+    """What the views of a trial depend on, and the views themselves, which are loaded when first asked for."""
+
+    def __init__(self, store: Store, capture: Capture, init: Step, options: SceneConfig) -> None:
+        self.store, self.capture, self.init, self.options = store, capture, init, options
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """What the views depend on besides the cameras, which are those of ``init``."""
+        return {
+            "capture": self.capture.fingerprint,
+            "test": split_of(self.capture),
+            "downscale": self.options.downscale,
+            "max_size": self.options.max_size,
+            "resample": self.options.resample,
+            "principal_point": self.options.principal_point,
+        }
+
+    @cached_property
+    def scene(self) -> Scene:
+        """Undistorted and shrunk; ``init`` must be built. Prepared images are cached beside the store's stages."""
+        with progress("scene") as report:
+            return load_scene(
+                self.capture,
+                self.store.path(self.init) / MODEL_FOLDER,
+                self.store.root / "views",
+                downscale=self.options.downscale,
+                max_size=self.options.max_size,
+                resample=cast(Resample, self.options.resample),
+                principal_point=cast(PrincipalPoint, self.options.principal_point),
+                progress=lambda done, total: report("views", done, total),
+            )
