@@ -92,10 +92,11 @@ class _Stepper:
 
         from gsbench.gaussians.ply import read_ply
         from gsbench.pipeline.loss import PhotometricLoss
+        from gsbench.raster.executors import find
 
         self.threads = threads or torch.get_num_threads()
         torch.set_num_threads(self.threads)
-        self.device = torch.device("cuda" if raster == "cuda" else "cpu")
+        self.device = torch.device("cpu" if raster == PEER or find(raster).runs_on("cpu") else "cuda")
         scene = trained_like_gaussians(count) if ply is None else read_ply(ply)
         self.count = len(scene)
         self.gaussians = scene.map(lambda tensor: tensor.detach().to(self.device).requires_grad_())
@@ -282,8 +283,11 @@ def _count(text: str) -> int:
 
 def main(argv: list[str]) -> int:
     """``gsbench bench``: print the table, or with ``--json`` the list of results."""
+    from gsbench.raster.executors import EXECUTORS
+
+    known = [executor.name for executor in EXECUTORS]
     parser = argparse.ArgumentParser(prog="gsbench bench", description="Time rasterizers and the training step.")
-    parser.add_argument("--raster", default="cpu", help=f"names, comma between: reference, cpu, cuda, {PEER}")
+    parser.add_argument("--raster", default="cpu", help=f"names, comma between: {', '.join(known)}, {PEER}")
     parser.add_argument("--size", default="500x375", help="image sizes, comma between")
     parser.add_argument("--count", default="100000", help="numbers of Gaussians, comma between")
     parser.add_argument("--ply", type=Path, help="time this model instead of the synthetic scene")

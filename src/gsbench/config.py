@@ -13,6 +13,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from gsbench.errors import InputError
+from gsbench.raster import executors
 from gsbench.source import source_of
 
 ALLOWED_TARGETS = ("gsbench.",)  # a ``_target_`` is code: only these prefixes, and those in ``allow_targets``
@@ -41,7 +42,8 @@ class SceneConfig:
 
 @dataclass
 class RasterConfig:
-    name: str = MISSING  # auto | reference | cpu | cuda
+    name: str = MISSING  # auto, or an executor of gsbench.raster.executors
+    _target_: str | None = None  # a class of your own, instead; its options are further keys
 
 
 @dataclass
@@ -169,7 +171,11 @@ def check(config: DictConfig) -> None:
         ("scene.max_size", config.scene.max_size is None or config.scene.max_size >= 16, "at least 16 px"),
         ("scene.max_images", config.scene.max_images >= 3, "at least 3"),
         ("scene.test_every", config.scene.test_every >= 2, "at least 2"),
-        ("raster", config.raster.name in ("auto", "reference", "cpu", "cuda"), "auto, reference, cpu or cuda"),
+        (
+            "raster",
+            config.raster._target_ is not None or config.raster.name in executors.names(),
+            f"one of {', '.join(executors.names())}",
+        ),
         ("train.iterations", config.train.iterations >= 1, "at least 1"),
         ("train.sh_interval", config.train.sh_interval >= 1, "at least 1"),
         ("train.ssim_weight", 0 <= config.train.ssim_weight <= 1, "in [0, 1]"),
@@ -198,7 +204,7 @@ def check(config: DictConfig) -> None:
             raise InputError(f"{key} must be {rule}, got {OmegaConf.select(config, key)!r}")
     if config.scene.kind != "courtyard" and not config.scene.path:
         raise InputError("scene.path is not set: say where the capture lies, for example scene.path=/my/photos")
-    for group in ("init", "densify"):
+    for group in ("init", "densify", *(["raster"] if config.raster._target_ is not None else [])):
         check_target(OmegaConf.select(config, f"{group}._target_"), group, config.allow_targets)
 
 
@@ -226,7 +232,9 @@ def config_hash(values: dict[str, Any]) -> str:
     for key, group in kept.items():
         if isinstance(group, dict):
             kept[key] = {name: value for name, value in group.items() if name not in WITHOUT_EFFECT}
-            if "_target_" in group:
+            if kept[key].get("_target_", "") is None:  # gsbench's own, by its name
+                del kept[key]["_target_"]
+            elif "_target_" in group:
                 kept[key] |= source_of(group["_target_"])
     return sha256_of(kept)
 

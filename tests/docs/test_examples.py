@@ -41,7 +41,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    for name in ("largest", "mine"):
+    for name in ("largest", "mine", "untiled"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return tmp_path
 
@@ -62,6 +62,13 @@ def test_densifier(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert found["event"]["split_volume"] > 0
     results = list(Path("runs").glob("largest/courtyard/random-largest/*/results.json"))
     assert len(results) == 1
+
+
+@pytest.mark.end_to_end
+def test_rasterizer(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = run_blocks(ROOT / "docs" / "rasterizer.md", folder)
+    assert found["status"] == 0, capsys.readouterr().err
+    assert len(list(Path("runs").glob("untiled/courtyard/*/*/results.json"))) == 1
 
 
 def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder: Path) -> None:

@@ -73,7 +73,7 @@ def test_sweep_leaves_complete_trials_and_a_table(gsbench: Run, tmp_path: Path) 
         (["scene=photos", "scene.path=/nowhere/at/all"], ["/nowhere/at/all"]),
         (["scene=colmap", "scene.path=."], ["sparse"]),
         (["train.iterations=many"], ["iterations"]),
-        (["raster=cuda", "device=cpu"], ["raster=cuda"]),
+        (["raster=gsplat", "device=cpu"], ["raster=gsplat", "device=cuda"]),
         (["tabels"], ["tabels", "tables"]),
         (["densify._target_=os.system"], ["os.system", "allow_targets"]),
     ],

@@ -144,7 +144,7 @@ def test_name_seed_and_machine_are_in_no_hash_and_settings_are() -> None:
         (["+experiment=tabel1"], ["tabel1 does not exist", "did you mean table1"]),
         (["train.iterations=many"], ["train.iterations=many", "Integer"]),
         (["train.iterations=0"], ["train.iterations must be at least 1", "got 0"]),
-        (["raster=gpu"], ["raster=gpu does not exist", "cuda"]),
+        (["raster=gpu"], ["raster=gpu does not exist", "gsplat"]),
         (["eval.lpips=3"], ["eval.lpips=3", "list"]),
         (["seed=0,1"], ["seed=0,1 lists several values", "-m"]),
         (["foo"], ["'foo' is not a setting like key=value"]),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 
 import numpy as np
@@ -11,36 +10,31 @@ import torch
 from hypothesis import HealthCheck, given, settings
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.raster import create_rasterizer
+from gsbench.raster import EXECUTORS, create_rasterizer
 from gsbench.raster.base import Rasterizer
+from gsbench.raster.contract import CASES, GRADIENT_TOLERANCE, VALUE_TOLERANCE, Case, render_with_gradients
+from gsbench.raster.executors import Executor, find
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.camera import Camera
-from tests.raster.strategies import Case, extreme_gaussians, render_with_gradients
+from tests.raster.strategies import extreme_gaussians
 
-VALUE_TOLERANCE = 1e-4
-GRADIENT_TOLERANCE = 1e-3  # of the largest entry of each gradient
+PEERS = ("gsplat",)  # to measure against: their departures from the contract stand in their modules
 
-CASES = [
-    Case(33, 49, 50, sh_degree=3),  # the last tiles are one pixel wide and one pixel high
-    Case(97, 65, 250, sh_degree=3, principal=(7.3, -5.1)),
-    Case(64, 48, 150, sh_degree=2, log_scale=-3.0),
-    Case(50, 37, 120, sh_degree=1, log_scale=-1.0),
-    Case(81, 50, 150, sh_degree=0, log_scale=-2.5, principal=(-20.0, 11.0)),
-    Case(40, 40, 300, sh_degree=3, log_scale=-1.5, logit=3.0),  # opaque: pixels stop early, alphas are clamped
-    Case(7, 5, 20, sh_degree=3),  # smaller than a tile
-]
+
+def _home(executor: Executor) -> str:
+    """The type of device that an executor is made for."""
+    return "cpu" if executor.runs_on("cpu") else "cuda"
 
 
 def _available() -> list[str]:
-    names = ["reference", "cpu"]
-    if torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None:
-        names.append("cuda")
-    return names
+    places = {"cpu": True, "cuda": torch.cuda.is_available()}
+    here = [executor for executor in EXECUTORS if places[_home(executor)] and not executor.obstacle(_home(executor))]
+    return [executor.name for executor in here if executor.name not in PEERS]
 
 
 @pytest.fixture(params=_available())
 def device(request: pytest.FixtureRequest) -> str:
-    return "cuda" if request.param == "cuda" else "cpu"
+    return _home(find(request.param))
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""From configuration to objects: initialisers, densifiers, devices and threads, with errors that name the key."""
+"""From configuration to objects: initialisers, densifiers, rasterizers, devices, with errors that name the key."""
 
 from __future__ import annotations
 
@@ -10,19 +10,24 @@ from typing import Any
 
 import torch
 
-from gsbench.config import WITHOUT_EFFECT, check_target
+from gsbench.config import ALLOWED_TARGETS, WITHOUT_EFFECT, check_target
 from gsbench.errors import InputError
+from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.settings import checked, unknown_setting
 from gsbench.source import has_changed_since_import, source_of
 
 log = logging.getLogger(__name__)
 
 RESERVED = ("_target_", "name")  # keys of a group that are not options of its class
-METHODS = {"init": ("needs_reference", "run"), "densify": ("prepare", "begin", "observe", "refine", "after_step")}
+METHODS = {
+    "init": ("needs_reference", "run"),
+    "densify": ("prepare", "begin", "observe", "refine", "after_step"),
+    "raster": ("render",),
+}
 
 
 def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
-    """The object that ``values`` of ``group`` (init, densify) describes.
+    """The object that ``values`` of ``group`` (init, densify, raster) describes.
 
     ``_target_`` names a class by its import path; the other keys are its arguments. For dataclasses, values are checked
     against the annotations. Raises InputError naming the key that is unknown or wrong.
@@ -35,12 +40,42 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
         options = checked(cls, options, group)
     else:
         _check_names(cls, options, group)
+    if options and not dataclasses.is_dataclass(cls) and not target.startswith(ALLOWED_TARGETS):
+        raise InputError(
+            f"{group}._target_={target} has options but is no dataclass: make it one, so that results are stored under "
+            "their values"
+        )
     try:
         return cls(**options)
     except InputError:
         raise
     except (TypeError, ValueError) as error:
         raise InputError(f"{group}: {error}") from error
+
+
+def build_rasterizer(
+    values: dict[str, Any], allow_targets: list[str], device: torch.device, threads: int | None = None
+) -> Rasterizer:
+    """The rasterizer that ``values`` of the group raster describes: a class of the user's own, or one by name.
+
+    Raises InputError where it cannot run on ``device``.
+    """
+    if values.get("_target_") is None:
+        return create_rasterizer(values["name"], device, threads)
+    rasterizer: Rasterizer = build("raster", values, allow_targets)
+    target, name = values["_target_"], getattr(rasterizer, "name", None)
+    if not isinstance(name, str) or any(name == executor.name for executor in EXECUTORS):
+        raise InputError(
+            f"raster._target_={target} needs a name of its own, as results and tables will call it; it has {name!r}"
+        )
+    return rasterizer
+
+
+def rasterizer_inputs(rasterizer: Rasterizer) -> str | dict[str, Any]:
+    """The rasterizer as it enters a stage's key: gsbench's own by name, a user's by class, source and options."""
+    if f"{type(rasterizer).__module__}.".startswith(ALLOWED_TARGETS):
+        return rasterizer.name
+    return {"name": rasterizer.name} | options_of(rasterizer)
 
 
 def _check_names(cls: Any, options: dict[str, Any], group: str) -> None:

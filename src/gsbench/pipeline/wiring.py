@@ -19,7 +19,7 @@ from gsbench.densify import Densifier
 from gsbench.eval.protocol import Evaluator
 from gsbench.init import Sfm
 from gsbench.init.base import Initializer
-from gsbench.pipeline.components import build, select_device
+from gsbench.pipeline.components import build, build_rasterizer, select_device
 from gsbench.pipeline.resources import available_threads
 from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.capture import capture_step, read_capture
@@ -29,7 +29,7 @@ from gsbench.pipeline.steps.init import init_step
 from gsbench.pipeline.steps.train import train_step
 from gsbench.pipeline.steps.views import Views
 from gsbench.pipeline.store import Store
-from gsbench.raster import Rasterizer, create_rasterizer, resolve_name
+from gsbench.raster import Rasterizer
 from gsbench.scene.types import Capture
 
 CaptureReader = Callable[[SceneConfig, Path | None], Capture]
@@ -58,7 +58,7 @@ class Parts:
             scene=SceneConfig(**values["scene"]),
             initializer=build("init", values["init"], values["allow_targets"]),
             densifier=build("densify", values["densify"], values["allow_targets"]),
-            rasterizer=create_rasterizer(resolve_name(values["raster"]["name"], device), device, threads),
+            rasterizer=build_rasterizer(values["raster"], values["allow_targets"], device, threads),
             train=TrainConfig(**values["train"]),
             eval=EvalConfig(**values["eval"]),
             seed=values["seed"],

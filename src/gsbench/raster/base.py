@@ -1,14 +1,15 @@
-"""The contract of every rasterizer: what goes in, what comes out, and the constants of 3DGS."""
+"""The contract of every rasterizer: what goes in, what comes out, and the constants of 3DGS. Loads no torch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from torch import Tensor
+if TYPE_CHECKING:
+    from torch import Tensor
 
-from gsbench.gaussians.model import Gaussians
-from gsbench.scene.camera import Camera
+    from gsbench.gaussians.model import Gaussians
+    from gsbench.scene.camera import Camera
 
 
 @dataclass(frozen=True)

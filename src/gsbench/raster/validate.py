@@ -17,19 +17,29 @@ MAX_PRINCIPAL_OFFSET = 100.0  # image sides that the principal point may lie out
 def check_inputs(gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor) -> None:
     """Raise ValueError, naming the parameter, on anything that ``Rasterizer.render`` cannot use.
 
-    Looks at every value of ``gaussians``. An executor that meets the values anyway calls ``check_settings`` alone and
-    ``raise_for_values`` when it finds a bad one.
+    Looks at every value of ``gaussians``, and waits for a device once. An executor that meets the values anyway calls
+    ``check_settings`` alone and ``raise_for_values`` when it finds a bad one; one that waits for its device later asks
+    ``bad_values`` and reads the answer then.
     """
     check_settings(gaussians, camera, sh_degree, background)
-    for tensor in gaussians.tensors().values():
-        if not torch.isfinite(tensor.detach().sum()):  # overflow of the sum is told apart below
-            raise_for_values(gaussians)
-    if len(gaussians) and gaussians.quaternions.detach().norm(dim=-1).amin() < MIN_QUATERNION_NORM:
-        raise_for_values(gaussians)
+    if bad_values(gaussians, background):
+        raise_for_values(gaussians, background)
+
+
+def bad_values(gaussians: Gaussians, background: Tensor) -> Tensor:
+    """One bool, still on the device: whether ``raise_for_values`` has to look.
+
+    It may be True for sound values whose sum overflows; it is never False for a bad one.
+    """
+    tensors = [background, *gaussians.tensors().values()]
+    bad = ~torch.stack([tensor.detach().sum() for tensor in tensors]).isfinite().all()
+    if len(gaussians):
+        bad = bad | (gaussians.quaternions.detach().norm(dim=-1).amin() < MIN_QUATERNION_NORM)
+    return bad
 
 
 def check_settings(gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor) -> None:
-    """The part of ``check_inputs`` that does not look at the values of the Gaussians."""
+    """The part of ``check_inputs`` that looks at no value that a device would have to be waited for."""
     if not 0 <= sh_degree <= MAX_SH_DEGREE:
         raise ValueError(f"sh_degree: must be 0 to {MAX_SH_DEGREE}, got {sh_degree}")
     dtype, device = gaussians.means.dtype, gaussians.means.device
@@ -38,8 +48,10 @@ def check_settings(gaussians: Gaussians, camera: Camera, sh_degree: int, backgro
     for name, tensor in [*gaussians.tensors().items(), ("background", background)]:
         if tensor.dtype != dtype or tensor.device != device:
             raise ValueError(f"{name}: is {tensor.dtype} on {tensor.device}, but means is {dtype} on {device}")
-    if tuple(background.shape) != (3,) or not torch.isfinite(background).all():
-        raise ValueError(f"background: must be three finite numbers, got shape {tuple(background.shape)}")
+    if tuple(background.shape) != (3,):
+        raise ValueError(f"background: must be three numbers, got shape {tuple(background.shape)}")
+    if device.type == "cpu":
+        _check_background(background)
     _check_camera(camera)
 
 
@@ -57,8 +69,15 @@ def _check_camera(camera: Camera) -> None:
             raise ValueError(f"camera: c{axis} is {principal} px, which is degenerate for a {side} of {size} px")
 
 
-def raise_for_values(gaussians: Gaussians) -> None:
+def _check_background(background: Tensor) -> None:
+    if not torch.isfinite(background).all():
+        raise ValueError(f"background: must be three finite numbers, got {background.tolist()}")
+
+
+def raise_for_values(gaussians: Gaussians, background: Tensor | None = None) -> None:
     """Raise ValueError on the first parameter that has a non-finite value or, of quaternions, no length."""
+    if background is not None:
+        _check_background(background)
     for name, tensor in gaussians.tensors().items():
         finite = torch.isfinite(tensor.detach())
         while finite.dim() > 1:

@@ -22,7 +22,7 @@ Verdict = Literal["ok", "note", "bad"]
 LITTLE_SPACE_GB = 5.0
 OPTIONAL = {
     "transformers": "init=dim: pip install 'gsbench[dim]'",
-    "gsplat": "raster=cuda and export --to compressed: pip install 'gsbench[cuda]'",
+    "gsplat": "raster=gsplat and export --to compressed: pip install 'gsbench[gsplat]'",
     "submitit": "launch=local and launch=slurm: pip install 'gsbench[slurm]'",
     "viser": "gsbench view: pip install 'gsbench[view]'",
 }

@@ -19,7 +19,7 @@ from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.machine import describe_machine
 from gsbench.memory import peak_memory_mb, reset_peak_memory
-from gsbench.pipeline.components import options_of
+from gsbench.pipeline.components import options_of, rasterizer_inputs
 from gsbench.pipeline.progress import progress
 from gsbench.pipeline.stages import TRAIN
 from gsbench.pipeline.step import Step
@@ -42,7 +42,7 @@ def train_step(
         "scene": views.inputs,
         "init": views.init.key,
         "densify": options_of(densifier),
-        "raster": rasterizer.name,
+        "raster": rasterizer_inputs(rasterizer),
         "train": {key: value for key, value in dataclasses.asdict(options).items() if key not in WITHOUT_EFFECT},
         "seed": seed,
     }

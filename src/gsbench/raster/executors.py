@@ -1,0 +1,114 @@
+"""The executors that come with gsbench, as one table of facts that everything asks. Loads no torch.
+
+A rasterizer of your own needs no entry here: ``raster._target_=mine.MyRasterizer`` (docs/rasterizer.md).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from dataclasses import dataclass
+
+from gsbench.errors import InputError
+
+log = logging.getLogger(__name__)
+
+AUTO = "auto"
+
+
+@dataclass(frozen=True)
+class Executor:
+    """What is known of an executor before it is loaded."""
+
+    name: str  # as in ``raster=NAME``, in results and in tables
+    target: str  # import path of its class
+    devices: tuple[str, ...]  # types of torch devices that it runs on; empty: on any
+    text: str  # what it is, in one line
+    package: str | None = None  # what it imports beyond gsbench's own requirements
+    install: str = ""  # how to get that package
+    takes_threads: bool = False  # its class has an argument ``threads``
+
+    @property
+    def is_installed(self) -> bool:
+        """Whether its package can be found; nothing is imported."""
+        return self.package is None or importlib.util.find_spec(self.package) is not None
+
+    def runs_on(self, device_type: str) -> bool:
+        return not self.devices or device_type in self.devices
+
+    def obstacle(self, device_type: str) -> str | None:
+        """Why it cannot run here on a device of this type and what to do about it; None if it can."""
+        if not self.runs_on(device_type):
+            needed = " or ".join(self.devices)
+            others = ", ".join(other.name for other in EXECUTORS if other.runs_on(device_type))
+            return f"runs on device={needed}, not on {device_type}; choose from {others}, or set device={needed}"
+        if not self.is_installed:
+            return f"needs {self.package}: {self.install}"
+        return None
+
+
+EXECUTORS = (
+    Executor(
+        "reference",
+        "gsbench.raster.reference.ReferenceRasterizer",
+        devices=(),
+        text="plain torch, float32 or float64: the definition that all others are tested against; slow",
+    ),
+    Executor(
+        "cpu",
+        "gsbench.raster.cpu.CpuRasterizer",
+        devices=("cpu",),
+        text="compiled by numba at first use; the same bits on every run and for any number of threads",
+        takes_threads=True,
+    ),
+    Executor(
+        "gsplat",
+        "gsbench.raster.gsplat.GsplatRasterizer",
+        devices=("cuda",),
+        text="gsplat's CUDA kernels, to measure against; compiled with a CUDA toolkit (nvcc) at first use",
+        package="gsplat",
+        install="pip install 'gsbench[gsplat]'",
+    ),
+)
+# What ``auto`` takes: the first that is installed. Other types of devices have the reference alone.
+PREFERRED = {"cpu": ("cpu",), "cuda": ("triton", "gsplat")}
+
+
+def names() -> tuple[str, ...]:
+    """What ``raster=`` accepts."""
+    return (AUTO, *(executor.name for executor in EXECUTORS))
+
+
+def find(name: str) -> Executor:
+    """The executor called ``name``; raises InputError that lists the names."""
+    for executor in EXECUTORS:
+        if executor.name == name:
+            return executor
+    raise InputError(
+        f"raster={name} is not known; choose {', '.join(names())}, or set raster._target_ to a class of your own"
+    )
+
+
+def resolve(name: str, device_type: str) -> Executor:
+    """The executor that ``name`` (``auto`` included) means on a device of this type.
+
+    Raises InputError where it cannot run there. ``auto`` says so where only the slow reference is left.
+    """
+    if name == AUTO:
+        return _automatic(device_type)
+    executor = find(name)
+    obstacle = executor.obstacle(device_type)
+    if obstacle is not None:
+        raise InputError(f"raster={name} {obstacle}")
+    return executor
+
+
+def _automatic(device_type: str) -> Executor:
+    wanted = [executor for executor in EXECUTORS if executor.name in PREFERRED.get(device_type, ())]
+    wanted.sort(key=lambda executor: PREFERRED[device_type].index(executor.name))
+    for executor in wanted:
+        if executor.obstacle(device_type) is None:
+            return executor
+    hints = "; ".join(f"{executor.name} needs {executor.package}: {executor.install}" for executor in wanted)
+    log.warning("raster=auto: the slow reference rasterizer runs%s", f" ({hints})" if hints else "")
+    return find("reference")

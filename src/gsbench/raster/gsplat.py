@@ -1,0 +1,238 @@
+"""gsplat's CUDA kernels (Ye et al., arXiv 2409.06765) under the contract of ``raster.base``: a peer to measure against.
+
+gsplat's parts are put together here so that the conventions of 3DGS hold where its own ``rasterization`` has others:
+the near plane is 0.2, and a Gaussian reaches the tiles of a square of 3 sigma along its larger axis, whatever its
+opacity. What still differs, since it stands in gsplat's kernels, in the terms of ``RenderOutput``:
+
+- ``image`` and ``alpha``: a contribution is clamped to 0.999 instead of 0.99, and no gradient passes the clamp. A tile
+  at the edge of the square is taken in when any part of it is reached, not only its first pixel.
+- ``radii`` and ``visible``: a Gaussian is culled by a box of 3.33 sigma along each image axis, not by the square. One
+  whose square reaches the image but whose box does not has radius 0 here; it would contribute less than 1/255 anywhere.
+  Densifiers that count the iterations in which a Gaussian was visible count fewer.
+- All gradients, ``screen_points`` included: sums are made with atomics, so two runs differ in the last bits.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gsbench.errors import InputError
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster.base import CONSTANTS, RasterConstants, RenderOutput
+from gsbench.raster.executors import find
+from gsbench.raster.validate import bad_values, check_settings, raise_for_values
+from gsbench.readback import Readback
+from gsbench.scene.camera import Camera
+
+MAX_RADIUS = 2**24  # px; keeps the tile arithmetic of an absurdly large Gaussian inside int32
+COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}  # harmonics up to each degree
+
+
+class GsplatRasterizer:
+    """Renders with gsplat on a CUDA device; float32.
+
+    ``library`` is the module ``gsplat``, or one with the same functions.
+    """
+
+    name = "gsplat"
+
+    def __init__(self, constants: RasterConstants = CONSTANTS, library: Any = None) -> None:
+        if library is None:
+            try:
+                library = importlib.import_module("gsplat")
+            except ImportError as error:
+                raise InputError(f"raster=gsplat needs gsplat: {find('gsplat').install}") from error
+        self.library = library
+        self.constants = constants
+        self._cameras: WeakKeyDictionary[Camera, _DeviceCamera] = WeakKeyDictionary()
+
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        sh_degree: int,
+        background: Tensor,
+        absolute_gradient: bool = False,
+    ) -> RenderOutput:
+        """See ``raster.base.Rasterizer``; raises ValueError naming the parameter that cannot be used."""
+        check_settings(gaussians, camera, sh_degree, background)
+        points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
+        absolute = torch.zeros_like(points) if absolute_gradient else None
+        if len(gaussians) == 0:  # gsplat's projection divides by the number of Gaussians, on the host
+            return _empty(camera, background, points, absolute)
+        bad = Readback(bad_values(gaussians, background))
+        constants, width, height = self.constants, camera.width, camera.height
+        on_device = self._on_device(camera, gaussians.means)
+        radii, means, depths, conics, _ = self.library.fully_fused_projection(
+            gaussians.means,
+            None,
+            torch.nn.functional.normalize(gaussians.quaternions, dim=-1),
+            gaussians.scales,
+            on_device.view,
+            on_device.intrinsics,
+            width,
+            height,
+            eps2d=constants.blur,
+            near_plane=constants.near,
+        )  # radii [1, N, 2], means [1, N, 2] px, depths [1, N], conics [1, N, 3]
+        seen = (radii > 0).all(-1)  # [1, N]
+        square = _square_radii(conics.detach(), seen, constants)  # [1, N] int32
+        tiles_x, tiles_y = -(-width // constants.tile), -(-height // constants.tile)
+        both = square.unsqueeze(-1).expand(-1, -1, 2).contiguous()
+        _, crossings, members = self.library.isect_tiles(means, both, depths, constants.tile, tiles_x, tiles_y)
+        if bad.values():  # no wait: gsplat has just waited for the number of crossings
+            raise_for_values(gaussians, background)
+        offsets = self.library.isect_offset_encode(crossings, 1, tiles_x, tiles_y)
+        frame = _Frame(width, height, constants.tile, offsets, members, on_device.half_size, absolute)
+        colors = self._colors(gaussians, on_device.center, sh_degree, seen[0])  # [N, 3]
+        image, alpha = _Composite.apply(
+            self.library,
+            frame,
+            means,
+            conics,
+            colors.unsqueeze(0),
+            gaussians.opacities.unsqueeze(0),
+            background,
+            points,
+        )
+        reached = _reaches_image(means.detach()[0], square[0], width, height)
+        return RenderOutput(image, alpha, torch.where(reached, square[0], 0), points, absolute)
+
+    def _on_device(self, camera: Camera, like: Tensor) -> _DeviceCamera:
+        """``camera`` as tensors beside ``like``, uploaded once."""
+        known = self._cameras.get(camera)
+        if known is None or known.view.device != like.device or known.view.dtype != like.dtype:
+            known = self._cameras[camera] = _DeviceCamera.of(camera, like)
+        return known
+
+    def _colors(self, gaussians: Gaussians, center: Tensor, sh_degree: int, seen: Tensor) -> Tensor:
+        directions = gaussians.means - center  # [N, 3]; gsplat normalises
+        used = gaussians.sh_rest[:, : COEFFICIENTS[sh_degree] - 1]
+        coefficients = torch.cat([gaussians.sh_dc.unsqueeze(1), used], dim=1)  # [N, K, 3]
+        rgb = self.library.spherical_harmonics(sh_degree, directions, coefficients, masks=seen)
+        return (rgb + 0.5).clamp_min(0)
+
+
+@dataclass(frozen=True)
+class _DeviceCamera:
+    """A camera as gsplat takes it."""
+
+    view: Tensor  # [1, 4, 4] world to camera
+    intrinsics: Tensor  # [1, 3, 3]
+    center: Tensor  # [3] world units
+    half_size: Tensor  # [2] px: one unit of NDC
+
+    @classmethod
+    def of(cls, camera: Camera, like: Tensor) -> _DeviceCamera:
+        view = np.eye(4)
+        view[:3, :3], view[:3, 3] = camera.rotation, camera.translation
+        intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+        half_size = np.array([camera.width / 2, camera.height / 2])
+        numbers = [view.ravel(), intrinsics.ravel(), camera.center, half_size]
+        packed = torch.from_numpy(np.concatenate(numbers)).to(like)  # one upload
+        parts = packed.split([16, 9, 3, 2])
+        return cls(parts[0].view(1, 4, 4), parts[1].view(1, 3, 3), parts[2], parts[3])
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """What compositing needs besides tensors with a gradient."""
+
+    width: int
+    height: int
+    tile: int
+    offsets: Tensor  # [1, tiles_y, tiles_x]
+    members: Tensor  # [crossings]
+    half_size: Tensor  # [2] px
+    absolute: Tensor | None  # [N, 2] NDC, filled by the backward pass
+
+
+class _Composite(torch.autograd.Function):
+    """gsplat's compositing on leaves of its own, so that the gradient of the means comes by here.
+
+    gsplat leaves the absolute gradient as an attribute of the means that it was given. A hook on these means that reads
+    it would be a cycle through C++ that no collector frees: every step would stay alive. Here nothing refers to
+    its own graph.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        library: Any,
+        frame: _Frame,
+        means: Tensor,
+        conics: Tensor,
+        colors: Tensor,
+        opacities: Tensor,
+        background: Tensor,
+        screen_points: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        needed = ctx.needs_input_grad
+        wanted = (needed[2] or needed[7], *needed[3:6])  # the screen points ask for the means' gradient too
+        leaves = (tensor.detach() for tensor in (means, conics, colors, opacities))
+        ctx.leaves = [leaf.requires_grad_(want) for leaf, want in zip(leaves, wanted, strict=True)]
+        with torch.enable_grad():
+            ctx.outputs = library.rasterize_to_pixels(
+                *ctx.leaves,
+                frame.width,
+                frame.height,
+                frame.tile,
+                frame.offsets,
+                frame.members,
+                backgrounds=background.detach().unsqueeze(0),
+                absgrad=frame.absolute is not None,
+            )  # [1, H, W, 3], [1, H, W, 1]
+        ctx.frame = frame
+        ctx.set_materialize_grads(False)
+        image, alpha = (output.detach() for output in ctx.outputs)
+        return image[0], alpha[0, ..., 0]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None) -> tuple[Tensor | None, ...]:
+        image, alpha = ctx.outputs
+        g_image = torch.zeros_like(image) if g_image is None else g_image.unsqueeze(0)
+        g_alpha = torch.zeros_like(alpha) if g_alpha is None else g_alpha.unsqueeze(0).unsqueeze(-1)
+        wanted = [leaf for leaf in ctx.leaves if leaf.requires_grad]
+        found = iter(torch.autograd.grad((image, alpha), wanted, (g_image, g_alpha), retain_graph=True))
+        gradients = [next(found) if leaf.requires_grad else None for leaf in ctx.leaves]
+        frame: _Frame = ctx.frame
+        g_means = gradients[0]
+        g_screen = None if g_means is None else g_means[0] * frame.half_size
+        if frame.absolute is not None and g_means is not None:
+            frame.absolute.add_(ctx.leaves[0].absgrad[0] * frame.half_size)
+        g_background = (g_image * (1 - alpha.detach())).sum((0, 1, 2)) if ctx.needs_input_grad[6] else None
+        return None, None, *gradients, g_background, g_screen
+
+
+def _empty(camera: Camera, background: Tensor, points: Tensor, absolute: Tensor | None) -> RenderOutput:
+    """The background, joined to the graph so that ``backward`` works."""
+    nothing = 0 * points.sum()
+    image = background.expand(camera.height, camera.width, 3) + nothing
+    alpha = torch.zeros_like(image[..., 0]) + nothing
+    return RenderOutput(image, alpha, torch.zeros_like(points[:, 0], dtype=torch.int32), points, absolute)
+
+
+def _square_radii(conics: Tensor, seen: Tensor, constants: RasterConstants) -> Tensor:
+    """ceil(3 sqrt(lambda_max)) px of the covariances whose inverses are ``conics`` [1, N, 3]; 0 where not ``seen``."""
+    a, b, c = conics.double().unbind(-1)  # the inverse of the covariance: yy, -xy, xx over its determinant
+    determinant = 1 / (a * c - b * b)
+    middle = 0.5 * (a + c) * determinant
+    root = (middle * middle - determinant).clamp_min(constants.eigenvalue_floor).sqrt()
+    radii = (constants.sigma_extent * (middle + root).sqrt()).ceil().nan_to_num(0, 0, 0).clamp(0, MAX_RADIUS)
+    return torch.where(seen, radii, 0.0).to(torch.int32)
+
+
+def _reaches_image(means: Tensor, radii: Tensor, width: int, height: int) -> Tensor:
+    """[N] bool: whether the square around the mean (px, first pixel centre at 0.5) touches the image."""
+    x, y = means.unbind(-1)
+    inside = (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)
+    return inside & (radii > 0)

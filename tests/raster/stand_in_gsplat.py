@@ -1,0 +1,144 @@
+"""A stand-in for the module ``gsplat`` 1.5 on the CPU: the signatures, shapes and habits that its CUDA code has.
+
+Projection, crossings and harmonics are gsplat's own torch definitions. Compositing is written here in plain torch,
+behind an autograd function that saves the means it was given and leaves the absolute gradient on them, as gsplat's
+does.
+"""
+
+from __future__ import annotations
+
+import itertools
+import weakref
+from typing import Any
+
+import torch
+from gsplat.cuda import _torch_impl as definitions
+from torch import Tensor
+
+ALPHA_MIN = 1 / 255
+ALPHA_MAX = 0.999  # gsplat 1.5; no gradient passes
+TRANSMITTANCE_MIN = 1e-4
+
+calls: list[str] = []  # what was called, by name
+graphs: list[weakref.ref] = []  # to every compositing in an autograd graph: dead when the graph is freed
+
+
+def fully_fused_projection(
+    means: Tensor,
+    covars: None,
+    quats: Tensor,
+    scales: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,  # noqa: N803 - gsplat's name
+    width: int,
+    height: int,
+    eps2d: float = 0.3,
+    near_plane: float = 0.01,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
+    calls.append("fully_fused_projection")
+    if len(means) == 0:
+        raise ZeroDivisionError("gsplat's kernel divides by the number of Gaussians, and the process dies")
+    covariances, _ = definitions._quat_scale_to_covar_preci(quats, scales, True, False)
+    radii, means2d, depths, conics, _ = definitions._fully_fused_projection(
+        means, covariances, viewmats, Ks, width, height, eps2d=eps2d, near_plane=near_plane
+    )
+    return radii.detach(), means2d.contiguous(), depths, conics, None
+
+
+def isect_tiles(
+    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    calls.append("isect_tiles")
+    return definitions._isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height)
+
+
+def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
+    calls.append("isect_offset_encode")
+    return definitions._isect_offset_encode(isect_ids, n_images, tile_width, tile_height)
+
+
+def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
+    calls.append("spherical_harmonics")
+    colors = definitions._spherical_harmonics(degrees_to_use, dirs, coeffs)
+    return colors if masks is None else torch.where(masks.unsqueeze(-1), colors, 0.0)
+
+
+def rasterize_to_pixels(
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+    backgrounds: Tensor | None = None,
+    absgrad: bool = False,
+) -> tuple[Tensor, Tensor]:
+    calls.append("rasterize_to_pixels")
+    settings = (image_width, image_height, tile_size, isect_offsets, flatten_ids, absgrad)
+    return _Rasterize.apply(means2d, conics, colors, opacities, backgrounds, settings)
+
+
+class _Rasterize(torch.autograd.Function):
+    """The picture again in ``backward``, with a copy of the means for each pixel: absolute values can be summed."""
+
+    @staticmethod
+    def forward(ctx: Any, means2d: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
+        *tensors, settings = rest
+        image, alpha, _ = _composite(means2d, *tensors, settings)
+        ctx.save_for_backward(means2d, *tensors)
+        ctx.settings = settings
+        graphs.append(weakref.ref(ctx))
+        return image, alpha
+
+    @staticmethod
+    def backward(ctx: Any, g_image: Tensor, g_alpha: Tensor) -> tuple[Tensor | None, ...]:
+        means2d, *tensors = ctx.saved_tensors
+        with torch.enable_grad():
+            leaves = [tensor.detach().requires_grad_() for tensor in (means2d, *tensors[:3])]
+            image, alpha, spread = _composite(*leaves, tensors[3], ctx.settings)
+            joined = (image * g_image).sum() + (alpha * g_alpha).sum() + 0 * sum(leaf.sum() for leaf in leaves)
+            wanted = [*leaves, *(copies for _, copies in spread)]
+            found = torch.autograd.grad(joined, wanted, allow_unused=True)
+        if ctx.settings[-1]:
+            absolute = torch.zeros_like(means2d)
+            for (members, _), gradient in zip(spread, found[4:], strict=True):
+                absolute[0].index_add_(0, members, gradient.abs().sum(0))
+            means2d.absgrad = absolute
+        return *found[:4], None, None
+
+
+def _composite(
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: Tensor, settings: Any
+) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
+    """Image [1, H, W, 3], alpha [1, H, W, 1], and a tile's Gaussians [K] with copies of their means [P, K, 2]."""
+    width, height, tile, offsets, members, _ = settings
+    bounds = [*offsets.flatten().tolist(), len(members)]
+    tiles_x = offsets.shape[-1]
+    image = backgrounds[0].expand(height, width, 3).clone()
+    alpha = torch.zeros(height, width, 1, dtype=image.dtype)
+    spread = []
+    for k, (begin, end) in enumerate(itertools.pairwise(bounds)):
+        if begin == end:
+            continue
+        index = members[begin:end].long()
+        x0, y0 = k % tiles_x * tile, k // tiles_x * tile
+        x1, y1 = min(x0 + tile, width), min(y0 + tile, height)
+        rows, columns = torch.meshgrid(torch.arange(y0, y1) + 0.5, torch.arange(x0, x1) + 0.5, indexing="ij")
+        copies = means2d[0, index].expand(rows.numel(), -1, -1)  # [P, K, 2]
+        spread.append((index, copies))
+        dx, dy = copies[..., 0] - columns.reshape(-1, 1), copies[..., 1] - rows.reshape(-1, 1)  # [P, K]
+        a, b, c = conics[0, index].unbind(-1)
+        sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+        raw = (opacities[0, index] * torch.exp(-sigma)).clamp_max(ALPHA_MAX)
+        value = torch.where((sigma >= 0) & (raw >= ALPHA_MIN), raw, 0.0)
+        after = torch.cumprod(1 - value, 1)
+        before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
+        weight = torch.where(after > TRANSMITTANCE_MIN, value * before, 0.0)
+        opacity = weight.sum(1, keepdim=True)  # [P, 1]
+        picture = weight @ colors[0, index] + (1 - opacity) * backgrounds[0]
+        image[y0:y1, x0:x1] = picture.reshape(y1 - y0, x1 - x0, 3)
+        alpha[y0:y1, x0:x1] = opacity.reshape(y1 - y0, x1 - x0, 1)
+    return image.unsqueeze(0), alpha.unsqueeze(0), spread

@@ -1,0 +1,101 @@
+"""The table of executors: what `raster=` accepts, what `auto` takes, and that nothing else lists them."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsbench.config import conf_dir
+from gsbench.errors import InputError
+from gsbench.pipeline.components import locate
+from gsbench.raster import create_rasterizer, executors, resolve_name
+from gsbench.raster.contract import CASES, departures
+from gsbench.raster.executors import EXECUTORS, Executor, find, resolve
+from gsbench.raster.reference import ReferenceRasterizer
+
+CPU = torch.device("cpu")
+
+
+def installed(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
+    """Make as if of the executors' packages these were installed, and no others."""
+    monkeypatch.setattr(executors.importlib.util, "find_spec", lambda name: object() if name in packages else None)
+
+
+@pytest.mark.parametrize("executor", EXECUTORS, ids=lambda executor: executor.name)
+def test_facts_agree_with_the_class(executor: Executor) -> None:
+    kind = locate(executor.target, "raster")
+    assert kind.name == executor.name
+    assert ("threads" in kind.__init__.__code__.co_varnames) == executor.takes_threads
+    assert (executor.package is None) == (executor.install == "")
+
+
+def test_every_executor_has_its_file_in_conf() -> None:
+    assert {path.stem for path in (conf_dir() / "raster").glob("*.yaml")} == set(executors.names())
+
+
+def test_names_are_the_same_everywhere() -> None:
+    root = Path(__file__).resolve().parents[2]
+    for document in ("README.md", "docs/rasterizer.md"):
+        for name in executors.names():
+            assert f"`{name}`" in (root / document).read_text(encoding="utf-8"), (document, name)
+
+
+def test_the_table_loads_no_torch() -> None:
+    code = "import sys, gsbench.raster.executors, gsbench.raster.base; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
+
+
+def test_auto(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr(logging.getLogger("gsbench"), "propagate", True)
+    assert resolve_name("auto", CPU) == "cpu"
+    installed(monkeypatch, "gsplat")
+    assert resolve("auto", "cuda").name == "gsplat"
+    assert caplog.text == ""
+    installed(monkeypatch)
+    assert resolve("auto", "cuda").name == "reference"
+    assert "slow reference" in caplog.text
+    assert "pip install 'gsbench[gsplat]'" in caplog.text
+    assert resolve("auto", "mps").name == "reference"
+
+
+def test_what_cannot_run_is_said_with_what_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert resolve_name("reference", CPU) == "reference"
+    assert isinstance(create_rasterizer("reference", CPU, threads=1), ReferenceRasterizer)
+    with pytest.raises(InputError, match=r"opengl is not known; choose auto, reference, cpu, .*_target_"):
+        resolve_name("opengl", CPU)
+    with pytest.raises(InputError, match="raster=gsplat runs on device=cuda, not on cpu; choose from reference, cpu"):
+        resolve_name("gsplat", CPU)
+    with pytest.raises(InputError, match=r"raster=cpu runs on device=cpu, not on cuda; choose from reference, "):
+        resolve("cpu", "cuda")
+    installed(monkeypatch)
+    with pytest.raises(InputError, match=r"raster=gsplat needs gsplat: pip install 'gsbench\[gsplat\]'"):
+        resolve("gsplat", "cuda")
+    assert find("gsplat").obstacle("cuda") is not None
+
+
+def test_departures_are_told() -> None:
+    class Wrong(ReferenceRasterizer):
+        def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
+            out = super().render(*arguments, **options)
+            return dataclasses.replace(out, image=out.image * 1.01, radii=out.radii + 1)
+
+    class Broken(ReferenceRasterizer):
+        def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
+            raise RuntimeError("no kernel")
+
+    case = CASES[-1]
+    assert departures(ReferenceRasterizer(), cases=(case,)) == []
+    told = departures(Wrong(), cases=(case,))
+    assert any("image is off" in line for line in told)
+    assert any("radii differ for 20 of 20" in line for line in told)
+    assert any("gradient of sh_dc is off by 1" in line for line in told)
+    assert departures(Broken(), cases=(case,)) == [
+        f"{case}: RuntimeError: no kernel",
+        "without Gaussians: RuntimeError: no kernel",
+    ]

@@ -1,0 +1,161 @@
+"""The adapter on gsplat, without a GPU: on a stand-in with gsplat's signatures, against the float64 reference."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from types import ModuleType
+
+import pytest
+import torch
+
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster import CONSTANTS
+from gsbench.raster.contract import Case, departures, render_with_gradients
+from gsbench.raster.gsplat import GsplatRasterizer, _DeviceCamera, _reaches_image, _square_radii
+from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
+from tests.gaussians.helpers import front_camera, random_gaussians
+
+FAINT = Case(50, 37, 60, sh_degree=3, log_scale=-2.0, logit=-3.0, principal=(3.0, -2.0))  # no alpha reaches a clamp
+
+
+@pytest.fixture
+def library() -> ModuleType:
+    pytest.importorskip("gsplat", reason="the stand-in is made of gsplat's torch definitions")
+    from tests.raster import stand_in_gsplat
+
+    stand_in_gsplat.calls.clear()
+    stand_in_gsplat.graphs.clear()
+    return stand_in_gsplat
+
+
+def test_values_and_gradients_match_the_reference(library: ModuleType) -> None:
+    expected, references = render_with_gradients(ReferenceRasterizer(), FAINT, torch.float64)
+    output, gradients = render_with_gradients(GsplatRasterizer(library=library), FAINT, torch.float32)
+    assert (output.image.double() - expected.image).abs().max() < 1e-4
+    assert (output.alpha.double() - expected.alpha).abs().max() < 1e-4
+    for name, reference in references.items():
+        assert (gradients[name] - reference).abs().max() < 1e-3 * reference.abs().max(), name
+    both = output.visible & expected.visible
+    assert both.sum() > 0.9 * expected.visible.sum()
+    assert not (output.visible & ~expected.visible).any()  # its box culls more, never less
+    assert (output.radii - expected.radii)[both].abs().max() <= 1  # ceil may fall either way
+
+
+def test_late_and_repeated_backward_without_the_absolute_gradient(library: ModuleType) -> None:
+    rasterizer = GsplatRasterizer(library=library)
+    leaves = FAINT.gaussians().map(lambda tensor: tensor.float().requires_grad_())
+    background = torch.tensor([0.1, 0.2, 0.3], requires_grad=True)
+    outputs = [rasterizer.render(leaves, FAINT.camera(), 3, background) for _ in range(2)]
+    assert outputs[0].screen_gradient_abs is None
+    outputs[0].image.square().sum().backward(retain_graph=True)
+    once = leaves.means.grad.clone()
+    assert once.abs().max() > 0
+    assert background.grad[0].item() == pytest.approx(
+        (2 * outputs[0].image[..., 0] * (1 - outputs[0].alpha)).sum().item(), rel=1e-5
+    )
+    outputs[0].image.square().sum().backward()
+    outputs[1].alpha.sum().backward()
+    assert torch.equal(outputs[0].screen_points.grad[:, 0] != 0, once.abs().sum(-1) != 0)
+
+
+def test_screen_points_have_a_gradient_though_nothing_else_wants_one(library: ModuleType) -> None:
+    _, expected = render_with_gradients(GsplatRasterizer(library=library), FAINT, torch.float32)
+    gaussians = FAINT.gaussians().map(torch.Tensor.float)
+    output = GsplatRasterizer(library=library).render(gaussians, FAINT.camera(), 3, torch.tensor([0.2, 0.5, 0.9]))
+    weights = torch.randn(37, 50, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64).float()
+    ((output.image * weights[..., :3]).sum() + (output.alpha * weights[..., 3]).sum()).backward()
+    assert torch.equal(output.screen_points.grad.double(), expected["screen_points"])
+
+
+def test_nothing_stays_alive_after_a_step(library: ModuleType) -> None:
+    """Without the garbage collector: a cycle through the graph would keep 60 MB a step at a million Gaussians."""
+    rasterizer = GsplatRasterizer(library=library)
+    camera, black = FAINT.camera(), torch.zeros(3)
+    leaves = FAINT.gaussians().map(lambda tensor: tensor.float().requires_grad_())
+    alive: list[weakref.ref] = library.graphs
+    gc.collect()
+    gc.disable()
+    try:
+        for absolute in (False, True):
+            for backward in (True, False):
+                output = rasterizer.render(leaves, camera, 3, black, absolute_gradient=absolute)
+                loss = output.image.sum()
+                if backward:
+                    loss.backward()
+                alive += [weakref.ref(tensor) for tensor in (output.image, output.alpha, output.screen_points)]
+                del output, loss
+        assert len(alive) == 16
+        assert [ref() for ref in alive] == [None] * 16
+    finally:
+        gc.enable()
+
+
+def test_no_gaussians_never_reach_gsplat(library: ModuleType) -> None:
+    none = Case(20, 17, 1, 3).gaussians().map(torch.Tensor.float).select(torch.zeros(0, dtype=torch.long))
+    leaves = none.map(lambda tensor: tensor.requires_grad_())
+    background = torch.tensor([0.1, 0.2, 0.3])
+    output = GsplatRasterizer(library=library).render(leaves, Case(20, 17, 1, 3).camera(), 3, background, True)
+    assert library.calls == []
+    assert torch.equal(output.image, background.expand(17, 20, 3))
+    assert output.alpha.shape == (17, 20)
+    assert output.radii.shape == (0,)
+    (output.image.sum() + output.alpha.sum()).backward()
+    assert output.screen_gradient_abs.shape == (0, 2)
+
+
+def test_values_that_are_not_finite_are_named(library: ModuleType) -> None:
+    rasterizer = GsplatRasterizer(library=library)
+    for name in ("means", "opacity_logits", "sh_rest"):
+        gaussians: Gaussians = FAINT.gaussians().map(torch.Tensor.float)
+        getattr(gaussians, name).flatten()[0] = torch.nan
+        with pytest.raises(ValueError, match=name):
+            rasterizer.render(gaussians, FAINT.camera(), 3, torch.zeros(3))
+
+
+def test_a_camera_is_uploaded_once_and_forgotten_with_it(library: ModuleType) -> None:
+    rasterizer = GsplatRasterizer(library=library)
+    camera = FAINT.camera()
+    gaussians = FAINT.gaussians().map(torch.Tensor.float)
+    for _ in range(3):
+        rasterizer.render(gaussians, camera, 3, torch.zeros(3))
+    assert len(rasterizer._cameras) == 1
+    del camera
+    gc.collect()
+    assert len(rasterizer._cameras) == 0
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_on_a_gpu_it_departs_only_as_its_module_says() -> None:
+    pytest.importorskip("gsplat")
+    told = departures(GsplatRasterizer(), "cuda", cases=(FAINT,))
+    assert [line for line in told if "radii differ" not in line] == []
+
+
+def test_square_radii_are_those_of_the_reference() -> None:
+    projected = project(random_gaussians(300, seed=4, log_scale=(-4, 0.5)), front_camera(64, 48))
+    seen = torch.ones(1, len(projected.index), dtype=torch.bool)
+    radii = _square_radii(projected.conics.unsqueeze(0), seen, CONSTANTS)[0]
+    assert (radii - projected.radii).abs().max() <= 1  # ceil may fall either way on an exact integer
+    assert (radii == projected.radii).double().mean() > 0.99
+
+
+def test_reach_agrees_with_the_tiles_of_the_reference() -> None:
+    camera = front_camera(64, 48)
+    projected = project(random_gaussians(300, seed=6, log_scale=(-4, 0)), camera)
+    low, high = tile_rectangles(projected, camera, CONSTANTS.tile)
+    reached = ((high - low) > 0).all(-1)
+    ours = _reaches_image(projected.means + 0.5, projected.radii, 64, 48)
+    assert (ours | ~reached).all()  # whatever reaches a tile there reaches the image here
+
+
+def test_the_camera_takes_the_world_to_pixels() -> None:
+    camera = front_camera(64, 48, (3.0, -2.0))
+    point = torch.tensor([0.3, -0.2, 4.0], dtype=torch.float64)
+    on_device = _DeviceCamera.of(camera, point)
+    pixel = on_device.intrinsics[0] @ (on_device.view[0] @ torch.cat([point, torch.ones(1)]))[:3]
+    expected = camera.rotation @ point.numpy() + camera.translation
+    assert float(pixel[0] / pixel[2]) == pytest.approx(camera.fx * expected[0] / expected[2] + camera.cx)
+    assert on_device.center.tolist() == pytest.approx(camera.center.tolist())
+    assert on_device.half_size.tolist() == [32, 24]

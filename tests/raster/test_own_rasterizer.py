@@ -1,0 +1,117 @@
+"""A rasterizer from a file outside gsbench: that of docs/rasterizer.md, in the real program and by the contract."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsbench.config import config_hash
+from gsbench.errors import InputError
+from gsbench.pipeline.components import build_rasterizer, rasterizer_inputs
+from gsbench.raster import create_rasterizer
+from tests.conftest import ROOT
+from tests.test_config import composed
+
+CPU = torch.device("cpu")
+TINY = ["scene.views=10", "scene.width=48", "scene.height=36", "init=random", "init.count=150", "init.size=1.2"]
+TINY += ["scene=courtyard", "train.iterations=12", "eval.lpips=[]", "eval.flip=false", "tracking=none", "device=cpu"]
+OWN = ["raster._target_=untiled.Untiled", "allow_targets=[untiled]"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the document's ``untiled.py``, from which modules can be imported."""
+    blocks = re.findall(
+        r"^```python\n(# untiled\.py\n.*?)^```$", (ROOT / "docs/rasterizer.md").read_text(), re.S | re.M
+    )
+    (tmp_path / "untiled.py").write_text(blocks[0])
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "untiled", raising=False)
+    return tmp_path
+
+
+def gsbench(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"GSBENCH_RUNS": str(folder / "runs")}
+    return subprocess.run(
+        [sys.executable, "-m", "gsbench.cli", *words],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+
+
+@pytest.mark.end_to_end
+def test_the_real_program_trains_with_it_and_knows_its_source(folder: Path) -> None:
+    first = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own")
+    assert first.returncode == 0, first.stderr
+    (path,) = (folder / "runs").glob("own/*/*/*/results.json")
+    assert json.loads(path.read_text())["raster"] == "untiled"
+    (manifest,) = (folder / "runs" / "store" / "train").glob("*/manifest.json")
+    recorded = json.loads(manifest.read_text())["inputs"]["raster"]
+    assert (recorded["class"], recorded["name"], recorded["rows"]) == ("untiled.Untiled", "untiled", 36)
+    assert len(recorded["source"]) == 64
+
+    assert "was done" in gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own").stderr
+    with (folder / "untiled.py").open("a") as stream:
+        stream.write("# another version\n")
+    changed = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own", "--dry-run")
+    assert "missing" in changed.stdout
+
+
+def test_options_are_checked_and_the_key_has_them(folder: Path) -> None:
+    values = composed(*OWN, "+raster.rows=7")
+    rasterizer = build_rasterizer(values["raster"], values["allow_targets"], CPU)
+    key = rasterizer_inputs(rasterizer)
+    assert isinstance(key, dict)
+    assert key["rows"] == 7
+    assert rasterizer_inputs(create_rasterizer("reference", CPU)) == "reference"
+    for words, message in (
+        (["+raster.rows=0"], r"raster\.rows must be a whole number above 0"),
+        (["+raster.rows=many"], r"raster\.rows"),
+        (["+raster.row=3"], r"raster\.row is not a setting; did you mean rows"),
+    ):
+        values = composed(*OWN, *words)
+        with pytest.raises(InputError, match=message):
+            build_rasterizer(values["raster"], values["allow_targets"], CPU)
+    with pytest.raises(InputError, match=r"allow_targets=\[untiled\]"):
+        composed(OWN[0])
+
+
+def test_only_rasterizers_with_a_name_of_their_own(folder: Path) -> None:
+    (folder / "untiled.py").write_text(
+        "from gsbench.raster.reference import ReferenceRasterizer\n"
+        "class Same(ReferenceRasterizer):\n    pass\n"
+        "class Blind:\n    name = 'blind'\n"
+        "class Nameless:\n    def render(self): pass\n"
+        "class Options:\n    name = 'own'\n    def __init__(self, size=1): self.size = size\n"
+        "    def render(self): pass\n"
+    )
+    for target, options, message in (
+        ("Same", {}, "a name of its own.* it has 'reference'"),
+        ("Nameless", {}, "a name of its own.* it has None"),
+        ("Blind", {}, r"no render\(\)"),
+        ("Options", {"size": 2}, "no dataclass"),
+        ("Absent", {}, "cannot be imported"),
+    ):
+        with pytest.raises(InputError, match=message):
+            build_rasterizer({"name": "auto", "_target_": f"untiled.{target}", **options}, ["untiled"], CPU)
+
+
+def test_hashes_of_configurations_without_one_are_as_before(folder: Path) -> None:
+    values = composed("raster=cpu")
+    before = values | {"raster": {"name": "cpu"}}  # the schema had no _target_
+    assert config_hash(values) == config_hash(before)
+    own = config_hash(composed(*OWN))
+    assert own != config_hash(composed())
+    (folder / "untiled.py").write_text("changed = True\n")
+    assert config_hash(composed(*OWN)) != own
