@@ -18,6 +18,10 @@ from gsbench.words import closest
 DONE, TRIAL_FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
 VERBS = {
+    "fetch": (
+        "gsbench.verbs.fetch",
+        "bring public scenes here: Mip-NeRF 360, Tanks and Temples, Deep Blending",
+    ),
     "tables": ("gsbench.verbs.tables", "Markdown, CSV, LaTeX or HTML tables of an experiment"),
     "report": ("gsbench.verbs.report", "one HTML file with the evidence of an experiment"),
     "explain": ("gsbench.verbs.explain", "how a table's number came about; with --stale, why a stage is computed anew"),

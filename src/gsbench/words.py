@@ -26,3 +26,13 @@ def closest(word: str, choices: Iterable[str]) -> str:
     """'; did you mean X?' where one choice is near, else ''."""
     near = difflib.get_close_matches(word, list(choices), n=1)
     return f"; did you mean {near[0]}?" if near else ""
+
+
+def readable_bytes(count: int | None) -> str:
+    """Bytes as people say them, in powers of ten; ``unknown size`` for None."""
+    if count is None:
+        return "unknown size"
+    for unit, size in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
+        if count >= size:
+            return f"{count / size:.3g} {unit}"
+    return f"{count} bytes"

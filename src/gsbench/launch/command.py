@@ -79,17 +79,16 @@ def run_trials(trials: Sequence[Composed]) -> int:
 
 
 def missing_folders(trials: Sequence[Composed]) -> list[str]:
-    """A line for each scene of the trials whose folder of photographs is not there."""
-    from gsbench.scene.readers import existing_folder
+    """A line for each scene of the trials whose folder of photographs is not there, and one that says the mend."""
+    from gsbench.datasets.catalog import how_to_get
+    from gsbench.scene.readers import missing_folder
 
     scenes = {(scene["name"], scene["path"]) for scene in (t.values["scene"] for t in trials) if scene["kind"] in READ}
-    lines = []
-    for name, path in sorted(scenes, key=str):
-        try:
-            existing_folder(name, path)
-        except InputError as error:
-            lines.append(str(error))
-    return lines
+    folders = [(name, Path(path).expanduser()) for name, path in sorted(scenes, key=str)]
+    missing = [(name, folder) for name, folder in folders if not folder.is_dir()]
+    if not missing:
+        return []
+    return [*(missing_folder(name, folder) for name, folder in missing), how_to_get(missing)]
 
 
 def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:

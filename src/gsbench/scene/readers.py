@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from gsbench.datasets.catalog import how_to_get
 from gsbench.errors import InputError
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import IMAGE_SUFFIXES
@@ -90,9 +91,13 @@ def existing_folder(name: str, path: Path | str) -> Path:
         raise InputError(f"scene {name}: scene.path is not set: give the folder of the photos")
     root = Path(path).expanduser()
     if not root.is_dir():
-        what = "is a file" if root.exists() else "does not exist"
-        raise InputError(f"scene {name}: the folder {root} {what}: set scene.path, or GSBENCH_DATA for a known scene")
+        raise InputError(f"{missing_folder(name, root)}: {how_to_get([(name, root)])}")
     return root
+
+
+def missing_folder(name: str, root: Path) -> str:
+    """What is wrong with the folder ``root`` of the scene ``name``, which is not there."""
+    return f"scene {name}: the folder {root} {'is a file' if root.exists() else 'does not exist'}"
 
 
 def list_images(folder: Path) -> list[str]:

@@ -1,0 +1,117 @@
+"""Zip archives of scenes: which members are wanted, and each of them on the disk, whole and with the right checksum."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+from gsbench.errors import InputError
+from gsbench.files import CHUNK
+
+RUN_GAP_BYTES = 1 << 18  # members closer than this are read in one request, the gap with them
+
+
+class DamagedError(Exception):
+    """What arrived is not what the archive's directory promises."""
+
+
+@dataclass(frozen=True)
+class Member:
+    """A wanted file: ``name`` below the scene's folder, and its entry in the archive's directory."""
+
+    name: str
+    info: zipfile.ZipInfo
+
+    @property
+    def bytes(self) -> int:
+        return self.info.file_size
+
+
+def open_archive(file: IO[bytes], where: str) -> zipfile.ZipFile:
+    """The zip archive in ``file``; `InputError`, one line naming ``where``, if it is none or has been cut."""
+    try:
+        return zipfile.ZipFile(file)
+    except (zipfile.BadZipFile, ValueError, EOFError) as error:
+        raise InputError(f"{where} is no whole zip archive ({error}): give another address with --mirror") from error
+
+
+def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], where: str) -> list[Member]:
+    """The files of the folders ``wanted`` below ``folder`` (and no others), sorted by name.
+
+    Raises `InputError` where a wanted folder is empty, or a name would lead out of the scene's folder.
+    """
+    members: dict[str, Member] = {}
+    for info in archive.infolist():
+        if info.is_dir() or not info.filename.startswith(f"{folder}/"):
+            continue
+        name = info.filename[len(folder) + 1 :]
+        if not any(name.startswith(f"{part}/") for part in wanted) or "/." in f"/{name}":
+            continue  # hidden files, ".." among them, are never wanted
+        if "\\" in name or "//" in name or ":" in name or PurePosixPath(name).is_absolute():
+            raise InputError(f"{where}: the member {info.filename!r} has an unsafe name: give another --mirror")
+        members[name] = Member(name, info)
+    for part in wanted:
+        if not any(name.startswith(f"{part}/") for name in members):
+            raise InputError(f"{where} has no files below {folder}/{part}: it is not the archive that was expected")
+    return [members[name] for name in sorted(members)]
+
+
+def holds(path: Path, size: int, crc: int) -> bool:
+    """Whether the file ``path`` is there with this size and CRC-32."""
+    try:
+        if path.stat().st_size != size:
+            return False
+        checksum = 0
+        with path.open("rb") as file:
+            while piece := file.read(CHUNK):
+                checksum = zlib.crc32(piece, checksum)
+    except OSError:
+        return False
+    return checksum == crc
+
+
+def runs_of(archive: zipfile.ZipFile, members: Sequence[Member]) -> Iterator[tuple[list[Member], int]]:
+    """The members in the archive's order, in runs that lie close together, each with the byte where the run ends."""
+    starts = sorted(info.header_offset for info in archive.infolist())
+    ends = dict(zip(starts, [*starts[1:], archive.start_dir], strict=True))
+    run: list[Member] = []
+    end = 0
+    for member in sorted(members, key=lambda member: member.info.header_offset):
+        if run and member.info.header_offset - end > RUN_GAP_BYTES:
+            yield run, end
+            run = []
+        run.append(member)
+        end = ends[member.info.header_offset]
+    if run:
+        yield run, end
+
+
+def extract(archive: zipfile.ZipFile, member: Member, target: Path, advance: Callable[[int], None]) -> None:
+    """Write the member to ``target``, which appears only when size and CRC-32 are right; ``advance`` gets bytes.
+
+    Raises `DamagedError`, and `InputError` for a member that the archive has packed in a way not known here.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.tmp-{os.getpid()}")
+    written = 0
+    try:
+        with archive.open(member.info) as source, temporary.open("wb") as file:
+            while piece := source.read(CHUNK):  # checks the CRC at the end
+                file.write(piece)
+                written += len(piece)
+                advance(len(piece))
+        if written != member.bytes:
+            raise DamagedError(f"{written} bytes instead of {member.bytes}")
+        os.replace(temporary, target)
+    except (zipfile.BadZipFile, zlib.error, EOFError, DamagedError) as error:
+        advance(-written)
+        raise DamagedError(str(error) or type(error).__name__) from error
+    except (NotImplementedError, RuntimeError) as error:
+        raise InputError(f"{member.info.filename} is packed in a way that cannot be read here ({error})") from error
+    finally:
+        temporary.unlink(missing_ok=True)

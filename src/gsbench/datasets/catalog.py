@@ -1,0 +1,90 @@
+"""The data file of public data sets (``catalog.yaml``), and which of them a missing scene belongs to."""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+DATA_VARIABLE = "GSBENCH_DATA"
+CATALOG_FILE = Path(__file__).with_name("catalog.yaml")
+
+
+@dataclass(frozen=True)
+class Archive:
+    """One zip file: its address, about how many bytes it has, the folder of each of its scenes in it, and checksums
+    where they are published: of the whole file under ``archive``, of a scene under its record's name."""
+
+    url: str
+    bytes: int | None
+    scenes: Mapping[str, str]
+    sha256: Mapping[str, str]
+
+    @property
+    def name(self) -> str:
+        return self.url.rpartition("/")[2]
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A published set of scenes, whose licence and citation are shown to who fetches it."""
+
+    name: str
+    title: str
+    page: str
+    licence: str
+    citation: str
+    archives: tuple[Archive, ...]
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        return tuple(sorted(scene for archive in self.archives for scene in archive.scenes))
+
+
+def read_catalog(file: Path = CATALOG_FILE) -> dict[str, Dataset]:
+    """The data sets of a catalogue by name."""
+    content: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
+    return {name: _dataset(name, entry) for name, entry in content.items()}
+
+
+def _dataset(name: str, entry: Mapping[str, Any]) -> Dataset:
+    texts = {key: entry[key] for key in ("title", "page", "licence", "citation")}
+    archives = tuple(
+        Archive(archive["url"], archive["bytes"], archive["scenes"], archive["sha256"]) for archive in entry["archives"]
+    )
+    return Dataset(name=name, archives=archives, **texts)
+
+
+def data_dir() -> Path:
+    """Where the scene files look for public data: ``$GSBENCH_DATA``, else ``data`` here."""
+    return Path(os.environ.get(DATA_VARIABLE, "data")).expanduser()
+
+
+@cache
+def _known() -> dict[str, tuple[str, str]]:
+    """Of each scene in the catalogue: its data set, and its folder."""
+    return {
+        scene: (dataset.name, folder)
+        for dataset in read_catalog().values()
+        for archive in dataset.archives
+        for scene, folder in archive.scenes.items()
+    }
+
+
+def how_to_get(scenes: Iterable[tuple[str, Path]]) -> str:
+    """The mend for scenes whose folders ``(scene, folder)`` are not there: the commands that fetch them, if any do."""
+    wanted = defaultdict(list)
+    for scene, folder in scenes:
+        dataset, place = _known().get(scene, ("", ""))
+        if dataset and folder.expanduser().absolute() == (data_dir() / place).absolute():
+            wanted[dataset].append(scene)
+    commands = [f"`gsbench fetch {dataset} {' '.join(sorted(names))}`" for dataset, names in sorted(wanted.items())]
+    if not commands:
+        return f"set scene.path, or {DATA_VARIABLE} for a known scene"
+    return f"{' and '.join(commands)} {'brings' if len(commands) == 1 else 'bring'} what is missing"

@@ -1,0 +1,59 @@
+"""Small archives with the layout of the real ones, and a server for them."""
+
+from __future__ import annotations
+
+import shutil
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsbench.datasets.catalog import read_catalog
+from tests.datasets.server import Server, serve
+
+
+def archive_content(scene_folder: str, seed: int = 0, photos: int = 4) -> dict[str, bytes]:
+    """Files of a scene as the archives have them: images in four sizes, a model, and what nobody wants."""
+    rng = np.random.default_rng([seed, *scene_folder.encode()])
+    files = {}
+    for images, size in (("images", 40_000), ("images_2", 20_000), ("images_4", 9_000), ("images_8", 3_000)):
+        for index in range(photos):
+            files[f"{scene_folder}/{images}/IMG_{index:04d}.JPG"] = rng.bytes(size + index)
+    for name in ("cameras", "images", "points3D"):
+        files[f"{scene_folder}/sparse/0/{name}.bin"] = rng.bytes(5_000) + bytes(20_000)  # half of it packs well
+    files[f"{scene_folder}/images_4/.DS_Store"] = b"nobody wants this"
+    files[f"{scene_folder}/poses_bounds.npy"] = rng.bytes(600)
+    return files
+
+
+def write_archive(path: Path, content: Mapping[str, bytes], compression: int = zipfile.ZIP_DEFLATED) -> None:
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, data in content.items():
+            archive.writestr(name, data)
+
+
+@pytest.fixture(scope="session")
+def made_archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with small files under the names of all archives in the catalogue."""
+    folder = tmp_path_factory.mktemp("archives")
+    for dataset in read_catalog().values():
+        for archive in dataset.archives:
+            content: dict[str, bytes] = {}
+            for place in archive.scenes.values():
+                content |= archive_content(place)
+            write_archive(folder / archive.name, content)
+    return folder
+
+
+@pytest.fixture
+def archives(made_archives: Path, tmp_path: Path) -> Path:
+    """A copy that the test may change."""
+    return Path(shutil.copytree(made_archives, tmp_path / "archives"))
+
+
+@pytest.fixture
+def server(archives: Path) -> Iterator[Server]:
+    with serve(archives) as running:
+        yield running

@@ -1,0 +1,131 @@
+"""A file server on loopback whose manners can be chosen: what a real one on a bad day does, on purpose."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+RANGE = re.compile(r"bytes=(\d+)-(\d*)")
+
+
+@dataclass
+class Manners:
+    """How the server behaves. ``cut_every`` and ``stall_every``: after so many bytes of a body, again and again."""
+
+    ranges: bool = True
+    cut_every: int | None = None
+    cuts: int = 1_000_000  # how many times
+    stall_every: int | None = None
+    claimed_size: int | None = None  # a lie about the length
+    damage: Callable[[str, int, bytes], bytes] | None = None  # (path, offset, body) -> body
+    status: dict[str, int] = field(default_factory=dict)  # path -> status instead of an answer
+    fail_first: int = 0  # so many requests get 503
+    redirect: bool = False
+    validator: bool = True  # send an ETag
+    shift: int = 0  # a range that begins elsewhere than asked
+
+
+@dataclass
+class Server:
+    folder: Path
+    url: str
+    manners: Manners
+    requests: list[tuple[str, str]] = field(default_factory=list)  # path, range
+    sent: int = 0
+
+
+@contextmanager
+def serve(folder: Path) -> Iterator[Server]:
+    """Serve the files of ``folder`` while the block runs."""
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def log_message(self, *_: object) -> None:
+            return
+
+        def do_GET(self) -> None:
+            manners = state.manners
+            asked = self.headers.get("Range", "")
+            state.requests.append((self.path, asked))
+            self.close_connection = True
+            if manners.fail_first:
+                manners.fail_first -= 1
+                self.send_error(503)
+                return
+            if manners.redirect and not self.path.startswith("/moved"):
+                self.send_response(302)
+                self.send_header("Location", f"/moved{self.path}")
+                self.send_header("Content-Length", "0")
+                self.end_headers()
+                return
+            path = self.path.removeprefix("/moved")
+            if path in manners.status:
+                self.send_error(manners.status[path])
+                return
+            file = folder / path.lstrip("/")
+            if not file.is_file():
+                self.send_error(404)
+                return
+            size = file.stat().st_size
+            first, last = 0, size - 1
+            partial = manners.ranges and (match := RANGE.fullmatch(asked)) is not None
+            if partial:
+                first = int(match[1]) + (manners.shift if match[1] != "0" else 0)
+                last = min(int(match[2] or last), last)
+                if first > last:
+                    self.send_error(416)
+                    return
+            self.send_response(206 if partial else 200)
+            claimed = manners.claimed_size or size
+            self.send_header("Content-Length", str(last - first + 1 + claimed - size))
+            if partial:
+                self.send_header("Content-Range", f"bytes {first}-{last}/{claimed}")
+            if manners.validator:
+                with file.open("rb") as stream:
+                    tag = hashlib.sha256(stream.read(1 << 20)).hexdigest()[:16]
+                self.send_header("ETag", f'"{tag}"')
+            self.end_headers()
+            self.body(path, file, first, last + 1)
+
+        def body(self, path: str, file: Path, first: int, end: int) -> None:
+            manners = state.manners
+            with file.open("rb") as stream:
+                stream.seek(first)
+                position = first
+                while position < end:
+                    data = stream.read(min(1 << 14, end - position))
+                    if manners.damage is not None:
+                        data = manners.damage(path, position, data)
+                    limit = manners.cut_every or manners.stall_every
+                    stop = limit is not None and position + len(data) - first > limit and manners.cuts > 0
+                    if stop:
+                        data = data[: max(0, limit - (position - first))]
+                    try:
+                        self.wfile.write(data)
+                    except OSError:  # the client has what it wanted
+                        return
+                    state.sent += len(data)
+                    position += len(data)
+                    if stop:
+                        manners.cuts -= 1
+                        if manners.stall_every:
+                            time.sleep(1.0)  # longer than the clients of the tests wait
+                        return
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.daemon_threads = True
+    state = Server(folder, f"http://127.0.0.1:{server.server_port}", Manners())
+    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
+    try:
+        yield state
+    finally:
+        server.shutdown()
+        server.server_close()

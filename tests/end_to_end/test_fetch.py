@@ -1,0 +1,77 @@
+"""A fresh machine: one command brings the data, and nothing of the paper's sweep is missing any more."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gsbench.datasets.catalog import read_catalog
+from tests.datasets.conftest import archive_content, write_archive
+from tests.datasets.server import Manners, Server, serve
+from tests.end_to_end.conftest import Run
+
+pytestmark = pytest.mark.end_to_end
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    folder = tmp_path / "archives"
+    folder.mkdir()
+    for dataset in read_catalog().values():
+        for archive in dataset.archives:
+            content: dict[str, bytes] = {}
+            for place in archive.scenes.values():
+                content |= archive_content(place, photos=2)
+            write_archive(folder / archive.name, content)
+    with serve(folder) as running:
+        yield running
+
+
+def test_fetch_then_table1_misses_nothing(gsbench: Run, server: Server, tmp_path: Path) -> None:
+    one = gsbench("scene=garden")
+    assert one.returncode == 2
+    assert "`gsbench fetch mipnerf360 garden` brings what is missing" in one.stderr
+    before = gsbench("+experiment=table1", "--dry-run")
+    assert before.stdout.count("does not exist") == 13
+    advice = before.stdout.splitlines()[-1]
+    commands = [words.split()[1:] for words in advice.split("`") if words.startswith("gsbench fetch")]
+    assert len(commands) == 2
+    for command in commands:
+        done = gsbench(*command, GSBENCH_MIRROR=server.url)
+        assert done.returncode == 0, done.stderr
+        assert "licence:" in done.stdout
+    after = gsbench("+experiment=table1", "--dry-run")
+    assert after.returncode == 0, after.stderr
+    assert "does not exist" not in after.stdout
+    assert "fetch" not in after.stdout
+    assert (tmp_path / "data" / "tandt" / "truck" / "images" / "IMG_0001.JPG").is_file()
+
+
+def test_killed_and_started_again(server: Server, tmp_path: Path, environment: dict[str, str], gsbench: Run) -> None:
+    def slowly(_: str, __: int, body: bytes) -> bytes:
+        time.sleep(0.05)
+        return body
+
+    server.manners = Manners(damage=slowly)
+    command = [sys.executable, "-m", "gsbench.cli", "fetch", "mipnerf360", "--mirror", server.url]
+    process = subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while not list((tmp_path / "data" / ".fetch").glob("*/*/*.JPG")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    server.manners = Manners()
+    done = gsbench("fetch", "mipnerf360", "--mirror", server.url)
+    assert done.returncode == 0, done.stderr
+    for name, content in archive_content("garden", photos=2).items():
+        path = tmp_path / "data" / name
+        assert path.exists() == name.startswith(("garden/images_4/IMG", "garden/sparse/"))
+        assert not path.exists() or path.read_bytes() == content
+    assert not list((tmp_path / "data").rglob("*.tmp-*"))
