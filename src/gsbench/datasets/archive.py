@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from gsbench.errors import InputError
-from gsbench.files import CHUNK
+from gsbench.files import CHUNK, atomic
 
 RUN_GAP_BYTES = 1 << 18  # members closer than this are read in one request, the gap with them
 
@@ -97,21 +96,21 @@ def extract(archive: zipfile.ZipFile, member: Member, target: Path, advance: Cal
     Raises `DamagedError`, and `InputError` for a member that the archive has packed in a way not known here.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.name}.tmp-{os.getpid()}")
     written = 0
     try:
-        with archive.open(member.info) as source, temporary.open("wb") as file:
+        with (
+            atomic(target, sync=False) as temporary,  # a later fetch reads what is here and compares its CRC
+            archive.open(member.info) as source,
+            temporary.open("wb") as file,
+        ):
             while piece := source.read(CHUNK):  # checks the CRC at the end
                 file.write(piece)
                 written += len(piece)
                 advance(len(piece))
-        if written != member.bytes:
-            raise DamagedError(f"{written} bytes instead of {member.bytes}")
-        os.replace(temporary, target)
+            if written != member.bytes:
+                raise DamagedError(f"{written} bytes instead of {member.bytes}")
     except (zipfile.BadZipFile, zlib.error, EOFError, DamagedError) as error:
         advance(-written)
         raise DamagedError(str(error) or type(error).__name__) from error
     except (NotImplementedError, RuntimeError) as error:
         raise InputError(f"{member.info.filename} is packed in a way that cannot be read here ({error})") from error
-    finally:
-        temporary.unlink(missing_ok=True)

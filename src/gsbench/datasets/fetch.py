@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
@@ -17,6 +16,7 @@ from gsbench.datasets.plan import SceneFiles, ScenePlan, check_unchanged, descri
 from gsbench.datasets.records import RECORDS, FileRecord, SceneRecord, add_record, read_records, today
 from gsbench.datasets.remote import FetchError, Patience, RangesRefusedError, RemoteFile, download, size_of
 from gsbench.errors import InputError
+from gsbench.files import atomic
 from gsbench.scene.names import some_of
 from gsbench.weights import file_sha256
 from gsbench.words import readable_bytes
@@ -104,8 +104,7 @@ class Fetcher:
         log.info("%s: the server serves no ranges: the whole archive comes (%s)", where, readable_bytes(size))
         self._require_space(size or archive.bytes or 0)
         target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = target.with_name(f".{target.name}.tmp-{os.getpid()}")
-        try:
+        with atomic(target) as temporary:
             sha256 = download(
                 where, temporary, self.patience, lambda done, total: self.report(archive.name, done, total or done)
             )
@@ -114,9 +113,6 @@ class Fetcher:
                 raise InputError(f"{where} has sha256 {sha256}, not {pinned}: give another --mirror")
             with temporary.open("rb") as file:
                 open_archive(file, where).close()
-            os.replace(temporary, target)
-        finally:
-            temporary.unlink(missing_ok=True)
         return target
 
     def _plan(self, archive: Archive, opened: zipfile.ZipFile, files: SceneFiles) -> ScenePlan:

@@ -7,7 +7,6 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gsbench.config import closest
 from gsbench.datasets.catalog import DATA_VARIABLE, Archive, Dataset, data_dir, read_catalog
 from gsbench.datasets.fetch import STAGING, Fetcher
 from gsbench.datasets.plan import SceneFiles, describe, wanted_files
@@ -17,7 +16,7 @@ from gsbench.errors import InputError
 from gsbench.files import remove_temporaries, storage_errors
 from gsbench.pipeline.locks import hold
 from gsbench.pipeline.progress import progress
-from gsbench.words import readable_bytes
+from gsbench.words import closest, readable_bytes
 
 MIRROR_VARIABLE = "GSBENCH_MIRROR"
 LOCK = ".fetch.lock"
