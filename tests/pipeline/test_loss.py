@@ -7,7 +7,8 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from gsbench.pipeline.loss import PhotometricLoss, photometric_loss, ssim_map, torch_photometric_loss, window
+from gsbench.pipeline.loss import PhotometricLoss, photometric_loss
+from gsbench.pipeline.ssim import ssim_map, torch_photometric_loss, window
 
 SIZES = [(3, 4), (11, 16), (37, 53), (64, 65), (100, 21)]
 

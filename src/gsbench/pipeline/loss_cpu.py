@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsbench.cores import available_cores
-from gsbench.pipeline.loss import C1, C2, WINDOW_RADIUS, window
+from gsbench.pipeline.ssim import C1, C2, WINDOW_RADIUS, window
 from gsbench.raster.cpu.jit import inlined, kernel
 from gsbench.raster.cpu.simd import LANES, absolute, fma, lane_sums, load, select, splat, store
 from gsbench.raster.cpu.workspace import ArenaPool, ShardRunner, TensorPool
