@@ -48,7 +48,8 @@ settings += ["eval.lpips=[]", "eval.flip=false", "tracking=none"]
 #
 # It extends `ADC`, the baseline, and is a dataclass: its fields are its settings. `ADC` gathers, for each Gaussian,
 # the sum of its screen gradients and the number of iterations in which it was seen; what has a large mean is cloned
-# or split. So it is enough to scale the sum before `ADC` looks at it. It forgets the sums after each round by itself.
+# or split. A round of it is a list of rules, each a method: `grow_by_gradient`, `prune`, `reset_statistics`. So it is
+# enough to scale the sum before the first of them looks at it; the last forgets the sums after each round.
 
 # %%
 # %%writefile tightening.py
@@ -66,10 +67,10 @@ class Tightening(ADC):
 
     final_factor: Annotated[float, Ge(1)] = 3.0
 
-    def _grow_by_gradient(self, step, gaussians, rng, event):
-        progress = (step - self.start) / (self.stop - self.start)
-        self.gradient_sum /= 1 + (self.final_factor - 1) * progress
-        super()._grow_by_gradient(step, gaussians, rng, event)
+    def grow_by_gradient(self, refinement):
+        progress = (refinement.step - self.start) / (self.stop - self.start)
+        self.statistics["gradient_sum"] /= 1 + (self.final_factor - 1) * progress
+        super().grow_by_gradient(refinement)
 
 
 # %% [markdown]

@@ -82,12 +82,12 @@ def test_absolute_gradient_is_what_absgrad_reads() -> None:
     assert densifier.needs_absolute_gradient
     densifier.begin(gaussians, DensifyContext(1.0))
     densifier.observe(1, render)
-    assert densifier.gradient_sum.tolist() == [5.0, 0.0, 1.0]
+    assert densifier.statistics["gradient_sum"].tolist() == [5.0, 0.0, 1.0]
     signed = ADC()
     assert not signed.needs_absolute_gradient
     signed.begin(gaussians, DensifyContext(1.0))
     signed.observe(1, render)
-    assert not signed.gradient_sum.any()
+    assert not signed.statistics["gradient_sum"].any()
 
 
 def test_curve_rises_from_the_cloud_to_the_cap() -> None:
@@ -136,8 +136,8 @@ def test_threshold_strictness() -> None:
         trainable = TrainableGaussians(random_gaussians(1, log_scale=(-9, -8)), LearningRates(), 4.0)
         trainable.values.opacity_logits.data.fill_(2.0)
         densifier.begin(trainable.values.detach(), DensifyContext(4.0))
-        densifier.gradient_sum[:] = torch.tensor(2.5e-4)
-        densifier.visible_count[:] = 1
-        densifier.gradient_threshold = float(densifier.gradient_sum[0])  # as float32 holds it
+        densifier.statistics["gradient_sum"][:] = torch.tensor(2.5e-4)
+        densifier.statistics["visible_count"][:] = 1
+        densifier.gradient_threshold = float(densifier.statistics["gradient_sum"][0])  # as float32 holds it
         counts[inclusive] = densifier.refine(600, trainable, torch.Generator()).cloned
     assert counts == {True: 1, False: 0}

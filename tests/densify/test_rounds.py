@@ -181,7 +181,7 @@ def test_any_combination_of_switches_goes_through_several_rounds(seed: int) -> N
         assert event is not None
         grown = event.cloned + event.split_gradient + event.split_volume
         assert event.after == event.before + grown - event.pruned_opacity - event.pruned_size
-        assert event.after == len(trainable) == len(densifier.lineage.ids) == len(densifier.gradient_sum)
+        assert event.after == len(trainable) == len(densifier.lineage.ids) == len(densifier.statistics["gradient_sum"])
         assert all(torch.isfinite(tensor).all() for tensor in trainable.values.tensors().values())
         if options["max_gaussians"] is not None and options["cap"] != "soft":
             assert len(trainable) <= 90
@@ -231,7 +231,7 @@ def test_refinements_of_the_paper_schedule() -> None:
     trainable = TrainableGaussians(gaussians, LearningRates(), EXTENT)
     densifier.begin(gaussians, DensifyContext(EXTENT))
     due, resets = [], []
-    densifier._grow_and_prune = lambda step, *_: due.append(step)  # type: ignore[method-assign]
+    densifier.grow_by_gradient = lambda refinement: due.append(refinement.step)  # type: ignore[method-assign]
     for step in range(1, 30_001):
         event = densifier.refine(step, trainable, torch.Generator())
         if event is not None and event.opacity_reset:

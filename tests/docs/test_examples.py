@@ -102,7 +102,7 @@ def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder: 
             event = densifier.refine(step, gaussians, rng)
             assert event.after == event.before + event.split_volume - event.pruned_opacity == len(gaussians)
             assert len(densifier.lineage.ids) == len(gaussians)
-            assert len(densifier.seen) == len(gaussians)
+            assert len(densifier.statistics["seen"]) == len(gaussians)
         return gaussians.state_dict(), densifier.state_dict(), rng.get_state()
 
     through = rounds(None, 1, 6)
@@ -128,7 +128,14 @@ def test_class_of_the_readme_is_a_densifier(folder: Path) -> None:
         (folder / FILE.match(block).group(1)).write_text(block)  # type: ignore[union-attr]
     import mine  # type: ignore[import-not-found]
 
-    from gsbench.densify import ADC
+    from gsbench.densify import DensifyContext
+    from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+    from tests.gaussians.helpers import random_gaussians
 
-    assert issubclass(mine.Patient, ADC)
-    assert mine.Patient(min_views=8).min_views == 8
+    densifier = mine.Patient(min_views=8)
+    gaussians = TrainableGaussians(random_gaussians(6), LearningRates(), 1.0)
+    densifier.begin(gaussians.values.detach(), DensifyContext(1.0))
+    densifier.statistics["gradient_sum"] += 1.0
+    densifier.statistics["visible_count"] += torch.tensor([7, 8, 9, 1, 2, 3])
+    event = densifier.refine(600, gaussians, torch.Generator().manual_seed(0))
+    assert event.cloned + event.split_gradient == 2  # of those seen in eight views and more

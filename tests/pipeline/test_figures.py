@@ -7,9 +7,9 @@ import math
 import numpy as np
 import torch
 
-from gsbench.densify.events import Cause
+from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
-from gsbench.pipeline.figures import COLORS, draw_ellipsoids
+from gsbench.pipeline.figures import draw_ellipsoids
 from tests.pipeline.conftest import orbit_camera
 
 
@@ -28,7 +28,7 @@ def test_only_the_voluminous_is_outlined() -> None:
     black = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
     drawn = np.asarray(draw_ellipsoids(black, gaussians, causes, camera, 0.03))
     rows, columns = np.nonzero(drawn.any(-1))
-    assert {tuple(color) for color in drawn[rows, columns].tolist()} == {COLORS[Cause.SPLIT_VOLUME]}
+    assert {tuple(color) for color in drawn[rows, columns].tolist()} == {Cause.SPLIT_VOLUME.color}
     radius = math.sqrt((1.0 * camera.fx / 4) ** 2 + 0.3)  # one standard deviation and the blur, px
     distances = np.hypot(columns - (camera.cx - 0.5), rows - (camera.cy - 0.5))
     assert np.abs(distances - radius).max() < 1.5  # a line of pixels

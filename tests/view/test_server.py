@@ -15,11 +15,11 @@ import pytest
 import torch
 from PIL import Image
 
-from gsbench.densify.events import Cause
 from gsbench.errors import InputError
+from gsbench.events import Cause
 from gsbench.raster import create_rasterizer
 from gsbench.verbs import view as verb
-from gsbench.view.picture import CAUSE_COLORS, Layers, TrialPainter
+from gsbench.view.picture import Layers, TrialPainter
 from gsbench.view.server import Viewer, check_port, free_port
 from gsbench.view.trials import find_trial, load_viewed, read_causes
 
@@ -89,7 +89,7 @@ def test_ellipsoids_are_those_above_the_threshold_in_the_colour_of_their_cause(p
     picture = painter.draw(camera, Layers(ellipsoids=True, log10_volume=threshold)).astype(float)
     plain = painter.draw(camera, Layers(ellipsoids=True, log10_volume=99.0))
     changed = (picture != plain).any(-1)
-    hues = np.array([CAUSE_COLORS[cause] for cause in Cause if counts[cause]], float)
+    hues = np.array([cause.color for cause in Cause if counts[cause]], float)
     ratios = picture[changed][:, None] / np.maximum(hues.max(-1, keepdims=True), 1)  # shading scales a colour
     unit = hues / hues.max(-1, keepdims=True)
     distance = np.abs(ratios - unit * ratios.max(-1, keepdims=True)).max(-1).min(-1)

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from annotated_types import Ge, Interval
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import Densifier, DensifyContext
+from gsbench.densify.base import Densifier, DensifyContext, Refinement, Rule
 from gsbench.densify.budget import CapKind, admit, allowance, check_room, limit_at
-from gsbench.densify.events import Cause, RefineEvent
-from gsbench.densify.operations import revised_logits, split
 from gsbench.errors import InputError
+from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction
 
@@ -31,6 +29,12 @@ class ADC(Densifier):
     Sizes are fractions of the scene extent; ``gradient_threshold`` is in NDC units, averaged over the iterations in
     which a Gaussian was visible.
     """
+
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {
+        "gradient_sum": torch.float32,  # NDC, since the last refinement
+        "visible_count": torch.int32,  # iterations
+        "max_radii": torch.int32,  # px
+    }
 
     start: NonNegativeInt = 500  # refine where start < step < stop and step % interval == 0
     stop: int = 15_000
@@ -50,11 +54,6 @@ class ADC(Densifier):
     max_gaussians: PositiveInt | None = PAPER_CAP  # None: no limit, as 3DGS
     cap: CapKind = "soft"
 
-    initial_count: int = field(init=False, repr=False, compare=False, default=0)
-    gradient_sum: Tensor = field(init=False, repr=False, compare=False)  # [N] NDC, since the last refinement
-    visible_count: Tensor = field(init=False, repr=False, compare=False)  # [N] iterations
-    max_radii: Tensor = field(init=False, repr=False, compare=False)  # [N] px
-
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.stop <= self.start:
@@ -70,8 +69,6 @@ class ADC(Densifier):
         if self.max_gaussians is not None:
             check_room(self.max_gaussians, len(gaussians))
         super().begin(gaussians, context)
-        self.initial_count = len(gaussians)
-        self._forget_statistics(len(gaussians), gaussians.means.device)
 
     def observe(self, step: int, render: RenderOutput) -> None:
         if step >= self.stop:
@@ -81,142 +78,73 @@ class ADC(Densifier):
             raise RuntimeError(
                 "observe needs the screen gradient: call it after backward, with absolute_gradient if used"
             )
-        visible = render.visible  # [N]
-        self.gradient_sum += torch.where(visible, gradient.norm(dim=-1), 0.0)
-        self.visible_count += visible
-        self.max_radii = torch.maximum(self.max_radii, render.radii)
+        visible, statistics = render.visible, self.statistics
+        statistics["gradient_sum"] += torch.where(visible, gradient.norm(dim=-1), 0.0)
+        statistics["visible_count"] += visible
+        statistics["max_radii"] = torch.maximum(statistics["max_radii"], render.radii)
 
-    @torch.no_grad()
-    def refine(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> RefineEvent | None:
-        if step >= self.stop:
-            return None
-        due = step > self.start and step % self.interval == 0
-        reset = step % self.opacity_reset_interval == 0 or (self.context.white_background and step == self.start)
-        if not (due or reset):
-            return None
-        event = RefineEvent(step=step, before=len(gaussians))
-        if due:
-            self._grow_and_prune(step, gaussians, rng, event)
-        if reset:
-            self._reset_opacity(gaussians, event)
-        event.after = len(gaussians)
-        return event
+    def due(self, step: int) -> bool:
+        """Whether a round of growth and pruning is due."""
+        return self.start < step < self.stop and step % self.interval == 0
 
-    def _grow_and_prune(
-        self, step: int, gaussians: TrainableGaussians, rng: torch.Generator, event: RefineEvent
-    ) -> None:
-        """One round in the order of the baseline; a subclass adds its rule to it."""
-        self._grow_by_gradient(step, gaussians, rng, event)
-        self._prune(step, gaussians, event)
-        self._forget_statistics(len(gaussians), gaussians.device)
+    def rules(self, refinement: Refinement) -> list[Rule]:
+        """A round in the order of the baseline, and its opacity reset."""
+        step = refinement.step
+        rules: list[Rule] = []
+        if self.due(step):
+            rules += [self.grow_by_gradient, self.prune, self.reset_statistics]
+        periodic = step % self.opacity_reset_interval == 0
+        if step < self.stop and (periodic or (self.context.white_background and step == self.start)):
+            rules.append(self.reset_opacity)
+        return rules
 
-    def _grow_by_gradient(
-        self, step: int, gaussians: TrainableGaussians, rng: torch.Generator, event: RefineEvent
-    ) -> None:
-        mean = self.gradient_sum / self.visible_count.clamp_min(1)  # [N]; never seen: 0
+    def mean_gradient(self) -> Tensor:
+        """[N] NDC, over the iterations in which a Gaussian was visible; 0 where it never was."""
+        return self.statistics["gradient_sum"] / self.statistics["visible_count"].clamp_min(1)
+
+    def grow_by_gradient(self, refinement: Refinement) -> None:
+        """Clone the small and split the large of those whose mean gradient reaches the threshold."""
+        gaussians, event = refinement.gaussians, refinement.event
+        mean = self.mean_gradient()
         over = mean >= self.gradient_threshold if self.threshold_inclusive else mean > self.gradient_threshold
         large = gaussians.values.log_scales.amax(-1) > math.log(self.split_size * self.context.extent)  # [N]
-        gain = self.split_children - 1
-        allowed = self._allowance(step, len(gaussians))
-        selected, blocked = admit(over, mean, max(1, gain), allowed)
+        allowed = self.allowance(refinement)
+        selected, blocked = admit(over, mean, max(1, self.split_children - 1), allowed)
         event.blocked_by_cap += blocked
-        self._clone(step, gaussians, selected & ~large, event)
-        to_split = torch.cat(
-            [selected & large, selected.new_zeros(len(gaussians) - len(selected))]
-        )  # clones never split
-        event.split_gradient += self._split(
-            step,
-            gaussians,
+        event.cloned += self.clone(refinement, selected & ~large, revised_opacity=self.revised_opacity)
+        new = selected.new_zeros(len(gaussians) - len(selected))
+        to_split = torch.cat([selected & large, new])  # clones never split
+        event.split_gradient += self.split(
+            refinement,
             to_split,
             gaussians.values.log_scales.detach()[to_split] - math.log(self.split_shrink),
             self.split_children,
-            rng,
             Cause.SPLIT_GRADIENT,
             self.revised_opacity,
         )
 
-    def _allowance(self, step: int, num_gaussians: int) -> int | None:
-        limit = limit_at(step, self.start, self.stop, self.initial_count, self.max_gaussians, self.cap)
-        return allowance(num_gaussians, limit, self.cap)
+    def allowance(self, refinement: Refinement) -> int | None:
+        """How many Gaussians may be added now; None for no limit."""
+        initial = self.lineage.initial_count
+        limit = limit_at(refinement.step, self.start, self.stop, initial, self.max_gaussians, self.cap)
+        return allowance(len(refinement.gaussians), limit, self.cap)
 
-    def _clone(self, step: int, gaussians: TrainableGaussians, selected: Tensor, event: RefineEvent) -> None:
-        parents = selected.nonzero().squeeze(-1)  # [C]
-        if self.revised_opacity and len(parents):
-            logits = gaussians.values.opacity_logits.detach().clone()
-            logits[parents] = revised_logits(logits[parents])
-            gaussians.overwrite("opacity_logits", logits, where=selected)
-        copies = gaussians.values.detach().select(parents)
-        self._edit(gaussians, step, append=copies, parents=parents, cause=Cause.CLONE)
-        event.cloned += len(parents)
-
-    def _split(
-        self,
-        step: int,
-        gaussians: TrainableGaussians,
-        selected: Tensor,
-        child_log_scales: Tensor,
-        children: int,
-        rng: torch.Generator,
-        cause: Cause,
-        revised_opacity: bool = False,
-        keep_parent: bool = False,
-        sampled: bool = True,
-    ) -> int:
-        """Replace the Gaussians at the mask ``selected`` [N] by children; returns how many more there are than
-        before."""
-        parents = selected.nonzero().squeeze(-1)  # [S]
-        new = split(gaussians.values.detach().select(parents), children, child_log_scales, rng, sampled)
-        if revised_opacity:
-            new.opacity_logits = revised_logits(new.opacity_logits)
-        keep = None if keep_parent else ~selected
-        self._edit(gaussians, step, keep=keep, append=new, parents=parents.repeat(children), cause=cause)
-        return len(new) - (0 if keep_parent else len(parents))
-
-    def _prune(self, step: int, gaussians: TrainableGaussians, event: RefineEvent) -> None:
-        values = gaussians.values
+    def prune(self, refinement: Refinement) -> None:
+        """Remove the faint, and after the first opacity reset the huge."""
+        values, event = refinement.gaussians.values, refinement.event
         faint = values.opacities < self.prune_opacity  # [N]
         huge = torch.zeros_like(faint)
-        if step > self.opacity_reset_interval:
+        if refinement.step > self.opacity_reset_interval:
             huge = values.log_scales.amax(-1) > math.log(self.prune_size * self.context.extent)
             if self.prune_screen_radius is not None:
-                huge |= self.max_radii > self.prune_screen_radius
+                huge |= self.statistics["max_radii"] > self.prune_screen_radius
         event.pruned_opacity += int(faint.sum())
         event.pruned_size += int((huge & ~faint).sum())
-        self._edit(gaussians, step, keep=~(faint | huge))
+        self.edit(refinement, keep=~(faint | huge))
 
-    def _reset_opacity(self, gaussians: TrainableGaussians, event: RefineEvent) -> None:
+    def reset_opacity(self, refinement: Refinement) -> None:
+        """Make everything faint, so that what is not needed stays so and is pruned."""
         limit = math.log(self.opacity_reset_value / (1 - self.opacity_reset_value))
-        gaussians.overwrite("opacity_logits", gaussians.values.opacity_logits.detach().clamp_max(limit))
-        event.opacity_reset = True
-
-    def _forget_statistics(self, num_gaussians: int, device: torch.device) -> None:
-        self.gradient_sum = torch.zeros(num_gaussians, device=device)  # [N] NDC
-        self.visible_count = torch.zeros(num_gaussians, dtype=torch.int32, device=device)  # [N] iterations
-        self.max_radii = torch.zeros(num_gaussians, dtype=torch.int32, device=device)  # [N] px
-
-    def _carry_statistics(self, keep: Tensor | None, added: int) -> None:
-        """Rules that come later in the round need them; the new have none yet."""
-        self.gradient_sum = _carried(self.gradient_sum, keep, added)
-        self.visible_count = _carried(self.visible_count, keep, added)
-        self.max_radii = _carried(self.max_radii, keep, added)
-
-    def state_dict(self) -> dict[str, Any]:
-        return super().state_dict() | {
-            "initial_count": self.initial_count,
-            "gradient_sum": self.gradient_sum.clone(),
-            "visible_count": self.visible_count.clone(),
-            "max_radii": self.max_radii.clone(),
-        }
-
-    def load_state_dict(self, state: dict[str, Any], context: DensifyContext) -> None:
-        super().load_state_dict(state, context)
-        self.initial_count = state["initial_count"]
-        self.gradient_sum = state["gradient_sum"].clone()
-        self.visible_count = state["visible_count"].clone()
-        self.max_radii = state["max_radii"].clone()
-
-
-def _carried(statistic: Tensor, keep: Tensor | None, added: int) -> Tensor:
-    """A statistic [N] after an edit: that of the kept, then zeros."""
-    kept = statistic if keep is None else statistic[keep]
-    return torch.cat([kept, kept.new_zeros(added)])
+        logits = refinement.gaussians.values.opacity_logits.detach().clamp_max(limit)
+        refinement.gaussians.overwrite("opacity_logits", logits)
+        refinement.event.opacity_reset = True

@@ -3,17 +3,23 @@ did."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from gsbench.densify.events import Cause, Lineage, RefineEvent
+from gsbench.densify.lineage import Lineage
+from gsbench.densify.operations import revised_logits, split
+from gsbench.errors import InputError
+from gsbench.events import Cause, RefineEvent
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import check_settings
+
+CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -22,6 +28,28 @@ class DensifyContext:
 
     extent: float  # world units: 3DGS's cameras_extent
     white_background: bool = False
+    device: torch.device = CPU  # of the Gaussians
+
+
+@dataclass
+class Refinement:
+    """One refinement under way: what its rules read, change and count."""
+
+    step: int
+    gaussians: TrainableGaussians
+    rng: torch.Generator
+    event: RefineEvent
+
+
+Rule = Callable[[Refinement], None]
+
+
+RENAMED = {  # a class that still has the old name would never be asked
+    "_grow_by_gradient": "grow_by_gradient(refinement)",
+    "_grow_and_prune": "rules(refinement)",
+    "_prune": "prune(refinement)",
+    "_carry_statistics": "STATISTICS",
+}
 
 
 class Densifier:
@@ -29,12 +57,27 @@ class Densifier:
 
     A subclass is a dataclass of hyper-parameters, whose annotations say what is allowed. In every iteration the trainer
     calls ``regularizer`` before the backward pass, ``observe`` after it, then ``refine``, then the optimiser step, then
-    ``after_step``. Mutable state is in ``context``, ``lineage`` and what ``state_dict`` of a subclass adds.
+    ``after_step``. A subclass says what happens by ``rules``, and what it gathers by ``STATISTICS``, besides those of
+    its own base.
+
+    State: ``context``; ``lineage``; and ``statistics``, one tensor [N] for each name in ``STATISTICS``, zero at the
+    start. They follow every ``edit`` (the new have zero), are saved, and are on the device of the Gaussians.
     """
+
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {}
+    needs_absolute_gradient: bool = False
 
     context: DensifyContext
     lineage: Lineage
-    needs_absolute_gradient: bool = False
+    statistics: dict[str, Tensor]
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        own = [vars(parent).get("STATISTICS", {}) for parent in reversed(cls.__mro__)]
+        cls.STATISTICS = {name: dtype for table in own for name, dtype in table.items()}
+        for old, new in RENAMED.items():
+            if old in cls.__dict__:
+                raise InputError(f"{cls.__name__}.{old} is never called; it became {new}: see docs/densifier.md")
 
     def __post_init__(self) -> None:
         """Check the hyper-parameters against their annotations; a subclass adds the rules between them."""
@@ -48,6 +91,7 @@ class Densifier:
         """Start a training of ``gaussians``: forget all earlier state."""
         self.context = context
         self.lineage = Lineage(len(gaussians))
+        self.statistics = self._zeros(len(gaussians), gaussians.means.device)
 
     def regularizer(self, gaussians: Gaussians) -> Tensor | None:
         """A term added to the loss, or None."""
@@ -56,39 +100,101 @@ class Densifier:
     def observe(self, step: int, render: RenderOutput) -> None:
         """Gather statistics of iteration ``step`` (1, 2, …) after its backward pass."""
 
+    def rules(self, refinement: Refinement) -> list[Rule]:
+        """What is due at ``refinement.step``, in the order in which it is done; usually nothing."""
+        return []
+
+    @torch.no_grad()
     def refine(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> RefineEvent | None:
-        """Change the Gaussians if ``step`` is due, and say what was done; None where nothing was due."""
-        return None
+        """Change the Gaussians by the rules that are due, and say what was done; None where nothing was due."""
+        refinement = Refinement(step, gaussians, rng, RefineEvent(step=step, before=len(gaussians)))
+        rules = self.rules(refinement)
+        if not rules:
+            return None
+        for rule in rules:
+            rule(refinement)
+        refinement.event.after = len(gaussians)
+        return refinement.event
 
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
         """Called after the optimiser step of iteration ``step``."""
 
-    def state_dict(self) -> dict[str, Any]:
-        """The state as tensors and plain values; with the same hyper-parameters, ``load_state_dict`` goes on from
-        it."""
-        return {"lineage": self.lineage.state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any], context: DensifyContext) -> None:
-        self.context = context
-        self.lineage = Lineage.from_state(state["lineage"])
-
-    def _edit(
+    def edit(
         self,
-        gaussians: TrainableGaussians,
-        step: int,
+        refinement: Refinement,
         keep: Tensor | None = None,
         append: Gaussians | None = None,
         parents: Tensor | None = None,
         cause: Cause = Cause.INITIAL,
     ) -> None:
-        """Edit Gaussians, lineage and statistics together; ``parents`` [A] are the indices, before the edit, of those
-        appended."""
-        gaussians.edit(keep, append)
-        self.lineage.edit(keep, parents, cause, step)
-        self._carry_statistics(keep, 0 if append is None else len(append))
+        """Keep the Gaussians at the mask ``keep`` [N] (None: all), then append new ones: with their optimiser state,
+        lineage and statistics. ``parents`` [A] are the indices, before the edit, of those appended."""
+        refinement.gaussians.edit(keep, append)
+        self.lineage.edit(keep, parents, cause, refinement.step)
+        added = self._zeros(0 if append is None else len(append), refinement.gaussians.device)
+        for name, statistic in self.statistics.items():
+            kept = statistic if keep is None else statistic[keep]
+            self.statistics[name] = torch.cat([kept, added[name]])
 
-    def _carry_statistics(self, keep: Tensor | None, added: int) -> None:
-        """Follow an edit with what was gathered: that of the Gaussians at the mask ``keep`` [N], then ``added`` new."""
+    def clone(
+        self, refinement: Refinement, selected: Tensor, cause: Cause = Cause.CLONE, revised_opacity: bool = False
+    ) -> int:
+        """Append a copy of each Gaussian at the mask ``selected`` [N]; returns how many.
+
+        With ``revised_opacity`` each pair is as opaque as the one was (arXiv 2404.06109).
+        """
+        gaussians = refinement.gaussians
+        parents = selected.nonzero().squeeze(-1)  # [C]
+        if revised_opacity and len(parents):
+            logits = gaussians.values.opacity_logits.detach().clone()
+            logits[parents] = revised_logits(logits[parents])
+            gaussians.overwrite("opacity_logits", logits, where=selected)
+        copies = gaussians.values.detach().select(parents)
+        self.edit(refinement, append=copies, parents=parents, cause=cause)
+        return len(parents)
+
+    def split(
+        self,
+        refinement: Refinement,
+        selected: Tensor,
+        child_log_scales: Tensor,
+        children: int,
+        cause: Cause,
+        revised_opacity: bool = False,
+        keep_parent: bool = False,
+        sampled: bool = True,
+    ) -> int:
+        """Replace the Gaussians at the mask ``selected`` [N] by children with scales ``child_log_scales`` [S, 3];
+        returns how many more there are than before."""
+        parents = selected.nonzero().squeeze(-1)  # [S]
+        chosen = refinement.gaussians.values.detach().select(parents)
+        new = split(chosen, children, child_log_scales, refinement.rng, sampled)
+        if revised_opacity:
+            new.opacity_logits = revised_logits(new.opacity_logits)
+        keep = None if keep_parent else ~selected
+        self.edit(refinement, keep=keep, append=new, parents=parents.repeat(children), cause=cause)
+        return len(new) - (0 if keep_parent else len(parents))
+
+    def reset_statistics(self, refinement: Refinement) -> None:
+        """The rule that ends a round: gather anew."""
+        self.statistics = self._zeros(len(refinement.gaussians), refinement.gaussians.device)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state as tensors and plain values; with the same hyper-parameters, ``load_state_dict`` goes on from
+        it."""
+        return {
+            "lineage": self.lineage.state_dict(),
+            "statistics": {name: statistic.clone() for name, statistic in self.statistics.items()},
+        }
+
+    def load_state_dict(self, state: dict[str, Any], context: DensifyContext) -> None:
+        self.context = context
+        self.lineage = Lineage.from_state(state["lineage"])
+        saved = state.get("statistics", state)  # older checkpoints hold each beside the lineage
+        self.statistics = {name: saved[name].to(context.device, copy=True) for name in self.STATISTICS}
+
+    def _zeros(self, count: int, device: torch.device) -> dict[str, Tensor]:
+        return {name: torch.zeros(count, dtype=dtype, device=device) for name, dtype in self.STATISTICS.items()}
 
 
 class NoDensifier(Densifier):

@@ -11,10 +11,11 @@ import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import Densifier, DensifyContext
+from gsbench.densify.base import Densifier, DensifyContext, Refinement, Rule
 from gsbench.densify.budget import check_room
-from gsbench.densify.events import Cause, RefineEvent
+from gsbench.densify.operations import standard_normal
 from gsbench.errors import InputError
+from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.settings import OpenFraction
@@ -62,52 +63,48 @@ class MCMC(Densifier):
     def regularizer(self, gaussians: Gaussians) -> Tensor:
         return self.opacity_weight * gaussians.opacities.mean() + self.scale_weight * gaussians.scales.mean()
 
-    @torch.no_grad()
-    def refine(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> RefineEvent | None:
-        if not (self.start < step < self.stop and step % self.interval == 0):
-            return None
-        event = RefineEvent(step=step, before=len(gaussians))
-        dead = gaussians.values.opacities <= self.min_opacity  # [N]
-        if dead.all():
-            event.after = len(gaussians)
-            return event
-        event.relocated = self._relocate(step, gaussians, dead, rng)
-        wanted = int((1 + self.growth) * len(gaussians)) - len(gaussians)
-        event.added = min(wanted, max(0, self.max_gaussians - len(gaussians)))
-        event.blocked_by_cap = wanted - event.added
-        self._add(step, gaussians, event.added, rng)
-        event.after = len(gaussians)
-        return event
+    def rules(self, refinement: Refinement) -> list[Rule]:
+        due = self.start < refinement.step < self.stop and refinement.step % self.interval == 0
+        return [self.relocate, self.add] if due else []
 
     @torch.no_grad()
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
         values = gaussians.values
         gate = torch.sigmoid(-GATE_STEEPNESS * (values.opacities - self.min_opacity))  # [N]
-        noise = torch.randn(len(gaussians), 3, generator=rng, dtype=values.means.dtype).to(values.means.device)
+        noise = standard_normal((len(gaussians), 3), rng, values.means)
         axes = values.rotations * values.scales.unsqueeze(-2)  # [N, 3, 3]
         covariance = axes @ axes.mT
         offsets = (covariance @ noise.unsqueeze(-1)).squeeze(-1)  # [N, 3]
         values.means += offsets * gate.unsqueeze(-1) * (self.noise_rate * gaussians.position_rate)
 
-    def _relocate(self, step: int, gaussians: TrainableGaussians, dead: Tensor, rng: torch.Generator) -> int:
+    def relocate(self, refinement: Refinement) -> None:
         """Turn every dead Gaussian into a copy of a living one, drawn by opacity."""
+        gaussians = refinement.gaussians
+        dead = gaussians.values.opacities <= self.min_opacity  # [N]
         gone = dead.nonzero().squeeze(-1)  # [D]
-        if len(gone) == 0:
-            return 0
-        opacities = gaussians.values.opacities.detach().masked_fill(dead, 0)
-        sources = _draw(opacities, len(gone), rng)  # [D]
-        self._share(gaussians, sources)
-        copies = gaussians.values.detach().select(sources)
-        self._edit(gaussians, step, keep=~dead, append=copies, parents=sources, cause=Cause.RELOCATED)
-        return len(gone)
-
-    def _add(self, step: int, gaussians: TrainableGaussians, count: int, rng: torch.Generator) -> None:
-        if count == 0:
+        if len(gone) in (0, len(gaussians)):
             return
-        sources = _draw(gaussians.values.opacities.detach(), count, rng)  # [A]
+        opacities = gaussians.values.opacities.detach().masked_fill(dead, 0)
+        sources = _draw(opacities, len(gone), refinement.rng)  # [D]
         self._share(gaussians, sources)
         copies = gaussians.values.detach().select(sources)
-        self._edit(gaussians, step, append=copies, parents=sources, cause=Cause.ADDED)
+        self.edit(refinement, keep=~dead, append=copies, parents=sources, cause=Cause.RELOCATED)
+        refinement.event.relocated = len(gone)
+
+    def add(self, refinement: Refinement) -> None:
+        """Add copies of living Gaussians, drawn by opacity: a share of the present count, up to the cap."""
+        gaussians, event = refinement.gaussians, refinement.event
+        if event.relocated == 0 and (gaussians.values.opacities <= self.min_opacity).all():
+            return  # nobody lives
+        wanted = int((1 + self.growth) * len(gaussians)) - len(gaussians)
+        event.added = min(wanted, max(0, self.max_gaussians - len(gaussians)))
+        event.blocked_by_cap = wanted - event.added
+        if event.added == 0:
+            return
+        sources = _draw(gaussians.values.opacities.detach(), event.added, refinement.rng)  # [A]
+        self._share(gaussians, sources)
+        copies = gaussians.values.detach().select(sources)
+        self.edit(refinement, append=copies, parents=sources, cause=Cause.ADDED)
 
     def _share(self, gaussians: TrainableGaussians, sources: Tensor) -> None:
         """Give the ``sources`` [D] the opacity and scale that they and their copies will have."""

@@ -10,6 +10,20 @@ from gsbench.gaussians.model import Gaussians
 MIN_REVISED_OPACITY = 1e-6  # keeps the logit finite
 
 
+def standard_normal(shape: tuple[int, ...], rng: torch.Generator, like: Tensor) -> Tensor:
+    """Normal draws of ``shape`` with the dtype and on the device of ``like``, all determined by the CPU generator
+    ``rng``.
+
+    On another device a generator of its own draws, seeded by ``rng``: nothing is uploaded, and the state of ``rng``
+    stays all there is to save. The same seed gives other numbers there than on the CPU.
+    """
+    if like.device.type == "cpu":
+        return torch.randn(shape, generator=rng, dtype=like.dtype)
+    seed = int(torch.randint(2**62, (1,), generator=rng))
+    own = torch.Generator(like.device).manual_seed(seed)
+    return torch.randn(shape, generator=own, dtype=like.dtype, device=like.device)
+
+
 def sample_inside(gaussians: Gaussians, rng: torch.Generator) -> Tensor:
     """One point drawn from each Gaussian as a density, mu + R e with e ~ N(0, diag(s^2)), [N, 3].
 

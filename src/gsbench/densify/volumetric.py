@@ -10,17 +10,16 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-import torch
 from annotated_types import Ge
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from gsbench.densify.adc import ADC
+from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.budget import admit
-from gsbench.densify.events import Cause, RefineEvent
 from gsbench.densify.volume import ConditionOf, child_log_scales, log_volume
 from gsbench.errors import InputError
-from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.events import Cause
 from gsbench.settings import OpenFraction
 
 ThresholdMode = Literal["absolute", "extent_relative", "quantile", "auto"]
@@ -61,29 +60,28 @@ class Volumetric(ADC):
                 f"got {self.volume_interval}"
             )
 
-    def _grow_and_prune(
-        self, step: int, gaussians: TrainableGaussians, rng: torch.Generator, event: RefineEvent
-    ) -> None:
-        due = self._volume_due(step)
-        if due and self.volume_order == "before_adc":
-            self._split_by_volume(step, gaussians, rng, event)
-        self._grow_by_gradient(step, gaussians, rng, event)
-        if due and self.volume_order == "after_adc":
-            self._split_by_volume(step, gaussians, rng, event)
-        self._prune(step, gaussians, event)
-        if due and self.volume_order == "after_prune":
-            self._split_by_volume(step, gaussians, rng, event)
-        self._forget_statistics(len(gaussians), gaussians.device)
+    def rules(self, refinement: Refinement) -> list[Rule]:
+        """Those of ADC, and the split by volume at the place that ``volume_order`` says."""
+        rules = super().rules(refinement)
+        if self.due(refinement.step) and self.volume_due(refinement.step):
+            follower = {
+                "before_adc": self.grow_by_gradient,
+                "after_adc": self.prune,
+                "after_prune": self.reset_statistics,
+            }[self.volume_order]
+            rules.insert(rules.index(follower), self.split_by_volume)
+        return rules
 
-    def _volume_due(self, step: int) -> bool:
+    def volume_due(self, step: int) -> bool:
+        """Whether a round at ``step`` splits by volume."""
         start = self.start if self.volume_start is None else self.volume_start
         stop = self.stop if self.volume_stop is None else self.volume_stop
         return start < step < stop and step % (self.volume_interval or self.interval) == 0
 
-    def _split_by_volume(
-        self, step: int, gaussians: TrainableGaussians, rng: torch.Generator, event: RefineEvent
-    ) -> None:
-        log_scales = gaussians.values.log_scales.detach()
+    def split_by_volume(self, refinement: Refinement) -> None:
+        """Split every Gaussian with V > V_th (eq. 5 to 7)."""
+        event = refinement.event
+        log_scales = refinement.gaussians.values.log_scales.detach()
         volumes = log_volume(log_scales)  # [N]
         threshold = self.log_threshold(volumes)
         children = child_log_scales(log_scales, self.condition_of, self.max_condition)  # [N, 3]
@@ -92,18 +90,16 @@ class Volumetric(ADC):
         if not self.split_isotropic:
             selected &= ~again
         gain = self.volume_children - (0 if self.keep_parent else 1)
-        selected, blocked = admit(selected, volumes, gain, self._allowance(step, len(gaussians)))
+        selected, blocked = admit(selected, volumes, gain, self.allowance(refinement))
         event.volume_threshold = math.exp(threshold)
         event.blocked_by_cap += blocked
         event.isotropic_resplit += int((selected & again).sum())
         event.vanished += int((selected & (children.amax(-1) < math.log(VANISHING_SIZE * self.context.extent))).sum())
-        event.split_volume += self._split(
-            step,
-            gaussians,
+        event.split_volume += self.split(
+            refinement,
             selected,
             children[selected],
             self.volume_children,
-            rng,
             Cause.SPLIT_VOLUME,
             keep_parent=self.keep_parent,
             sampled=self.placement == "sampled",

@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from gsbench.densify.events import Cause
 from gsbench.densify.volume import log_volume
+from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.reference import project
 from gsbench.scene.camera import Camera
@@ -18,14 +18,6 @@ from gsbench.scene.camera import Camera
 OUTLINE_POINTS = 48
 MAX_OUTLINES = 1500  # the most voluminous; more would hide the picture
 MIN_OPACITY = 0.05  # fainter ones are not seen
-COLORS = {  # colour-blind safe (Okabe and Ito 2008)
-    Cause.INITIAL: (240, 228, 66),
-    Cause.CLONE: (86, 180, 233),
-    Cause.SPLIT_GRADIENT: (230, 159, 0),
-    Cause.SPLIT_VOLUME: (204, 121, 167),
-    Cause.RELOCATED: (0, 158, 115),
-    Cause.ADDED: (0, 114, 178),
-}
 
 
 def draw_ellipsoids(
@@ -34,7 +26,7 @@ def draw_ellipsoids(
     """The view ``render`` [H, W, 3] with the outlines of the Gaussians above ``volume_threshold`` (world units cubed).
 
     An outline is the ellipsoid of one standard deviation, projected; its colour tells the rule that made the Gaussian
-    (``causes`` [N], see ``COLORS``). At most the 1500 most voluminous are drawn.
+    (``causes`` [N], see ``Cause``). At most the 1500 most voluminous are drawn.
     """
     volumes = log_volume(gaussians.log_scales)  # [N]
     large = (volumes > math.log(volume_threshold)) & (gaussians.opacities > MIN_OPACITY)
@@ -49,6 +41,6 @@ def draw_ellipsoids(
         a, b, c = conic.tolist()
         covariance = np.linalg.inv(np.array([[a, b], [b, c]]))  # px^2
         outline = np.linalg.cholesky(covariance) @ circle + mean.numpy()[:, None]  # [2, K]
-        color = COLORS[Cause(int(causes[index[member]]))]
+        color = Cause(int(causes[index[member]])).color
         canvas.line([tuple(point) for point in outline.T.round().astype(int).tolist()], fill=color, width=1)
     return image

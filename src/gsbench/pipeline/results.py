@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.config import config_hash
-from gsbench.densify.events import sum_events
+from gsbench.events import sum_events
 from gsbench.init.base import REPORT_FILE
 from gsbench.pipeline.stages import EVALUATE, INIT, STAGES, TRAIN
 from gsbench.pipeline.steps.evaluate import METRICS_FILE

@@ -81,7 +81,7 @@ class Trainer:
         self.device = initial.means.device
         initial = densifier.prepare(initial)
         self.background = torch.tensor(list(options.background), dtype=torch.float32, device=self.device)  # [3]
-        self.context = DensifyContext(scene.extent, white_background=bool((self.background == 1).all()))
+        self.context = DensifyContext(scene.extent, bool((self.background == 1).all()), self.device)
         self.gaussians = TrainableGaussians(initial, learning_rates(options), scene.extent)
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
         self.rngs = {name: generator(seed, stream) for stream, name in enumerate(STREAMS)}

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from gsbench.densify.events import Cause
 from gsbench.eval.protocol import quantize
+from gsbench.events import Cause
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians, quaternion_to_matrix
 from gsbench.raster.base import Rasterizer
 from gsbench.scene.camera import Camera
@@ -21,14 +21,6 @@ from gsbench.scene.types import View
 from gsbench.view.ellipsoids import NEAR, Canvas
 from gsbench.view.trials import ViewedTrial
 
-CAUSE_COLORS = {
-    Cause.INITIAL: (150, 150, 150),
-    Cause.CLONE: (86, 180, 233),
-    Cause.SPLIT_GRADIENT: (0, 158, 115),
-    Cause.SPLIT_VOLUME: (230, 90, 20),
-    Cause.RELOCATED: (204, 121, 167),
-    Cause.ADDED: (240, 228, 66),
-}  # after Okabe and Ito's palette, which colour-blind people can tell apart
 MAX_ELLIPSOIDS = 20_000  # the largest; more would hide one another
 DIMMED = 0.35  # brightness of the render below ellipsoids or the cloud
 FRUSTUM_DEPTH = 0.1  # of the distance of the cameras to their mean
@@ -100,7 +92,7 @@ class TrialPainter:
         index = self.above(log10_volume)[:MAX_ELLIPSOIDS]
         chosen = torch.from_numpy(index)
         gaussians = self.trial.gaussians
-        palette = np.array([CAUSE_COLORS[cause] for cause in Cause], dtype=np.uint8)
+        palette = np.array([cause.color for cause in Cause], dtype=np.uint8)
         canvas.ellipsoids(
             gaussians.means[chosen].double().cpu().numpy(),
             quaternion_to_matrix(gaussians.quaternions[chosen].double()).cpu().numpy(),

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.densify.events import Cause
 from gsbench.errors import InputError
+from gsbench.events import Cause
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
-from gsbench.view.picture import CAUSE_COLORS, Layers, Picture, TrialPainter, photograph_at, side_by_side
+from gsbench.view.picture import Layers, Picture, TrialPainter, photograph_at, side_by_side
 
 log = logging.getLogger(__name__)
 
@@ -116,9 +116,9 @@ class Viewer:
         lines = [f"V > {volume:.3g}"]
         for cause in Cause:
             if any(count[cause] for count in counts):
-                color = "#{:02x}{:02x}{:02x}".format(*CAUSE_COLORS[cause])
+                color = "#{:02x}{:02x}{:02x}".format(*cause.color)
                 numbers = " | ".join(f"{count[cause]:,}" for count in counts)
-                lines.append(f"<span style='color:{color}'>&#9679;</span> {cause.name.lower()}: {numbers}")
+                lines.append(f"<span style='color:{color}'>&#9679;</span> {cause.words}: {numbers}")
         return "<br>".join(lines)
 
     def _update_threshold(self) -> None:

@@ -19,6 +19,7 @@ from gsbench.analysis.statistics import ALPHA, Comparison, compare, seeds_needed
 from gsbench.analysis.tables import change_words, cost_change
 from gsbench.analysis.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve
 from gsbench.errors import InputError
+from gsbench.events import Cause, RefineEvent
 
 CROPS = 4  # places of each kind
 EVENTS_FILE, HISTOGRAMS_FILE = "events.jsonl", "volume_histograms.jsonl"
@@ -26,7 +27,7 @@ EVENTS_FILE, HISTOGRAMS_FILE = "events.jsonl", "volume_histograms.jsonl"
 WORTHWHILE = {"psnr": 0.1, "ssim": 0.005, "flip": 0.005}
 WORTHWHILE_LPIPS = 0.005
 COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time"}
-EVENT_CAUSES = ("cloned", "split_gradient", "split_volume", "added", "relocated", "pruned_opacity", "pruned_size")
+EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)
 CURVES = (  # key of metrics.jsonl, title, y axis
     ("num_gaussians", "Gaussians during training", "Gaussians"),
     ("loss", "Training loss (of single views, averaged over trials)", "loss"),
@@ -158,7 +159,8 @@ def _origin_chart(trials: Sequence[Trial], arms: Sequence[Arm]) -> str:
     if not shown:
         return ""
     bars = [(arm_name(arm), [row[index] for index in shown]) for arm, row in means.items()]
-    labels = [causes[index].replace("_", " ") for index in shown]
+    words = {cause.key: cause.words for cause in Cause}
+    labels = [words.get(causes[index], causes[index]) for index in shown]
     return bar_chart("What made the final Gaussians, mean of a trial", labels, bars, "Gaussians")
 
 

@@ -1,0 +1,88 @@
+"""What a refinement did, and why a Gaussian exists: the one table of both. Loads no torch."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from enum import IntEnum
+from typing import ClassVar
+
+
+class Cause(IntEnum):
+    """Why a Gaussian exists: the number in ``lineage.npz``, words, and a colour (r, g, b) for pictures.
+
+    The colours are those of Okabe and Ito (2008), which colour-blind people can tell apart.
+    """
+
+    words: str
+    color: tuple[int, int, int]
+
+    INITIAL = 0, "initial", (240, 228, 66)
+    CLONE = 1, "clone", (86, 180, 233)
+    SPLIT_GRADIENT = 2, "split by gradient", (230, 159, 0)
+    SPLIT_VOLUME = 3, "split by volume", (204, 121, 167)
+    RELOCATED = 4, "relocated", (0, 158, 115)
+    ADDED = 5, "added", (0, 114, 178)
+
+    def __new__(cls, value: int, words: str = "", color: tuple[int, int, int] = (0, 0, 0)) -> Cause:
+        member = int.__new__(cls, value)
+        member._value_ = value
+        member.words = words
+        member.color = color
+        return member
+
+    @property
+    def key(self) -> str:
+        """Its name in result files."""
+        return self.name.lower()
+
+
+@dataclass
+class RefineEvent:
+    """One refinement, as a closed record of counts by cause.
+
+    ``after`` is ``before`` plus the counts in ``GROWN`` minus those in ``PRUNED``, where a split counts the Gaussians
+    that it adds beyond its parent (one per parent, for two children). ``blocked_by_cap`` counts candidates that the
+    budget refused. ``isotropic_resplit`` counts parents split by volume whose children are still above the threshold,
+    so that they are split again at the next refinement; ``vanished`` counts parents split by volume whose children are
+    far below a pixel. ``relocated`` moves dead Gaussians and changes no count (3DGS-MCMC).
+    """
+
+    GROWN: ClassVar[tuple[str, ...]] = ("cloned", "split_gradient", "split_volume", "added")
+    PRUNED: ClassVar[tuple[str, ...]] = ("pruned_opacity", "pruned_size")
+
+    step: int
+    before: int
+    after: int = 0
+    cloned: int = 0
+    split_gradient: int = 0
+    split_volume: int = 0
+    added: int = 0
+    relocated: int = 0
+    pruned_opacity: int = 0
+    pruned_size: int = 0
+    blocked_by_cap: int = 0
+    isotropic_resplit: int = 0
+    vanished: int = 0
+    opacity_reset: bool = False
+    volume_threshold: float | None = None
+
+    def balances(self) -> bool:
+        """Whether the counts explain ``after``."""
+        grown = sum(getattr(self, name) for name in self.GROWN)
+        return self.after == self.before + grown - sum(getattr(self, name) for name in self.PRUNED)
+
+    def as_dict(self) -> dict[str, object]:
+        """The record as written to ``events.jsonl``."""
+        return {key: value for key, value in asdict(self).items() if value is not None}
+
+    @staticmethod
+    def count_names() -> tuple[str, ...]:
+        """The fields that can be summed over a trial."""
+        return tuple(
+            f.name for f in fields(RefineEvent) if f.name not in ("step", "before", "after", "volume_threshold")
+        )
+
+
+def sum_events(events: list[dict[str, object]]) -> dict[str, int]:
+    """Totals by cause over the records of ``events.jsonl``."""
+    return {name: sum(int(event.get(name, 0)) for event in events) for name in RefineEvent.count_names()}  # type: ignore[call-overload]

@@ -1,0 +1,168 @@
+"""What the base keeps for every densifier: statistics that follow edits, lineage, saving, and the table of causes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.densify import ADC, Cause, Densifier, DensifyContext, Lineage, RefineEvent, Refinement, Volumetric
+from gsbench.densify.operations import standard_normal
+from gsbench.errors import InputError
+from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from tests.gaussians.helpers import random_gaussians
+
+
+class Gathering(Densifier):
+    STATISTICS = {"sum": torch.float64, "seen": torch.bool}  # noqa: RUF012
+
+
+def started(densifier: Densifier, count: int) -> Refinement:
+    gaussians = TrainableGaussians(random_gaussians(count), LearningRates(), 1.0)
+    densifier.begin(gaussians.values.detach(), DensifyContext(1.0))
+    return Refinement(7, gaussians, torch.Generator().manual_seed(0), RefineEvent(7, count))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_statistics_and_lineage_follow_every_edit(seed: int) -> None:
+    """Against a list of rows that is edited one Gaussian at a time."""
+    draw = np.random.default_rng(seed)
+    densifier = Gathering()
+    refinement = started(densifier, 12)
+    values = torch.from_numpy(draw.normal(size=12))
+    densifier.statistics["sum"] += values
+    densifier.statistics["seen"] |= values > 0
+    rows = [(i, float(v), bool(v > 0)) for i, v in enumerate(values)]  # identity, statistics
+    parent_of = dict.fromkeys(range(12), -1)
+    for _ in range(6):
+        n = len(rows)
+        keep = torch.from_numpy(draw.random(n) < 0.7)
+        parents = torch.from_numpy(draw.integers(0, n, draw.integers(0, 5)))
+        append = refinement.gaussians.values.detach().select(parents)
+        densifier.edit(refinement, keep, append, parents, Cause.CLONE)
+        born = [len(parent_of) + k for k in range(len(parents))]
+        parent_of |= {child: rows[int(p)][0] for child, p in zip(born, parents, strict=True)}
+        rows = [row for row, kept in zip(rows, keep.tolist(), strict=True) if kept]
+        rows += [(child, 0.0, False) for child in born]
+        assert densifier.lineage.ids.tolist() == [row[0] for row in rows]
+        assert densifier.statistics["sum"].tolist() == [row[1] for row in rows]
+        assert densifier.statistics["seen"].tolist() == [row[2] for row in rows]
+    assert densifier.lineage.state_dict()["parents"].tolist() == list(parent_of.values())
+    assert len(refinement.gaussians) == len(rows)
+
+
+def test_statistics_are_saved_and_reset() -> None:
+    densifier = Gathering()
+    refinement = started(densifier, 5)
+    densifier.statistics["sum"] += 3.0
+    saved = densifier.state_dict()
+    densifier.reset_statistics(refinement)
+    assert not densifier.statistics["sum"].any()
+    again = Gathering()
+    again.load_state_dict(saved, DensifyContext(1.0))
+    assert again.statistics["sum"].tolist() == [3.0] * 5
+    again.statistics["sum"] += 1.0
+    assert saved["statistics"]["sum"].tolist() == [3.0] * 5  # a copy
+
+
+def test_a_checkpoint_of_the_older_layout_is_read() -> None:
+    """It held each statistic beside the lineage, and ADC's count of the initial cloud."""
+    old = {
+        "lineage": Lineage(3).state_dict(),
+        "initial_count": 3,
+        "gradient_sum": torch.tensor([1.0, 2.0, 3.0]),
+        "visible_count": torch.tensor([1, 1, 2], dtype=torch.int32),
+        "max_radii": torch.zeros(3, dtype=torch.int32),
+    }
+    densifier = Volumetric()
+    densifier.load_state_dict(old, DensifyContext(1.0))
+    assert densifier.mean_gradient().tolist() == [1.0, 2.0, 1.5]
+    assert densifier.lineage.initial_count == 3
+
+
+def test_the_count_of_the_initial_cloud_survives_growth_and_saving() -> None:
+    densifier = Gathering()
+    refinement = started(densifier, 4)
+    densifier.clone(refinement, torch.tensor([True, False, True, True]))
+    densifier.edit(refinement, keep=torch.arange(7) > 2)
+    assert Lineage.from_state(densifier.lineage.state_dict()).initial_count == densifier.lineage.initial_count == 4
+
+
+def test_a_subclass_adds_to_the_statistics_of_its_base() -> None:
+    @dataclass
+    class Own(Volumetric):
+        STATISTICS = {"hits": torch.int64}  # noqa: RUF012
+
+    assert list(Own.STATISTICS) == [*ADC.STATISTICS, "hits"]
+    assert Volumetric.STATISTICS == ADC.STATISTICS
+
+
+@pytest.mark.parametrize("old", ["_grow_by_gradient", "_grow_and_prune", "_prune", "_carry_statistics"])
+def test_a_class_written_for_the_old_names_is_refused(old: str) -> None:
+    with pytest.raises(InputError, match=rf"Mine\.{old} is never called; it became .*docs/densifier\.md"):
+        type("Mine", (ADC,), {old: lambda self, *_: None})
+
+
+@pytest.mark.parametrize(
+    ("order", "place"), [("before_adc", 0), ("after_adc", 1), ("after_prune", 2)], ids=lambda value: str(value)
+)
+def test_the_order_of_the_volumetric_rule_is_its_place_in_the_round(order: str, place: int) -> None:
+    densifier = Volumetric(volume_order=order)  # type: ignore[arg-type]
+    refinement = started(densifier, 3)
+    names = ["grow_by_gradient", "prune", "reset_statistics"]
+    names.insert(place, "split_by_volume")
+    refinement.step = 600
+    assert [rule.__name__ for rule in densifier.rules(refinement)] == names
+    refinement.step = 3000
+    assert [rule.__name__ for rule in densifier.rules(refinement)] == [*names, "reset_opacity"]
+    refinement.step = 601
+    assert densifier.rules(refinement) == []
+
+
+def test_every_cause_has_words_and_a_colour_of_its_own() -> None:
+    assert [cause.value for cause in Cause] == list(range(len(Cause)))  # lineage.npz indexes by it
+    for first, second in combinations(Cause, 2):
+        assert first.words != second.words
+        assert np.abs(np.subtract(first.color, second.color)).max() > 60
+
+
+def test_an_event_that_does_not_add_up_says_so() -> None:
+    event = RefineEvent(600, before=10, after=13, cloned=2, split_gradient=2, added=1, pruned_opacity=1, pruned_size=1)
+    assert event.balances()
+    event.cloned += 1
+    assert not event.balances()
+
+
+def test_normal_draws_on_the_cpu_are_those_of_the_generator() -> None:
+    like = torch.zeros(1, dtype=torch.float64)
+    drawn = standard_normal((4, 3), torch.Generator().manual_seed(3), like)
+    assert torch.equal(drawn, torch.randn(4, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_state_goes_through_a_checkpoint_on_a_gpu() -> None:
+    """As the trainer does: everything in the checkpoint is moved to the GPU; the lineage belongs on the CPU."""
+    cuda = torch.device("cuda")
+    densifier = Gathering()
+    gaussians = TrainableGaussians(random_gaussians(6).map(lambda tensor: tensor.to(cuda)), LearningRates(), 1.0)
+    densifier.begin(gaussians.values.detach(), DensifyContext(1.0, device=cuda))
+    refinement = Refinement(7, gaussians, torch.Generator().manual_seed(0), RefineEvent(7, 6))
+    densifier.clone(refinement, torch.arange(6, device=cuda) % 2 == 0)
+    saved = densifier.state_dict()
+    moved = {group: {name: tensor.to(cuda) for name, tensor in saved[group].items()} for group in saved}
+    again = Gathering()
+    again.load_state_dict(moved, DensifyContext(1.0, device=cuda))
+    assert again.statistics["sum"].device.type == "cuda"
+    assert all(tensor.device.type == "cpu" for tensor in again.lineage.state_dict().values())
+    again.edit(refinement, keep=torch.arange(9, device=cuda) > 3)
+    assert again.lineage.ids.tolist() == list(range(4, 9))
+    assert again.lineage.state_dict()["ids"].numpy().tolist() == list(range(4, 9))
+    like = gaussians.values.means.detach()
+    first = [standard_normal((9, 3), torch.Generator().manual_seed(5), like) for _ in range(2)]
+    assert torch.equal(*first)
+    rng = torch.Generator().manual_seed(5)
+    assert not torch.equal(standard_normal((9, 3), rng, like), standard_normal((9, 3), rng, like))
