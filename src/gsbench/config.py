@@ -142,6 +142,11 @@ GROUP_SCHEMAS = {
 }
 WITHOUT_EFFECT = ("threads", "weights", "download")  # options of a group that cannot change its result
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
+# Settings that are younger than the first results, with the default at which a result is what it was before them. There
+# they are left out of hashes and keys, so that nothing is computed anew for a setting that changes nothing.
+ADDED_LATER: dict[str, dict[str, Any]] = {
+    "raster": {"_target_": None},
+}
 
 
 def register_schemas() -> None:
@@ -231,12 +236,16 @@ def config_hash(values: dict[str, Any]) -> str:
     kept = {key: value for key, value in values.items() if key not in NOT_HASHED}
     for key, group in kept.items():
         if isinstance(group, dict):
-            kept[key] = {name: value for name, value in group.items() if name not in WITHOUT_EFFECT}
-            if kept[key].get("_target_", "") is None:  # gsbench's own, by its name
-                del kept[key]["_target_"]
-            elif "_target_" in group:
+            kept[key] = without_later(key, {name: value for name, value in group.items() if name not in WITHOUT_EFFECT})
+            if "_target_" in kept[key]:
                 kept[key] |= source_of(group["_target_"])
     return sha256_of(kept)
+
+
+def without_later(group: str, values: dict[str, Any]) -> dict[str, Any]:
+    """``values`` of a group as they are hashed: without the settings of `ADDED_LATER` that stand at their defaults."""
+    later = ADDED_LATER.get(group, {})
+    return {name: value for name, value in values.items() if name not in later or value != later[name]}
 
 
 def sha256_of(values: Any) -> str:

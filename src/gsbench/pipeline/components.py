@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from gsbench.config import ALLOWED_TARGETS, WITHOUT_EFFECT, check_target
+from gsbench.config import ALLOWED_TARGETS, WITHOUT_EFFECT, check_target, without_later
 from gsbench.errors import InputError
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.settings import checked, unknown_setting
@@ -75,7 +75,7 @@ def rasterizer_inputs(rasterizer: Rasterizer) -> str | dict[str, Any]:
     """The rasterizer as it enters a stage's key: gsbench's own by name, a user's by class, source and options."""
     if f"{type(rasterizer).__module__}.".startswith(ALLOWED_TARGETS):
         return rasterizer.name
-    return {"name": rasterizer.name} | options_of(rasterizer)
+    return {"name": rasterizer.name} | options_of("raster", rasterizer)
 
 
 def _check_names(cls: Any, options: dict[str, Any], group: str) -> None:
@@ -103,15 +103,16 @@ def locate(target: str, group: str) -> type:
     return found
 
 
-def options_of(component: Any) -> dict[str, Any]:
-    """Class and options of a component, as they enter a stage's key; those that cannot change a result are left out."""
+def options_of(group: str, component: Any) -> dict[str, Any]:
+    """Class and options of a component of ``group``, as they enter a stage's key; those that cannot change a result are
+    left out."""
     target = f"{type(component).__module__}.{type(component).__qualname__}"
     values = {"class": target} | source_of(target)
     if dataclasses.is_dataclass(component):
         fields = [
             field.name for field in dataclasses.fields(component) if field.init and field.name not in WITHOUT_EFFECT
         ]
-        values |= {name: _plain(getattr(component, name)) for name in fields}
+        values |= without_later(group, {name: _plain(getattr(component, name)) for name in fields})
     return values
 
 

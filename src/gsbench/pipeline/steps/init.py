@@ -24,7 +24,7 @@ def init_step(store: Store, capture: Capture, initializer: Initializer, referenc
         "capture": capture.fingerprint,
         "test": split_of(capture),
         "exact_poses": capture.exact_poses,
-        "options": options_of(initializer),
+        "options": options_of("init", initializer),
         "content": initializer.content() if hasattr(initializer, "content") else None,
         "reference": None if reference is None else reference.key,
         "pycolmap": version("pycolmap"),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsbench.config import TrainConfig
+from gsbench.config import TrainConfig, without_later
 from gsbench.densify import Densifier
 from gsbench.files import write_json
 from gsbench.gaussians.initial import gaussians_from_cloud
@@ -41,9 +41,11 @@ def train_step(
     inputs = {
         "scene": views.inputs,
         "init": views.init.key,
-        "densify": options_of(densifier),
+        "densify": options_of("densify", densifier),
         "raster": rasterizer_inputs(rasterizer),
-        "train": {key: value for key, value in dataclasses.asdict(options).items() if key not in WITHOUT_EFFECT},
+        "train": without_later(
+            "train", {key: value for key, value in dataclasses.asdict(options).items() if key not in WITHOUT_EFFECT}
+        ),
         "seed": seed,
     }
 
