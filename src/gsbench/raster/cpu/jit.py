@@ -13,48 +13,46 @@ from typing import Any
 
 import numba
 
-# What kernels import, constants included, below the package's folder.
-COMPILED_FROM = (
-    "raster/*.py",
-    "raster/cpu/*.py",
-    "gaussians/model.py",
-    "gaussians/spherical_harmonics.py",
-    "pipeline/ssim.py",
-)
+from gsbench.raster.cpu.imports import PACKAGE, import_closure
+
 FIRST_COMPILE_SECONDS = 10  # about; measured 7.5 s of processor time on a 2024 server core
+DIGEST_CHARACTERS = 16
 
 njit: Any = numba.njit
 config: Any = numba.config
 
 _logger = logging.getLogger(__name__)
+_used: set[Path] = set()  # the folders of the kernels that this process has
 
 
-def _cache_folder() -> Path:
-    """Where compiled kernels are kept: a folder of its own for each state of the sources.
+@functools.cache
+def cache_base() -> Path:
+    """The folder that holds compiled kernels: ``NUMBA_CACHE_DIR``, else one in the user's cache.
 
-    numba looks at the file of a kernel, not at what that file imports, so a changed helper would leave stale machine
-    code in use. The base is ``NUMBA_CACHE_DIR``, else the user's cache folder; where neither can be written, a private
-    temporary folder, and the next process compiles again.
+    Where neither can be written, a private temporary folder, and the next process compiles again.
     """
-    digest = hashlib.sha256(numba.__version__.encode())
-    package = Path(__file__).parents[2]
-    for pattern in COMPILED_FROM:
-        for source in sorted(package.glob(pattern)):
-            digest.update(source.read_bytes())
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     given = os.environ.get("NUMBA_CACHE_DIR")
     for base in [*([Path(given)] if given else []), Path(home) / "gsbench" / "numba"]:
-        folder = base / digest.hexdigest()[:16]
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            base.mkdir(parents=True, exist_ok=True)
         except OSError:
             continue
-        if os.access(folder, os.W_OK):
-            return folder
+        if os.access(base, os.W_OK):
+            return base
     return Path(tempfile.mkdtemp(prefix="gsbench-numba-"))
 
 
-CACHE_FOLDER = _cache_folder()
+def cache_folder(source: Path, package: Path = PACKAGE) -> Path:
+    """Where the kernels of the file ``source`` are kept: a folder of its own for each state of what they are made of.
+
+    numba looks at the file of a kernel, not at what that file imports, so a changed helper would leave stale machine
+    code in use. The folder's name is a digest of all that the file imports of gsbench, constants included.
+    """
+    digest = hashlib.sha256(numba.__version__.encode())
+    for content in sorted(path.read_bytes() for path in import_closure(source, package)):
+        digest.update(hashlib.sha256(content).digest())
+    return cache_base() / digest.hexdigest()[:DIGEST_CHARACTERS]
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -63,8 +61,10 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     Also without reference counts (``_nrt``), which numba would keep, atomically, at each inlined call: a kernel borrows
     all its arrays and may not allocate.
     """
+    folder = cache_folder(Path(function.__code__.co_filename))
+    _used.add(folder)
     previous = config.CACHE_DIR  # read when the decorator runs; other users of numba in this process keep theirs
-    config.CACHE_DIR = str(CACHE_FOLDER)
+    config.CACHE_DIR = str(folder)
     try:
         return njit(nogil=True, cache=True, error_model="numpy", _nrt=False)(function)
     finally:
@@ -78,6 +78,6 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @functools.cache
 def announce_compilation() -> None:
-    """Tell the user, once, that the first call will take a while, if the cache on disk is empty."""
-    if not any(CACHE_FOLDER.rglob("*.nbc")):
+    """Tell the user, once, that the first call will take a while, if the cache on disk lacks kernels."""
+    if not all(any(folder.rglob("*.nbc")) for folder in _used):
         _logger.warning("compiling the CPU rasterizer, about %d s, once", FIRST_COMPILE_SECONDS)
