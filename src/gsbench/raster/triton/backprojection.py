@@ -1,0 +1,219 @@
+"""From the gradient sums of compositing to the gradients of the parameters, derived by hand.
+
+Sums are made in a fixed order and without atomics, so they have the same bits on every run.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from gsbench.raster.triton.geometry import (
+    dot,
+    from_camera,
+    image_axes,
+    load_quaternion,
+    load_vector,
+    rotation_matrix,
+    scaled,
+    spread,
+    times,
+    to_view,
+)
+from gsbench.raster.triton.harmonics import pull_back_colors
+from gsbench.raster.triton.layout import (
+    CLAMPED,
+    RECORD,
+    ROW,
+    SUM_ABS_T,
+    SUM_ABS_Y,
+    SUM_BLUE,
+    SUM_GREEN,
+    SUM_H,
+    SUM_H_T,
+    SUM_H_TT,
+    SUM_H_TY,
+    SUM_H_Y,
+    SUM_H_YY,
+    SUM_RED,
+)
+
+
+@triton.jit
+def sum_units(pair_ends, unit_widths, units, rows, GROUP: tl.constexpr):
+    """Add the ``rows`` [pairs, 16] of each unit into the first of them. Its slots are neighbours."""
+    unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
+    inside = unit < units
+    width = tl.load(unit_widths + unit, mask=inside, other=0)
+    first = tl.load(pair_ends + unit, mask=inside, other=0) - width
+    place = rows + first[:, None] * ROW + tl.arange(0, ROW)[None, :]  # [GROUP, ROW]
+    total = tl.zeros([GROUP, ROW], tl.float32)
+    for k in range(0, tl.max(width, 0)):
+        total += tl.load(place + k * ROW, mask=(k < width)[:, None], other=0.0)
+    tl.store(place, total, mask=(width > 1)[:, None])
+
+
+@triton.jit
+def _sum_rows(index, rows_of_blocks, first_units, pair_ends, unit_widths, rows, ABSOLUTE: tl.constexpr):
+    """The gradient sums of each Gaussian over its units: nine, and two more if ``ABSOLUTE``."""
+    unit = tl.load(first_units + index, mask=rows_of_blocks > 0, other=0)
+    zero = tl.zeros_like(rows_of_blocks).to(tl.float32)
+    sums = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
+    for k in range(0, tl.max(rows_of_blocks, 0)):
+        active = k < rows_of_blocks
+        width = tl.load(unit_widths + unit + k, mask=active, other=0)
+        slot = tl.load(pair_ends + unit + k, mask=active, other=0) - width
+        active = width > 0
+        place = rows + slot * ROW
+        sums = (
+            sums[0] + tl.load(place + SUM_H, mask=active, other=0.0),
+            sums[1] + tl.load(place + SUM_H_T, mask=active, other=0.0),
+            sums[2] + tl.load(place + SUM_H_Y, mask=active, other=0.0),
+            sums[3] + tl.load(place + SUM_H_TT, mask=active, other=0.0),
+            sums[4] + tl.load(place + SUM_H_TY, mask=active, other=0.0),
+            sums[5] + tl.load(place + SUM_H_YY, mask=active, other=0.0),
+            sums[6] + tl.load(place + SUM_RED, mask=active, other=0.0),
+            sums[7] + tl.load(place + SUM_GREEN, mask=active, other=0.0),
+            sums[8] + tl.load(place + SUM_BLUE, mask=active, other=0.0),
+            sums[9] + tl.load(place + SUM_ABS_T, mask=active & ABSOLUTE, other=0.0),
+            sums[10] + tl.load(place + SUM_ABS_Y, mask=active & ABSOLUTE, other=0.0),
+        )
+    return sums
+
+
+@triton.jit
+def _store_vector(array, index, values, mask):
+    tl.store(array + 3 * index, values[0], mask=mask)
+    tl.store(array + 3 * index + 1, values[1], mask=mask)
+    tl.store(array + 3 * index + 2, values[2], mask=mask)
+
+
+@triton.jit
+def backproject(
+    means,
+    log_scales,
+    quaternions,
+    logits,
+    sh_rest,
+    count,
+    v,
+    record_ints,
+    row_counts,
+    first_units,
+    pair_ends,
+    unit_widths,
+    rows,
+    g_means,
+    g_log_scales,
+    g_quaternions,
+    g_logits,
+    g_sh_dc,
+    g_sh_rest,
+    g_screen,
+    g_absolute,
+    DEGREE: tl.constexpr,
+    ABSOLUTE: tl.constexpr,
+    GROUP: tl.constexpr,
+):
+    """Write the gradients of the Gaussians that were seen; those of the others stay as they are."""
+    index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
+    row_count = tl.load(row_counts + index, mask=index < count, other=0)
+    seen = row_count > 0
+    h, h_t, h_y, h_tt, h_ty, h_yy, red, green, blue, abs_t, abs_y = _sum_rows(
+        index, row_count, first_units, pair_ends, unit_widths, rows, ABSOLUTE
+    )
+    mean, log_scale = load_vector(means, index, seen), load_vector(log_scales, index, seen)
+    offset = from_camera(mean, v)
+
+    # Colour, and the position through the direction of the colour.
+    clamped = tl.load(record_ints + index * RECORD + CLAMPED, mask=seen, other=0)
+    g_rgb = (
+        tl.where(clamped & 1 != 0, 0.0, red),
+        tl.where(clamped & 2 != 0, 0.0, green),
+        tl.where(clamped & 4 != 0, 0.0, blue),
+    )
+    distance = tl.sqrt(dot(offset, offset))
+    inverse_distance = 1.0 / tl.where(distance > 0, distance, 1.0)
+    to = scaled(offset, (inverse_distance, inverse_distance, inverse_distance))
+    pulled = pull_back_colors(to, g_rgb, sh_rest, g_sh_dc, g_sh_rest, index, seen, DEGREE)
+    radial = dot(pulled, to)
+    from_x = (pulled[0] - radial * to[0]) * inverse_distance
+    from_y = (pulled[1] - radial * to[1]) * inverse_distance
+    from_z = (pulled[2] - radial * to[2]) * inverse_distance
+
+    # The forward geometry once more.
+    quaternion, inverse_norm, _ = load_quaternion(quaternions, index, seen)
+    qw, qx, qy, qz = quaternion
+    matrix = rotation_matrix(quaternion)
+    x, y, z = to_view(offset, v)
+    inverse_z = 1.0 / tl.where(seen, z, 1.0)
+    axis_x, axis_y, slope_x, slope_y = image_axes(x * inverse_z, y * inverse_z, inverse_z, v)
+    scales = (tl.exp(log_scale[0]), tl.exp(log_scale[1]), tl.exp(log_scale[2]))
+    m0, m1 = scaled(times(axis_x, matrix), scales), scaled(times(axis_y, matrix), scales)
+    _, xy, yy, a = spread(m0, m1)
+    e, shear = 1.0 / yy, -xy / yy  # power = -(a t^2 + e dy^2) / 2, t = dx + shear dy
+
+    # Mean on the image: d power / d mean = (a t, shear a t + e dy).
+    g_column = a * h_t
+    g_row = shear * g_column + e * h_y
+    half_width, half_height = 0.5 * v.width.to(tl.float32), 0.5 * v.height.to(tl.float32)
+    tl.store(g_screen + 2 * index, g_column * half_width, mask=seen)
+    tl.store(g_screen + 2 * index + 1, g_row * half_height, mask=seen)
+    if ABSOLUTE:
+        tl.store(g_absolute + 2 * index, a * abs_t * half_width, mask=seen)
+        tl.store(g_absolute + 2 * index + 1, abs_y * half_height, mask=seen)
+
+    # d loss / d M = U^T (D G D) (U M), with D = diag(a, e), U = [[1, shear], [0, 1]], G the second moments of h over
+    # (t, dy).
+    p00, p01, p11 = a * a * h_tt, a * e * h_ty, e * e * h_yy
+    n0 = (m0[0] + shear * m1[0], m0[1] + shear * m1[1], m0[2] + shear * m1[2])
+    g0 = (p00 * n0[0] + p01 * m1[0], p00 * n0[1] + p01 * m1[1], p00 * n0[2] + p01 * m1[2])
+    g1 = (
+        shear * g0[0] + p01 * n0[0] + p11 * m1[0],
+        shear * g0[1] + p01 * n0[1] + p11 * m1[1],
+        shear * g0[2] + p01 * n0[2] + p11 * m1[2],
+    )
+
+    # M = A R S: the scales, then R through B = A^T (d loss / d M) S.
+    g_scales = (g0[0] * m0[0] + g1[0] * m1[0], g0[1] * m0[1] + g1[1] * m1[1], g0[2] * m0[2] + g1[2] * m1[2])
+    _store_vector(g_log_scales, index, g_scales, seen)
+    s0, s1 = scaled(g0, scales), scaled(g1, scales)
+    b00, b11 = axis_x[0] * s0[0] + axis_y[0] * s1[0], axis_x[1] * s0[1] + axis_y[1] * s1[1]
+    b22 = axis_x[2] * s0[2] + axis_y[2] * s1[2]
+    b01, b10 = axis_x[0] * s0[1] + axis_y[0] * s1[1], axis_x[1] * s0[0] + axis_y[1] * s1[0]
+    b02, b20 = axis_x[0] * s0[2] + axis_y[0] * s1[2], axis_x[2] * s0[0] + axis_y[2] * s1[0]
+    b12, b21 = axis_x[1] * s0[2] + axis_y[1] * s1[2], axis_x[2] * s0[1] + axis_y[2] * s1[1]
+    g_w = 2 * (qx * (b21 - b12) + qy * (b02 - b20) + qz * (b10 - b01))
+    g_x = 2 * (qw * (b21 - b12) + qy * (b01 + b10) + qz * (b02 + b20) - 2 * qx * (b11 + b22))
+    g_y = 2 * (qw * (b02 - b20) + qx * (b01 + b10) + qz * (b12 + b21) - 2 * qy * (b00 + b22))
+    g_z = 2 * (qw * (b10 - b01) + qx * (b02 + b20) + qy * (b12 + b21) - 2 * qz * (b00 + b11))
+    along = g_w * qw + g_x * qx + g_y * qy + g_z * qz
+    tl.store(g_quaternions + 4 * index, (g_w - along * qw) * inverse_norm, mask=seen)
+    tl.store(g_quaternions + 4 * index + 1, (g_x - along * qx) * inverse_norm, mask=seen)
+    tl.store(g_quaternions + 4 * index + 2, (g_y - along * qy) * inverse_norm, mask=seen)
+    tl.store(g_quaternions + 4 * index + 3, (g_z - along * qz) * inverse_norm, mask=seen)
+
+    # A = J W: d loss / d A, then J's entries, then the position in the view.
+    a0 = (dot(s0, matrix[0]), dot(s0, matrix[1]), dot(s0, matrix[2]))
+    a1 = (dot(s1, matrix[0]), dot(s1, matrix[1]), dot(s1, matrix[2]))
+    j00, j02 = a0[0] * v.r00 + a0[1] * v.r01 + a0[2] * v.r02, a0[0] * v.r20 + a0[1] * v.r21 + a0[2] * v.r22
+    j11, j12 = a1[0] * v.r10 + a1[1] * v.r11 + a1[2] * v.r12, a1[0] * v.r20 + a1[1] * v.r21 + a1[2] * v.r22
+    fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
+    free_x, free_y = x * inverse_z, y * inverse_z
+    # The clamp of the slope passes the gradient only within its limits.
+    g_slope_x = tl.where((free_x >= v.slope_x_min) & (free_x <= v.slope_x_max), -fx_z * j02, 0.0)
+    g_slope_y = tl.where((free_y >= v.slope_y_min) & (free_y <= v.slope_y_max), -fy_z * j12, 0.0)
+    view_x = g_column * fx_z + g_slope_x * inverse_z
+    view_y = g_row * fy_z + g_slope_y * inverse_z
+    through_focal = fx_z * (j00 - slope_x * j02) + fy_z * (j11 - slope_y * j12)
+    view_z = -(through_focal * inverse_z + view_x * free_x + view_y * free_y)
+    g_mean = (
+        view_x * v.r00 + view_y * v.r10 + view_z * v.r20 + from_x,
+        view_x * v.r01 + view_y * v.r11 + view_z * v.r21 + from_y,
+        view_x * v.r02 + view_y * v.r12 + view_z * v.r22 + from_z,
+    )
+    _store_vector(g_means, index, g_mean, seen)
+
+    # d log(alpha) / d logit = 1 - opacity
+    g_logit = h / (tl.exp(tl.load(logits + index, mask=seen, other=0.0)) + 1.0)
+    tl.store(g_logits + index, g_logit, mask=seen)

@@ -1,0 +1,100 @@
+"""What the kernels pass to each other: the camera as numbers, the blocks, and the places inside a record and a row."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import triton.language as tl
+
+from gsbench.raster.base import CONSTANTS, RasterConstants
+from gsbench.scene.camera import Camera
+
+# A block is what one program of one warp composites: half a tile of 3DGS, four pixels a lane. Lane l has the row
+# l // LANE_COLUMNS, and of it every LANE_COLUMNS-th pixel from column l % LANE_COLUMNS on.
+TILE = tl.constexpr(16)  # px
+BLOCK_WIDTH = tl.constexpr(16)  # px; as wide as a tile
+BLOCK_HEIGHT = tl.constexpr(8)  # px; BLOCK_ROWS of them in a tile
+BLOCK_ROWS = tl.constexpr(2)
+LANES = tl.constexpr(32)
+LANE_COLUMNS = tl.constexpr(4)
+STEPS = tl.constexpr(4)  # pixels of a lane
+BLOCK_PIXELS = tl.constexpr(128)
+
+# A record: what compositing needs of one Gaussian, 16 float32. With d = pixel - mean and t = dx + SHEAR dy,
+# log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2: the conic as a sum of squares, which, unlike
+# a dx^2 + 2b dx dy + c dy^2, does not cancel for needles and is never positive.
+RECORD = tl.constexpr(16)
+MEAN_X, MEAN_Y = tl.constexpr(0), tl.constexpr(1)  # px, integer pixel centres
+SHEAR = tl.constexpr(2)  # b / a
+CURVE_T, CURVE_Y = tl.constexpr(3), tl.constexpr(4)  # -log2(e)/2 a and -log2(e)/2 (c - b^2/a)
+LOG2_OPACITY = tl.constexpr(5)
+RED, GREEN, BLUE = tl.constexpr(6), tl.constexpr(7), tl.constexpr(8)
+RIGHTMOST_Y = tl.constexpr(9)  # px; dy of the rightmost point of the contour alpha = 1/255
+# int32 from here on
+COLUMNS = tl.constexpr(10)  # of blocks that the contour can touch: first + past-the-last * 65536
+FIRST_ROW = tl.constexpr(11)  # of blocks
+CLAMPED = tl.constexpr(12)  # bit c: colour channel c was below 0
+
+# A row: the gradient sums of one Gaussian over the pixels of one block, 16 float32; h = d loss / d log(alpha).
+ROW = tl.constexpr(16)
+SUM_H, SUM_H_T, SUM_H_Y = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
+SUM_H_TT, SUM_H_TY, SUM_H_YY = tl.constexpr(3), tl.constexpr(4), tl.constexpr(5)
+SUM_RED, SUM_GREEN, SUM_BLUE = tl.constexpr(6), tl.constexpr(7), tl.constexpr(8)
+SUM_ABS_T, SUM_ABS_Y = tl.constexpr(9), tl.constexpr(10)  # |h t|, |h (d power / d dy)|
+
+LOG2_E = tl.constexpr(1 / math.log(2.0))
+ALPHA_MIN = tl.constexpr(CONSTANTS.alpha_min)
+LOG2_ALPHA_MIN = tl.constexpr(math.log2(CONSTANTS.alpha_min))
+
+
+class View(NamedTuple):
+    """A camera as plain numbers for the kernels; float32 once they get there."""
+
+    width: int
+    height: int
+    blocks_x: int
+    blocks_y: int
+    fx: float
+    fy: float
+    pixel_cx: float  # px, integer pixel centres
+    pixel_cy: float
+    slope_x_min: float  # limits of x/z in the Jacobian
+    slope_x_max: float
+    slope_y_min: float
+    slope_y_max: float
+    r00: float
+    r01: float
+    r02: float
+    r10: float
+    r11: float
+    r12: float
+    r20: float
+    r21: float
+    r22: float
+    center_x: float
+    center_y: float
+    center_z: float
+
+    @property
+    def blocks(self) -> int:
+        return self.blocks_x * self.blocks_y
+
+
+def make_view(camera: Camera, constants: RasterConstants = CONSTANTS) -> View:
+    margin_x = constants.fov_margin * camera.width / (2 * camera.fx)
+    margin_y = constants.fov_margin * camera.height / (2 * camera.fy)
+    numbers = [
+        camera.fx,
+        camera.fy,
+        camera.cx - 0.5,
+        camera.cy - 0.5,
+        -camera.cx / camera.fx - margin_x,
+        (camera.width - camera.cx) / camera.fx + margin_x,
+        -camera.cy / camera.fy - margin_y,
+        (camera.height - camera.cy) / camera.fy + margin_y,
+        *camera.rotation.ravel(),
+        *camera.center,
+    ]
+    blocks = -(-camera.width // BLOCK_WIDTH.value), -(-camera.height // BLOCK_HEIGHT.value)
+    return View(camera.width, camera.height, *blocks, *map(float, numbers))
