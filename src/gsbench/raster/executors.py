@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import os
 from dataclasses import dataclass
 
 from gsbench.errors import InputError
@@ -60,6 +61,14 @@ EXECUTORS = (
         devices=("cpu",),
         text="compiled by numba at first use; the same bits on every run and for any number of threads",
         takes_threads=True,
+    ),
+    Executor(
+        "triton",
+        "gsbench.raster.triton.TritonRasterizer",
+        devices=("cuda", "cpu") if os.environ.get("TRITON_INTERPRET") == "1" else ("cuda",),  # its interpreter, for tests
+        text="Triton kernels, compiled at first use with what torch brings along; the same bits on every run of one GPU",
+        package="triton",
+        install="pip install triton, in the version that your torch asks for",
     ),
     Executor(
         "gsplat",

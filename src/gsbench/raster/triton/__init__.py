@@ -1,4 +1,4 @@
-"""The rasterizer for GPUs in Triton kernels (`TritonRasterizer`): needs nothing but torch and the Triton it comes with."""
+"""The rasterizer for GPUs, in Triton kernels: needs nothing but torch and the Triton that torch brings along."""
 
 from gsbench.raster.triton.executor import TritonRasterizer
 

@@ -2,8 +2,8 @@
 
 A Gaussian's blocks are found row by row: the contour alpha = 1/255 cuts a span of blocks from each row of blocks. One
 (Gaussian, row) is a *unit*, one (Gaussian, block) a *pair*. Units and pairs are numbered front to back and, within a
-Gaussian, in order; the number of a pair is its *slot*. Sorting the pairs by block without changing their order otherwise
-then gives every block its list.
+Gaussian, in order; the number of a pair is its *slot*. Sorting the pairs by block, and else leaving them in
+order, gives every block its list.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ def find_units(
 ):
     """Fill the units of the Gaussians in the ``order`` [N] of their depth; a lane a Gaussian.
 
-    ``unit_ends`` [N] is the running sum of ``row_counts`` in that order. Out: ``first_units`` [N], the first unit of each
-    Gaussian, and for each unit its Gaussian, its first block and its number of blocks (possibly 0), as far as
+    ``unit_ends`` [N] is the running sum of ``row_counts`` in that order. Out: ``first_units`` [N], the first unit of
+    each Gaussian, and for each unit its Gaussian, its first block and its number of blocks (possibly 0), as far as
     ``capacity`` goes.
     """
     rank = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]

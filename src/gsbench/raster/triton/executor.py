@@ -19,6 +19,7 @@ from gsbench.raster.triton.layout import BLOCK_PIXELS, RECORD, ROW, TILE, View, 
 from gsbench.raster.triton.projection import project
 from gsbench.raster.triton.workspace import Workspace, WorkspacePool
 from gsbench.raster.validate import check_settings, raise_for_values
+from gsbench.readback import Readback
 from gsbench.scene.camera import Camera
 
 MAX_INT16, MAX_INT32 = 2**15 - 1, 2**31 - 1
@@ -135,9 +136,9 @@ def _forward(
         torch.cumsum(widths, 0, out=pair_ends)
         status = scratch.take("status", 3, torch.int64)
         summarise[(1,)](unit_ends, count, pair_ends, capacity, flags, background, status)
-        units, pairs, bad = status.tolist()
+        units, pairs, bad = Readback(status).values().tolist()  # the one wait for the device
         if bad:
-            raise_for_values(gaussians)
+            raise_for_values(gaussians, background)
         if units <= capacity:
             break
         capacity = 2 * units

@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 class Workspace:
-    """Named one-dimensional tensors that grow by doubling. ``take`` gives a view; its content is what was left there."""
+    """Named one-dimensional tensors that grow by doubling. ``take`` gives a view with what was left there."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
