@@ -65,8 +65,8 @@ EXECUTORS = (
     Executor(
         "triton",
         "gsbench.raster.triton.TritonRasterizer",
-        devices=("cuda", "cpu") if os.environ.get("TRITON_INTERPRET") == "1" else ("cuda",),  # its interpreter, for tests
-        text="Triton kernels, compiled at first use with what torch brings along; the same bits on every run of one GPU",
+        devices=("cuda", "cpu") if os.environ.get("TRITON_INTERPRET") == "1" else ("cuda",),  # tests
+        text="Triton kernels, compiled at first use by what torch brings along; the same bits on every run",
         package="triton",
         install="pip install triton, in the version that your torch asks for",
     ),
