@@ -81,6 +81,7 @@ class EvalConfig:
     protocol: str = MISSING  # paper | standard
     lpips: list[str] = field(default_factory=lambda: ["vgg_raw", "vgg", "alex", "squeeze"])
     flip: bool = True
+    at: list[int] = field(default_factory=list)  # iterations at which the test views are measured beside the last
     maps: bool = False  # keep maps of depth, volume and distance to the initial cloud: where an arm helps
     weights: str | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
     download: bool = True  # fetch missing weights, checked by checksum
@@ -146,6 +147,7 @@ NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tra
 # they are left out of hashes and keys, so that nothing is computed anew for a setting that changes nothing.
 ADDED_LATER: dict[str, dict[str, Any]] = {
     "raster": {"_target_": None},
+    "eval": {"at": []},
 }
 
 

@@ -14,7 +14,8 @@ from gsbench.densify import ADC, MCMC, Densifier, NoDensifier, Volumetric
 from gsbench.errors import TrainingError
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
-from gsbench.pipeline.trainer import CameraOrder, Status, Trainer, generator, learning_rates
+from gsbench.gaussians.ply import read_ply
+from gsbench.pipeline.trainer import CameraOrder, Status, Trainer, generator, learning_rates, snapshot_file
 from gsbench.raster import create_rasterizer
 from gsbench.raster.base import Rasterizer
 from gsbench.scene.types import Scene
@@ -201,3 +202,13 @@ def test_a_densifier_that_was_never_due_is_told(
     caplog.clear()
     train(tiny_scene, truth, rasterizer, tmp_path / "none", NoDensifier(), iterations=15)
     assert "refinement" not in caplog.text
+
+
+def test_a_snapshot_is_the_model_of_a_training_that_ends_there(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    """Iteration 60 is due for a refinement and an opacity reset: 3DGS saves before both."""
+    (tmp_path / "long").mkdir()
+    Trainer(tiny_scene, cloud(truth), small(), rasterizer, options(), 0, snapshot_at=[60]).run(tmp_path / "long")
+    short = train(tiny_scene, truth, rasterizer, tmp_path / "short", small(), iterations=60)
+    assert same(read_ply(tmp_path / "long" / snapshot_file(60)), short)

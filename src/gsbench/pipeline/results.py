@@ -47,6 +47,7 @@ def results_of(
         "iterations": training["iterations"],
         "metrics": metrics["metrics"],
         "unavailable": metrics["unavailable"],
+        **({"metrics_at": metrics["at"]} if "at" in metrics else {}),
         "num_init_points": training["num_init_points"],
         "num_gaussians": training["num_gaussians"],
         "causes": training["causes"],

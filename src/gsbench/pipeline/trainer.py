@@ -6,7 +6,7 @@ import json
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from gsbench.densify import Densifier, DensifyContext, NoDensifier
 from gsbench.densify.volume import log_volume
 from gsbench.errors import TrainingError
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
+from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
 from gsbench.pipeline.checkpoint import load_checkpoint, save_checkpoint
 from gsbench.pipeline.loss import PhotometricLoss
@@ -65,7 +66,8 @@ class Trainer:
 
     All randomness comes from generators made of ``seed``. ``run`` writes metrics, events and checkpoints into a
     folder, and goes on from the newest checkpoint that it finds there: on the CPU, to the same bits as an undisturbed
-    run. A signal to stop (see `gsbench.pipeline.stopping`) ends it after the iteration, with a checkpoint.
+    run. A signal to stop (see `gsbench.pipeline.stopping`) ends it after the iteration, with a checkpoint. At the
+    iterations ``snapshot_at`` the model is kept as well (see `snapshot_file`).
     """
 
     def __init__(
@@ -76,8 +78,10 @@ class Trainer:
         rasterizer: Rasterizer,
         options: TrainConfig,
         seed: int,
+        snapshot_at: Collection[int] = (),
     ) -> None:
         self.scene, self.densifier, self.rasterizer, self.options = scene, densifier, rasterizer, options
+        self.snapshot_at = frozenset(snapshot_at)
         self.device = initial.means.device
         initial = densifier.prepare(initial)
         self.background = torch.tensor(list(options.background), dtype=torch.float32, device=self.device)  # [3]
@@ -94,6 +98,8 @@ class Trainer:
     def run(self, folder: Path, on_status: Callable[[Status], None] = lambda status: None) -> Gaussians:
         """Train to the last iteration, or to the end of the time budget; returns the Gaussians, detached."""
         self._resume(folder)
+        if self.snapshot_at:
+            (folder / snapshot_file(0)).parent.mkdir(exist_ok=True)
         first_step, started = self.step, time.perf_counter()
         before = self.seconds
         options = self.options
@@ -173,6 +179,8 @@ class Trainer:
         }
         if step == options.iterations:  # 3DGS saves before it would refine or step
             return record, None
+        if step in self.snapshot_at:
+            write_ply(self.gaussians.values, folder / snapshot_file(step))
         self.densifier.observe(step, render)
         if options.step_after_refine:
             self._optimize(render.visible)
@@ -225,6 +233,11 @@ class Trainer:
             log.info("going on from iteration %d", self.step)
         for name in (METRICS, EVENTS, HISTOGRAMS):
             drop_after(folder / name, self.step)
+
+
+def snapshot_file(step: int) -> str:
+    """The file, below a training's folder, of the model as 3DGS saves it at iteration ``step``: before it refines."""
+    return f"snapshots/iteration_{step}.ply"
 
 
 def learning_rates(options: TrainConfig) -> LearningRates:

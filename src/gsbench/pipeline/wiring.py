@@ -66,6 +66,11 @@ class Parts:
             threads=threads,
         )
 
+    @property
+    def measured_earlier(self) -> list[int]:
+        """The iterations before the last at which the test views are measured as well."""
+        return sorted({step for step in self.eval.at if step < self.train.iterations})
+
 
 class Trial:
     """A trial before, while and after its steps are built; each step's result is found in ``store`` under its key."""
@@ -100,11 +105,16 @@ class Trial:
         init = init_step(store, self.capture, parts.initializer, reference)
         yield init
         self.views = Views(store, self.capture, init, parts.scene)
-        trained = train_step(self.views, parts.densifier, parts.rasterizer, parts.train, parts.seed, parts.device)
+        earlier = parts.measured_earlier
+        trained = train_step(
+            self.views, parts.densifier, parts.rasterizer, parts.train, parts.seed, parts.device, earlier
+        )
         yield trained
         yield ground_truth_step(self.views)
         background, maps = parts.train.background, parts.eval.maps
-        yield evaluate_step(self.views, trained, parts.rasterizer, self.evaluator, background, maps, parts.device)
+        yield evaluate_step(
+            self.views, trained, parts.rasterizer, self.evaluator, background, maps, parts.device, earlier
+        )
 
 
 class StepFinder:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.ground_truth import png_name
 from gsbench.pipeline.steps.train import LINEAGE_FILE, PLY_FILE
 from gsbench.pipeline.steps.views import Views
+from gsbench.pipeline.trainer import snapshot_file
 from gsbench.raster import Rasterizer
 from gsbench.scene.types import Scene
 
@@ -42,35 +44,53 @@ def evaluate_step(
     background: tuple[float, float, float],
     maps: bool,
     device: torch.device,
+    earlier: Sequence[int] = (),
 ) -> Step:
-    """Render and measure the model of ``trained``; ``maps`` also keeps what the report needs to say where it helps."""
-    inputs = {
+    """Render and measure the model of ``trained``, and its snapshots of the iterations ``earlier``.
+
+    ``maps`` also keeps what the report needs to say where an arm helps.
+    """
+    inputs: dict[str, Any] = {
         "train": trained.key,
         "protocol": evaluator.protocol.id,
         "unavailable": sorted(evaluator.unavailable),  # so that weights that arrive later are used
         "maps": maps,
     }
+    if earlier:
+        inputs["earlier"] = list(earlier)
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
         gaussians = read_ply(training / PLY_FILE, device)
         color = torch.tensor(list(background), device=device)  # [3]
         (folder / "renders").mkdir(exist_ok=True)
-        per_view: dict[str, dict[str, float]] = {}
-        with progress("evaluate") as report:
+
+        def measure(model: Gaussians, phase: str, renders: Path | None) -> dict[str, dict[str, float]]:
+            per_view = {}
             for done, view in enumerate(scene.test, 1):
                 with torch.no_grad():
-                    rendered = rasterizer.render(gaussians, view.camera, MAX_SH_DEGREE, color).image
+                    rendered = rasterizer.render(model, view.camera, MAX_SH_DEGREE, color).image
                 image = quantize(rendered).cpu().numpy()  # [H, W, 3] uint8
-                Image.fromarray(image).save(folder / "renders" / png_name(view.name))
+                if renders is not None:
+                    Image.fromarray(image).save(renders / png_name(view.name))
                 per_view[view.name] = evaluator.evaluate_view(image, view.image)
-                report("views", done, len(scene.test))
+                report(phase, done, len(scene.test))
+            return per_view
+
+        at = {}
+        with progress("evaluate") as report:
+            per_view = measure(gaussians, "views", folder / "renders")
+            for step in earlier:
+                if (snapshot := training / snapshot_file(step)).exists():  # else a limit of time came first
+                    model = read_ply(snapshot, device)
+                    means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
+                    at[str(step)] = {"metrics": means, "num_gaussians": len(model)}
         if maps:
             write_maps(folder / "maps", scene, views.store.path(views.init), gaussians, rasterizer)
             draw_figures(folder / "figures", folder / "renders", scene, training, gaussians)
         write_per_view(folder / PER_VIEW_FILE, per_view)
         metrics = {"metrics": summarize(per_view, evaluator.unavailable), "unavailable": evaluator.unavailable}
-        write_json(folder / METRICS_FILE, metrics)
+        write_json(folder / METRICS_FILE, metrics | ({"at": at} if at else {}))
 
     return Step(EVALUATE, inputs, build)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +36,16 @@ WITHOUT_EFFECT = ("name", "log_every", "checkpoint_every", "checkpoint_minutes",
 
 
 def train_step(
-    views: Views, densifier: Densifier, rasterizer: Rasterizer, options: TrainConfig, seed: int, device: torch.device
+    views: Views,
+    densifier: Densifier,
+    rasterizer: Rasterizer,
+    options: TrainConfig,
+    seed: int,
+    device: torch.device,
+    snapshot_at: Sequence[int] = (),
 ) -> Step:
-    """Train on the training views, from the cloud of the initialiser."""
-    inputs = {
+    """Train on the training views, from the cloud of the initialiser; keep the model at ``snapshot_at`` too."""
+    inputs: dict[str, Any] = {
         "scene": views.inputs,
         "init": views.init.key,
         "densify": options_of("densify", densifier),
@@ -48,11 +55,13 @@ def train_step(
         ),
         "seed": seed,
     }
+    if snapshot_at:
+        inputs["snapshots"] = list(snapshot_at)
 
     def build(folder: Path) -> None:
         scene = views.scene
         initial = initial_gaussians(views.store.path(views.init), device)
-        trainer = Trainer(scene, initial, densifier, rasterizer, options, seed)
+        trainer = Trainer(scene, initial, densifier, rasterizer, options, seed, snapshot_at)
         reset_peak_memory(device)
         with progress("train") as report:
 
