@@ -123,7 +123,7 @@ def test_wheel_runs_a_trial_outside_the_checkout(environment: dict[str, str], tm
     pytest.importorskip("hatchling", reason="building the wheel offline needs hatchling (extra dev)")
     build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path / "dist"), str(ROOT)]
     subprocess.run(build, check=True, capture_output=True, timeout=300)
-    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    (wheel,) = (tmp_path / "dist").glob("gsbench_3dgs-*.whl")
     home = tmp_path / "clean"
     venv.create(home, with_pip=False)
     python = home / "bin" / "python"
@@ -135,15 +135,19 @@ def test_wheel_runs_a_trial_outside_the_checkout(environment: dict[str, str], tm
         [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(packages), str(wheel)],
         check=True,
     )
+    clean = {key: value for key, value in environment.items() if key != "PYTHONPATH"}  # not the checkout's modules
     where = "import gsbench, gsbench.config as c; print(gsbench.__file__); print(c.conf_dir())"
-    found = subprocess.run([python, "-c", where], cwd=tmp_path, capture_output=True, text=True, check=True)
+    found = subprocess.run([python, "-c", where], cwd=tmp_path, env=clean, capture_output=True, text=True, check=True)
     assert all(line.startswith(str(packages)) for line in found.stdout.split())
+    hint = "from gsbench.install import install_command; print(install_command('view'))"
+    found = subprocess.run([python, "-c", hint], cwd=tmp_path, env=clean, capture_output=True, text=True, check=True)
+    assert found.stdout == "pip install 'gsbench-3dgs[view]'\n"
     arguments = [*SMALL, "train.iterations=10", "tracking=none"]
     runs = tmp_path / "runs"
     done = subprocess.run(
         [python, "-m", "gsbench.cli", *arguments],
         cwd=tmp_path,
-        env=environment | {"GSBENCH_RUNS": str(runs)},
+        env=clean | {"GSBENCH_RUNS": str(runs)},
         capture_output=True,
         text=True,
         timeout=300,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ import torch
 
 from gsbench.config import conf_dir
 from gsbench.errors import InputError
+from gsbench.install import install_command
 from gsbench.pipeline.components import locate
 from gsbench.raster import create_rasterizer, executors, resolve_name
 from gsbench.raster.contract import CASES, departures
@@ -62,7 +64,7 @@ def test_auto(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture)
     installed(monkeypatch)
     assert resolve("auto", "cuda").name == "reference"
     assert "slow reference" in caplog.text
-    assert "pip install 'gsbench[gsplat]'" in caplog.text
+    assert install_command("gsplat") in caplog.text
     assert resolve("auto", "mps").name == "reference"
 
 
@@ -76,7 +78,7 @@ def test_what_cannot_run_is_said_with_what_can(monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(InputError, match=r"raster=cpu runs on device=cpu, not on cuda; choose from reference, "):
         resolve("cpu", "cuda")
     installed(monkeypatch)
-    with pytest.raises(InputError, match=r"raster=gsplat needs gsplat: pip install 'gsbench\[gsplat\]'"):
+    with pytest.raises(InputError, match=f"raster=gsplat needs gsplat: {re.escape(install_command('gsplat'))}"):
         resolve("gsplat", "cuda")
     assert find("gsplat").obstacle("cuda") is not None
 

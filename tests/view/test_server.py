@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import time
@@ -17,6 +18,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.events import Cause
+from gsbench.install import install_command
 from gsbench.raster import create_rasterizer
 from gsbench.verbs import view as verb
 from gsbench.view.picture import Layers, TrialPainter
@@ -46,7 +48,7 @@ def painters(small_runs: Path) -> list[TrialPainter]:
 
 @pytest.fixture
 def viewer(painters: list[TrialPainter]) -> Iterator[Viewer]:
-    pytest.importorskip("viser", reason="the viewer needs viser: pip install 'gsbench[view]'")
+    pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
     viewer = Viewer(painters, 0)
     yield viewer
     viewer.stop()
@@ -98,7 +100,7 @@ def test_ellipsoids_are_those_above_the_threshold_in_the_colour_of_their_cause(p
 
 
 def test_page_answers_until_it_is_stopped(painters: list[TrialPainter]) -> None:
-    pytest.importorskip("viser", reason="the viewer needs viser: pip install 'gsbench[view]'")
+    pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
     viewer = Viewer(painters[:1], free_port())
     assert viewer.url.startswith("http://127.0.0.1:")
     with urllib.request.urlopen(viewer.url, timeout=20) as answer:
@@ -163,7 +165,7 @@ def test_what_cannot_be_viewed_is_said(small_runs: Path, tmp_path: Path) -> None
 
 def test_without_viser_the_mend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install 'gsbench\[view\]'"):
+    with pytest.raises(InputError, match=re.escape(install_command("view"))):
         verb.main(["a:b:c"])
     with pytest.raises(InputError, match="one or two"):
         verb.main(["a:b:c"] * 3)

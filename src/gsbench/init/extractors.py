@@ -10,6 +10,7 @@ import torch
 from gsbench.errors import InputError
 from gsbench.init.feature_settings import FeatureSettings
 from gsbench.init.features import Extractor
+from gsbench.install import install_command
 from gsbench.weights import MissingWeights, load_state
 
 SUPERPOINT_BORDER = 4  # px without keypoints, as in deep-image-matching; its network has no margin of its own
@@ -45,7 +46,7 @@ def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.d
         from transformers import SuperPointConfig, SuperPointForKeypointDetection
     except ImportError as error:
         raise InputError(
-            "init.extractor=superpoint needs the package transformers: pip install 'gsbench[dim]' "
+            f"init.extractor=superpoint needs the package transformers: {install_command('dim')} "
             "(and pip uninstall torchvision where that cannot be imported)"
         ) from error
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from gsbench.compose import Composed
 from gsbench.errors import InputError
 from gsbench.files import write_json
+from gsbench.install import install_command
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.pipeline.resources import assign_gpu, assign_threads, take_slot
 from gsbench.pipeline.stopping import Stopped, stop_on_signals
@@ -92,7 +93,7 @@ def make_executor(launch: dict[str, Any], folder: Path) -> Executor:
         import submitit
     except ImportError:
         raise InputError(
-            f"launch={launch['name']} needs submitit: pip install 'gsbench[slurm]' (or pip install submitit)"
+            f"launch={launch['name']} needs submitit: {install_command('slurm')} (or pip install submitit)"
         ) from None
     folder.mkdir(parents=True, exist_ok=True)
     if launch["name"] == "local":

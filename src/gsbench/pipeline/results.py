@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from gsbench import __version__
 from gsbench.config import config_hash
 from gsbench.events import sum_events
 from gsbench.init.base import REPORT_FILE
@@ -20,7 +21,7 @@ from gsbench.pipeline.trainer import EVENTS
 from gsbench.scene.types import Scene
 from gsbench.source import sources_of
 
-PACKAGES = ("gsbench", "torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")  # on whose versions a result depends
+PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")  # on whose versions a result depends
 
 
 def results_of(
@@ -79,7 +80,7 @@ def results_of(
 
 def versions() -> dict[str, str]:
     """Versions of what a result depends on."""
-    found = {"python": sys.version.split()[0]}
+    found = {"python": sys.version.split()[0], "gsbench": __version__}
     for package in PACKAGES:
         try:
             found[package] = version(package)

@@ -11,6 +11,7 @@ import os
 from dataclasses import dataclass
 
 from gsbench.errors import InputError
+from gsbench.install import install_command
 
 log = logging.getLogger(__name__)
 
@@ -76,7 +77,7 @@ EXECUTORS = (
         devices=("cuda",),
         text="gsplat's CUDA kernels, to measure against; compiled with a CUDA toolkit (nvcc) at first use",
         package="gsplat",
-        install="pip install 'gsbench[gsplat]'",
+        install=install_command("gsplat"),
     ),
 )
 # What ``auto`` takes: the first that is installed. Other types of devices have the reference alone.

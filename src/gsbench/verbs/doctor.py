@@ -16,15 +16,16 @@ from pathlib import Path
 from typing import Literal
 
 from gsbench.files import explain_storage
+from gsbench.install import install_command
 from gsbench.pipeline.resources import available_threads
 
 Verdict = Literal["ok", "note", "bad"]
 LITTLE_SPACE_GB = 5.0
-OPTIONAL = {
-    "transformers": "init=dim: pip install 'gsbench[dim]'",
-    "gsplat": "raster=gsplat and export --to compressed: pip install 'gsbench[gsplat]'",
-    "submitit": "launch=local and launch=slurm: pip install 'gsbench[slurm]'",
-    "viser": "gsbench view: pip install 'gsbench[view]'",
+OPTIONAL = {  # package -> what needs it, and the extra that brings it
+    "transformers": ("init=dim", "dim"),
+    "gsplat": ("raster=gsplat and export --to compressed", "gsplat"),
+    "submitit": ("launch=local and launch=slurm", "slurm"),
+    "viser": ("gsbench view", "view"),
 }
 
 
@@ -105,10 +106,11 @@ def check_packages() -> Iterator[Finding]:
     for name in ("pycolmap", "kornia", "numba", "mlflow"):
         installed = _version(name)
         verdict: Verdict = "bad" if installed is None else "ok"
-        yield Finding(verdict, name, installed or "missing: pip install gsbench")
-    for name, mend in OPTIONAL.items():
+        yield Finding(verdict, name, installed or f"missing: {install_command()}")
+    for name, (purpose, extra) in OPTIONAL.items():
         installed = _version(name)
-        yield Finding("ok" if installed else "note", name, installed or f"not installed; needed for {mend}")
+        text = installed or f"not installed; needed for {purpose}: {install_command(extra)}"
+        yield Finding("ok" if installed else "note", name, text)
 
 
 def check_kernels() -> Iterator[Finding]:

@@ -7,6 +7,7 @@ import importlib.util
 import threading
 
 from gsbench.errors import InputError
+from gsbench.install import install_command
 from gsbench.view import ADDRESS
 
 DEFAULT_PORT = 8080
@@ -23,7 +24,7 @@ def main(argv: list[str]) -> int:
     if len(options.trial) > 2:
         raise InputError(f"one or two trials can be viewed, not {len(options.trial)}")
     if importlib.util.find_spec("viser") is None:
-        raise InputError("the viewer needs viser: pip install 'gsbench[view]'")
+        raise InputError(f"the viewer needs viser: {install_command('view')}")
 
     from gsbench.cli import runs_dir
     from gsbench.pipeline.components import select_device
