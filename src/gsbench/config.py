@@ -93,6 +93,7 @@ class TrackingConfig:
     enabled: bool = True
     uri: str | None = None  # null: sqlite in the runs folder
     flush_seconds: float = 10.0
+    patience_seconds: float = 30.0  # with a slow tracker at the end of a trial; `gsbench sync` adds what it missed
     images: int = 4  # test renders mirrored per trial
 
 

@@ -26,7 +26,7 @@ from gsbench.errors import GsbenchError
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_BOOTSTRAP = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from gsbench.isolate import _child; _child()"
+_BOOTSTRAP = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from {module} import {name}; {name}()"
 _SECONDS_TO_END = 5.0  # patience with a child that was asked to end, before it is killed
 _TAIL_LINES = 3
 _STACK_LINE = re.compile(r"^\s*(@|PC:|\*\*\* )|^\s*File |^\s*$")  # glog's crash dump, blank lines
@@ -64,7 +64,7 @@ def run_isolated(
             start = stream.seek(0, os.SEEK_END)
             code = _run_child(call, result, stream)
         if code != 0 or not result.is_file():
-            raise CrashError(f"{what} {_describe(code)}; its last words: {_telling_tail(output, start)}")
+            raise CrashError(f"{what} {describe_exit(code)}; its last words: {_telling_tail(output, start)}")
         succeeded, value, trace = pickle.loads(result.read_bytes())
     if succeeded:
         return value
@@ -72,9 +72,17 @@ def run_isolated(
     raise value
 
 
+def python_command(module: str, name: str, *arguments: str) -> list[str]:
+    """A fresh interpreter that finds the modules which this one finds, and calls the function ``name`` of ``module``.
+
+    The function takes nothing; it finds ``arguments`` in ``sys.argv[2:]``.
+    """
+    return [sys.executable, "-c", _BOOTSTRAP.format(module=module, name=name), json.dumps(sys.path), *arguments]
+
+
 def _run_child(call: Path, result: Path, output: BinaryIO) -> int:
     """Start the child, wait for it and return its exit code; end it on any exception here (Ctrl-C included)."""
-    command = [sys.executable, "-c", _BOOTSTRAP, json.dumps(sys.path), str(call), str(result)]
+    command = python_command("gsbench.isolate", "_child", str(call), str(result))
     # A session of its own: Ctrl-C reaches the parent only, which then ends the child: one traceback, not two.
     # stdin is a pipe that is never written: its end of file tells the child that the parent is gone.
     child = subprocess.Popen(
@@ -125,7 +133,8 @@ def _portable(error: Exception) -> Exception:
     return error
 
 
-def _describe(code: int) -> str:
+def describe_exit(code: int) -> str:
+    """How a process ended that should not have, by its exit code: "crashed (SIGSEGV)", "ended early (exit code 1)"."""
     if code < 0:
         try:
             name = signal.Signals(-code).name
@@ -136,10 +145,14 @@ def _describe(code: int) -> str:
 
 
 def _telling_tail(output: Path, start: int) -> str:
-    """The last lines of the output from byte ``start`` that look like a reason, on one line."""
     with output.open("rb") as stream:
         stream.seek(start)
-        lines = stream.read().decode("utf-8", "replace").splitlines()
+        return telling_lines(stream.read())
+
+
+def telling_lines(output: bytes) -> str:
+    """The last lines of a process's output that look like a reason, on one line."""
+    lines = output.decode("utf-8", "replace").splitlines()
     lines = [line.strip() for line in lines if not _STACK_LINE.match(line)]
     telling = [line for line in lines if _REASON_LINE.search(line)] or lines
     return " | ".join(telling[-_TAIL_LINES:]) or "(no output)"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from gsbench.errors import GsbenchError
 from gsbench.launch.plan import TRIAL_GLOB
-from gsbench.pipeline.locks import BusyError
 from gsbench.pipeline.trial_files import label_of, read_config, state_of
+from gsbench.tracking.process import MirrorError, MirrorProcess
 from gsbench.verbs.status import experiment_home
 from gsbench.words import counted
 
@@ -32,32 +32,30 @@ def main(argv: list[str]) -> int:
         else [runs / n for n in list_experiments(runs)]
     )
     new = known = 0
-    for home in homes:
-        for folder in sorted(home.glob(TRIAL_GLOB)):
-            if state_of(folder) in ("done", "failed"):
-                if _sync_one(folder, runs, options.uri):
-                    new += 1
-                    print(f"mirrored {label_of(folder)}")
-                else:
-                    known += 1
+    with MirrorProcess() as process:  # Ctrl-C ends it, whatever the tracker does
+        for home in homes:
+            for folder in sorted(home.glob(TRIAL_GLOB)):
+                if state_of(folder) in ("done", "failed"):
+                    if _sync_one(process, folder, runs, options.uri):
+                        new += 1
+                        print(f"mirrored {label_of(folder)}")
+                    else:
+                        known += 1
     print(f"{counted(new, 'trial')} mirrored, {known} were")
     return 0
 
 
-def _sync_one(folder: Path, runs: Path, uri: str | None) -> bool:
-    from gsbench.tracking import mirror_trial
-
+def _sync_one(process: MirrorProcess, folder: Path, runs: Path, uri: str | None) -> bool:
+    """Whether something of the trial was missing. Raises GsbenchError where the tracker does not take it."""
     values = read_config(folder)
     tracking = values["tracking"] | ({} if uri is None else {"uri": uri})
     try:
-        return mirror_trial(tracking, runs, folder, values)
-    except BusyError:
+        answer = process.ask("sync", None, options=tracking, runs=str(runs), folder=str(folder), values=values)
+    except MirrorError as error:
+        raise GsbenchError(f"{error}; the files are complete: try again") from error
+    if answer["outcome"] == "failed":
+        reason = f"MLflow does not take {label_of(folder)} ({answer['error']})"
+        raise GsbenchError(f"{reason}; the files are complete: try again")
+    if answer["outcome"] == "busy":
         print(f"{label_of(folder)} is being mirrored by another process", file=sys.stderr)
-        return False
-    except GsbenchError:
-        raise
-    except Exception as error:
-        text = " ".join(f"{type(error).__name__}: {error}".split())[:300]
-        raise GsbenchError(
-            f"MLflow does not take {label_of(folder)} ({text}); the files are complete: try again"
-        ) from error
+    return bool(answer["outcome"] == "mirrored")

@@ -1,98 +1,33 @@
-"""The MLflow mirror: what the files of a trial say, shown in a dashboard.
+"""The MLflow run of one trial: what is logged there, and how far that has come.
 
-Files come first. A thread reads them and writes to MLflow in batches, so a tracker that is slow, down or read-only
-never harms a trial; what it missed, `mirror_trial` adds later from the same files. Each metric's time is a function of
-the files, so that MLflow, which drops exact repetitions, holds it once even if it was sent twice.
+Each metric's time is a function of the files, so that MLflow, which drops exact repetitions, holds it once even if it
+was sent twice. Which run it is stands in the trial's folder, so that none is begun twice.
 """
 
 from __future__ import annotations
 
 import json
-import logging
-import os
-import threading
 import time
+import uuid
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from filelock import FileLock
+from typing import Any
 
 from gsbench.config import sha256_of
 from gsbench.files import write_json
-from gsbench.pipeline.locks import BusyError, hold
+from gsbench.pipeline.locks import hold
 from gsbench.pipeline.trial_files import FAILED, RESULTS, read_object
-
-if TYPE_CHECKING:
-    from mlflow import MlflowClient
-
-log = logging.getLogger(__name__)
+from gsbench.tracking.client import connect, ensure_experiment
 
 STATE = "mlflow.json"  # in the trial's folder: the run that mirrors it and how far
 LOCK = ".mlflow.lock"
+TOKEN_TAG = "gsbench.token"
 MAX_VALUE = 6000  # characters of a parameter (MLflow's limit)
 MAX_PARAMS = 100  # parameters in a batch
 MAX_METRICS = 1000  # metrics in a batch
-SECONDS_TO_FINISH = 30.0  # patience with the tracker at the end of a trial
-SECONDS_TO_STOP = 3.0  # and when a signal asks to end
-ADVISORY_LOCK = 0x67736265_6E6368  # "gsbench": the number of our lock in a PostgreSQL database
 # Of the init's report: is the cloud to be trusted, and what does a volume threshold mean there?
 INIT_FIELDS = ("num_registered", "num_points", "mean_reprojection_error", "mean_track_length", "pose_errors", "gauge")
 CURVES = {"metrics.jsonl": "train", "events.jsonl": "events"}
-# What would print, phone home or hang for minutes in a thread beside a training.
-SETTINGS = {
-    "MLFLOW_DISABLE_TELEMETRY": "true",
-    "MLFLOW_LOGGING_LEVEL": "WARNING",
-    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
-    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
-    "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
-}
-
-
-class Mirror:
-    """Mirrors a trial while the ``with`` block runs; on leaving it, waits a bounded time for the tracker."""
-
-    def __init__(self, options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any]) -> None:
-        self.options, self.runs, self.folder, self.values = options, runs, folder, values
-        self._ended = threading.Event()
-        self._status = "FINISHED"
-        self._sources: list[Path] = [folder]
-        self._thread = threading.Thread(target=self._run, name="mlflow-mirror", daemon=True)
-
-    def follow(self, folder: Path) -> None:
-        """Read curves from ``folder`` as well: where a training in progress writes them."""
-        self._sources = [folder, self.folder]
-
-    def __enter__(self) -> Mirror:
-        if self.options["enabled"]:
-            self._thread.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
-        if not self.options["enabled"]:
-            return
-        stopped = kind is not None and not issubclass(kind, Exception)
-        if kind is not None:
-            self._status = "KILLED" if stopped else "FAILED"
-        self._ended.set()
-        self._thread.join(SECONDS_TO_STOP if stopped else SECONDS_TO_FINISH)
-        if self._thread.is_alive():
-            log.warning("tracking: MLflow is slow; `gsbench sync` mirrors the rest of %s later", self.folder)
-
-    def _run(self) -> None:
-        try:
-            with hold(self.folder / LOCK, "mirroring", wait=False):
-                run = TrackedTrial(self.options, self.runs, self.folder, self.values)
-                while not self._ended.wait(self.options["flush_seconds"]):
-                    run.add_curves(self._sources)
-                run.add_curves(self._sources)
-                run.finish(self._status)
-        except BusyError:
-            log.debug("another process mirrors %s", self.folder)
-        except Exception as error:  # the mirror must never harm the trial, whatever the tracker raises
-            log.warning("tracking: %s; the files are complete, `gsbench sync` mirrors them later", _one_line(error))
-            log.debug("tracking failed", exc_info=True)
 
 
 def mirror_trial(options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any]) -> bool:
@@ -114,8 +49,7 @@ class TrackedTrial:
         self.client = connect(options["uri"], runs)
         self.state = self._known_state()
         if not self.state:
-            experiment = ensure_experiment(self.client, values["name"], runs)
-            self.state = self._create_run(experiment)
+            self.state = self._create_run(ensure_experiment(self.client, values["name"], runs))
             self._save()
         elif not self.is_complete:
             self.client.update_run(self.state["run_id"], status="RUNNING")
@@ -213,6 +147,7 @@ class TrackedTrial:
         from mlflow.entities import Param, RunTag
 
         values = self.values
+        begun = self._begin()
         label = f"{values['scene']['name']} {values['init']['name']}-{values['densify']['name']} seed {values['seed']}"
         tags = {
             "mlflow.runName": label,
@@ -222,19 +157,25 @@ class TrackedTrial:
             "densify": values["densify"]["name"],
             "seed": str(values["seed"]),
             "folder": str(self.folder),
+            TOKEN_TAG: begun["token"],
         }
-        run_id = self.client.create_run(experiment_id, tags=tags, run_name=label).info.run_id
+        found = self.client.search_runs([experiment_id], f"tags.`{TOKEN_TAG}` = '{begun['token']}'", max_results=1)
+        run = found[0] if found else self.client.create_run(experiment_id, tags=tags, run_name=label)
+        run_id = run.info.run_id
         params = [Param("arm", f"{values['init']['name']}-{values['densify']['name']}")]  # first in MLflow's charts
         params += [Param(key, value[:MAX_VALUE]) for key, value in _flatten(values) if value]
         for start in range(0, len(params), MAX_PARAMS):
             self.client.log_batch(run_id, params=params[start : start + MAX_PARAMS], tags=[RunTag("gsbench", "1")])
-        return {
-            "run_id": run_id,
-            "uri": self._uri(),
-            "started": int(time.time() * 1000),
-            "logged": {},
-            "complete": None,
-        }
+        return begun | {"run_id": run_id, "logged": {}, "complete": None}
+
+    def _begin(self) -> dict[str, Any]:
+        """Note, before a run is created, by what it is found again if nobody hears of its creation."""
+        state = read_object(self.folder / STATE)
+        if state.get("uri") == self._uri() and "token" in state and "run_id" not in state:
+            return state
+        begun = {"uri": self._uri(), "token": uuid.uuid4().hex, "started": int(time.time() * 1000)}
+        write_json(self.folder / STATE, begun)
+        return begun
 
     def _time_of(self, record: dict[str, Any]) -> int:
         """A record's time in ms: the run's start, and the training time or else the iterations since."""
@@ -245,69 +186,6 @@ class TrackedTrial:
 
     def _save(self) -> None:
         write_json(self.folder / STATE, self.state)
-
-
-def default_uri(runs: Path) -> str:
-    return f"sqlite:///{runs}/mlflow.db"
-
-
-def connect(uri: str | None, runs: Path) -> MlflowClient:
-    """A client of the tracker; creates a new database under a lock, since MLflow's own set-up races."""
-    for name, value in SETTINGS.items():
-        os.environ.setdefault(name, value)
-    import mlflow
-
-    for logger in ("mlflow", "alembic"):  # importing mlflow has set their levels
-        logging.getLogger(logger).setLevel(logging.WARNING)
-    address = uri or default_uri(runs)
-    with _set_up_lock(address, runs):
-        client = mlflow.MlflowClient(tracking_uri=address)  # with the first client come the tables
-        client.search_experiments(max_results=1)
-    return client
-
-
-@contextmanager
-def _set_up_lock(uri: str, runs: Path) -> Iterator[None]:
-    """Let one process at a time create tables and experiments: on this runs folder, and on a PostgreSQL everywhere."""
-    with FileLock(runs / ".mlflow.lock"):
-        if not uri.startswith("postgresql"):
-            yield
-            return
-        import sqlalchemy
-
-        engine = sqlalchemy.create_engine(uri, poolclass=sqlalchemy.pool.NullPool)
-        with engine.connect() as connection:  # closing it frees the lock, as does the death of this process
-            connection.execute(sqlalchemy.text("SELECT pg_advisory_lock(:key)"), {"key": ADVISORY_LOCK})
-            yield
-
-
-def prepare(options: dict[str, Any], runs: Path, experiment: str) -> None:
-    """Create tables and ``experiment`` before many processes need them; a tracker that fails is only mentioned."""
-    if not options["enabled"]:
-        return
-    try:
-        ensure_experiment(connect(options["uri"], runs), experiment, runs)
-    except Exception as error:  # noqa: BLE001 - the mirror must never harm a sweep, whatever the tracker raises
-        log.warning("tracking: %s; the files will be complete, `gsbench sync` mirrors them later", _one_line(error))
-
-
-def ensure_experiment(client: MlflowClient, name: str, runs: Path) -> str:
-    """The id of experiment ``name``, created once under a lock; a deleted one is restored."""
-    from mlflow.exceptions import MlflowException
-
-    with _set_up_lock(str(client.tracking_uri), runs):
-        found = client.get_experiment_by_name(name)
-        if found is None:
-            served = str(client.tracking_uri).startswith(("http:", "https:"))  # then the server says where
-            location = None if served else (runs / "mlartifacts" / name).as_uri()
-            with suppress(MlflowException):  # a rival on another machine was first, or what follows says what is wrong
-                return str(client.create_experiment(name, artifact_location=location))
-            found = client.get_experiment_by_name(name)
-        if found is None:
-            raise RuntimeError(f"MLflow could not create the experiment {name}")
-        if found.lifecycle_stage != "active":
-            client.restore_experiment(found.experiment_id)
-        return str(found.experiment_id)
 
 
 def _records(path: Path) -> Iterator[dict[str, Any]]:
@@ -334,8 +212,3 @@ def _numbers(report: dict[str, Any], names: Sequence[str]) -> Iterator[tuple[str
             yield from _numbers(value, tuple(value))
         elif isinstance(value, (int, float)) and not isinstance(value, bool):
             yield name, float(value)
-
-
-def _one_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0][:200] if lines else ''}"

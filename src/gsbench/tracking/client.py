@@ -1,0 +1,103 @@
+"""The tracker: its address, a client of it, and the tables and experiments that many processes want at once."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from filelock import FileLock
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+ADVISORY_LOCK = 0x67736265_6E6368  # "gsbench": the number of our lock in a PostgreSQL database
+# What would print, phone home or hang for minutes.
+SETTINGS = {
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "MLFLOW_LOGGING_LEVEL": "WARNING",
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
+    "PGCONNECT_TIMEOUT": "20",
+}
+
+
+def default_uri(runs: Path) -> str:
+    return f"sqlite:///{runs}/mlflow.db"
+
+
+def connect(uri: str | None, runs: Path) -> MlflowClient:
+    """A client of the tracker; creates a new database under a lock, since MLflow's own set-up races."""
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
+    import mlflow
+
+    for logger in ("mlflow", "alembic"):  # importing mlflow has set their levels
+        logging.getLogger(logger).setLevel(logging.WARNING)
+    address = uri or default_uri(runs)
+    with _set_up_lock(address, runs):
+        _create_sqlite(address)
+        client = mlflow.MlflowClient(tracking_uri=address)  # with the first client come the tables
+        client.search_experiments(max_results=1)
+    return client
+
+
+def ensure_experiment(client: MlflowClient, name: str, runs: Path) -> str:
+    """The id of experiment ``name``, created once under a lock; a deleted one is restored."""
+    from mlflow.exceptions import MlflowException
+
+    with _set_up_lock(str(client.tracking_uri), runs):
+        found = client.get_experiment_by_name(name)
+        if found is None:
+            served = str(client.tracking_uri).startswith(("http:", "https:"))  # then the server says where
+            location = None if served else (runs / "mlartifacts" / name).as_uri()
+            with suppress(MlflowException):  # a rival on another machine was first, or what follows says what is wrong
+                return str(client.create_experiment(name, artifact_location=location))
+            found = client.get_experiment_by_name(name)
+        if found is None:
+            raise RuntimeError(f"MLflow could not create the experiment {name}")
+        if found.lifecycle_stage != "active":
+            client.restore_experiment(found.experiment_id)
+        return str(found.experiment_id)
+
+
+@contextmanager
+def _set_up_lock(uri: str, runs: Path) -> Iterator[None]:
+    """Let one process at a time create tables and experiments: on this runs folder, and on a PostgreSQL everywhere."""
+    with FileLock(runs / ".mlflow.lock"):
+        if not uri.startswith("postgresql"):
+            yield
+            return
+        import sqlalchemy
+
+        engine = sqlalchemy.create_engine(uri, poolclass=sqlalchemy.pool.NullPool)
+        with engine.connect() as connection:  # closing it frees the lock, as does the death of this process
+            connection.execute(sqlalchemy.text("SELECT pg_advisory_lock(:key)"), {"key": ADVISORY_LOCK})
+            yield
+
+
+def _create_sqlite(uri: str) -> None:
+    """Make the database file of a SQLite address, if it is missing, whole or not at all.
+
+    MLflow's migrations of SQLite are no transaction: a process that was killed within them would leave tables that no
+    later one can use.
+    """
+    import sqlalchemy
+    from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
+
+    if not uri.startswith("sqlite:"):
+        return
+    name = sqlalchemy.engine.make_url(uri).database
+    if not name or name == ":memory:" or Path(name).exists():
+        return
+    temporary = Path(name).with_name(f".{Path(name).name}.tmp-{os.getpid()}")
+    try:
+        store = SqlAlchemyStore(f"sqlite:///{temporary}", str(Path(name).parent / "mlartifacts"))
+        store.engine.dispose()
+        os.replace(temporary, name)
+    finally:
+        temporary.unlink(missing_ok=True)

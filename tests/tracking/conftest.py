@@ -1,0 +1,48 @@
+"""A PostgreSQL server of our own."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.tracking.helpers import free_port
+
+
+@pytest.fixture
+def postgresql(tmp_path: Path) -> Iterator[str]:
+    """The address of an empty database in a PostgreSQL server of our own; the test is skipped where there is none."""
+    pytest.importorskip("psycopg2", reason="needs psycopg2-binary")
+    homes = (
+        sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: int(path.parent.name))
+        if os.name == "posix"
+        else []
+    )
+    binaries = [str(path) for path in homes] + os.environ.get("PATH", "").split(os.pathsep)
+    initdb = shutil.which("initdb", path=os.pathsep.join(reversed(binaries[: len(homes)])) or None) or shutil.which(
+        "initdb"
+    )
+    if initdb is None:
+        pytest.skip("needs a PostgreSQL server (apt-get install postgresql)")
+    home = Path(initdb).parent
+    data = tmp_path / "postgresql"
+    data.mkdir()
+    prefix = []
+    if os.geteuid() == 0:  # the server refuses to run as root
+        if shutil.which("runuser") is None:
+            pytest.skip("PostgreSQL does not run as root, and there is no runuser")
+        prefix = ["runuser", "-u", "nobody", "--"]
+        shutil.chown(data, "nobody")
+        for folder in (tmp_path, *tmp_path.parents[:2]):
+            folder.chmod(folder.stat().st_mode | 0o011)
+    port = free_port()
+    run = lambda *words: subprocess.run([*prefix, *words], check=True, capture_output=True, timeout=60)  # noqa: E731
+    run(str(home / "initdb"), "-D", str(data), "-U", "gsbench", "--auth=trust", "--no-sync")
+    settings = f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories={data} -c fsync=off"
+    run(str(home / "pg_ctl"), "-D", str(data), "-l", str(data / "log"), "-w", "-o", settings, "start")
+    yield f"postgresql+psycopg2://gsbench@127.0.0.1:{port}/postgres"
+    subprocess.run([*prefix, str(home / "pg_ctl"), "-D", str(data), "-m", "immediate", "stop"], check=False, timeout=60)

@@ -1,0 +1,68 @@
+"""Trials as files, and what MLflow shows of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+RECORDS = 150
+
+
+def options(uri: str | None = None, patience: float = 30.0) -> dict[str, Any]:
+    return {"enabled": True, "uri": uri, "flush_seconds": 0.2, "images": 2, "patience_seconds": patience}
+
+
+def trial_values(runs: Path, seed: int = 0, name: str = "tracked") -> dict[str, Any]:
+    named = {group: {"name": f"a_{group}"} for group in ("scene", "init", "densify")}
+    return {"name": name, "seed": seed, "runs": str(runs), "train": {"iterations": RECORDS}, **named}
+
+
+def write_trial(folder: Path, values: dict[str, Any], records: int = RECORDS, psnr: float = 20.0) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    seed = values["seed"]
+    lines = [{"step": i, "loss": 1 / i, "seed": seed, "seconds": 0.01 * i} for i in range(1, records + 1)]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (folder / "events.jsonl").write_text("".join(json.dumps({"step": i, "cloned": i}) + "\n" for i in (50, 100)))
+    (folder / "config.yaml").write_text("a: 1\n")
+    results = {
+        "metrics": {"psnr": psnr},
+        "num_gaussians": 10 + seed,
+        "num_init_points": 5,
+        "peak_memory_mb": 1.5,
+        "iterations": records,
+        "seconds": {"train": 2.0},
+        "events": {"cloned": 150},
+        "protocol": "paper-1",
+        "raster": "cpu",
+        "hashes": {"config": "abc"},
+        "init_report": {
+            "num_points": 5,
+            "pose_errors": None,
+            "gauge": {"scene_extent": 4.5, "scale_to_reference": None},
+        },
+    }
+    (folder / "results.json").write_text(json.dumps(results))
+
+
+def found_runs(client: Any, name: str) -> list[Any]:
+    experiment = client.get_experiment_by_name(name)
+    return [] if experiment is None else client.search_runs([experiment.experiment_id])
+
+
+def history(client: Any, run_id: str, key: str) -> list[tuple[int, float]]:
+    return [(metric.step, metric.value) for metric in client.get_metric_history(run_id, key)]
+
+
+def free_port() -> int:
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return int(server.getsockname()[1])
+
+
+def child_environment() -> dict[str, str]:
+    places = [str(ROOT), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")]
+    return dict(os.environ) | {"PYTHONPATH": os.pathsep.join(place for place in places if place)}

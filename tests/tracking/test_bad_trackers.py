@@ -1,0 +1,232 @@
+"""Whatever a tracker does, and whenever: a trial that is complete ends with exit code 0, and one line says the rest."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import psutil
+import pytest
+
+from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.tracking import connect, mirror_trial, prepare
+from tests.end_to_end.conftest import SMALL
+from tests.tracking.helpers import (
+    RECORDS,
+    child_environment,
+    found_runs,
+    free_port,
+    history,
+    options,
+    trial_values,
+    write_trial,
+)
+from tests.tracking.servers import Gate, Listener
+
+pytestmark = pytest.mark.end_to_end
+# Not measured, only the limit within which a program that hangs for good is told from a slow machine.
+SECONDS = 240
+PATIENCE = 4.0
+TINY = [*SMALL, "train.iterations=20", "scene.views=8", "init.count=500", "eval.lpips=[]", "eval.flip=false"]
+MIRROR = """
+import sys
+from pathlib import Path
+from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.tracking import Mirror
+from tests.tracking.helpers import options, trial_values, write_trial
+runs, uri, seed, patience = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), float(sys.argv[4])
+values = trial_values(runs, seed)
+folder = TrialPaths.of(values).folder
+with Mirror(options(uri, patience), runs, folder, values):
+    write_trial(folder, values)
+"""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("bad-trackers")
+
+
+def start(runs: Path, *words: str) -> subprocess.Popen[str]:
+    kept = {key: value for key, value in child_environment().items() if not key.startswith(("GSBENCH_", "MLFLOW_"))}
+    return subprocess.Popen(
+        [sys.executable, "-m", "gsbench.cli", *TINY, f"tracking.patience_seconds={PATIENCE}", *words],
+        cwd=runs,
+        env=kept | {"GSBENCH_RUNS": str(runs)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def check_complete(runs: Path, name: str, code: int, errors: str) -> None:
+    assert code == 0, errors
+    said = [line for line in errors.splitlines() if "tracking" in line or "MLflow" in line]
+    assert len(said) == 1, errors
+    assert "gsbench sync" in said[0]
+    (results,) = (runs / name).glob("**/results.json")
+    assert json.loads(results.read_text())["status"] == "complete"
+
+
+@pytest.mark.parametrize("kind", ["never answers", "answers after a minute", "refuses", "hangs up", "postgresql"])
+def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
+    with ExitStack() as stack:
+        port = free_port()
+        if kind in ("never answers", "postgresql"):
+            port = stack.enter_context(Listener()).port
+        elif kind == "answers after a minute":
+            port = stack.enter_context(Listener(seconds=60)).port
+        elif kind == "hangs up":
+            port = stack.enter_context(Gate(free_port())).port
+        uri = f"postgresql+psycopg2://x@127.0.0.1:{port}/x" if kind == "postgresql" else f"http://127.0.0.1:{port}"
+        name = kind.replace(" ", "_")
+        _, errors = (program := start(runs, f"name={name}", f"tracking.uri={uri}")).communicate(timeout=SECONDS)
+    check_complete(runs, name, program.returncode, errors)
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_nothing_is_left_of_a_trial_that_is_ended_while_its_tracker_hangs(signum: int, runs: Path) -> None:
+    name = f"ended_by_{signum}"
+    with Listener() as tracker:
+        program = start(
+            runs, f"name={name}", f"tracking.uri=http://127.0.0.1:{tracker.port}", "train.iterations=100000"
+        )
+        mirrors = mirrors_of(program)
+        wait_until(lambda: bool(tracker.connections) and any((runs / name).glob("**/building.json")))
+        program.send_signal(signum)
+        _, errors = program.communicate(timeout=SECONDS)
+        gone, alive = psutil.wait_procs(mirrors, timeout=SECONDS)
+    assert not alive
+    assert len(gone) == 1
+    assert program.returncode == (128 + signum if signum != signal.SIGKILL else -signum), errors
+    assert "Traceback" not in errors
+
+
+def test_sync_can_be_stopped_while_the_tracker_hangs(runs: Path) -> None:
+    values = trial_values(runs, name="synced")
+    folder = TrialPaths.of(values).folder
+    write_trial(folder, values)
+    with Listener() as tracker:
+        config = values | {"tracking": options(f"postgresql+psycopg2://x@127.0.0.1:{tracker.port}/x")}
+        (folder / "config.yaml").write_text(json.dumps(config))
+        results = json.loads((folder / "results.json").read_text()) | {"status": "complete"}
+        (folder / "results.json").write_text(json.dumps(results))
+        program = subprocess.Popen(
+            [sys.executable, "-m", "gsbench.cli", "sync", "synced"],
+            env=child_environment() | {"GSBENCH_RUNS": str(runs)},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        mirrors = mirrors_of(program)
+        wait_until(lambda: bool(tracker.connections))
+        program.send_signal(signal.SIGINT)
+        _, errors = program.communicate(timeout=SECONDS)
+        _, alive = psutil.wait_procs(mirrors, timeout=SECONDS)
+    assert not alive
+    assert program.returncode == 128 + signal.SIGINT
+    assert "Traceback" not in errors
+
+
+def mirrors_of(program: subprocess.Popen[str]) -> list[psutil.Process]:
+    """The mirror processes of a program, once there are any."""
+    found: list[psutil.Process] = []
+
+    def look() -> bool:
+        with suppress(psutil.NoSuchProcess):
+            children = psutil.Process(program.pid).children(recursive=True)
+            found[:] = [
+                child for child in children if any("gsbench.tracking.child" in word for word in child.cmdline())
+            ]
+        return bool(found)
+
+    wait_until(look)
+    return found
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + SECONDS
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+@pytest.fixture(params=["http", "postgresql"])
+def tracker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Gate, str]]:
+    """A tracker that works, behind a gate, and its address there."""
+    with ExitStack() as stack:
+        if request.param == "http":
+            port = stack.enter_context(mlflow_server(tmp_path_factory.mktemp("server")))
+        else:
+            port = urlsplit(request.getfixturevalue("postgresql")).port
+        gate = stack.enter_context(Gate(port))
+        http = request.param == "http"
+        yield (
+            gate,
+            f"http://127.0.0.1:{gate.port}"
+            if http
+            else f"postgresql+psycopg2://gsbench@127.0.0.1:{gate.port}/postgres",
+        )
+
+
+def test_a_tracker_may_go_at_any_moment(tracker: tuple[Gate, str], tmp_path: Path) -> None:
+    """It is taken away early, late and in between; each time ``sync`` completes one run, with each value once."""
+    gate, uri = tracker
+    prepare(options(uri, patience=SECONDS), tmp_path, "tracked")
+    gate.passed = 0
+    assert "tracking" not in mirror_a_trial(tmp_path, uri, seed=0, patience=SECONDS)
+    whole = gate.passed
+    for seed, (share, then) in enumerate(
+        [(0.1, "hang"), (0.3, "close"), (0.5, "hang"), (0.7, "close"), (0.9, "hang")], 1
+    ):
+        gate.passed, gate.then, gate.limit = 0, then, int(share * whole)
+        assert "gsbench sync" in mirror_a_trial(tmp_path, uri, seed, patience=PATIENCE)
+        gate.mended()
+        values = trial_values(tmp_path, seed)
+        mirror_trial(options(uri), tmp_path, TrialPaths.of(values).folder, values)
+    client = connect(uri, tmp_path)
+    found = found_runs(client, "tracked")
+    assert sorted(run.data.tags["seed"] for run in found) == [str(seed) for seed in range(6)]
+    for run in found:
+        assert run.info.status == "FINISHED"
+        assert history(client, run.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
+        assert run.data.metrics["num_gaussians"] == 10 + int(run.data.tags["seed"])
+
+
+def mirror_a_trial(runs: Path, uri: str, seed: int, patience: float) -> str:
+    """Mirror a trial in a process of its own, which must end well; returns what it said."""
+    words = [sys.executable, "-c", MIRROR, str(runs), uri, str(seed), str(patience)]
+    done = subprocess.run(words, env=child_environment(), capture_output=True, text=True, timeout=SECONDS, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stderr
+
+
+@contextmanager
+def mlflow_server(folder: Path) -> Iterator[int]:
+    port = free_port()
+    words = ["server", "--backend-store-uri", f"sqlite:///{folder}/mlflow.db", "--artifacts-destination", str(folder)]
+    command = [sys.executable, "-m", "mlflow", *words, "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
+    lean = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
+    server = subprocess.Popen(
+        command, env=os.environ | lean, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+
+    def answers() -> bool:
+        with suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=5) as answer:
+            return bool(answer.status == 200)
+        return False
+
+    try:
+        wait_until(answers)
+        yield port
+    finally:
+        os.killpg(server.pid, signal.SIGKILL)
+        server.wait()

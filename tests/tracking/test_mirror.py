@@ -1,0 +1,263 @@
+"""The MLflow mirror: every metric arrives once and in the right experiment, and a bad tracker harms no trial."""
+
+from __future__ import annotations
+
+import json
+import logging
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.tracking import Mirror, connect, ensure_experiment, mirror_trial, prepare
+from gsbench.tracking.process import SECONDS_IN_VAIN, MirrorProcesses
+from gsbench.tracking.trial_run import STATE
+from tests.tracking.helpers import (
+    RECORDS,
+    child_environment,
+    found_runs,
+    free_port,
+    history,
+    options,
+    trial_values,
+    write_trial,
+)
+from tests.tracking.servers import Listener
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A runs folder with a database; making one takes MLflow seconds."""
+    folder = tmp_path_factory.mktemp("runs")
+    prepare(options(), folder, "tracked")
+    return folder
+
+
+@pytest.fixture
+def processes(monkeypatch: pytest.MonkeyPatch) -> MirrorProcesses:
+    """None kept from other tests."""
+    processes = MirrorProcesses()
+    monkeypatch.setattr("gsbench.tracking.mirror.processes", processes)
+    return processes
+
+
+def test_all_that_the_files_say_is_mirrored_once(runs: Path) -> None:
+    values = trial_values(runs, seed=1)
+    folder = TrialPaths.of(values).folder
+    folder.mkdir(parents=True)
+    with Mirror(options(), runs, folder, values):
+        write_trial(folder, values)
+    assert not mirror_trial(options(), runs, folder, values)
+    client = connect(None, runs)
+    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "1"]
+    assert run.info.status == "FINISHED"
+    assert run.data.metrics["psnr"] == 20.0
+    assert run.data.metrics["total/cloned"] == 150
+    assert {key: run.data.metrics[key] for key in run.data.metrics if key.startswith("init/")} == {
+        "init/num_points": 5.0,
+        "init/scene_extent": 4.5,
+    }
+    assert run.data.params["densify.name"] == "a_densify"
+    assert history(client, run.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
+    assert history(client, run.info.run_id, "events/cloned") == [(50, 50.0), (100, 100.0)]
+    assert {item.path for item in client.list_artifacts(run.info.run_id)} >= {"config.yaml", "results.json"}
+
+
+def test_a_crash_between_sending_and_noting_it_repeats_nothing(runs: Path) -> None:
+    values = trial_values(runs, seed=2)
+    folder = TrialPaths.of(values).folder
+    write_trial(folder, values)
+    assert mirror_trial(options(), runs, folder, values)
+    state = json.loads((folder / STATE).read_text())
+    (folder / STATE).write_text(json.dumps(state | {"complete": None, "logged": {"metrics.jsonl": 70}}))
+    assert mirror_trial(options(), runs, folder, values)
+    client = connect(None, runs)
+    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "2"]
+    assert len(history(client, run.info.run_id, "train/loss")) == RECORDS
+    assert len(history(client, run.info.run_id, "psnr")) == 1
+
+
+def test_results_that_changed_replace_the_run(runs: Path) -> None:
+    values = trial_values(runs, seed=3)
+    folder = TrialPaths.of(values).folder
+    write_trial(folder, values)
+    assert mirror_trial(options(), runs, folder, values)
+    write_trial(folder, values, psnr=33.0)
+    assert mirror_trial(options(), runs, folder, values)
+    assert not mirror_trial(options(), runs, folder, values)
+    (run,) = [run for run in found_runs(connect(None, runs), "tracked") if run.data.tags["seed"] == "3"]
+    assert run.data.metrics["psnr"] == 33.0
+
+
+def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs: Path) -> None:
+    values = trial_values(runs, seed=4)
+    folder = TrialPaths.of(values).folder
+    folder.mkdir(parents=True)
+    client = connect(None, runs)
+    for error, status in ((KeyboardInterrupt(), "KILLED"), (RuntimeError("x"), "FAILED")):
+        with pytest.raises(type(error)), Mirror(options(), runs, folder, values):  # noqa: PT012
+            time.sleep(1)
+            raise error
+        (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "4"]
+        assert run.info.status == status
+    with Mirror(options(), runs, folder, values):
+        write_trial(folder, values)
+    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "4"]
+    assert run.info.status == "FINISHED"
+
+
+def test_curves_of_a_training_in_progress_are_followed(runs: Path, tmp_path: Path) -> None:
+    values = trial_values(runs, seed=5)
+    folder = TrialPaths.of(values).folder
+    folder.mkdir(parents=True)
+    client = connect(None, runs)
+    seen = 0
+    with Mirror(options(), runs, folder, values) as mirror:
+        mirror.follow(tmp_path)
+        (tmp_path / "metrics.jsonl").write_text('{"step": 10, "loss": 0.5}\n{"step": 20, "lo')
+        for _ in range(100):
+            time.sleep(0.1)
+            state = folder / STATE
+            run_id = json.loads(state.read_text()).get("run_id") if state.exists() else None
+            seen = 0 if run_id is None else len(history(client, run_id, "train/loss"))
+            if seen:
+                break
+    assert seen == 1
+
+
+@pytest.mark.parametrize("uri", ["down", "not a database", "no such place", "nonsense"])
+def test_a_broken_tracker_harms_no_trial(uri: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "broken.db").write_text("this is no database" * 100)
+    address = {
+        "down": f"http://127.0.0.1:{free_port()}",
+        "not a database": f"sqlite:///{tmp_path}/broken.db",
+        "no such place": "sqlite:////proc/no/such/place.db",
+        "nonsense": "gopher://x",
+    }[uri]
+    values = trial_values(tmp_path)
+    folder = TrialPaths.of(values).folder
+    folder.mkdir(parents=True)
+    prepare(options(address), tmp_path, "tracked")
+    with Mirror(options(address), tmp_path, folder, values):
+        write_trial(folder, values)
+    warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert any(text.startswith("tracking: ") and "gsbench sync" in text for text in warnings)
+    assert all("\n" not in text for text in warnings)
+    assert (folder / "results.json").exists()
+
+
+@pytest.mark.usefixtures("processes")
+def test_a_slow_tracker_is_not_waited_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    others = psutil.Process().children()
+    values = trial_values(tmp_path)
+    folder = TrialPaths.of(values).folder
+    folder.mkdir(parents=True)
+    threads = threading.active_count()
+    with Listener() as tracker:
+        slow = options(f"http://127.0.0.1:{tracker.port}", patience=0.2)
+        prepare(slow, tmp_path, "tracked")
+        with Mirror(slow, tmp_path, folder, values):
+            write_trial(folder, values)
+    assert [record.getMessage().split(";")[0] for record in caplog.records] == ["tracking: MLflow is slow"] * 2
+    assert threading.active_count() == threads  # none that the end of the interpreter could hit
+    assert psutil.Process().children() == others
+
+
+def test_patience_is_short_after_it_was_in_vain(processes: MirrorProcesses) -> None:
+    class Fake:
+        is_alive = True
+
+        def kill(self) -> None:
+            self.is_alive = False
+
+        def close(self) -> None:
+            pass
+
+    process: Any = Fake()
+    assert processes.patience(30) == 30
+    processes.give_up(process)
+    assert not process.is_alive
+    assert processes.patience(30) == SECONDS_IN_VAIN
+    assert processes.patience(1) == 1
+    other: Any = Fake()
+    processes.give_back(other)
+    assert processes.patience(30) == 30
+    assert processes.take() is other
+
+
+@pytest.mark.usefixtures("processes")
+def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(
+    runs: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for seed in (6, 7):
+        values = trial_values(runs, seed)
+        folder = TrialPaths.of(values).folder
+        folder.mkdir(parents=True)
+        with Mirror(options(), runs, folder, values):
+            write_trial(folder, values)
+            if seed == 6:
+                for child in psutil.Process().children():
+                    child.kill()
+    (said,) = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert "the mirror crashed (SIGKILL" in said
+    assert "gsbench sync" in said
+    (run,) = [run for run in found_runs(connect(None, runs), "tracked") if run.data.tags["seed"] == "7"]
+    assert run.info.status == "FINISHED"
+
+
+def test_the_trials_process_loads_no_mlflow(runs: Path) -> None:
+    """No part of it can then take the process down, and it takes no memory beside a training."""
+    values = trial_values(runs, seed=8)
+    folder = TrialPaths.of(values).folder
+    folder.mkdir(parents=True)
+    code = (
+        "import json, sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror\n"
+        "options, runs, folder, values = json.loads(sys.argv[1])\n"
+        "with Mirror(options, Path(runs), Path(folder), values): pass\nsys.exit('mlflow' in sys.modules)"
+    )
+    words = json.dumps([options(), str(runs), str(folder), values])
+    done = subprocess.run(
+        [sys.executable, "-c", code, words], env=child_environment(), capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_database_is_whole_or_absent(tmp_path: Path) -> None:
+    """Killed while it makes the tables, a process leaves nothing that stops the next one."""
+    code = (
+        "import sys; from pathlib import Path; from gsbench.tracking import connect; connect(None, Path(sys.argv[1]))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], env=child_environment())
+    while not any(path.stat().st_size > 0 for path in tmp_path.glob(".mlflow.db.tmp-*")):
+        assert process.poll() is None
+        time.sleep(0.001)
+    process.kill()
+    process.wait()
+    assert not (tmp_path / "mlflow.db").exists()
+    assert connect(None, tmp_path).search_experiments()
+    assert (tmp_path / "mlflow.db").exists()
+
+
+def test_switched_off_means_no_mlflow(tmp_path: Path) -> None:
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror, prepare\n"
+        "o = {'enabled': False, 'uri': None, 'flush_seconds': 1, 'images': 0}\n"
+        "prepare(o, Path('.'), 'x')\nwith Mirror(o, Path('.'), Path('.'), {}): pass\nsys.exit('mlflow' in sys.modules)"
+    )
+    assert (
+        subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=child_environment(), check=False).returncode == 0
+    )
+
+
+def test_deleted_experiment_is_restored(runs: Path) -> None:
+    client = connect(None, runs)
+    first = ensure_experiment(client, "gone", runs)
+    client.delete_experiment(first)
+    assert ensure_experiment(client, "gone", runs) == first
+    assert client.get_experiment(first).lifecycle_stage == "active"
