@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 from filelock import FileLock
 
+from gsbench.files import atomic
+
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
@@ -94,10 +96,6 @@ def _create_sqlite(uri: str) -> None:
     name = sqlalchemy.engine.make_url(uri).database
     if not name or name == ":memory:" or Path(name).exists():
         return
-    temporary = Path(name).with_name(f".{Path(name).name}.tmp-{os.getpid()}")
-    try:
+    with atomic(Path(name)) as temporary:
         store = SqlAlchemyStore(f"sqlite:///{temporary}", str(Path(name).parent / "mlartifacts"))
         store.engine.dispose()
-        os.replace(temporary, name)
-    finally:
-        temporary.unlink(missing_ok=True)
