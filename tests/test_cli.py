@@ -42,10 +42,10 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("verb", list(cli.VERBS))
-def test_every_verb_has_help_without_torch(verb: str) -> None:
+def test_every_verb_has_help_without_torch(verb: str, tmp_path: Path) -> None:
     module = importlib.import_module(cli.VERBS[verb][0])
     with pytest.raises(SystemExit) as done:
-        module.main(["--help"])
+        module.main(["--help"], tmp_path)
     assert done.value.code == 0
 
 

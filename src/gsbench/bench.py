@@ -281,7 +281,7 @@ def _count(text: str) -> int:
     return int(text)
 
 
-def main(argv: list[str]) -> int:
+def main(argv: list[str], _runs: Path | None = None) -> int:
     """``gsbench bench``: print the table, or with ``--json`` the list of results."""
     from gsbench.raster.executors import EXECUTORS
 

@@ -79,8 +79,8 @@ def _verb(name: str, argv: list[str]) -> int:
             f"{name!r} is neither a verb nor a setting like key=value{closest(name, list(VERBS))} "
             f"(verbs: {', '.join(VERBS)})"
         )
-    main_function: Callable[[list[str]], int] = importlib.import_module(VERBS[name][0]).main
-    return main_function(argv)
+    main_function: Callable[[list[str], Path], int] = importlib.import_module(VERBS[name][0]).main
+    return main_function(argv, runs_dir())
 
 
 def _trials(argv: list[str]) -> int:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from gsbench.analysis.explain import explain
+from gsbench.analysis.explain import explain_cell
 from gsbench.analysis.results import load_experiment, read_experiment
 from gsbench.analysis.superseded import find_superseded
 from gsbench.analysis.tables import build_table
@@ -44,7 +44,7 @@ def test_two_versions_of_a_users_class_are_refused_and_both_are_named(tmp_path: 
     ):
         assert part in words
     with pytest.raises(InputError, match=r"different versions of mine\.Patient"):
-        explain("exp:garden:psnr:adc", tmp_path)
+        explain_cell("exp:garden:psnr:adc", tmp_path)
 
 
 def test_two_versions_of_a_stage_are_refused(tmp_path: Path) -> None:

@@ -6,14 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.analysis.explain import explain, main_explain
+from gsbench.analysis.explain import explain_cell
 from gsbench.errors import InputError
+from gsbench.verbs import explain as verb
 from tests.analysis.synthetic import Plan, write_runs
 
 
 def test_a_cell_names_its_trials_hashes_and_versions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = write_runs(tmp_path, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
-    assert main_explain(["table1:garden:lpips:volumetric"], tmp_path) == 0
+    assert verb.main(["table1:garden:lpips:volumetric"], tmp_path) == 0
     text = capsys.readouterr().out
     for path in paths:
         assert (str(path) in text) == ("volumetric" in str(path))
@@ -34,17 +35,17 @@ def test_the_settings_that_make_the_difference_are_shown(tmp_path: Path) -> None
     for path in write_runs(tmp_path, Plan(scenes=("garden",))):
         if "volumetric" in str(path):
             path.rename(path.with_name(path.name.replace("c0ffee00", "deadbeef")))
-    text = explain("exp:garden:psnr:sfm-volumetric", tmp_path)
+    text = explain_cell("exp:garden:psnr:sfm-volumetric", tmp_path)
     assert "Settings that differ from sfm-adc\n  densify.name: adc -> volumetric" in text
 
 
 def test_what_is_missing_is_said(tmp_path: Path) -> None:
     paths = write_runs(tmp_path, Plan(scenes=("garden",)))
     (paths[0] / "results.json").unlink()
-    text = explain("exp:garden:psnr:adc", tmp_path)
+    text = explain_cell("exp:garden:psnr:adc", tmp_path)
     assert "over 2 of 3 trials" in text
     assert "Left out\n  exp/garden/sfm-adc/c0ffee00-seed0: unfinished" in text
-    assert "not available: weights file alexnet.pth not found" in explain("exp:garden:lpips_alex:adc", tmp_path)
+    assert "not available: weights file alexnet.pth not found" in explain_cell("exp:garden:lpips_alex:adc", tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -61,4 +62,4 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
 def test_bad_addresses_are_explained(tmp_path: Path, address: str, words: str) -> None:
     write_runs(tmp_path, Plan(scenes=("garden",), inits=("sfm", "dim")))
     with pytest.raises(InputError, match=words):
-        explain(address, tmp_path)
+        explain_cell(address, tmp_path)

@@ -13,8 +13,8 @@ from gsbench.analysis.paper import TABLE1_QUANTITIES, Printed, inconsistencies, 
 from gsbench.analysis.paper_tables import Agreement, agreement, paper_tables, t_half_width
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.tables_cli import main_tables
 from gsbench.errors import InputError
+from gsbench.verbs import tables
 from tests.analysis.synthetic import Plan, write_runs
 
 
@@ -130,14 +130,14 @@ def test_an_experiment_without_the_papers_arms_is_refused(make_experiment: Calla
 def test_the_verb_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runs = tmp_path / "runs"
     write_runs(runs, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
-    assert main_tables(["table1"], runs) == 0
+    assert tables.main(["table1"], runs) == 0
     out = capsys.readouterr().out
     assert "### Table 1, measured" in out
     assert "### Table 1, difference" in out
-    assert main_tables(["table1", "--format", "latex", "--out", str(tmp_path / "out")], runs) == 0
+    assert tables.main(["table1", "--format", "latex", "--out", str(tmp_path / "out")], runs) == 0
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["table1-difference.tex", "table1.tex"]
-    assert main_tables(["table1", "--rows", "scene,densify", "--metrics", "psnr", "--format", "csv"], runs) == 0
-    assert main_tables(["paper"], runs) == 0
+    assert tables.main(["table1", "--rows", "scene,densify", "--metrics", "psnr", "--format", "csv"], runs) == 0
+    assert tables.main(["paper"], runs) == 0
     assert "ratio of totals" in capsys.readouterr().out
 
 
@@ -145,10 +145,10 @@ def test_the_verb_names_bad_options_and_left_out_trials(tmp_path: Path, capsys: 
     path = write_runs(tmp_path, Plan())[0]
     (path / "results.json").write_text("{")
     with pytest.raises(InputError, match="no trial has iterations=7"):
-        main_tables(["exp", "--where", "iterations=7"], tmp_path)
+        tables.main(["exp", "--where", "iterations=7"], tmp_path)
     assert "left out: exp/courtyard/sfm-adc/c0ffee00-seed0: damaged" in capsys.readouterr().err
     with pytest.raises(InputError, match="KEY=VALUE"):
-        main_tables(["exp", "--where", "iterations"], tmp_path)
+        tables.main(["exp", "--where", "iterations"], tmp_path)
     with pytest.raises(InputError, match="scene stands in --rows and --columns"):
-        main_tables(["exp", "--rows", "scene", "--columns", "scene"], tmp_path)
+        tables.main(["exp", "--rows", "scene", "--columns", "scene"], tmp_path)
     assert load_experiment(tmp_path, "exp").trials

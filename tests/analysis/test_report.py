@@ -13,7 +13,7 @@ from plyfile import PlyData
 
 from gsbench.analysis.errors_by_region import errors_by_region, texture_energy
 from gsbench.analysis.pairing import ViewCache, pair_trials
-from gsbench.analysis.report.build import build_report, main_report
+from gsbench.analysis.report.build import build_report
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
 from gsbench.analysis.report.crops import choose_crops
 from gsbench.analysis.report.sections import compare_arms, mean_by_step
@@ -21,6 +21,7 @@ from gsbench.analysis.report.sweep_charts import sweep_charts
 from gsbench.analysis.report.volumes import log10_volumes, share_above, volume_histogram
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.errors import InputError
+from gsbench.verbs import report
 from tests.analysis.synthetic import TEXTURED, Plan, trial_data, write_runs, write_trial
 
 ADC, VOLUMETRIC = ("sfm", "adc"), ("sfm", "volumetric")
@@ -225,7 +226,7 @@ def test_nothing_to_draw_is_an_empty_string() -> None:
 
 
 def test_the_verb_writes_the_file(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main_report(["exp", "--out", str(tmp_path / "sub" / "r.html")], runs) == 0
+    assert report.main(["exp", "--out", str(tmp_path / "sub" / "r.html")], runs) == 0
     assert (tmp_path / "sub" / "r.html").read_text().startswith("<!doctype html>")
     assert str(tmp_path / "sub" / "r.html") in capsys.readouterr().out
     assert [path.name for path in (tmp_path / "sub").iterdir()] == ["r.html"]

@@ -166,9 +166,9 @@ def test_what_cannot_be_viewed_is_said(small_runs: Path, tmp_path: Path) -> None
 def test_without_viser_the_mend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(InputError, match=re.escape(install_command("view"))):
-        verb.main(["a:b:c"])
+        verb.main(["a:b:c"], Path())
     with pytest.raises(InputError, match="one or two"):
-        verb.main(["a:b:c"] * 3)
+        verb.main(["a:b:c"] * 3, Path())
 
 
 def test_a_port_in_use_is_said() -> None:

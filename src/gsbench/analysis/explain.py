@@ -1,9 +1,7 @@
-"""The verb ``gsbench explain``: how one number of a table came about."""
+"""How one number of a table came about."""
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import Cell, check_averageable, make_cell, swept_settings
@@ -19,25 +17,13 @@ from gsbench.errors import InputError
 ADDRESS = "EXPERIMENT:SCENE:METRIC:ARM, such as table1:garden:lpips:volumetric or demo:courtyard:psnr:sfm-adc"
 
 
-def main_explain(argv: Sequence[str], runs_dir: Path) -> int:
-    """Run the verb; returns the exit code, raises ``InputError`` for bad input."""
-    parser = argparse.ArgumentParser(
-        prog="gsbench explain",
-        description="The runs, settings, data and code versions behind a cell of a table.",
-        epilog="gsbench explain --stale FOLDER tells why a stage of a trial is computed anew.",
-    )
-    parser.add_argument("cell", help=ADDRESS)
-    print(explain(parser.parse_args(argv).cell, runs_dir))
-    return 0
-
-
-def explain(address: str, runs_dir: Path) -> str:
+def explain_cell(address: str, runs: Path) -> str:
     """Plain text on the cell at ``address``; raises ``InputError`` where there is no such cell."""
     parts = address.split(":")
     if len(parts) != 4 or not all(parts):
         raise InputError(f"{address!r} is not {ADDRESS}")
     name, scene, metric, arm = parts
-    experiment = load_experiment(runs_dir, name)
+    experiment = load_experiment(runs, name)
     trials = _find(experiment, scene, arm)
     shown = quantity(metric, trials)
     variants = swept_settings(trials)

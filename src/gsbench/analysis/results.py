@@ -123,11 +123,7 @@ class Experiment:
 
 def load_experiment(runs_dir: Path, name: str) -> Experiment:
     """Read every trial of the experiment ``name``; raises ``InputError`` where there is no usable one."""
-    folder = runs_dir / name
-    if not name or not folder.is_dir():
-        known = ", ".join(list_experiments(runs_dir)) or "none yet"
-        raise InputError(f"no experiment {name!r} in {runs_dir}; there: {known}")
-    experiment = read_experiment(folder)
+    experiment = read_experiment(experiment_home(runs_dir, name))
     if not experiment.trials:
         warnings = experiment.warnings
         first = f" (first: {warnings[0]})" if warnings else ""
@@ -157,6 +153,14 @@ def list_experiments(runs_dir: Path) -> list[str]:
         return []
     found = (entry for entry in os.scandir(runs_dir) if entry.is_dir() and not entry.name.startswith("."))
     return sorted(entry.name for entry in found if entry.name not in NOT_EXPERIMENTS)
+
+
+def experiment_home(runs_dir: Path, name: str) -> Path:
+    """The folder of the experiment ``name``; raises InputError naming those there are."""
+    known = list_experiments(runs_dir)
+    if name not in known:
+        raise InputError(f"no experiment {name!r} in {runs_dir}; there: {', '.join(known) or 'none yet'}")
+    return runs_dir / name
 
 
 class _UnusableError(Exception):

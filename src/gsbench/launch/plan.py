@@ -50,7 +50,7 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Progress:
+class TrialState:
     """A trial's state with what people want to know of it: since when (Unix time), and a note.
 
     A trial that is done is ``superseded`` where the code that made it is no longer the present one.
@@ -117,28 +117,28 @@ def _read(home: Path) -> dict[str, Any]:
         ) from error
 
 
-def progress_of_experiment(home: Path) -> list[Progress]:
+def progress_of_experiment(home: Path) -> list[TrialState]:
     """The state of every trial of the experiment in ``home``, planned or found there."""
     planned = {trial.folder: trial.time for trial in read_plan(home)}
     found = {path for path in home.glob(TRIAL_GLOB) if path.is_dir() and (path / CONFIG).exists()}
     return [progress_of(folder, planned.get(folder)) for folder in sorted({*planned, *found})]
 
 
-def progress_of(folder: Path, planned: float | None = None) -> Progress:
+def progress_of(folder: Path, planned: float | None = None) -> TrialState:
     """The state of the trial in ``folder``; ``planned`` is when it was asked for."""
     state = state_of(folder)
     if state == "done":
-        return Progress(folder, state, _changed(folder / RESULTS), "")
+        return TrialState(folder, state, _changed(folder / RESULTS), "")
     if state == "failed":
-        return Progress(folder, state, _changed(folder / FAILED), failure_of(folder))
+        return TrialState(folder, state, _changed(folder / FAILED), failure_of(folder))
     if state == "running":
         holder = read_holder(folder / LOCK)
         job = f", Slurm job {holder['slurm']}" if holder.get("slurm") else ""
         where = f"process {holder.get('pid', '?')} on {holder.get('host', '?')}{job}"
-        return Progress(folder, state, holder.get("since"), f"{_reached(folder)} {where}".strip())
+        return TrialState(folder, state, holder.get("since"), f"{_reached(folder)} {where}".strip())
     if state == "partial":
-        return Progress(folder, state, _changed(folder / CONFIG), f"stopped {_reached(folder)}".strip())
-    return Progress(folder, state, planned, "never started")
+        return TrialState(folder, state, _changed(folder / CONFIG), f"stopped {_reached(folder)}".strip())
+    return TrialState(folder, state, planned, "never started")
 
 
 def _reached(folder: Path) -> str:

@@ -9,7 +9,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -38,9 +38,8 @@ class Finding:
     text: str
 
 
-def main(argv: list[str]) -> int:
+def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: 1 if something is bad."""
-    from gsbench.cli import runs_dir
 
     parser = argparse.ArgumentParser(prog="gsbench doctor", description="Check this machine and say what is missing.")
     parser.add_argument(
@@ -53,12 +52,12 @@ def main(argv: list[str]) -> int:
         check_torchvision,
         check_packages,
         check_kernels,
-        lambda: check_runs(runs_dir()),
-        lambda: check_tracking(runs_dir()),
+        lambda: check_runs(runs),
+        lambda: check_tracking(runs),
         check_weights,
     ]
     if options.store:
-        checks.append(lambda: check_store(runs_dir()))
+        checks.append(lambda: check_store(runs))
     bad = 0
     for check in checks:
         for finding in check():

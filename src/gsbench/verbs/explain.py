@@ -6,21 +6,26 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from gsbench.analysis.explain import ADDRESS, explain_cell
 from gsbench.errors import InputError
 
 
-def main(argv: list[str]) -> int:
-    from gsbench.cli import runs_dir
-
+def main(argv: Sequence[str], runs: Path) -> int:
+    """The verb; raises InputError for bad input."""
     if "--stale" in argv:
-        return main_stale([word for word in argv if word != "--stale"], runs_dir())
-    from gsbench.analysis.explain import main_explain
+        return _stale([word for word in argv if word != "--stale"], runs)
+    parser = argparse.ArgumentParser(
+        prog="gsbench explain",
+        description="The runs, settings, data and code versions behind a cell of a table.",
+        epilog="gsbench explain --stale FOLDER tells why a stage of a trial is computed anew.",
+    )
+    parser.add_argument("cell", help=ADDRESS)
+    print(explain_cell(parser.parse_args(argv).cell, runs))
+    return 0
 
-    return main_explain(argv, runs_dir())
 
-
-def main_stale(argv: Sequence[str], runs: Path) -> int:
-    """The verb with ``--stale``; returns the exit code, raises ``InputError`` for bad input."""
+def _stale(argv: Sequence[str], runs: Path) -> int:
+    """The verb with ``--stale``."""
     parser = argparse.ArgumentParser(
         prog="gsbench explain --stale",
         description="For each stage of a trial: whether its result is in the store; if not, what differs from the most "

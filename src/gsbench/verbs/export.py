@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,8 +21,7 @@ FORMATS = {
 }
 
 
-def main(argv: list[str]) -> int:
-    from gsbench.cli import runs_dir
+def main(argv: Sequence[str], runs: Path) -> int:
     from gsbench.view.trials import ADDRESS, find_trial
 
     parser = argparse.ArgumentParser(
@@ -41,7 +40,7 @@ def main(argv: list[str]) -> int:
     is_init = len(options.trial) == 2 and options.trial[0] == "init"
     if len(options.trial) > 1 and not is_init:
         raise InputError(f"one TRIAL is exported, not {len(options.trial)}; for an initial model: export init TRIAL")
-    trial = find_trial(options.trial[-1], runs_dir())
+    trial = find_trial(options.trial[-1], runs)
     out = options.out.expanduser()
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

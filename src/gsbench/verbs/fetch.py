@@ -22,7 +22,7 @@ MIRROR_VARIABLE = "GSBENCH_MIRROR"
 LOCK = ".fetch.lock"
 
 
-def main(argv: list[str]) -> int:
+def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: 0 if all that was asked for is here."""
     catalog = read_catalog()
     options = _parser(list(catalog)).parse_args(argv)

@@ -6,22 +6,22 @@ import argparse
 import logging
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import yaml
 
+from gsbench.analysis.results import experiment_home
 from gsbench.compose import Composed, compose_one
 from gsbench.errors import InputError
 from gsbench.launch.plan import Planned, describe_plan, forget, progress_of_experiment, read_plan
 from gsbench.pipeline.trial_files import TrialPaths, label_of, read_config
-from gsbench.verbs.status import experiment_home
 
 log = logging.getLogger(__name__)
 
 
-def main(argv: list[str]) -> int:
+def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: as the sweep's own command, the exit code says whether some trial failed."""
-    from gsbench.cli import runs_dir
     from gsbench.launch.command import run_trials
 
     parser = argparse.ArgumentParser(
@@ -33,7 +33,7 @@ def main(argv: list[str]) -> int:
     )
     parser.add_argument("--dry-run", action="store_true", help="only list them")
     options = parser.parse_args(argv)
-    home = experiment_home(runs_dir(), options.experiment)
+    home = experiment_home(runs, options.experiment)
     unfinished = [
         trial.folder for trial in progress_of_experiment(home) if trial.state in ("failed", "partial", "missing")
     ]
@@ -41,7 +41,7 @@ def main(argv: list[str]) -> int:
         print(f"nothing to retry: all trials of {options.experiment} are done or running")
         return 0
     planned = {trial.folder: trial for trial in read_plan(home)}
-    trials = [recompose(folder, planned.get(folder), runs_dir(), options.changes) for folder in unfinished]
+    trials = [recompose(folder, planned.get(folder), runs, options.changes) for folder in unfinished]
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0

@@ -6,13 +6,13 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from gsbench.analysis.results import Trial, read_experiment
+from gsbench.analysis.results import Trial, experiment_home, list_experiments, read_experiment
 from gsbench.analysis.superseded import find_superseded
-from gsbench.errors import InputError
-from gsbench.launch.plan import Progress, forget, progress_of_experiment, read_plan, remove
+from gsbench.launch.plan import TrialState, forget, progress_of_experiment, read_plan, remove
 from gsbench.pipeline.trial_files import label_of
 from gsbench.source import source_of
 from gsbench.words import counted, readable_time
@@ -20,10 +20,8 @@ from gsbench.words import counted, readable_time
 ORDER = ("failed", "running", "partial", "missing", "superseded", "done")
 
 
-def main(argv: list[str]) -> int:
+def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: 0 if all trials are done, 1 if some failed or are missing."""
-    from gsbench.cli import runs_dir
-
     parser = argparse.ArgumentParser(prog="gsbench status", description="The state of every trial of an experiment.")
     parser.add_argument("experiment", nargs="?", help="its name; without one, a line for each experiment")
     parser.add_argument("--all", action="store_true", help="list the finished trials too")
@@ -36,8 +34,8 @@ def main(argv: list[str]) -> int:
     )
     options = parser.parse_args(argv)
     if options.experiment is None:
-        return _overview(runs_dir())
-    home = experiment_home(runs_dir(), options.experiment)
+        return _overview(runs)
+    home = experiment_home(runs, options.experiment)
     trials = progress_with_superseded(home)
     if options.forget_superseded:
         superseded = [trial for trial in trials if trial.state == "superseded"]
@@ -58,7 +56,7 @@ def main(argv: list[str]) -> int:
     return 0 if all(trial.state in ("done", "running", "superseded") for trial in trials) else 1
 
 
-def progress_with_superseded(home: Path) -> list[Progress]:
+def progress_with_superseded(home: Path) -> list[TrialState]:
     """The state of every trial of the experiment in ``home``, of finished ones also whether their code is the present.
 
     A user's class is looked up where the trial was asked for: another folder may have another file of that name.
@@ -87,16 +85,7 @@ def present_source(target: str, folder: str) -> str | None:
         sys.path[:] = saved
 
 
-def experiment_home(runs: Path, name: str) -> Path:
-    """The folder of the experiment ``name``; raises InputError naming those there are."""
-    from gsbench.analysis.results import list_experiments
-
-    if name not in list_experiments(runs):
-        raise InputError(f"no experiment {name!r} in {runs}; there: {', '.join(list_experiments(runs)) or 'none yet'}")
-    return runs / name
-
-
-def lines_of(trials: list[Progress], everything: bool) -> list[str]:
+def lines_of(trials: list[TrialState], everything: bool) -> list[str]:
     """A line for each trial that deserves attention (or each, with ``everything``), and a summary."""
     lines = []
     for state in ORDER:
@@ -109,7 +98,7 @@ def lines_of(trials: list[Progress], everything: bool) -> list[str]:
     return lines
 
 
-def summary_of(trials: list[Progress]) -> str:
+def summary_of(trials: list[TrialState]) -> str:
     """How many trials are in which state, in one line."""
     counts = {state: sum(trial.state == state for trial in trials) for state in reversed(ORDER)}
     return f"{counted(len(trials), 'trial')}: " + ", ".join(
@@ -118,8 +107,6 @@ def summary_of(trials: list[Progress]) -> str:
 
 
 def _overview(runs: Path) -> int:
-    from gsbench.analysis.results import list_experiments
-
     names = list_experiments(runs)
     if not names:
         print(f"no experiment in {runs} yet")
@@ -128,9 +115,9 @@ def _overview(runs: Path) -> int:
     return 0
 
 
-def _age(trial: Progress) -> str:
+def _age(trial: TrialState) -> str:
     return "" if trial.since is None else readable_time(max(0.0, time.time() - trial.since))
 
 
-def _as_dict(trial: Progress) -> dict[str, object]:
+def _as_dict(trial: TrialState) -> dict[str, object]:
     return {"folder": str(trial.folder), "state": trial.state, "since": trial.since, "note": trial.note}

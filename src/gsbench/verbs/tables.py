@@ -1,10 +1,95 @@
-"""``gsbench tables``: tables of an experiment from its result files."""
+"""``gsbench tables``: read an experiment's result files, print or write its tables."""
 
 from __future__ import annotations
 
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
 
-def main(argv: list[str]) -> int:
-    from gsbench.analysis.tables_cli import main_tables
-    from gsbench.cli import runs_dir
+from gsbench.analysis.cells import select_trials
+from gsbench.analysis.paper import inconsistencies, load_paper
+from gsbench.analysis.paper_tables import PAPER_TABLES, paper_tables
+from gsbench.analysis.results import load_experiment
+from gsbench.analysis.table_formats import FORMATS
+from gsbench.analysis.tables import DEFAULT_ROWS, Table, build_table
+from gsbench.errors import InputError
 
-    return main_tables(argv, runs_dir())
+PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsistencies
+
+
+def main(argv: Sequence[str], runs: Path) -> int:
+    """The verb; raises InputError for bad input."""
+    options = _parser().parse_args(argv)
+    if options.experiment == PAPER_NOTES and not (runs / PAPER_NOTES).exists():
+        print("\n".join(f"- {line}" for line in inconsistencies(load_paper())))
+        return 0
+    experiment = load_experiment(runs, options.experiment)
+    for warning in experiment.warnings:
+        print(f"left out: {warning}", file=sys.stderr)
+    trials = select_trials(experiment.trials, _conditions(options.where))
+    layout = options.layout or (experiment.name if _is_plain(options) and experiment.name in PAPER_TABLES else "plain")
+    metrics = _words(options.metrics)
+    if layout == "plain":
+        rows, columns = _words(options.rows), _words(options.columns) or ()
+        if set(rows or ()) & set(columns):
+            raise InputError(
+                f"{', '.join(sorted(set(rows or ()) & set(columns)))} stands in --rows and --columns: choose one"
+            )
+        tables = [build_table(experiment, trials, rows, columns, metrics)]
+    else:
+        tables = paper_tables(experiment, layout, trials, metrics)
+    _write(tables, options.format, options.out, experiment.name)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="gsbench tables",
+        description="Tables of an experiment, from its result files; `gsbench tables paper` lists what the paper's own "
+        "numbers contradict.",
+    )
+    parser.add_argument(
+        "experiment", help="its name; table1 and table2 come in the paper's layout, with its values beside"
+    )
+    parser.add_argument("--format", choices=list(FORMATS), default="md")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write into this folder instead of printing")
+    parser.add_argument("--rows", metavar="A,B", help=f"fields or config keys (default {','.join(DEFAULT_ROWS)})")
+    parser.add_argument("--columns", metavar="A,B", help="fields or config keys, each crossed with every metric")
+    parser.add_argument("--metrics", metavar="A,B", help="such as psnr,ssim,lpips_squeeze,gaussians,train_time")
+    parser.add_argument(
+        "--where", action="append", default=[], metavar="KEY=VALUE", help="only such trials (repeatable)"
+    )
+    parser.add_argument("--layout", choices=[*PAPER_TABLES, "plain"], help="the paper's layout for any experiment")
+    return parser
+
+
+def _is_plain(options: argparse.Namespace) -> bool:
+    """No layout of the user's own was asked for."""
+    return options.rows is None and options.columns is None
+
+
+def _words(text: str | None) -> tuple[str, ...] | None:
+    return None if text is None else tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def _conditions(pairs: Sequence[str]) -> dict[str, str]:
+    for pair in pairs:
+        if "=" not in pair:
+            raise InputError(f"--where {pair!r} is not KEY=VALUE, such as iterations=30000")
+    return dict(pair.split("=", 1) for pair in pairs)
+
+
+def _write(tables: Sequence[Table], form: str, out: Path | None, name: str) -> None:
+    suffix, writer = FORMATS[form]
+    if out is None:
+        print("\n".join(writer(table) for table in tables), end="")
+        return
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write into {out} ({error.strerror}); give another --out") from None
+    for index, table in enumerate(tables):
+        path = out / (f"{name}.{suffix}" if index == 0 else f"{name}-difference.{suffix}")
+        path.write_text(writer(table), encoding="utf-8")
+        print(path)

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
@@ -16,9 +17,8 @@ DEFAULT_PORT = 5000
 MAX_COMPARED = 100  # runs in an address; browsers limit its length
 
 
-def main(argv: list[str]) -> int:
+def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: serves until Ctrl-C."""
-    from gsbench.cli import runs_dir
 
     parser = argparse.ArgumentParser(prog="gsbench ui", description="The MLflow dashboard, on this machine only.")
     parser.add_argument("experiment", nargs="?", help="print the address that compares its trials")
@@ -26,7 +26,6 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--port", type=int, default=DEFAULT_PORT)
     parser.add_argument("--print-url", action="store_true", help="only print the address")
     options = parser.parse_args(argv)
-    runs = runs_dir()
     if options.uri is None and not (runs / "mlflow.db").exists():
         raise InputError(f"no MLflow database in {runs}: run a trial first, or `gsbench sync`, or give --uri")
     from gsbench.tracking import default_uri

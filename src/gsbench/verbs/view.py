@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import threading
+from collections.abc import Sequence
+from pathlib import Path
 
 from gsbench.errors import InputError
 from gsbench.install import install_command
@@ -13,7 +15,7 @@ from gsbench.view import ADDRESS
 DEFAULT_PORT = 8080
 
 
-def main(argv: list[str]) -> int:
+def main(argv: Sequence[str], runs: Path) -> int:
     parser = argparse.ArgumentParser(
         prog="gsbench view", description="Look at trained models in the browser: one, or two side by side."
     )
@@ -26,7 +28,6 @@ def main(argv: list[str]) -> int:
     if importlib.util.find_spec("viser") is None:
         raise InputError(f"the viewer needs viser: {install_command('view')}")
 
-    from gsbench.cli import runs_dir
     from gsbench.pipeline.components import select_device
     from gsbench.raster import create_rasterizer
     from gsbench.view.picture import TrialPainter
@@ -35,7 +36,7 @@ def main(argv: list[str]) -> int:
 
     check_port(options.port)
     device = select_device(options.device)
-    trials = [find_trial(address, runs_dir()) for address in options.trial]
+    trials = [find_trial(address, runs) for address in options.trial]
     rasterizer = create_rasterizer("auto", device)
     viewer = Viewer([TrialPainter(load_viewed(trial, device), rasterizer) for trial in trials], options.port)
     print(f"{viewer.url}  (Ctrl+C ends it)", flush=True)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from importlib.resources import files
-from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined
 
@@ -24,35 +22,11 @@ from gsbench.analysis.report.sections import (
 )
 from gsbench.analysis.report.sweep_charts import sweep_charts
 from gsbench.analysis.report.tradeoff_charts import tradeoff_charts, tradeoff_gaps
-from gsbench.analysis.results import Experiment, Trial, load_experiment
+from gsbench.analysis.results import Experiment, Trial
 from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import build_table
-from gsbench.errors import InputError
-from gsbench.files import write_text
 
 FIGURES = "figures"  # a trial's pictures for the report, such as ellipsoid overlays and initial clouds
-REPORT_NAME = "report.html"
-
-
-def main_report(argv: Sequence[str], runs_dir: Path) -> int:
-    """The verb ``gsbench report``; returns the exit code, raises ``InputError`` for bad input."""
-    parser = argparse.ArgumentParser(
-        prog="gsbench report", description="One HTML file with the evidence of an experiment."
-    )
-    parser.add_argument("experiment")
-    parser.add_argument("--out", type=Path, metavar="FILE", help=f"default: {REPORT_NAME} in the experiment's folder")
-    parser.add_argument("--baseline", default=BASELINE, help=f"the densifier that others are held against ({BASELINE})")
-    options = parser.parse_args(argv)
-    experiment = load_experiment(runs_dir, options.experiment)
-    path = options.out or experiment.folder / REPORT_NAME
-    text = build_report(experiment, options.baseline)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, text)
-    except OSError as error:
-        raise InputError(f"cannot write {path} ({error.strerror}); give another --out") from None
-    print(path)
-    return 0
 
 
 def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
