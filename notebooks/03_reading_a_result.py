@@ -26,9 +26,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from IPython.display import Markdown
 
+from gsbench.analysis import load_experiment, to_frame
 from gsbench.analysis.errors_by_region import errors_by_region
 from gsbench.analysis.pairing import ViewCache, pair_arms
-from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import compare, seeds_needed
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
@@ -67,6 +67,17 @@ run(["-m", "scene=courtyard", "densify=adc,volumetric", "seed=0,1,2", "name=read
 # %%
 experiment = load_experiment(runs, "reading")
 Markdown(to_markdown(build_table(experiment)))
+
+# %% [markdown]
+# Or everything as a data frame, one row a trial, for whatever pandas can do with it. `gsbench tables reading --format
+# trials` writes the same as CSV.
+
+# %%
+frame = to_frame(experiment)
+frame[["densify", "seed", "psnr", "ssim", "num_gaussians", "seconds_train", "event_cloned", "event_split_volume"]]
+
+# %%
+frame.groupby("densify")[["psnr", "num_gaussians"]].agg(["mean", "std", "min", "max"]).round(2)
 
 # %% [markdown]
 # ## Seeds are paired

@@ -1,1 +1,6 @@
-"""What result files say: cells, statistics, tables, report. Loads no torch."""
+"""What result files say: tables, statistics, reports. Knows result files only, and loads no torch."""
+
+from gsbench.analysis.frame import to_frame
+from gsbench.analysis.results import load_experiment
+
+__all__ = ["load_experiment", "to_frame"]

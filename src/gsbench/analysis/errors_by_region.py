@@ -52,11 +52,11 @@ class RegionErrors:
 
 def texture_energy(image: NDArray[np.uint8]) -> Array:
     """Local mean of the squared luminance gradient (8-bit levels squared), [H, W], of an image [H, W, 3] uint8."""
-    from scipy.ndimage import gaussian_filter  # here, since it is slow to import
+    from skimage.filters import gaussian  # here, since it is slow to import
 
     luminance = image.astype(np.float64) @ np.array(LUMINANCE)  # [H, W]
     rows, columns = np.gradient(luminance)
-    return gaussian_filter(rows**2 + columns**2, TEXTURE_SIGMA)
+    return gaussian(rows**2 + columns**2, TEXTURE_SIGMA, mode="reflect", preserve_range=True)
 
 
 def absolute_error(render: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Array:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import html
-import io
 import itertools
 import re
 from collections.abc import Callable
@@ -26,15 +24,15 @@ def to_markdown(table: Table) -> str:
 
 def to_csv(table: Table) -> str:
     """One line for each cell, in full precision, with the folders of its trials."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(
-        [*table.row_headings, "quantity", "column", "mean", "std", "count", "expected", "best", "text", "trials"]
-    )
-    for row in table.rows:
-        for (quantity, arm), entry in zip(table.keys, row.entries, strict=True):
-            writer.writerow([*row.labels, quantity, arm, *_numbers(entry), int(entry.bold), entry.text, _trials(entry)])
-    return buffer.getvalue()
+    import pandas as pd  # here, since it is slow to import
+
+    heads = [*table.row_headings, "quantity", "column", "mean", "std", "count", "expected", "best", "text", "trials"]
+    cells = [
+        [*row.labels, quantity, arm, *_numbers(entry), int(entry.bold), entry.text, _trials(entry)]
+        for row in table.rows
+        for (quantity, arm), entry in zip(table.keys, row.entries, strict=True)
+    ]
+    return str(pd.DataFrame(cells, columns=heads, dtype=object).to_csv(index=False, lineterminator="\n"))
 
 
 def to_latex(table: Table) -> str:
@@ -164,9 +162,7 @@ def _html_text(entry: Entry) -> str:
 
 def _numbers(entry: Entry) -> list[object]:
     cell = entry.cell
-    if cell is None:
-        return ["", "", "", ""]
-    return ["" if cell.mean is None else cell.mean, "" if cell.std is None else cell.std, cell.count, cell.expected]
+    return [None] * 4 if cell is None else [cell.mean, cell.std, cell.count, cell.expected]
 
 
 def _trials(entry: Entry) -> str:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import select_trials
+from gsbench.analysis.frame import to_frame
 from gsbench.analysis.paper import inconsistencies, load_paper
 from gsbench.analysis.paper_tables import PAPER_TABLES, paper_tables
-from gsbench.analysis.results import load_experiment
+from gsbench.analysis.results import Experiment, Trial, load_experiment
 from gsbench.analysis.table_formats import FORMATS
-from gsbench.analysis.tables import DEFAULT_ROWS, Table, build_table
+from gsbench.analysis.tables import DEFAULT_ROWS, build_table
 from gsbench.errors import InputError
+from gsbench.files import write_text
 
+TRIALS = "trials"
 PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsistencies
 
 
@@ -28,6 +31,21 @@ def main(argv: Sequence[str], runs: Path) -> int:
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     trials = select_trials(experiment.trials, _conditions(options.where))
+    texts = _trials(trials, options) if options.format == TRIALS else _tables(experiment, trials, options)
+    _write(texts, options.out, experiment.name)
+    return 0
+
+
+def _trials(trials: Sequence[Trial], options: argparse.Namespace) -> dict[str, str]:
+    """One row a trial; what only a table has is refused."""
+    for name in ("rows", "columns", "metrics", "layout"):
+        if getattr(options, name) is not None:
+            raise InputError(f"--format {TRIALS} shows every column of every trial, and takes no --{name}")
+    return {"-trials.csv": to_frame(trials).to_csv(index=False, lineterminator="\n")}
+
+
+def _tables(experiment: Experiment, trials: Sequence[Trial], options: argparse.Namespace) -> dict[str, str]:
+    """The tables as text, each with what its file's name ends in."""
     layout = options.layout or (experiment.name if _is_plain(options) and experiment.name in PAPER_TABLES else "plain")
     metrics = _words(options.metrics)
     if layout == "plain":
@@ -39,8 +57,9 @@ def main(argv: Sequence[str], runs: Path) -> int:
         tables = [build_table(experiment, trials, rows, columns, metrics)]
     else:
         tables = paper_tables(experiment, layout, trials, metrics)
-    _write(tables, options.format, options.out, experiment.name)
-    return 0
+    suffix, writer = FORMATS[options.format]
+    ends = ("", "-difference")
+    return {f"{end}.{suffix}": writer(table) for end, table in zip(ends, tables, strict=False)}
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -52,7 +71,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "experiment", help="its name; table1 and table2 come in the paper's layout, with its values beside"
     )
-    parser.add_argument("--format", choices=list(FORMATS), default="md")
+    parser.add_argument(
+        "--format", choices=[*FORMATS, TRIALS], default="md", help=f"{TRIALS}: CSV with one row a trial instead"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="write into this folder instead of printing")
     parser.add_argument("--rows", metavar="A,B", help=f"fields or config keys (default {','.join(DEFAULT_ROWS)})")
     parser.add_argument("--columns", metavar="A,B", help="fields or config keys, each crossed with every metric")
@@ -80,16 +101,16 @@ def _conditions(pairs: Sequence[str]) -> dict[str, str]:
     return dict(pair.split("=", 1) for pair in pairs)
 
 
-def _write(tables: Sequence[Table], form: str, out: Path | None, name: str) -> None:
-    suffix, writer = FORMATS[form]
+def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
+    """Print the texts, or write each into a file of the folder ``out`` that is named after the experiment."""
     if out is None:
-        print("\n".join(writer(table) for table in tables), end="")
+        print("\n".join(texts.values()), end="")
         return
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot write into {out} ({error.strerror}); give another --out") from None
-    for index, table in enumerate(tables):
-        path = out / (f"{name}.{suffix}" if index == 0 else f"{name}-difference.{suffix}")
-        path.write_text(writer(table), encoding="utf-8")
+    for end, text in texts.items():
+        path = out / f"{name}{end}"
+        write_text(path, text)
         print(path)

@@ -78,9 +78,11 @@ def _extremes(
     first: NDArray[np.uint8], second: NDArray[np.uint8], truth: NDArray[np.uint8]
 ) -> list[tuple[float, tuple[int, int, int, int]]]:
     """The boxes of largest and smallest mean gain of the second image in a view."""
+    from skimage.transform import integral_image  # here, since it is slow to import
+
     gain = absolute_error(first, truth) - absolute_error(second, truth)  # [H, W]
     height = width = max(1, min(CROP, min(gain.shape) // 3))
-    sums = np.pad(gain.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))  # integral image
+    sums = np.pad(integral_image(gain), ((1, 0), (1, 0)))  # [H + 1, W + 1]
     boxes = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
     found = []
     for place in (int(boxes.argmax()), int(boxes.argmin())):

@@ -1,0 +1,61 @@
+"""An experiment as a data frame: one row a trial, for notebooks, for other programs, and as CSV."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from gsbench.analysis.cells import swept_settings
+from gsbench.analysis.quantities import METRICS
+from gsbench.analysis.results import Experiment, Trial
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+NAMES = ("experiment", "scene", "init", "densify", "seed")
+CONDITIONS = ("protocol", "raster", "iterations")
+COUNTS = ("num_init_points", "num_gaussians", "scene_extent", "peak_memory_mb", "train_views", "test_views")
+
+
+def to_frame(trials: Experiment | Sequence[Trial]) -> pd.DataFrame:
+    """The complete trials of an experiment, or some of them, as a data frame with these columns:
+
+    - ``experiment``, ``scene``, ``init``, ``densify``, ``seed``: which trial it is;
+    - every setting that was swept within those, by its dotted key, such as ``densify.max_gaussians``;
+    - ``protocol``, ``raster``, ``iterations``, and ``width`` and ``height`` of the views in px;
+    - every metric that some trial has, as the mean over its test views (``psnr`` in dB; not a number where it could
+      not be computed);
+    - ``num_init_points``, ``num_gaussians``, ``scene_extent`` (world units), ``peak_memory_mb``, ``train_views`` and
+      ``test_views``;
+    - ``seconds_init``, ``seconds_train``, ``seconds_evaluate``;
+    - ``event_<cause>``: how many Gaussians the refinements cloned, split, pruned and so on, by cause;
+    - ``hash_config``, ``hash_data``, ``hash_init`` and so on: what the trial came from;
+    - ``folder``: where its files lie.
+
+    What a trial lacks is missing in its row, never 0.
+    """
+    import pandas as pd  # here, since it is slow to import
+
+    chosen = list(trials.trials if isinstance(trials, Experiment) else trials)
+    swept = swept_settings(chosen)
+    present = {key for trial in chosen for key in trial.metrics}
+    metrics = [key for key in METRICS if key in present] + sorted(present - METRICS.keys())
+    return pd.DataFrame([_row(trial, swept, metrics) for trial in chosen]).convert_dtypes(
+        convert_string=False, convert_floating=False
+    )
+
+
+def _row(trial: Trial, swept: Sequence[str], metrics: Sequence[str]) -> dict[str, Any]:
+    data = trial.data
+    size = data.get("resolution") or (None, None)
+    groups = {"seconds": data["seconds"], "event": data.get("events") or {}, "hash": data.get("hashes") or {}}
+    return (
+        {name: data[name] for name in NAMES}
+        | {key: trial.config.get(key) for key in swept}
+        | {name: data[name] for name in CONDITIONS}
+        | {"width": size[0], "height": size[1]}
+        | {key: trial.metrics.get(key) for key in metrics}
+        | {name: data.get(name) for name in COUNTS}
+        | {f"{prefix}_{key}": value for prefix, group in groups.items() for key, value in group.items()}
+        | {"folder": str(trial.path)}
+    )

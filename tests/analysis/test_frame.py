@@ -1,0 +1,74 @@
+"""The data frame of an experiment: one row a trial, as the result files have it."""
+
+from __future__ import annotations
+
+import io
+import json
+import statistics
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from gsbench.analysis import to_frame
+from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.errors import InputError
+from gsbench.verbs import tables
+from tests.analysis.test_tables import one_trial
+
+Make = Callable[..., Experiment]
+
+
+def test_a_row_is_a_trial_as_its_file_says(make_experiment: Make) -> None:
+    experiment = make_experiment()
+    frame = to_frame(experiment)
+    assert len(frame) == len(experiment.trials) == 12
+    for (_, row), trial in zip(frame.iterrows(), experiment.trials, strict=True):
+        data = json.loads((trial.path / "results.json").read_text())
+        assert row["folder"] == str(trial.path)
+        for key in ("experiment", "scene", "init", "densify", "seed", "raster", "protocol", "num_gaussians"):
+            assert row[key] == data[key]
+        assert {key: row[key] for key in data["metrics"]} == data["metrics"]
+        assert (row["width"], row["height"]) == (400, 300)
+        assert row["seconds_train"] == data["seconds"]["train"]
+        assert row["event_split_volume"] == data["events"]["split_volume"]
+        assert row["hash_init"] == data["hashes"]["init"]
+    assert frame["num_gaussians"].dtype == frame["seed"].dtype == pd.Int64Dtype()
+
+
+def test_groups_of_the_frame_are_the_cells_of_the_table(make_experiment: Make) -> None:
+    experiment = make_experiment()
+    means = to_frame(experiment).groupby(["scene", "densify"])["psnr"].agg(["mean", "std"])
+    values = [t.metrics["psnr"] for t in experiment.trials if (t.scene, t.densify) == ("garden", "adc")]
+    assert means.loc[("garden", "adc"), "mean"] == pytest.approx(statistics.fmean(values), abs=1e-12)
+    assert means.loc[("garden", "adc"), "std"] == pytest.approx(statistics.stdev(values), abs=1e-12)
+
+
+def test_what_is_missing_is_missing_and_what_was_swept_has_a_column(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0, flip=0.1, _num_init_points=None)
+    one_trial(tmp_path, 0, "bbbbbbbb", {"densify__volume_threshold": 0.1}, psnr=28.0, own=3.0)
+    frame = to_frame(load_experiment(tmp_path, "exp"))
+    assert frame["densify.volume_threshold"].tolist() == [0.03, 0.1]
+    assert frame["flip"].isna().tolist() == [False, True]
+    assert frame["own"].tolist()[1] == 3.0
+    assert frame["num_init_points"].isna().tolist() == [True, False]
+    assert frame["num_init_points"][1] == 3000
+
+
+def test_the_csv_of_trials_reads_back_as_the_frame(
+    make_experiment: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frame = to_frame(make_experiment())
+    assert tables.main(["exp", "--format", "trials"], tmp_path) == 0
+    again = pd.read_csv(io.StringIO(capsys.readouterr().out))
+    assert again.columns.tolist() == frame.columns.tolist()
+    for name in ("psnr", "flip", "seconds_train"):
+        np.testing.assert_array_equal(again[name], frame[name])
+    assert (
+        tables.main(["exp", "--format", "trials", "--where", "seed=1", "--out", str(tmp_path / "out")], tmp_path) == 0
+    )
+    assert len(pd.read_csv(tmp_path / "out" / "exp-trials.csv")) == 4
+    with pytest.raises(InputError, match="takes no --metrics"):
+        tables.main(["exp", "--format", "trials", "--metrics", "psnr"], tmp_path)
