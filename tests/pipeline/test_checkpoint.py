@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.pipeline.checkpoint import load_checkpoint, save_checkpoint
+from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.pipeline.checkpoint import CheckpointWriter, load_checkpoint, save_checkpoint, to_host
 from gsbench.pipeline.stopping import Stopped, deferred, requested, stop_on_signals
-
-CPU = torch.device("cpu")
+from tests.gaussians.helpers import random_gaussians
 
 
 def state(step: int) -> dict[str, object]:
@@ -38,11 +38,11 @@ def equal(first: object, second: object) -> bool:
 
 
 def test_newest_is_loaded_and_two_are_kept(tmp_path: Path) -> None:
-    assert load_checkpoint(tmp_path, CPU) is None
+    assert load_checkpoint(tmp_path) is None
     for step in (10, 20, 30):
         save_checkpoint(tmp_path, step, state(step))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-00000020.pt", "checkpoint-00000030.pt"]
-    loaded = load_checkpoint(tmp_path, CPU)
+    loaded = load_checkpoint(tmp_path)
     assert equal(loaded, state(30))
 
 
@@ -67,17 +67,17 @@ def test_any_flipped_or_missing_byte_is_noticed_and_the_one_before_serves(
             del content[rng.randrange(len(content)) :]
         newest.write_bytes(content)
         caplog.clear()
-        assert equal(load_checkpoint(tmp_path, CPU), state(10))
+        assert equal(load_checkpoint(tmp_path), state(10))
         assert "checkpoint-00000020.pt is damaged" in caplog.text
         assert not newest.exists()
     newest.write_bytes(sound)
-    assert equal(load_checkpoint(tmp_path, CPU), state(20))
+    assert equal(load_checkpoint(tmp_path), state(20))
 
 
 def test_all_damaged_means_none(tmp_path: Path) -> None:
     save_checkpoint(tmp_path, 10, state(10))
     (tmp_path / "checkpoint-00000010.pt").write_bytes(b"")
-    assert load_checkpoint(tmp_path, CPU) is None
+    assert load_checkpoint(tmp_path) is None
 
 
 def test_nothing_in_a_checkpoint_is_run_as_code(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_nothing_in_a_checkpoint_is_run_as_code(tmp_path: Path) -> None:
             return os.mkdir, (str(tmp_path / "hacked"),)
 
     save_checkpoint(tmp_path, 10, {"evil": Evil()})
-    assert load_checkpoint(tmp_path, CPU) is None
+    assert load_checkpoint(tmp_path) is None
     assert not (tmp_path / "hacked").exists()
 
 
@@ -102,11 +102,57 @@ def test_failed_write_leaves_the_old_one_and_no_temporary(tmp_path: Path, monkey
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint-00000010.pt"]
 
 
-def test_killed_while_writing_leaves_a_readable_one(tmp_path: Path) -> None:
+def test_in_the_background_the_state_is_that_of_the_moment(tmp_path: Path) -> None:
+    """The training goes on, in place, while the thread writes."""
+    writer = CheckpointWriter(tmp_path, background=True)
+    live = {"step": 0, "nested": [{"tensor": torch.zeros(2_000_000)}], "view": torch.arange(6).view(2, 3)[:, 1]}
+    for step in (1, 2, 3):
+        live["step"] = step
+        live["nested"][0]["tensor"].fill_(step)  # type: ignore[index]
+        writer.save(step, live)
+        live["nested"][0]["tensor"].fill_(-1)  # type: ignore[index]
+    writer.close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-00000002.pt", "checkpoint-00000003.pt"]
+    loaded = load_checkpoint(tmp_path)
+    assert loaded is not None
+    assert loaded["step"] == 3
+    assert bool((loaded["nested"][0]["tensor"] == 3).all())
+    assert torch.equal(loaded["view"], live["view"])  # type: ignore[arg-type]
+
+
+def test_an_error_in_the_background_is_raised_and_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    writer = CheckpointWriter(tmp_path, background=True)
+    writer.save(10, state(10))
+    writer.finish()
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "save", lambda *arguments: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+        writer.save(20, state(20))
+        with pytest.raises(OSError, match="No space left"):
+            writer.save(30, state(30))
+    writer.save(40, state(40))
+    writer.close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-00000010.pt", "checkpoint-00000040.pt"]
+
+
+def test_a_state_goes_to_another_device_whole() -> None:
+    """Nothing of a checkpoint stays on the CPU that the model's device needs, and the other way round."""
+    rates = LearningRates()
+    gaussians = TrainableGaussians(random_gaussians(5, seed=0, dtype=torch.float32), rates, 1.0)
+    gaussians.values.means.square().sum().backward()
+    gaussians.optimizer_step()
+    moved = TrainableGaussians.load(to_host(gaussians.state_dict()), rates, 1.0, torch.device("meta"))
+    assert {tensor.device.type for tensor in moved.values.tensors().values()} == {"meta"}
+    moments = moved.optimizer.state[moved.values.means]
+    assert {moments["exp_avg"].device.type, moments["exp_avg_sq"].device.type} == {"meta"}
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_killed_while_writing_leaves_a_readable_one(background: bool, tmp_path: Path) -> None:
     code = (
-        "import sys, torch; from pathlib import Path; from gsbench.pipeline.checkpoint import save_checkpoint\n"
+        "import sys, torch; from pathlib import Path; from gsbench.pipeline.checkpoint import CheckpointWriter\n"
+        f"writer = CheckpointWriter(Path(sys.argv[1]), {background})\n"
         "for step in range(1, 10**6):\n"
-        "    save_checkpoint(Path(sys.argv[1]), step, {'step': step, 'tensor': torch.full((200_000,), float(step))})\n"
+        "    writer.save(step, {'step': step, 'tensor': torch.full((200_000,), float(step))})\n"
     )
     process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)])
     last = 0
@@ -117,7 +163,7 @@ def test_killed_while_writing_leaves_a_readable_one(tmp_path: Path) -> None:
     time.sleep(0.037)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    loaded = load_checkpoint(tmp_path, CPU)
+    loaded = load_checkpoint(tmp_path)
     assert loaded is not None
     assert loaded["step"] >= last
     assert bool((loaded["tensor"] == loaded["step"]).all())

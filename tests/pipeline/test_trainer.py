@@ -15,9 +15,12 @@ from gsbench.errors import TrainingError
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
+from gsbench.pipeline import trainer
+from gsbench.pipeline.checkpoint import CheckpointWriter
 from gsbench.pipeline.trainer import CameraOrder, Status, Trainer, generator, learning_rates, snapshot_file
 from gsbench.raster import create_rasterizer
-from gsbench.raster.base import Rasterizer
+from gsbench.raster.base import Rasterizer, RenderOutput
+from gsbench.readback import Readback
 from gsbench.scene.types import Scene
 
 CPU = torch.device("cpu")
@@ -171,6 +174,52 @@ def test_non_finite_loss_names_the_iteration(
     with pytest.raises(TrainingError, match=r"iteration 57.*last good state"):
         train(tiny_scene, truth, rasterizer, tmp_path, Explode())
     assert (tmp_path / "checkpoint-00000050.pt").exists()
+
+
+def test_a_full_device_names_the_last_checkpoint_and_what_to_lower(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    class Full(NoDensifier):
+        def observe(self, step: int, render: RenderOutput) -> None:
+            if step == 57:
+                raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB\nand more")
+
+    with pytest.raises(TrainingError) as caught:
+        train(tiny_scene, truth, rasterizer, tmp_path, Full())
+    assert f"no memory left at {len(truth)} Gaussians" in str(caught.value)
+    assert f"newest checkpoint in {tmp_path}; lower densify.max_gaussians" in str(caught.value)
+    assert (tmp_path / "checkpoint-00000050.pt").exists()
+
+
+@pytest.mark.parametrize("kind", ["adc", "mcmc"])
+def test_as_on_a_device_that_is_behind(
+    kind: str,
+    tiny_scene: Scene,
+    truth: Gaussians,
+    rasterizer: Rasterizer,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Losses that arrive late, streamed images, checkpoints written by a thread: the same bits, stopped or not."""
+
+    def make() -> Densifier:
+        return small() if kind == "adc" else MCMC(start=20, stop=110, interval=20)
+
+    def stop_at_70(status: Status) -> None:
+        if status.step == 70:
+            raise KeyboardInterrupt
+
+    whole = train(tiny_scene, truth, rasterizer, tmp_path / "whole", make())
+    monkeypatch.setattr(Readback, "arrived", property(lambda self: False))
+    monkeypatch.setattr(trainer, "room_for_images", lambda *_: 0)
+    monkeypatch.setattr(trainer, "CheckpointWriter", lambda folder, background: CheckpointWriter(folder, True))
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        Trainer(tiny_scene, cloud(truth), make(), rasterizer, options(), 0).run(broken, stop_at_70)
+    assert sorted(path.name for path in broken.iterdir() if path.suffix == ".pt") == ["checkpoint-00000050.pt"]
+    assert same(whole, train(tiny_scene, truth, rasterizer, broken, make()))
+    assert (broken / "events.jsonl").read_text() == (tmp_path / "whole" / "events.jsonl").read_text()
 
 
 def test_every_view_is_used_once_before_any_is_used_again() -> None:

@@ -167,9 +167,12 @@ class TrainableGaussians:
         }
 
     @classmethod
-    def load(cls, state: dict, rates: LearningRates, spatial_scale: float) -> TrainableGaussians:
-        """The inverse of ``state_dict``; copies."""
-        trainable = cls(Gaussians(**state["gaussians"]), rates, spatial_scale)
+    def load(
+        cls, state: dict, rates: LearningRates, spatial_scale: float, device: torch.device | None = None
+    ) -> TrainableGaussians:
+        """The inverse of ``state_dict``, on ``device`` (None: where the state is); copies."""
+        gaussians = Gaussians(**state["gaussians"]).map(lambda tensor: tensor.to(device))
+        trainable = cls(gaussians, rates, spatial_scale)
         trainable.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))  # torch itself would share the moments
         return trainable
 

@@ -138,4 +138,16 @@ def select_device(name: str) -> torch.device:
         )
     if device.type == "cuda" and device.index is not None and device.index >= torch.cuda.device_count():
         raise InputError(f"device={name}: there are {torch.cuda.device_count()} CUDA devices, numbered from 0")
+    if device.type == "cuda":
+        keep_float32()
     return device
+
+
+def keep_float32() -> None:
+    """Let GPUs compute float32 as float32 in the whole process, also in backward passes.
+
+    torch lets cuDNN's convolutions round to TF32, 10 bits, by default. SSIM takes differences of nearly equal moments:
+    with TF32 its map was off by up to 350 and its gradient was noise.
+    """
+    torch.backends.cudnn.allow_tf32 = False
+    torch.backends.cuda.matmul.allow_tf32 = False

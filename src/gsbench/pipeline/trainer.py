@@ -6,7 +6,8 @@ import json
 import logging
 import math
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,14 +19,18 @@ from gsbench.config import TrainConfig
 from gsbench.densify import Densifier, DensifyContext, NoDensifier
 from gsbench.densify.volume import log_volume
 from gsbench.errors import TrainingError
+from gsbench.events import RefineEvent
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
-from gsbench.pipeline.checkpoint import load_checkpoint, save_checkpoint
+from gsbench.pipeline.checkpoint import CheckpointWriter, load_checkpoint
 from gsbench.pipeline.loss import PhotometricLoss
+from gsbench.pipeline.losses import LossLog
+from gsbench.pipeline.room import explain_full, free_bytes, room_for_images
 from gsbench.pipeline.stopping import deferred, requested
+from gsbench.pipeline.targets import Targets
 from gsbench.raster import Rasterizer
-from gsbench.scene.types import Scene, View
+from gsbench.scene.types import Scene
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +38,6 @@ METRICS = "metrics.jsonl"
 EVENTS = "events.jsonl"
 HISTOGRAMS = "volume_histograms.jsonl"
 LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, a quarter decade each
-LOSS_SMOOTHING = 0.9  # of the loss that is shown and logged
 STREAMS = ("cameras", "densify")  # every random draw of a training belongs to one
 
 
@@ -59,6 +63,11 @@ class CameraOrder:
         if not self.remaining:
             self.remaining = torch.randperm(self.num_views, generator=self.rng).tolist()
         return self.remaining.pop()
+
+    @property
+    def following(self) -> int | None:
+        """What `next` will give, or None where that is not drawn yet."""
+        return self.remaining[-1] if self.remaining else None
 
 
 class Trainer:
@@ -92,7 +101,11 @@ class Trainer:
         self.order = CameraOrder(len(scene.train), self.rngs["cameras"])
         self.step = 0
         self.seconds = 0.0
-        self.smoothed_loss = math.nan
+        self.losses = LossLog()
+        cap = getattr(densifier, "max_gaussians", None)
+        pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
+        room = room_for_images(free_bytes(self.device), len(initial), cap, pixels)
+        self.targets = Targets(scene.train, self.device, room)
         densifier.begin(initial, self.context)
 
     def run(self, folder: Path, on_status: Callable[[Status], None] = lambda status: None) -> Gaussians:
@@ -100,85 +113,84 @@ class Trainer:
         self._resume(folder)
         if self.snapshot_at:
             (folder / snapshot_file(0)).parent.mkdir(exist_ok=True)
-        first_step, started = self.step, time.perf_counter()
-        before = self.seconds
+        writer = CheckpointWriter(folder, background=self.device.type != "cpu")
+        try:
+            with deferred(), self._explained(folder):
+                self._loop(folder, writer, on_status)
+        finally:
+            writer.close()
+        if not isinstance(self.densifier, NoDensifier) and (folder / EVENTS).stat().st_size == 0:
+            log.warning(
+                "not one refinement was due in %d iterations: the densifier changed nothing (see train.densify_start, "
+                "now %d)", self.step, self.options.densify_start,
+            )  # fmt: skip
+        return self.gaussians.values.detach()
+
+    def _loop(self, folder: Path, writer: CheckpointWriter, on_status: Callable[[Status], None]) -> None:
+        """Iterate to the end, a signal to stop or the end of the time budget; write down what happens."""
         options = self.options
+        first_step, started, before = self.step, time.perf_counter(), self.seconds
         last_checkpoint = time.monotonic()
-        with (folder / METRICS).open("a") as metrics, (folder / EVENTS).open("a") as events, deferred():
+        with (folder / METRICS).open("a") as metrics, (folder / EVENTS).open("a") as events:
             while self.step < options.iterations:
-                record, event = self._iterate(folder)
+                counts = {"num_gaussians": len(self.gaussians)}
+                event = self.iterate(folder)
                 self.seconds = before + time.perf_counter() - started
                 out_of_time = options.max_seconds is not None and self.seconds >= options.max_seconds
                 last = self.step == options.iterations or out_of_time
                 if event is not None:
-                    _append(events, event)
+                    _append(events, event.as_dict())
                 if self.step in options.volume_histogram:
                     with (folder / HISTOGRAMS).open("a") as stream:
                         _append(stream, self._volume_histogram())
                 if self.step % options.log_every == 0 or last:
+                    record = self.losses.settle() | counts | {"sh_degree": self.sh_degree}
+                    self.seconds = before + time.perf_counter() - started
                     rate = (self.step - first_step) / max(self.seconds - before, 1e-9)
                     _append(metrics, record | {"seconds": round(self.seconds, 3)})
-                    on_status(Status(self.step, self.smoothed_loss, len(self.gaussians), rate))
+                    on_status(Status(self.step, self.losses.smoothed, len(self.gaussians), rate))
                 minutes = (time.monotonic() - last_checkpoint) / 60
                 due = self.step % options.checkpoint_every == 0 or minutes >= options.checkpoint_minutes
                 stop = requested()
                 if stop or (due and not last):
-                    save_checkpoint(folder, self.step, self._state())
+                    writer.save(self.step, self._state())
                     last_checkpoint = time.monotonic()
                 if stop:
+                    writer.finish()
                     log.info("stopping at iteration %d, with a checkpoint", self.step)
                 if last or stop:
                     break
-        if not isinstance(self.densifier, NoDensifier) and (folder / EVENTS).stat().st_size == 0:
-            log.warning(
-                "not one refinement was due in %d iterations: the densifier changed nothing (see train.densify_start, "
-                "now %d)", self.step, options.densify_start,
-            )  # fmt: skip
-        return self.gaussians.values.detach()
 
-    def _iterate(self, folder: Path) -> tuple[dict[str, Any], dict[str, object] | None]:
-        """One iteration in 3DGS's order: rates, SH degree, render, backward, statistics, refinement, optimiser step."""
+    def iterate(self, folder: Path) -> RefineEvent | None:
+        """One iteration in 3DGS's order: rates, SH degree, render, backward, statistics, refinement, optimiser step.
+
+        Its losses go to ``losses``, perhaps later; ``folder`` takes the snapshots. Raises TrainingError where a
+        parameter is out of range or no Gaussian is left.
+        """
         self.step += 1
         step, options = self.step, self.options
         self.gaussians.set_step(step)
-        view = self.scene.train[self.order.next()]
+        index = self.order.next()
+        target = self.targets.get(index)
+        if self.order.following is not None:
+            self.targets.prefetch(self.order.following)
         try:
             render = self.rasterizer.render(
                 self.gaussians.values,
-                view.camera,
+                self.scene.train[index].camera,
                 self.sh_degree,
                 self.background,
                 self.densifier.needs_absolute_gradient,
             )
         except ValueError as error:  # the optimiser has driven a parameter out of range
-            raise TrainingError(
-                f"iteration {step}: {error}; the last good state is the newest checkpoint in {folder}"
-            ) from error
-        loss, l1, ssim = self.loss(render.image, self._target(view))
+            raise TrainingError(f"iteration {step}: {error}; {_last_state(folder)}") from error
+        loss, l1, ssim = self.loss(render.image, target)
         regularizer = self.densifier.regularizer(self.gaussians.values)
         total = loss if regularizer is None else loss + regularizer
-        value = loss.item()
-        if not math.isfinite(total.item()):
-            raise TrainingError(
-                f"the loss became {total.item()} at iteration {step}; "
-                f"the last good state is the newest checkpoint in {folder}"
-            )
-        self.smoothed_loss = (
-            value
-            if math.isnan(self.smoothed_loss)
-            else LOSS_SMOOTHING * self.smoothed_loss + (1 - LOSS_SMOOTHING) * value
-        )
+        self.losses.add(step, loss, l1, ssim, total)
         total.backward()
-        record = {
-            "step": step,
-            "loss": value,
-            "l1": l1.item(),
-            "ssim": ssim.item(),
-            "num_gaussians": len(self.gaussians),
-            "sh_degree": self.sh_degree,
-        }
         if step == options.iterations:  # 3DGS saves before it would refine or step
-            return record, None
+            return None
         if step in self.snapshot_at:
             write_ply(self.gaussians.values, folder / snapshot_file(step))
         self.densifier.observe(step, render)
@@ -190,7 +202,17 @@ class Trainer:
         self.densifier.after_step(step, self.gaussians, self.rngs["densify"])
         if len(self.gaussians) == 0:
             raise TrainingError(f"no Gaussian was left after iteration {step}; the pruning thresholds are too high")
-        return record, None if event is None else event.as_dict()
+        return event
+
+    @contextmanager
+    def _explained(self, folder: Path) -> Iterator[None]:
+        """Name the last good state where the loss stopped being finite or the device's memory is full."""
+        try:
+            yield
+        except FloatingPointError as error:
+            raise TrainingError(f"{error}; {_last_state(folder)}") from error
+        except torch.OutOfMemoryError as error:
+            raise explain_full(self.step, len(self.gaussians), self.device, _last_state(folder)) from error
 
     @property
     def sh_degree(self) -> int:
@@ -199,9 +221,6 @@ class Trainer:
     def _optimize(self, visible: torch.Tensor) -> None:
         self.gaussians.optimizer_step(self.sh_degree, visible if self.options.visible_adam else None)
 
-    def _target(self, view: View) -> torch.Tensor:
-        return torch.from_numpy(view.image).to(self.device)  # [H, W, 3] uint8
-
     def _volume_histogram(self) -> dict[str, Any]:
         volumes = (log_volume(self.gaussians.values.log_scales.detach()) / math.log(10)).cpu().numpy()
         clipped = np.clip(volumes, LOG_VOLUME_BINS[0], LOG_VOLUME_BINS[-1])
@@ -209,10 +228,11 @@ class Trainer:
         return {"step": self.step, "log10_edges": edges.tolist(), "counts": counts.tolist()}
 
     def _state(self) -> dict[str, Any]:
+        self.losses.settle()  # no state is saved that a loss would have condemned
         return {
             "step": self.step,
             "seconds": self.seconds,
-            "smoothed_loss": self.smoothed_loss,
+            "smoothed_loss": self.losses.smoothed,
             "gaussians": self.gaussians.state_dict(),
             "densifier": self.densifier.state_dict(),
             "rngs": {name: rng.get_state() for name, rng in self.rngs.items()},
@@ -220,19 +240,23 @@ class Trainer:
         }
 
     def _resume(self, folder: Path) -> None:
-        state = load_checkpoint(folder, self.device)
+        state = load_checkpoint(folder)
         if state is not None:
-            self.step, self.seconds, self.smoothed_loss = state["step"], state["seconds"], state["smoothed_loss"]
+            self.step, self.seconds, self.losses.smoothed = state["step"], state["seconds"], state["smoothed_loss"]
             self.gaussians = TrainableGaussians.load(
-                state["gaussians"], self.gaussians.rates, self.gaussians.spatial_scale
+                state["gaussians"], self.gaussians.rates, self.gaussians.spatial_scale, self.device
             )
             self.densifier.load_state_dict(state["densifier"], self.context)
             for name, rng in self.rngs.items():
-                rng.set_state(state["rngs"][name].cpu())
+                rng.set_state(state["rngs"][name])
             self.order.remaining = list(state["remaining_views"])
             log.info("going on from iteration %d", self.step)
         for name in (METRICS, EVENTS, HISTOGRAMS):
             drop_after(folder / name, self.step)
+
+
+def _last_state(folder: Path) -> str:
+    return f"the last good state is the newest checkpoint in {folder}"
 
 
 def snapshot_file(step: int) -> str:
