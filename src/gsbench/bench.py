@@ -20,6 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gsbench.arguments import ArgumentParser
 from gsbench.errors import InputError
 from gsbench.memory import peak_memory_mb
 
@@ -286,7 +287,7 @@ def main(argv: list[str], _runs: Path | None = None) -> int:
     from gsbench.raster.executors import EXECUTORS
 
     known = [executor.name for executor in EXECUTORS]
-    parser = argparse.ArgumentParser(prog="gsbench bench", description="Time rasterizers and the training step.")
+    parser = ArgumentParser(prog="gsbench bench", description="Time rasterizers and the training step.")
     parser.add_argument("--raster", default="cpu", help=f"names, comma between: {', '.join(known)}, {PEER}")
     parser.add_argument("--size", default="500x375", help="image sizes, comma between")
     parser.add_argument("--count", default="100000", help="numbers of Gaussians, comma between")

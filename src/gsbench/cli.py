@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gsbench.errors import GsbenchError, InputError
+from gsbench.files import checked_runs_folder
 from gsbench.logs import set_up_logging
 from gsbench.words import closest
 
@@ -53,11 +54,9 @@ def run(argv: list[str]) -> int:
             return _verb(argv[0], argv[1:])
         return _trials(argv)
     except InputError as error:
-        print(f"gsbench: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return _refuse(error, BAD_INPUT)
     except GsbenchError as error:
-        print(f"gsbench: {error}", file=sys.stderr)
-        return TRIAL_FAILED
+        return _refuse(error, TRIAL_FAILED)
     except KeyboardInterrupt as stop:
         print(
             f"gsbench: stopped{f' by {stop}' if str(stop) else ''}; the same command goes on from here", file=sys.stderr
@@ -68,9 +67,15 @@ def run(argv: list[str]) -> int:
         return DONE
 
 
+def _refuse(error: GsbenchError, code: int) -> int:
+    """Say an error in one line, whatever the name of a file or the message of a library holds."""
+    print("gsbench: " + " ".join(str(error).split()).encode("utf-8", "backslashreplace").decode(), file=sys.stderr)
+    return code
+
+
 def runs_dir() -> Path:
     """The runs folder of the verbs: ``$GSBENCH_RUNS``, else ``runs`` here."""
-    return Path(os.environ.get("GSBENCH_RUNS", "runs")).expanduser().resolve()
+    return checked_runs_folder(os.environ.get("GSBENCH_RUNS", "runs"))
 
 
 def _verb(name: str, argv: list[str]) -> int:

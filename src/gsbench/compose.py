@@ -4,30 +4,26 @@ from __future__ import annotations
 
 import itertools
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
-from omegaconf.errors import OmegaConfBaseException
 
-from gsbench.config import check, conf_dir, plain, register_schemas
+from gsbench.command_words import GROUPS, check_sweep, check_words, is_sweep, options
+from gsbench.config import Config, check, check_values, conf_dir, plain, register_schemas
 from gsbench.errors import InputError
+from gsbench.settings import checked
 from gsbench.words import closest
 
-GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")
 MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood
 SEED = re.compile(r"seed=(\d+)")
-
-
-NO_PLUGINS = "hydra/launcher and hydra/sweeper are not used: choose launch=serial, local or slurm"
 
 
 @dataclass(frozen=True)
@@ -44,43 +40,47 @@ def compose_trials(overrides: Sequence[str], multirun: bool = False) -> list[Com
 
     Raises InputError, one line, for what does not compose or does not hold together.
     """
-    _check_words(overrides)
-    with _errors(overrides), _hydra():
-        master = compose(
-            "config", overrides=[word for word in overrides if not _is_sweep(word)], return_hydra_config=True
-        )
+    check_words(overrides)
+    swept = [word for word in overrides if is_sweep(word)]
+    with _hydra():
+        master = _compose([word for word in overrides if word not in swept], overrides, return_hydra_config=True)
         hydra = master.hydra
-        if not hydra.launcher._target_.endswith(".BasicLauncher") or not hydra.sweeper._target_.endswith(
-            ".BasicSweeper"
-        ):
-            raise InputError(NO_PLUGINS)
-        is_sweep = multirun or (OmegaConf.select(hydra, "mode") is not None and hydra.mode.name == "MULTIRUN")
-        if not is_sweep:
-            swept = [word for word in overrides if _is_sweep(word)]
+        if not (multirun or (OmegaConf.select(hydra, "mode") is not None and hydra.mode.name == "MULTIRUN")):
             if swept:
                 raise InputError(f"{swept[0]} lists several values: add -m to run one trial for each")
             with open_dict(master):
                 del master["hydra"]
-            return [_composed(_check(master), overrides)]
+            return [_composed(master, overrides)]
         parameters = [f"{key}={value}" for key, value in (hydra.sweeper.params or {}).items()]
-        return list(_sweep([*parameters, *overrides]))
+        return list(_sweep([*parameters, *overrides], overrides))
 
 
 def compose_one(overrides: Sequence[str]) -> Composed:
     """The configuration of the single trial that ``overrides`` describe, as ``Composed.overrides`` has them."""
-    with _errors(overrides), _hydra():
-        return _composed(_check(compose("config", overrides=list(overrides))), overrides)
+    check_words(overrides)
+    with _hydra():
+        return _composed(_compose(overrides, overrides), overrides)
 
 
-def _sweep(words: Sequence[str]) -> Iterator[Composed]:
+def compose_values(overrides: Sequence[str]) -> DictConfig:
+    """The configuration to look at: every value is allowed, and what a trial needs may still be missing."""
+    with _hydra():
+        config = _compose(overrides, overrides)
+    with _errors(overrides):
+        check_values(config)
+    return config
+
+
+def _sweep(words: Sequence[str], given: Sequence[str]) -> Iterator[Composed]:
     """Every point of the grid; trials that differ in the seed alone share a composition."""
     grid: dict[str, list[str]] = {}
-    for override in OverridesParser.create().parse_overrides(list(words)):
+    for override in _parse_grid(words, given):
         key = override.get_key_element()
         if override.is_sweep_override():
-            if not override.is_discrete_sweep():
-                raise InputError(f"{override.input_line}: a sweep is a list of values, such as {key}=1,2,3")
+            check_sweep(override)
             grid[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+            if not grid[key]:
+                raise InputError(f"{override.input_line} lists no value")
         else:
             grid[key] = [_text(override)]
     known: dict[tuple[str, ...], DictConfig] = {}
@@ -88,21 +88,25 @@ def _sweep(words: Sequence[str]) -> Iterator[Composed]:
         seeds = [match for word in point if (match := SEED.fullmatch(word))]
         rest = tuple(word for word in point if not SEED.fullmatch(word))
         if rest not in known:
-            known[rest] = compose("config", overrides=list(point))
+            known[rest] = _compose(point, given)
+            yield _composed(known[rest], point)
+            continue
         config = known[rest]
         for match in seeds:
-            config.seed = int(match.group(1))
-        yield _composed(_check(config), point)
+            config.seed = checked(Config, {"seed": int(match.group(1))}, "")["seed"]
+        yield _resolved(config, point)
 
 
-def _check_words(overrides: Sequence[str]) -> None:
-    for word in overrides:
-        if word.lstrip("+").startswith("experiment") and not word.startswith("+experiment="):
-            raise InputError(f"{word}: write +experiment=NAME (choose: {', '.join(options('experiment'))})")
-        if "=" not in word and not word.startswith("~"):
-            raise InputError(f"{word!r} is not a setting like key=value")
-        if word.lstrip("+~").startswith(("hydra/launcher", "hydra/sweeper")):
-            raise InputError(NO_PLUGINS)
+def _parse_grid(words: Sequence[str], given: Sequence[str]) -> list[Override]:
+    with _errors(given):
+        return list(OverridesParser.create(GlobalHydra.instance().config_loader()).parse_overrides(list(words)))
+
+
+def _compose(words: Sequence[str], given: Sequence[str], return_hydra_config: bool = False) -> DictConfig:
+    """What Hydra makes of ``words``; its errors are explained in terms of what was ``given``."""
+    with _errors(given), warnings.catch_warnings():
+        warnings.filterwarnings("error", message=r".* is not available\.", module="hydra")  # a folder to search in
+        return compose("config", overrides=list(words), return_hydra_config=return_hydra_config)
 
 
 def _text(override: Override) -> str:
@@ -110,16 +114,13 @@ def _text(override: Override) -> str:
     return key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"
 
 
-def _is_sweep(word: str) -> bool:
-    return bool(OverridesParser.create().parse_override(word).is_sweep_override())
-
-
-def _check(config: DictConfig) -> DictConfig:
-    check(config)
-    return config
-
-
 def _composed(config: DictConfig, overrides: Sequence[str]) -> Composed:
+    with _errors(overrides):  # such as an interpolation that leads nowhere
+        check(config)
+        return _resolved(config, overrides)
+
+
+def _resolved(config: DictConfig, overrides: Sequence[str]) -> Composed:
     return Composed(plain(config), OmegaConf.to_yaml(config, resolve=True), tuple(overrides))
 
 
@@ -135,7 +136,9 @@ def _hydra() -> Iterator[None]:
 def _errors(overrides: Sequence[str]) -> Iterator[None]:
     try:
         yield
-    except (HydraException, OmegaConfBaseException) as error:
+    except InputError:
+        raise
+    except Exception as error:  # Hydra lets errors of any kind through, and all that it works on is the user's
         raise InputError(explain(error, overrides)) from error
 
 
@@ -172,13 +175,12 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
         choices = sorted({*options(name), *re.findall(r"[\w.-]+", missing.group(3))})
         word = wanted.rpartition("/")[2]
         return f"{name}={word} does not exist{closest(word, choices)} (choose: {', '.join(choices)})"
-    value = re.search(r"(?:Value|Invalid value) '([^']*)'(.*?)\n\s*full_key: ([\w.\[\]]+)", text, re.S)
-    if value:
-        said = " ".join(value.group(2).split())
-        said = re.sub(r"^of type '\w+' could not be converted to (\w+)", r"is not of type \1", said)
-        return f"{value.group(3)}={value.group(1)} {said}".strip()
+    absent = re.search(r"[Mm]issing mandatory value: ([\w.]+)", text)
+    if absent:
+        return f"{absent.group(1)} is not set: give it a value"
+    place = re.search(r"full_key: ([\w.\[\]]+)", text)
     text = re.sub(r"\s*(full_key|reference_type|object_type)[:=].*", "", text)
-    return " ".join(text.split())[:MAX_MESSAGE]
+    return (f"{place.group(1)}: " if place else "") + " ".join(text.split())[:MAX_MESSAGE]
 
 
 def _chain(error: BaseException | None) -> list[str]:
@@ -195,15 +197,10 @@ def _keys_below(parent: str, overrides: Sequence[str]) -> list[str]:
     with _hydra():
         try:
             config = compose("config", overrides=choices)
-        except (HydraException, OmegaConfBaseException):
+        except Exception:  # noqa: BLE001 - the choices may be what is wrong
             config = compose("config")
     node = OmegaConf.select(config, parent) if parent else config
     return [str(key) for key in node] if isinstance(node, DictConfig) else []
-
-
-def options(group: str) -> list[str]:
-    """The YAML files of a group that come with gsbench."""
-    return sorted(path.stem for path in Path(conf_dir(), group).glob("*.yaml"))
 
 
 def options_text() -> str:

@@ -1,43 +1,93 @@
 """The schema of the configuration, its checks, and where ``conf/`` lies. Loads neither torch nor the library
-packages."""
+packages.
+
+What a key may be stands at its field (see `gsbench.settings`), rules between the keys of a group in its
+``__post_init__``. Hydra gets the names and the defaults alone, so that one mechanism checks every value.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+from annotated_types import Ge, Interval, Predicate, doc
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.raster import executors
+from gsbench.settings import Fraction, check_settings, checked
 from gsbench.source import source_of
+from gsbench.words import closest
 
 ALLOWED_TARGETS = ("gsbench.",)  # a ``_target_`` is code: only these prefixes, and those in ``allow_targets``
+MIN_SIZE = 16  # px: the least side of an image that is worth training on
+MAX_SIZE = 16_384  # px, of a picture of the courtyard
+MAX_SEED = 2**63 - 1  # torch's generators take no larger one
+MAX_NAME_BYTES = 100  # of a name: folders are made of two, and file systems end at 255
+IN_RUNS = ("store", "mlartifacts", "mlflow.db")  # what lies in the runs folder beside the experiments
+
+
+def is_folder_name(value: str) -> bool:
+    """Whether a text can name a folder, on any system and in the address of a trial (``x:scene:arm:0``)."""
+    is_plain = value.isprintable() and not set(value) & set('/\\:*?"<>|') and value == value.strip()
+    return is_plain and value[:1] not in ("", ".", "-") and len(value.encode()) <= MAX_NAME_BYTES
+
+
+def is_path(value: str) -> bool:
+    """Whether a text can be a path: not empty, no control characters, no ``~user`` that is not known."""
+    try:
+        return value.strip() != "" and value.isprintable() and bool(Path(value).expanduser())
+    except RuntimeError:
+        return False
+
+
+FolderName = Annotated[str, Predicate(is_folder_name), doc("a plain folder name")]
+ExperimentName = Annotated[
+    str,
+    Predicate(lambda name: is_folder_name(name) and name not in IN_RUNS),
+    doc(f"a plain folder name, and none of {', '.join(IN_RUNS)}"),
+]
+PathName = Annotated[str, Predicate(is_path), doc("a path")]
+DeviceName = Annotated[
+    str,
+    Predicate(lambda name: re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", name) is not None),
+    doc("auto, cpu, cuda or cuda:1"),
+]
 
 
 @dataclass
 class SceneConfig:
-    name: str = MISSING
-    kind: str = MISSING  # colmap | photos | courtyard
-    path: str | None = None  # folder of the capture
-    images: str | None = None  # image folder below path; null: images
-    sparse: str | None = None  # model folder below path; null: sparse/0 or sparse
-    downscale: int = 1  # divide both sides by it
-    max_size: int | None = None  # longest side, px; never enlarges
-    resample: str = "lanczos"  # lanczos | area
-    max_images: int = 200  # evenly spaced over the sorted names
-    test_every: int = 8  # every 8th sorted name is held out
-    train_list: str | None = None  # file of names, one a line
-    test_list: str | None = None
-    principal_point: str = "used"  # used | centred (3DGS ignores it)
-    views: int = 48  # courtyard only, as are the next three
-    width: int = 400
-    height: int = 300
-    seed: int = 0
+    name: FolderName = MISSING
+    kind: Literal["colmap", "photos", "courtyard"] = MISSING
+    path: PathName | None = None  # folder of the capture
+    images: PathName | None = None  # image folder below path; null: images
+    sparse: PathName | None = None  # model folder below path; null: sparse/0 or sparse
+    downscale: PositiveInt = 1  # divide both sides by it
+    max_size: Annotated[int, Ge(MIN_SIZE)] | None = None  # longest side, px; never enlarges
+    resample: Literal["lanczos", "area"] = "lanczos"
+    max_images: Annotated[int, Ge(3)] = 200  # evenly spaced over the sorted names
+    test_every: Annotated[int, Ge(2)] = 8  # every 8th sorted name is held out
+    train_list: PathName | None = None  # file of names, one a line
+    test_list: PathName | None = None
+    principal_point: Literal["used", "centred"] = "used"  # 3DGS ignores it
+    views: Annotated[int, Interval(ge=3, le=9999)] = 48  # courtyard only, as are the next three
+    width: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 400
+    height: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 300
+    seed: Annotated[int, Interval(ge=0, le=2**31 - 1)] = 0
+
+    def __post_init__(self) -> None:
+        check_settings(self, "scene")
+        if self.kind != "courtyard" and not self.path:
+            raise InputError("scene.path is not set: say where the capture lies, for example scene.path=/my/photos")
 
 
 @dataclass
@@ -45,46 +95,62 @@ class RasterConfig:
     name: str = MISSING  # auto, or an executor of gsbench.raster.executors
     _target_: str | None = None  # a class of your own, instead; its options are further keys
 
+    def __post_init__(self) -> None:
+        check_settings(self, "raster")
+        if self._target_ is None and self.name not in executors.names():
+            choices = ", ".join(executors.names())
+            raise InputError(
+                f"raster must be one of {choices}, got {self.name!r}{closest(self.name, executors.names())}"
+            )
+
 
 @dataclass
 class TrainConfig:
     name: str = MISSING
-    iterations: int = 30_000
-    sh_interval: int = 1000  # spherical harmonics gain a degree so often
-    ssim_weight: float = 0.2  # loss = 0.8 L1 + 0.2 (1 - SSIM)
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    position_initial: float = 1.6e-4  # learning rates; positions times the scene extent
-    position_final: float = 1.6e-6
-    position_steps: int = 30_000
-    sh_dc: float = 2.5e-3
-    sh_rest: float = 1.25e-4
-    opacity: float = 0.05  # 2023 code; 0.025 in late-2024 code
-    scale: float = 5e-3
-    rotation: float = 1e-3
-    densify_start: int = 500  # the window of the densifiers, which read it from here
-    densify_stop: int = 15_000
-    densify_interval: int = 100
-    opacity_reset_interval: int = 3000
-    mcmc_stop: int = 25_000  # 3DGS-MCMC refines for longer
+    iterations: PositiveInt = 30_000
+    sh_interval: PositiveInt = 1000  # spherical harmonics gain a degree so often
+    ssim_weight: Fraction = 0.2  # loss = 0.8 L1 + 0.2 (1 - SSIM)
+    background: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
+    position_initial: PositiveFloat = 1.6e-4  # learning rates; positions times the scene extent
+    position_final: PositiveFloat = 1.6e-6
+    position_steps: PositiveInt = 30_000
+    sh_dc: PositiveFloat = 2.5e-3
+    sh_rest: PositiveFloat = 1.25e-4
+    opacity: PositiveFloat = 0.05  # 2023 code; 0.025 in late-2024 code
+    scale: PositiveFloat = 5e-3
+    rotation: PositiveFloat = 1e-3
+    densify_start: NonNegativeInt = 500  # the window of the densifiers, which read it from here
+    densify_stop: NonNegativeInt = 15_000
+    densify_interval: PositiveInt = 100
+    opacity_reset_interval: PositiveInt = 3000
+    mcmc_stop: NonNegativeInt = 25_000  # 3DGS-MCMC refines for longer
     step_after_refine: bool = False  # True: gsplat's order, the optimiser steps before a refinement and loses no step
     visible_adam: bool = False  # update visible Gaussians only; a departure from the baseline
-    max_seconds: float | None = None  # a budget of training time; the run ends at the first iteration past it
-    volume_histogram: list[int] = field(default_factory=lambda: [4000, 8000, 12_000])  # iterations (Fig. 5)
-    log_every: int = 10
-    checkpoint_every: int = 1000  # iterations; a killed trial goes on from the last one
-    checkpoint_minutes: float = 10.0  # and after so many minutes, whichever is first
+    max_seconds: PositiveFloat | None = None  # a budget of training time; the run ends at the first iteration past it
+    volume_histogram: list[NonNegativeInt] = field(default_factory=lambda: [4000, 8000, 12_000])  # iterations (Fig. 5)
+    log_every: PositiveInt = 10
+    checkpoint_every: PositiveInt = 1000  # iterations; a killed trial goes on from the last one
+    checkpoint_minutes: PositiveFloat = 10.0  # and after so many minutes, whichever is first
+
+    def __post_init__(self) -> None:
+        check_settings(self, "train")
 
 
 @dataclass
 class EvalConfig:
     name: str = MISSING
-    protocol: str = MISSING  # paper | standard
-    lpips: list[str] = field(default_factory=lambda: ["vgg_raw", "vgg", "alex", "squeeze"])
+    protocol: Literal["paper", "standard"] = MISSING
+    lpips: list[Literal["vgg_raw", "vgg", "alex", "squeeze"]] = field(
+        default_factory=lambda: ["vgg_raw", "vgg", "alex", "squeeze"]
+    )
     flip: bool = True
-    at: list[int] = field(default_factory=list)  # iterations at which the test views are measured beside the last
+    at: list[PositiveInt] = field(default_factory=list)  # iterations to measure the test views at, too
     maps: bool = False  # keep maps of depth, volume and distance to the initial cloud: where an arm helps
-    weights: str | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
+    weights: PathName | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
     download: bool = True  # fetch missing weights, checked by checksum
+
+    def __post_init__(self) -> None:
+        check_settings(self, "eval")
 
 
 @dataclass
@@ -92,37 +158,48 @@ class TrackingConfig:
     name: str = MISSING
     enabled: bool = True
     uri: str | None = None  # null: sqlite in the runs folder
-    flush_seconds: float = 10.0
-    patience_seconds: float = 30.0  # with a slow tracker at the end of a trial; `gsbench sync` adds what it missed
-    images: int = 4  # test renders mirrored per trial
+    flush_seconds: PositiveFloat = 10.0
+    patience_seconds: NonNegativeFloat = 30.0  # with a slow tracker, at the end of a trial; `gsbench sync` mends it
+    images: NonNegativeInt = 4  # test renders mirrored per trial
+
+    def __post_init__(self) -> None:
+        check_settings(self, "tracking")
 
 
 @dataclass
 class LaunchConfig:
-    name: str = MISSING  # serial | local | slurm
-    parallel: int = 1  # trials at once
-    timeout_min: int | None = None  # minutes until a trial is stopped with a checkpoint and queued again
-    max_requeues: int = 20  # Slurm only, as are the next: how often a trial may run out of time
-    signal_seconds: int = 120  # so long before the end a trial is told to save its checkpoint
-    cpus_per_trial: int | None = None
-    gpus_per_trial: int = 0
-    mem_gb: int | None = None  # null: the cluster's default
+    name: Literal["serial", "local", "slurm"] = MISSING
+    parallel: PositiveInt = 1  # trials at once
+    timeout_min: PositiveInt | None = None  # minutes until a trial is stopped with a checkpoint and queued again
+    max_requeues: NonNegativeInt = 20  # Slurm only, as are the next: how often a trial may run out of time
+    signal_seconds: PositiveInt = 120  # so long before the end a trial is told to save its checkpoint
+    cpus_per_trial: PositiveInt | None = None
+    gpus_per_trial: NonNegativeInt = 0
+    mem_gb: PositiveInt | None = None  # null: the cluster's default
     partition: str | None = None
     account: str | None = None
     qos: str | None = None
     setup: list[str] = field(default_factory=list)  # shell lines before the trial, such as "module load cuda"
     sbatch: dict[str, Any] = field(default_factory=dict)  # further options of sbatch, such as {constraint: a100}
 
+    def __post_init__(self) -> None:
+        check_settings(self, "launch")
+        if self.name == "slurm" and self.timeout_min is not None and self.signal_seconds >= 60 * self.timeout_min:
+            raise InputError(
+                f"launch.signal_seconds must be below launch.timeout_min ({self.timeout_min} minutes), "
+                f"got {self.signal_seconds}: a trial would be told to stop as soon as it starts"
+            )
+
 
 @dataclass
 class Config:
     """The root. ``init`` and ``densify`` are open, so that a user's own class brings its own keys."""
 
-    name: str = "default"  # the experiment
-    seed: int = 0
-    device: str = "auto"  # auto | cpu | cuda | cuda:1
-    threads: Any = "auto"  # auto | a number
-    runs: str = MISSING
+    name: ExperimentName = "default"
+    seed: Annotated[int, Interval(ge=0, le=MAX_SEED)] = 0
+    device: DeviceName = "auto"
+    threads: PositiveInt | Literal["auto"] = "auto"
+    runs: PathName = MISSING
     allow_targets: list[str] = field(default_factory=list)  # further prefixes for _target_
     scene: SceneConfig = field(default_factory=SceneConfig)
     init: Any = MISSING
@@ -134,7 +211,7 @@ class Config:
     launch: LaunchConfig = field(default_factory=LaunchConfig)
 
 
-GROUP_SCHEMAS = {
+GROUP_SCHEMAS: dict[str, type] = {
     "scene": SceneConfig,
     "raster": RasterConfig,
     "train": TrainConfig,
@@ -142,6 +219,7 @@ GROUP_SCHEMAS = {
     "tracking": TrackingConfig,
     "launch": LaunchConfig,
 }
+COMPONENTS = ("init", "densify")  # groups whose keys are the options of a class
 WITHOUT_EFFECT = ("threads", "weights", "download")  # options of a group that cannot change its result
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
 # Settings that are younger than the first results, with the default at which a result is what it was before them. There
@@ -155,9 +233,23 @@ ADDED_LATER: dict[str, dict[str, Any]] = {
 def register_schemas() -> None:
     """Make the schemas known to Hydra, the groups' under ``schema/`` so that they are not offered as options."""
     store = ConfigStore.instance()
-    store.store(name="config_schema", node=Config)
+    store.store(name="config_schema", node=_names_and_defaults(Config))
     for group, schema in GROUP_SCHEMAS.items():
-        store.store(group=f"schema/{group}", name="base", node=schema)
+        store.store(group=f"schema/{group}", name="base", node=_names_and_defaults(schema))
+
+
+@cache
+def _names_and_defaults(schema: type) -> type:
+    """A dataclass for Hydra with the fields of ``schema`` and no types: what values are allowed is said by `check`."""
+    fields: list[tuple[str, Any, Any]] = []
+    for entry in dataclasses.fields(schema):
+        factory: Any = entry.default_factory
+        if schema is Config and entry.name in GROUP_SCHEMAS:
+            factory = _names_and_defaults(GROUP_SCHEMAS[entry.name])
+        elif factory is dict:  # takes any key, without Hydra's plus
+            factory = partial(DictConfig, {}, flags={"struct": False})
+        fields.append((entry.name, Any, field(default=entry.default, default_factory=factory)))
+    return dataclasses.make_dataclass(schema.__name__, fields)
 
 
 def conf_dir() -> Path:
@@ -169,51 +261,66 @@ def conf_dir() -> Path:
     raise FileNotFoundError("gsbench's conf folder was not found; reinstall gsbench")
 
 
+def check_values(config: DictConfig) -> None:
+    """Hold the values of a composed configuration against their schemas, and convert them (``1e3`` to 1000).
+
+    The classes that ``init`` and ``densify`` name check their own options when they are made. Raises InputError naming
+    the key.
+    """
+    for group, schema in GROUP_SCHEMAS.items():
+        _convert(config[group], schema, _settings_of(config, group), group)
+    groups = (*GROUP_SCHEMAS, *COMPONENTS)
+    _convert(config, Config, {str(key): _unwrapped(config[key]) for key in config if key not in groups}, "")
+
+
 def check(config: DictConfig) -> None:
-    """Rules between fields, before any work. Raises InputError naming the key."""
-    rules = [
-        ("scene.kind", config.scene.kind in ("colmap", "photos", "courtyard"), "colmap, photos or courtyard"),
-        ("scene.resample", config.scene.resample in ("lanczos", "area"), "lanczos or area"),
-        ("scene.principal_point", config.scene.principal_point in ("used", "centred"), "used or centred"),
-        ("scene.downscale", config.scene.downscale >= 1, "at least 1"),
-        ("scene.max_size", config.scene.max_size is None or config.scene.max_size >= 16, "at least 16 px"),
-        ("scene.max_images", config.scene.max_images >= 3, "at least 3"),
-        ("scene.test_every", config.scene.test_every >= 2, "at least 2"),
-        (
-            "raster",
-            config.raster._target_ is not None or config.raster.name in executors.names(),
-            f"one of {', '.join(executors.names())}",
-        ),
-        ("train.iterations", config.train.iterations >= 1, "at least 1"),
-        ("train.sh_interval", config.train.sh_interval >= 1, "at least 1"),
-        ("train.ssim_weight", 0 <= config.train.ssim_weight <= 1, "in [0, 1]"),
-        ("train.position_steps", config.train.position_steps >= 1, "at least 1"),
-        ("train.log_every", config.train.log_every >= 1, "at least 1"),
-        ("train.checkpoint_every", config.train.checkpoint_every >= 1, "at least 1"),
-        ("train.checkpoint_minutes", config.train.checkpoint_minutes > 0, "above 0"),
-        ("train.max_seconds", config.train.max_seconds is None or config.train.max_seconds > 0, "above 0 or null"),
-        ("train.background", all(0 <= c <= 1 for c in config.train.background), "three numbers in [0, 1]"),
-        ("eval.protocol", config.eval.protocol in ("paper", "standard"), "paper or standard"),
-        ("launch", config.launch.name in ("serial", "local", "slurm"), "serial, local or slurm"),
-        (
-            "launch.timeout_min",
-            config.launch.timeout_min is None or config.launch.timeout_min >= 1,
-            "at least 1 or null",
-        ),
-        ("launch.parallel", config.launch.parallel >= 1, "at least 1"),
-        ("threads", config.threads == "auto" or _is_positive(config.threads), "auto or a whole number above 0"),
-        ("name", _is_folder_name(config.name), "a plain folder name"),
-        ("scene.name", _is_folder_name(config.scene.name), "a plain folder name"),
-    ]
-    rates = ("position_initial", "position_final", "sh_dc", "sh_rest", "opacity", "scale", "rotation")
-    rules += [(f"train.{rate}", config.train[rate] > 0, "above 0") for rate in rates]
-    for key, holds, rule in rules:
-        if not holds:
-            raise InputError(f"{key} must be {rule}, got {OmegaConf.select(config, key)!r}")
-    if config.scene.kind != "courtyard" and not config.scene.path:
-        raise InputError("scene.path is not set: say where the capture lies, for example scene.path=/my/photos")
-    for group in ("init", "densify", *(["raster"] if config.raster._target_ is not None else [])):
-        check_target(OmegaConf.select(config, f"{group}._target_"), group, config.allow_targets)
+    """`check_values`, and the rules between values: whether a trial can be made of the configuration."""
+    check_values(config)
+    for group, schema in GROUP_SCHEMAS.items():
+        schema(**_settings_of(config, group))
+    for group in COMPONENTS:
+        name = _group(config, group).get("name")
+        if not isinstance(name, str | int | float) or not is_folder_name(str(name)):
+            raise InputError(f"{group}.name must be a plain folder name, got {name!r}")
+    for group in (*COMPONENTS, *(["raster"] if config.raster._target_ is not None else [])):
+        check_target(config[group].get("_target_"), group, config.allow_targets)
+
+
+def require_values(values: Mapping[str, Any], group: str) -> None:
+    """Raise InputError for the first setting of ``group`` that must be given and is not."""
+    for key, value in values.items():
+        if value == MISSING:
+            raise InputError(f"{group}.{key} is not set: give it a value")
+
+
+def _settings_of(config: DictConfig, group: str) -> dict[str, Any]:
+    """The values of a group that its schema knows: all, but for those that are options of a user's own class."""
+    values = _group(config, group)
+    require_values(values, group)
+    return {key: values.get(key) for key in ("name", "_target_")} if values.get("_target_") is not None else values
+
+
+def _group(config: DictConfig, group: str) -> dict[str, Any]:
+    node = config.get(group)
+    if not isinstance(node, DictConfig):
+        raise InputError(f"{group} must be chosen, as {group}=NAME (see gsbench --help), got {node!r}")
+    return plain(node)
+
+
+def _unwrapped(value: Any) -> Any:
+    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+
+
+def _convert(node: DictConfig, schema: type, given: Mapping[str, Any], group: str) -> None:
+    """Hold ``given``, what ``node`` has, against the fields of ``schema``, and convert it in ``node``."""
+    prefix = f"{group}." if group else ""
+    for name in (entry.name for entry in dataclasses.fields(schema)):
+        if name not in given and name != "_target_" and name not in GROUP_SCHEMAS and name not in COMPONENTS:
+            raise InputError(f"{prefix}{name} has been taken away: give it a value instead")
+    for key, value in checked(schema, given, group).items():
+        value = list(value) if isinstance(value, tuple) else value
+        if repr(value) != repr(given[key]):
+            node[key] = value
 
 
 def check_target(target: str | None, group: str, allowed: list[str]) -> None:
@@ -254,11 +361,3 @@ def without_later(group: str, values: dict[str, Any]) -> dict[str, Any]:
 def sha256_of(values: Any) -> str:
     """sha256 of canonical JSON: sorted keys, no spaces, floats by repr."""
     return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
-def _is_positive(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value > 0
-
-
-def _is_folder_name(value: str) -> bool:
-    return bool(value) and value not in (".", "..") and not set(value) & set("/\\\0")

@@ -96,6 +96,37 @@ def remove_temporaries(folder: Path) -> None:
                 path.unlink()
 
 
+def checked_runs_folder(name: str) -> Path:
+    """The runs folder called ``name``, made absolute; it need not be there yet.
+
+    Raises InputError where a folder of this name can neither be there nor be made.
+    """
+    advice = "set runs=FOLDER or GSBENCH_RUNS to another folder"
+    try:
+        folder = Path(name).expanduser().resolve()
+        existing = next(place for place in (folder, *folder.parents) if place.exists())
+    except (OSError, RuntimeError, ValueError) as error:
+        raise InputError(f"{name!r} cannot be the runs folder ({error}): {advice}") from error
+    if name.strip() == "":
+        raise InputError(f"the runs folder has no name: {advice}")
+    if not existing.is_dir():
+        raise InputError(f"the runs folder {folder} cannot be made, because {existing} is a file: {advice}")
+    return folder
+
+
+def make_runs_folder(folder: Path) -> None:
+    """Make the runs folder; raises InputError where it cannot be made, and OSError on a full disk."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        if error.errno in FULL:
+            raise
+        reason = os.strerror(error.errno) if error.errno else error
+        raise InputError(
+            f"the runs folder {folder} cannot be made ({reason}): set runs=FOLDER or GSBENCH_RUNS"
+        ) from error
+
+
 @contextmanager
 def storage_errors(folder: Path) -> Iterator[None]:
     """Turn a full disk and forbidden writing within the block into one line that names ``folder``."""

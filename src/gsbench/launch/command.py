@@ -11,12 +11,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from gsbench.command_words import parse
 from gsbench.compose import Composed, compose_trials
-from gsbench.config import conf_dir, register_schemas
 from gsbench.errors import GsbenchError, InputError
-from gsbench.files import storage_errors
+from gsbench.files import checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan, describe_plan
+from gsbench.launch.preflight import check_components, missing_folders, need_no_check
+from gsbench.launch.queries import QUERIES, ask_hydra
 from gsbench.launch.serial import run_serial
 from gsbench.pipeline.stages import STAGES
 from gsbench.pipeline.stopping import stop_on_signals
@@ -25,20 +27,6 @@ from gsbench.pipeline.trial_files import TrialPaths, find_finished
 
 log = logging.getLogger(__name__)
 
-READ = ("colmap", "photos")  # the kinds of scenes that are read from scene.path
-HYDRA_QUERIES = (
-    "--cfg",
-    "-c",
-    "--info",
-    "-i",
-    "--hydra-help",
-    "--shell-completion",
-    "-sc",
-    "--resolve",
-    "--package",
-    "-p",
-)
-
 
 def launch(argv: list[str]) -> int:
     """Run the trials of the command line ``argv``; 0 if all are done, 1 if some failed.
@@ -46,11 +34,13 @@ def launch(argv: list[str]) -> int:
     Raises InputError for a configuration that does not compose or hold together, and for a single trial's bad input.
     """
     sys.path.insert(0, os.getcwd())  # a user's own class lies beside the user
-    if any(word.split("=")[0] in HYDRA_QUERIES for word in argv):
-        return _ask_hydra(argv)
+    if any(word.split("=")[0] in QUERIES for word in argv):
+        return ask_hydra(argv)
     overrides, multirun, dry_run = parse(argv)
     trials = compose_trials(overrides, multirun)
     if dry_run:
+        if not need_no_check(trials):
+            check_components(trials, here=False)
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"]) + missing_folders(trials)))
         return 0
     return run_trials(trials)
@@ -58,61 +48,24 @@ def launch(argv: list[str]) -> int:
 
 def run_trials(trials: Sequence[Composed]) -> int:
     """Run what is not done among ``trials`` by the launcher that they name; the exit code."""
-    runs = TrialPaths.of(trials[0].values).runs
+    runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
     with storage_errors(runs), stop_on_signals():
-        runs.mkdir(parents=True, exist_ok=True)
-        Store(runs / "store").sweep(STAGES)
         outcomes, unfinished = _skip_finished(trials)
-        # A node of a cluster may have folders that this machine lacks.
-        here = [trial for trial in unfinished if trial.values["launch"]["name"] != "slurm"]
-        if missing := missing_folders(here):
+        # A node of a cluster may have folders and devices that this machine lacks.
+        if launcher != "slurm" and (missing := missing_folders(unfinished)):
             raise InputError("; ".join(missing))
+        check_components(unfinished, here=launcher != "slurm")
+        make_runs_folder(runs)
+        Store(runs / "store").sweep(STAGES)
         add_to_plan(trials)
         if unfinished:
-            if unfinished[0].values["launch"]["name"] == "serial":
+            if launcher == "serial":
                 outcomes += run_serial(unfinished)
             else:
                 from gsbench.launch.jobs import run_jobs
 
                 outcomes += run_jobs(unfinished)
     return summarize(outcomes, trials)
-
-
-def missing_folders(trials: Sequence[Composed]) -> list[str]:
-    """A line for each scene of the trials whose folder of photographs is not there, and one that says the mend."""
-    from gsbench.datasets.catalog import how_to_get
-    from gsbench.scene.readers import missing_folder
-
-    scenes = {(scene["name"], scene["path"]) for scene in (t.values["scene"] for t in trials) if scene["kind"] in READ}
-    folders = [(name, Path(path).expanduser()) for name, path in sorted(scenes, key=str)]
-    missing = [(name, folder) for name, folder in folders if not folder.is_dir()]
-    if not missing:
-        return []
-    return [*(missing_folder(name, folder) for name, folder in missing), how_to_get(missing)]
-
-
-def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
-    """Overrides, whether to expand lists (``-m``), and whether to only list the trials (``--dry-run``)."""
-    overrides: list[str] = []
-    multirun = dry_run = False
-    words = iter(argv)
-    for word in words:
-        if word in ("-m", "--multirun"):
-            multirun = True
-        elif word == "--dry-run":
-            dry_run = True
-        elif word.split("=")[0] in ("--config-dir", "-cd"):
-            folder = word.partition("=")[2] or next(words, "")
-            if not Path(folder).is_dir():
-                raise InputError(f"--config-dir {folder}: no such folder")
-            overrides.append(f"hydra.searchpath=['file://{Path(folder).resolve()}']")
-        elif word.startswith("-"):
-            raise InputError(
-                f"{word} is not an option; there are -m, --dry-run, --config-dir FOLDER, --cfg job, --help"
-            )
-        else:
-            overrides.append(word)
-    return overrides, multirun, dry_run
 
 
 def _skip_finished(trials: Sequence[Composed]) -> tuple[list[Outcome], list[Composed]]:
@@ -167,20 +120,3 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Composed]) -> int:
     if failed and all(outcome.status == "failed" and outcome.bad_input for outcome in outcomes):
         return 2
     return 1 if failed else 0
-
-
-def _ask_hydra(argv: list[str]) -> int:
-    """Let Hydra answer about the configuration; no trial is run."""
-    import hydra
-
-    def task(config: Any) -> None:
-        raise AssertionError("Hydra was asked a question, and ran the task instead")
-
-    register_schemas()
-    saved = sys.argv
-    sys.argv = ["gsbench", *argv]
-    try:
-        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(task)()
-    finally:
-        sys.argv = saved
-    return 0

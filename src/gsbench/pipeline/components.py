@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from gsbench.config import ALLOWED_TARGETS, WITHOUT_EFFECT, check_target, without_later
+from gsbench.config import ALLOWED_TARGETS, WITHOUT_EFFECT, check_target, require_values, without_later
 from gsbench.errors import InputError
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.settings import checked, unknown_setting
@@ -35,6 +35,7 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     target = values["_target_"]
     check_target(target, group, allow_targets)
     cls = locate(target, group)
+    require_values(values, group)
     options = {key: value for key, value in values.items() if key not in RESERVED}
     if dataclasses.is_dataclass(cls):
         options = checked(cls, options, group)

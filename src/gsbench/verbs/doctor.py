@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import importlib.util
 import os
@@ -15,6 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
+from gsbench.arguments import ArgumentParser
 from gsbench.files import explain_storage
 from gsbench.install import install_command
 from gsbench.pipeline.resources import available_threads
@@ -41,7 +41,7 @@ class Finding:
 def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: 1 if something is bad."""
 
-    parser = argparse.ArgumentParser(prog="gsbench doctor", description="Check this machine and say what is missing.")
+    parser = ArgumentParser(prog="gsbench doctor", description="Check this machine and say what is missing.")
     parser.add_argument(
         "--store", action="store_true", help="also read every stored result whole and name damaged ones"
     )

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.explain import ADDRESS, explain_cell
+from gsbench.arguments import ArgumentParser
 from gsbench.errors import InputError
 
 
@@ -14,7 +14,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     """The verb; raises InputError for bad input."""
     if "--stale" in argv:
         return _stale([word for word in argv if word != "--stale"], runs)
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog="gsbench explain",
         description="The runs, settings, data and code versions behind a cell of a table.",
         epilog="gsbench explain --stale FOLDER tells why a stage of a trial is computed anew.",
@@ -26,7 +26,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 def _stale(argv: Sequence[str], runs: Path) -> int:
     """The verb with ``--stale``."""
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog="gsbench explain --stale",
         description="For each stage of a trial: whether its result is in the store; if not, what differs from the most "
         "similar result that is.",

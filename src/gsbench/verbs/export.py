@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gsbench.arguments import ArgumentParser
 from gsbench.errors import InputError
 from gsbench.files import atomic
 
@@ -24,7 +24,7 @@ FORMATS = {
 def main(argv: Sequence[str], runs: Path) -> int:
     from gsbench.view.trials import ADDRESS, find_trial
 
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog="gsbench export",
         description="Write a trained model for other programs; `gsbench export init TRIAL --out DIR` copies the COLMAP "
         "model that the trial started from.",

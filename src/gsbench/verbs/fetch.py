@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from gsbench.arguments import ArgumentParser
 from gsbench.datasets.catalog import DATA_VARIABLE, Archive, Dataset, data_dir, read_catalog
 from gsbench.datasets.fetch import STAGING, Fetcher
 from gsbench.datasets.plan import SceneFiles, describe, wanted_files
@@ -132,8 +132,8 @@ def _mirror(mirror: str | None) -> str | None:
     raise InputError(f"--mirror {mirror} is neither an http(s) address nor a folder")
 
 
-def _parser(names: Sequence[str]) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser(names: Sequence[str]) -> ArgumentParser:
+    parser = ArgumentParser(
         prog="gsbench fetch",
         description=f"Bring public scenes into the data folder (${DATA_VARIABLE}, else ./data), where scene=NAME finds "
         "them: only the wanted scenes and image folders out of the archives, where the server serves ranges. Stopped, "

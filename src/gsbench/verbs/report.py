@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.results import load_experiment
+from gsbench.arguments import ArgumentParser
 from gsbench.errors import InputError
 from gsbench.files import write_text
 
@@ -18,9 +18,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     """The verb; raises InputError for bad input."""
     from gsbench.analysis.report.build import build_report  # here, for a quick answer to --help
 
-    parser = argparse.ArgumentParser(
-        prog="gsbench report", description="One HTML file with the evidence of an experiment."
-    )
+    parser = ArgumentParser(prog="gsbench report", description="One HTML file with the evidence of an experiment.")
     parser.add_argument("experiment")
     parser.add_argument("--out", type=Path, metavar="FILE", help=f"default: {REPORT_NAME} in the experiment's folder")
     parser.add_argument("--baseline", default=BASELINE, help=f"the densifier that others are held against ({BASELINE})")

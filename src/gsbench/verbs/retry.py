@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
 import os
 import sys
@@ -12,6 +11,7 @@ from pathlib import Path
 import yaml
 
 from gsbench.analysis.results import experiment_home
+from gsbench.arguments import ArgumentParser
 from gsbench.compose import Composed, compose_one
 from gsbench.errors import InputError
 from gsbench.launch.plan import Planned, describe_plan, forget, progress_of_experiment, read_plan
@@ -24,7 +24,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: as the sweep's own command, the exit code says whether some trial failed."""
     from gsbench.launch.command import run_trials
 
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog="gsbench retry", description="Run the failed, stopped and missing trials of an experiment again."
     )
     parser.add_argument("experiment")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -12,6 +11,7 @@ from pathlib import Path
 
 from gsbench.analysis.results import Trial, experiment_home, list_experiments, read_experiment
 from gsbench.analysis.superseded import find_superseded
+from gsbench.arguments import ArgumentParser
 from gsbench.launch.plan import TrialState, forget, progress_of_experiment, read_plan, remove
 from gsbench.pipeline.trial_files import label_of
 from gsbench.source import source_of
@@ -22,7 +22,7 @@ ORDER = ("failed", "running", "partial", "missing", "superseded", "done")
 
 def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: 0 if all trials are done, 1 if some failed or are missing."""
-    parser = argparse.ArgumentParser(prog="gsbench status", description="The state of every trial of an experiment.")
+    parser = ArgumentParser(prog="gsbench status", description="The state of every trial of an experiment.")
     parser.add_argument("experiment", nargs="?", help="its name; without one, a line for each experiment")
     parser.add_argument("--all", action="store_true", help="list the finished trials too")
     parser.add_argument("--json", action="store_true", help="a list of objects instead of lines")

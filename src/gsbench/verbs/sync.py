@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.results import experiment_home, list_experiments
+from gsbench.arguments import ArgumentParser
 from gsbench.errors import GsbenchError
 from gsbench.launch.plan import TRIAL_GLOB
 from gsbench.pipeline.trial_files import label_of, read_config, state_of
@@ -18,9 +18,7 @@ from gsbench.words import counted
 def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: 1 if the tracker cannot be reached."""
 
-    parser = argparse.ArgumentParser(
-        prog="gsbench sync", description="Mirror finished and failed trials to MLflow, once."
-    )
+    parser = ArgumentParser(prog="gsbench sync", description="Mirror finished and failed trials to MLflow, once.")
     parser.add_argument("experiment", nargs="?", help="its name; without one, all")
     parser.add_argument("--uri", help="the tracker, such as http://127.0.0.1:5000; without it, each trial's own")
     options = parser.parse_args(argv)

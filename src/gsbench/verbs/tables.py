@@ -14,6 +14,7 @@ from gsbench.analysis.paper_tables import PAPER_TABLES, paper_tables
 from gsbench.analysis.results import Experiment, Trial, load_experiment
 from gsbench.analysis.table_formats import FORMATS
 from gsbench.analysis.tables import DEFAULT_ROWS, build_table
+from gsbench.arguments import ArgumentParser
 from gsbench.errors import InputError
 from gsbench.files import write_text
 
@@ -62,8 +63,8 @@ def _tables(experiment: Experiment, trials: Sequence[Trial], options: argparse.N
     return {f"{end}.{suffix}": writer(table) for end, table in zip(ends, tables, strict=False)}
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser(
         prog="gsbench tables",
         description="Tables of an experiment, from its result files; `gsbench tables paper` lists what the paper's own "
         "numbers contradict.",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -11,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
+from gsbench.arguments import ArgumentParser
 from gsbench.errors import InputError
 
 DEFAULT_PORT = 5000
@@ -20,7 +20,7 @@ MAX_COMPARED = 100  # runs in an address; browsers limit its length
 def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: serves until Ctrl-C."""
 
-    parser = argparse.ArgumentParser(prog="gsbench ui", description="The MLflow dashboard, on this machine only.")
+    parser = ArgumentParser(prog="gsbench ui", description="The MLflow dashboard, on this machine only.")
     parser.add_argument("experiment", nargs="?", help="print the address that compares its trials")
     parser.add_argument("--uri", help="the tracker's database or server; default: the one in the runs folder")
     parser.add_argument("--port", type=int, default=DEFAULT_PORT)

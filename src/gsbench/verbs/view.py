@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import threading
 from collections.abc import Sequence
 from pathlib import Path
 
+from gsbench.arguments import ArgumentParser
 from gsbench.errors import InputError
 from gsbench.install import install_command
 from gsbench.view import ADDRESS
@@ -16,7 +16,7 @@ DEFAULT_PORT = 8080
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog="gsbench view", description="Look at trained models in the browser: one, or two side by side."
     )
     parser.add_argument("trial", nargs="+", metavar="TRIAL", help=ADDRESS)

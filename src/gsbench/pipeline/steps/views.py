@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 from gsbench.config import SceneConfig
 from gsbench.init.base import MODEL_FOLDER
@@ -11,8 +11,7 @@ from gsbench.pipeline.progress import progress
 from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.capture import split_of
 from gsbench.pipeline.store import Store
-from gsbench.scene.images import Resample
-from gsbench.scene.load import PrincipalPoint, load_scene
+from gsbench.scene.load import load_scene
 from gsbench.scene.types import Capture, Scene
 
 
@@ -44,7 +43,7 @@ class Views:
                 self.store.root / "views",
                 downscale=self.options.downscale,
                 max_size=self.options.max_size,
-                resample=cast(Resample, self.options.resample),
-                principal_point=cast(PrincipalPoint, self.options.principal_point),
+                resample=self.options.resample,
+                principal_point=self.options.principal_point,
                 progress=lambda done, total: report("views", done, total),
             )

@@ -1,0 +1,77 @@
+"""What is refused before any trial starts: wrong options of components, folders and devices that are not there."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from gsbench.command_words import options
+from gsbench.compose import Composed
+from gsbench.config import COMPONENTS
+
+READ = ("colmap", "photos")  # the kinds of scenes that are read from scene.path
+
+
+def missing_folders(trials: Sequence[Composed]) -> list[str]:
+    """A line for each folder of photographs or weights that the trials name and that is not there, and the mend."""
+    from gsbench.datasets.catalog import how_to_get
+    from gsbench.scene.readers import missing_folder
+
+    scenes = {(scene["name"], scene["path"]) for scene in (t.values["scene"] for t in trials) if scene["kind"] in READ}
+    folders = [(name, Path(path).expanduser()) for name, path in sorted(scenes, key=str)]
+    missing = [(name, folder) for name, folder in folders if not folder.is_dir()]
+    lines = [missing_folder(name, folder) for name, folder in missing]
+    return lines + ([how_to_get(missing)] if missing else []) + _missing_weights(trials)
+
+
+def _missing_weights(trials: Sequence[Composed]) -> list[str]:
+    named = {
+        (group, str(folder))
+        for group in ("eval", "init")
+        for folder in (trial.values[group].get("weights") for trial in trials)
+        if folder is not None
+    }
+    return [
+        f"{group}.weights={folder}: no such folder; without it, weights are looked for where gsbench keeps them"
+        for group, folder in sorted(named)
+        if not Path(folder).expanduser().is_dir()
+    ]
+
+
+def check_components(trials: Sequence[Composed], here: bool) -> None:
+    """Make what the trials' init, densify and raster describe, so that their classes refuse what they do not take.
+
+    With ``here``, the trials will run on this machine, whose devices are known. Raises InputError naming the key.
+    """
+    from gsbench.pipeline.components import build, select_device
+    from gsbench.raster.executors import AUTO, resolve
+
+    for values in _distinct(trials, (*COMPONENTS, "raster", "device", "allow_targets")):
+        own_raster = values["raster"]["_target_"] is not None
+        for group in (*COMPONENTS, *(["raster"] if own_raster else [])):
+            build(group, values[group], values["allow_targets"])
+        if here:
+            device = select_device(values["device"])
+            if not own_raster and values["raster"]["name"] != AUTO:
+                resolve(values["raster"]["name"], device.type)
+
+
+def need_no_check(trials: Sequence[Composed]) -> bool:
+    """Whether the trials take their components as they ship, whose options gsbench's own tests have checked.
+
+    A dry run then answers without loading torch.
+    """
+    for word in {word for trial in trials for word in trial.overrides}:
+        key, _, value = word.lstrip("+~").partition("=")
+        group = re.split("[./@]", key)[0]
+        if group == "hydra" or (group in (*COMPONENTS, "raster", "train") and value not in options(key)):
+            return False
+    return True
+
+
+def _distinct(trials: Iterable[Composed], keys: Sequence[str]) -> list[dict[str, Any]]:
+    """The different values that trials have under ``keys``, in the order of their first appearance."""
+    return list({json.dumps([t.values[k] for k in keys], default=str): t.values for t in trials}.values())
