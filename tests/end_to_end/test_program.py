@@ -36,6 +36,9 @@ def test_sweep_leaves_complete_trials_and_a_table(gsbench: Run, tmp_path: Path) 
         assert 13 < result["metrics"]["psnr"] < 40
         assert "lpips_vgg_raw" not in result["metrics"]
         assert "lpips_vgg_raw" in result["unavailable"]
+        assert result["machine"]["cpu"]
+        assert len(result["hashes"]["cloud"]) == 64
+    assert len({result["hashes"]["cloud"] for result in results}) == 1
     trial = next(runs.glob("small/courtyard/random-volumetric/*-seed0"))
     names = {path.name for path in trial.iterdir()}
     wanted = (

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from gsbench.analysis.cells import Cell, check_averageable, make_cell, swept_settings
 from gsbench.analysis.differences import differing_settings, short_version
+from gsbench.analysis.origins import machine_of
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.paper import load_paper
 from gsbench.analysis.paper_tables import PAPER_TABLES, agreement
@@ -104,6 +105,8 @@ def _trial_lines(trial: Trial, shown: Quantity) -> list[str]:
         f"    {data.get('test_views', '?')} test views, raster {data['raster']}, {counts}",
     ]
     lines += [f"    {key:<9} {value}" for key, value in data.get("hashes", {}).items()]
+    if machine := machine_of(trial):
+        lines.append(f"    machine   {machine}")
     if trial.code:
         versions = [f"{part} {short_version(version)}" for part, version in trial.code.items()]
         lines.append("    code      " + ", ".join(versions))

@@ -21,6 +21,7 @@ from gsbench.analysis.cells import (
     swept_settings,
 )
 from gsbench.analysis.differences import differing_conditions
+from gsbench.analysis.origins import cloud_notes, machine_notes
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Experiment, Trial
@@ -120,7 +121,8 @@ def build_table(
     arms = [" + ".join(names.get(value, value) for value in arm) for arm in arm_keys]
     keys = tuple((quantity.key, "+".join(arm)) for quantity in quantities for arm in arm_keys)
     heads = tuple(Column(q.heading, arm) if columns else Column("", q.heading) for q in quantities for arm in arms)
-    notes += _reading_notes(grid, quantities, expected, "scene" in fields) + _cost_notes(trials) + _left_out(experiment)
+    notes += _reading_notes(grid, quantities, expected, "scene" in fields) + _cost_notes(trials)
+    notes += machine_notes(trials) + cloud_notes(trials) + _left_out(experiment)
     return Table(title or f"Experiment {experiment.name}", tuple(rows), heads, tuple(shown), tuple(notes), keys)
 
 

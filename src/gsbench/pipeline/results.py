@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from gsbench import __version__
-from gsbench.config import config_hash
+from gsbench.config import config_hash, sha256_of
 from gsbench.events import sum_events
-from gsbench.init.base import REPORT_FILE
+from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.pipeline.stages import EVALUATE, INIT, STAGES, TRAIN
 from gsbench.pipeline.steps.evaluate import METRICS_FILE
 from gsbench.pipeline.steps.train import TRAINING_FILE
@@ -69,6 +69,7 @@ def results_of(
             "config": config_hash(values),
             "data": fingerprint,
             "init": init.key,
+            "cloud": cloud_hash(init.path),
             "train": trained.key,
             "evaluate": evaluated.key,
         },
@@ -76,6 +77,14 @@ def results_of(
         "machine": training.get("machine"),  # None of a training before it was recorded
         "versions": versions(),
     }
+
+
+def cloud_hash(init: Path) -> str:
+    """The hash of what an initialiser made: cameras, poses and points, or Gaussians. Its key is only of its inputs."""
+    files = _read(init / MANIFEST)["outputs"]
+    model = (f"{MODEL_FOLDER.as_posix()}/", GAUSSIANS_FILE)
+    kept = {name: file["sha256"] for name, file in files.items() if name.startswith(model)}
+    return sha256_of(kept)
 
 
 def versions() -> dict[str, str]:

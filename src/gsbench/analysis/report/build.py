@@ -9,6 +9,7 @@ from jinja2 import Environment, StrictUndefined
 
 from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.errors_by_region import read_image
+from gsbench.analysis.origins import cloud_lines
 from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs
 from gsbench.analysis.paper import inconsistencies, load_paper
 from gsbench.analysis.paper_tables import PAPER_TABLES, paper_tables
@@ -61,6 +62,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         volume_notes=volume_notes,
         figures=trial_figures(trials),
         provenance=rows,
+        clouds=cloud_lines(trials),
         columns=list(dict.fromkeys(key for row in rows for key in row)),
         warnings=experiment.warnings,
     )

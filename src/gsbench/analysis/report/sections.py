@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gsbench.analysis.cells import by_key
+from gsbench.analysis.differences import short_version
 from gsbench.analysis.errors_by_region import MAP_PROPERTIES, RegionErrors, errors_by_region
+from gsbench.analysis.origins import machine_of, unlike_clouds
 from gsbench.analysis.pairing import ViewCache, arm_name, pair_arms, pair_trials
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart, short_number
@@ -106,7 +108,7 @@ def compare_arms(trials: Sequence[Trial], first: Arm, second: Arm, views: ViewCa
         tuple(regions),
         tuple(gained),
         tuple(lost),
-        tuple(dict.fromkeys([*notes, *faults])),
+        tuple(dict.fromkeys([*notes, *unlike_clouds(pairs), *faults])),
     )
 
 
@@ -208,6 +210,8 @@ def provenance(trials: Sequence[Trial]) -> list[dict[str, str]]:
             "protocol": str(trial.data["protocol"]),
             "iterations": str(trial.data["iterations"]),
             **{f"{key} hash": str(value)[:12] for key, value in trial.data.get("hashes", {}).items()},
+            "code": ", ".join(f"{part} {short_version(version)}" for part, version in trial.code.items()),
+            "machine": machine_of(trial) or "",
             "versions": ", ".join(f"{key} {value}" for key, value in trial.data.get("versions", {}).items()),
         }
         for trial in trials

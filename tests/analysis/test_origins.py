@@ -1,0 +1,82 @@
+"""Machines and initial clouds: averaged over, compared across, and always said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from gsbench.analysis.explain import explain_cell
+from gsbench.analysis.origins import cloud_lines, unlike_clouds
+from gsbench.analysis.pairing import ViewCache, pair_trials
+from gsbench.analysis.report.build import build_report
+from gsbench.analysis.report.sections import compare_arms
+from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.analysis.tables import build_table
+from tests.analysis.test_tables import one_trial
+
+Make = Callable[..., Experiment]
+XEON = {"cpu": "Xeon", "architecture": "x86_64", "kernels": "skylake-avx512", "torch": "AVX512", "device": "cpu"}
+RYZEN = XEON | {"cpu": "Ryzen", "kernels": "znver3", "torch": "AVX2"}
+A, B = "a" * 64, "b" * 64
+
+
+def notes_of(runs: Path) -> list[str]:
+    return list(build_table(load_experiment(runs, "exp"), metrics=["psnr"]).notes)
+
+
+def hashes(cloud: str | None, init: str = "init1") -> dict[str, str]:
+    return {"data": "d", "init": init} | ({} if cloud is None else {"cloud": cloud})
+
+
+def test_trials_of_several_machines_are_averaged_and_the_table_says_so(tmp_path: Path) -> None:
+    for seed, machine in enumerate((XEON, RYZEN, XEON, None)):
+        one_trial(tmp_path, seed, psnr=27.0, _machine=machine)
+    (note,) = (note for note in notes_of(tmp_path) if "machine" in note)
+    assert "2 kinds of machine" in note
+    assert note.endswith(
+        "Xeon (skylake-avx512, torch AVX512): 2 trials; Ryzen (znver3, torch AVX2): 1 trial; not recorded: 1."
+    )
+    assert "2 kinds of machine" in build_report(load_experiment(tmp_path, "exp"))
+    assert "machine   Ryzen (znver3, torch AVX2)" in explain_cell("exp:garden:psnr:adc", tmp_path)
+
+
+def test_one_machine_or_none_recorded_is_no_note(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, psnr=27.0, _machine=XEON)
+    one_trial(tmp_path, 1, psnr=27.0)
+    assert not any("machine" in note for note in notes_of(tmp_path))
+
+
+def test_one_initialiser_that_gave_two_clouds_is_noted(tmp_path: Path) -> None:
+    for seed, densify, cloud in ((0, "adc", A), (1, "adc", B), (0, "volumetric", A)):
+        one_trial(tmp_path, seed, psnr=27.0, _densify=densify, _hashes=hashes(cloud))
+    assert (
+        "garden: trials of init sfm started from 2 different clouds "
+        "(aaaaaaaa: adc seed 0; volumetric seed 0; bbbbbbbb: adc seed 1)."
+    ) in notes_of(tmp_path)
+    assert cloud_lines(load_experiment(tmp_path, "exp").trials) == [
+        "garden, sfm: cloud aaaaaaaa (stage result init1, 3,000 points); "
+        "cloud bbbbbbbb (stage result init1, 3,000 points)"
+    ]
+
+
+def test_compared_arms_with_unlike_clouds_are_named(tmp_path: Path) -> None:
+    for scene, clouds in (("garden", (A, B)), ("room", (A, A)), ("truck", (None, A))):
+        for densify, cloud in zip(("adc", "volumetric"), clouds, strict=True):
+            one_trial(tmp_path, 0, psnr=27.0, _densify=densify, _scene=scene, _hashes=hashes(cloud))
+    trials = load_experiment(tmp_path, "exp").trials
+    arms = (("sfm", "adc"), ("sfm", "volumetric"))
+    expected = "garden: the arms started from different clouds (aaaaaaaa and bbbbbbbb)"
+    assert unlike_clouds(pair_trials(trials, *arms)) == [expected]
+    assert expected in compare_arms(trials, *arms, ViewCache()).notes
+
+
+def test_without_recorded_clouds_the_stage_result_tells_them_apart(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, psnr=27.0, _hashes=hashes(None, "init1"))
+    one_trial(tmp_path, 0, psnr=27.0, _densify="volumetric", _hashes=hashes(None, "init2"))
+    trials = load_experiment(tmp_path, "exp").trials
+    assert len(unlike_clouds(pair_trials(trials, ("sfm", "adc"), ("sfm", "volumetric")))) == 1
+
+
+def test_the_report_shows_the_clouds(make_experiment: Make) -> None:
+    report = build_report(make_experiment())
+    assert "garden, sfm: cloud not recorded (stage result init-gar, 3,000 points)" in report
