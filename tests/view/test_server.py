@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
-import subprocess
 import time
 import urllib.error
 import urllib.request
@@ -24,19 +22,10 @@ from gsbench.verbs import view as verb
 from gsbench.view.picture import Layers, TrialPainter
 from gsbench.view.server import Viewer, check_port, free_port
 from gsbench.view.trials import find_trial, load_viewed, read_causes
+from tests.view.browser import Browser
 
 pytestmark = pytest.mark.end_to_end
 CPU = torch.device("cpu")
-FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--enable-unsafe-swiftshader",
-    "--no-first-run",
-    "--disable-sync",
-    "--disable-background-networking",
-    "--disable-component-update",
-)
 
 
 @pytest.fixture(scope="module")
@@ -131,19 +120,9 @@ def test_two_trials_and_their_photograph_share_one_camera(viewer: Viewer, painte
 
 @pytest.mark.browser
 def test_page_shows_the_trials_in_a_browser(viewer: Viewer, tmp_path: Path) -> None:
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if chromium is None:
-        pytest.skip("needs a headless Chromium")
-    shot = tmp_path / "page.png"
-    arguments = [*FLAGS, "--virtual-time-budget=60000", "--window-size=1200,600"]
-    for attempt in range(3):  # the browser's virtual time may run out before the server has drawn
-        profile = f"--user-data-dir={tmp_path / str(attempt)}"
-        command = [chromium, *arguments, profile, f"--screenshot={shot}", viewer.url]
-        subprocess.run(command, check=True, capture_output=True, timeout=120)
-        page = np.asarray(Image.open(shot).convert("RGB")).astype(float)
-        if page[150:, :800].std() > 20:  # without the controls and the browser's own notes
-            return
-    pytest.fail("the page stayed empty")
+    with Browser(viewer.url, tmp_path) as browser:
+        # Without the controls and the browser's own notes.
+        browser.wait_until(lambda page: bool(page[150:, :800].std() > 20), "the trials")
 
 
 def test_what_cannot_be_viewed_is_said(small_runs: Path, tmp_path: Path) -> None:

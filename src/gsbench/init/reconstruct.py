@@ -127,7 +127,7 @@ def triangulate(
     settings: MappingSettings,
     progress: Progress,
 ) -> pycolmap.Reconstruction:
-    """Points from the verified matches under the reference's cameras, which stay as they are."""
+    """Points from the verified matches under the reference's cameras, which stay as they are, to the bit."""
     progress("triangulate", 0, 1)
     pycolmap.set_random_seed(settings.seed)
     output.mkdir(parents=True, exist_ok=True)
@@ -148,6 +148,8 @@ def triangulate(
             "no point could be triangulated under the reference cameras: the matches contradict them (are they the "
             "cameras of these photos?), or the photos have too little texture or overlap"
         )
+    for image in model.images.values():  # the solver turns them by a rounding error, on some processors
+        image.frame.set_cam_from_world(image.camera_id, reference.find_image_with_name(image.name).cam_from_world())
     return model
 
 
