@@ -94,17 +94,23 @@ def _windows_name() -> str:
     return os.environ.get("PROCESSOR_IDENTIFIER", "")
 
 
-def kernel_target() -> str:
-    """What numba compiles for, this processor unless ``NUMBA_CPU_NAME`` is set: LLVM's name and the x86-64 level."""
+def numba_target() -> tuple[str, str]:
+    """The processor that numba compiles for and its features, as LLVM writes them ("+sse2,-avx512f,…")."""
     import llvmlite.binding
     import numba
 
     config: Any = numba.config  # its settings are made at run time
-    name = config.CPU_NAME or llvmlite.binding.get_host_cpu_name()
-    chosen = config.CPU_FEATURES
-    features = llvmlite.binding.get_host_cpu_features().flatten() if chosen is None else chosen  # "+sse2,-avx512f,…"
+    features = config.CPU_FEATURES
+    if features is None:
+        features = llvmlite.binding.get_host_cpu_features().flatten()
+    return str(config.CPU_NAME or llvmlite.binding.get_host_cpu_name()), str(features)
+
+
+def kernel_target() -> str:
+    """What numba compiles for, this processor unless ``NUMBA_CPU_NAME`` is set: LLVM's name and the x86-64 level."""
+    name, features = numba_target()
     if platform.machine().lower() not in ("x86_64", "amd64"):
-        return str(name)
+        return name
     return f"{name}, {x86_level({feature[1:] for feature in features.split(',') if feature.startswith('+')})}"
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
+import numba
 import pytest
 
 from gsbench.raster.cpu.imports import PACKAGE, import_closure
@@ -116,3 +117,14 @@ def test_the_base_is_the_folder_that_is_set_or_another_that_can_be_written(
     assert cache_base.__wrapped__() == tmp_path / "cache" / "gsbench" / "numba"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     assert cache_base.__wrapped__().name.startswith("gsbench-numba-")
+
+
+def test_processors_do_not_share_a_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Machines of two kinds may have one home folder, and write there at once."""
+    source = PACKAGE / KERNEL_MODULES[0]
+    folders = {cache_folder(source)}
+    for name, features in (("bonnell", ""), ("haswell", "+avx2"), ("haswell", "+avx2,+fma")):
+        monkeypatch.setattr(numba.config, "CPU_NAME", name)
+        monkeypatch.setattr(numba.config, "CPU_FEATURES", features)
+        folders.add(cache_folder(source))
+    assert len(folders) == 4

@@ -13,6 +13,7 @@ from typing import Any
 
 import numba
 
+from gsbench.machine import numba_target
 from gsbench.raster.cpu.imports import PACKAGE, import_closure
 
 FIRST_COMPILE_SECONDS = 10  # about; measured 7.5 s of processor time on a 2024 server core
@@ -47,9 +48,10 @@ def cache_folder(source: Path, package: Path = PACKAGE) -> Path:
     """Where the kernels of the file ``source`` are kept: a folder of its own for each state of what they are made of.
 
     numba looks at the file of a kernel, not at what that file imports, so a changed helper would leave stale machine
-    code in use. The folder's name is a digest of all that the file imports of gsbench, constants included.
+    code in use. The folder's name is a digest of all that the file imports of gsbench, constants included, and of the
+    processor: numba tells processors apart in an index that two machines with one home folder may write at once.
     """
-    digest = hashlib.sha256(numba.__version__.encode())
+    digest = hashlib.sha256("\n".join((numba.__version__, *numba_target())).encode())
     for content in sorted(path.read_bytes() for path in import_closure(source, package)):
         digest.update(hashlib.sha256(content).digest())
     return cache_base() / digest.hexdigest()[:DIGEST_CHARACTERS]
