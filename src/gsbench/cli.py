@@ -28,7 +28,7 @@ VERBS = {
     "explain": ("gsbench.verbs.explain", "how a table's number came about; with --stale, why a stage is computed anew"),
     "status": ("gsbench.verbs.status", "what an experiment has done, runs, failed and misses"),
     "retry": ("gsbench.verbs.retry", "run what failed, was stopped or is missing of an experiment"),
-    "bench": ("gsbench.bench", "time rasterizers and the training step"),
+    "bench": ("gsbench.verbs.bench", "time rasterizers and the training step"),
     "sync": ("gsbench.verbs.sync", "mirror to MLflow what it missed"),
     "ui": ("gsbench.verbs.ui", "open the MLflow dashboard on this machine"),
     "export": ("gsbench.verbs.export", "copy a trained model or an initial cloud to where another program reads it"),

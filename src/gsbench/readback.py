@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
@@ -11,7 +13,10 @@ class Readback:
 
     On a CUDA device the copy is put into the stream and the host goes on; ``values`` waits for it, which costs nothing
     once the device has come so far, for example an iteration later. On any other device the values are there at once.
+    ``waits`` counts, over all of them, how often that was too early.
     """
+
+    waits: ClassVar[int] = 0
 
     def __init__(self, source: Tensor) -> None:
         self._event: torch.cuda.Event | None = None
@@ -31,6 +36,8 @@ class Readback:
 
     def values(self) -> Tensor:
         """The values as a tensor on the CPU."""
+        if not self.arrived:
+            Readback.waits += 1
         if self._event is not None:
             self._event.synchronize()
             self._event = None

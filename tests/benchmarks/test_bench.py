@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
-from gsbench.bench import PEER, camera_before, frontal_camera, main, run_bench, trained_like_gaussians
+from gsbench.bench import run_bench
+from gsbench.bench.peer import PEER
+from gsbench.bench.scenes import camera_before, frontal_camera, random_gaussians, trained_like_gaussians
+from gsbench.bench.stepper import Setting, Stepper
 from gsbench.errors import InputError
+from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.raster.cpu import CpuRasterizer
+from gsbench.verbs.bench import main
 
 KEYS = {"raster", "size", "count", "forward_ms", "backward_ms", "step_ms", "peak_memory_mb"}
 
@@ -27,6 +33,41 @@ def test_rows() -> None:
         assert min(row["forward_ms"], row["backward_ms"], row["adam_ms"]) > 0
         assert row["step_ms"] == pytest.approx(parts, abs=0.01)  # the median of two steps is their mean
         assert row["peak_memory_mb"] is None
+
+
+def test_turns_are_compared_with_the_first_and_whole_steps_are_made() -> None:
+    first, second = run_bench(["cpu", "reference"], [(40, 30)], [50], repeats=3, memory=False, scene="random")
+    assert first["step_ratio"] == 1
+    assert second["step_ratio"] > 1  # the reference is meant to be read
+    assert (first["scene"], first["device"]) == ("random", "cpu")
+    assert min(first["steps_per_second"], second["steps_per_second"]) > 0
+    assert first["waits_per_step"] is None  # there is no device to wait for
+
+
+def test_whole_steps_leave_the_scene_as_it_is() -> None:
+    stepper = Stepper("cpu", Setting("trained", 40, 30, 50, threads=1))
+    before = [tensor.detach().clone() for tensor in stepper.trainer.gaussians.values.tensors().values()]
+    for _ in range(3):
+        stepper.step()
+        stepper.steps_per_second()
+    assert stepper.trainer.step == 6
+    assert stepper.trainer.sh_degree == 3
+    assert stepper.trainer.densifier.statistics["visible_count"].max() == 3  # of whole steps alone
+    for tensor, old in zip(stepper.trainer.gaussians.values.tensors().values(), before, strict=True):
+        assert torch.equal(tensor, old)
+
+
+def test_a_rasterizer_of_the_users_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "twice.py").write_text(
+        "from gsbench.raster.reference import ReferenceRasterizer\n"
+        "class Twice(ReferenceRasterizer):\n    name = 'twice'\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert main(["--raster", "twice.Twice", "--size", "20x20", "--count", "9", "--repeats", "1"]) == 0
+    assert capsys.readouterr().out.splitlines()[1].split()[0] == "twice.Twice"
 
 
 def test_json_with_memory(capsys: pytest.CaptureFixture[str]) -> None:
@@ -52,9 +93,10 @@ def test_peer_is_labelled() -> None:
     assert "no compositing" in row["note"]
 
 
-def test_scene_is_seeded_and_seen() -> None:
-    scene = trained_like_gaussians(500)
-    assert torch.equal(scene.means, trained_like_gaussians(500).means)
+@pytest.mark.parametrize("make", [trained_like_gaussians, random_gaussians])
+def test_scene_is_seeded_and_seen(make: Callable[[int], Gaussians]) -> None:
+    scene = make(500)
+    assert torch.equal(scene.means, make(500).means)
     for camera in (frontal_camera(60, 45), camera_before(scene, 60, 45)):
         output = CpuRasterizer(threads=1).render(scene, camera, 3, torch.zeros(3))
         assert 0.3 < output.visible.float().mean() <= 1
@@ -68,8 +110,11 @@ def test_scene_is_seeded_and_seen() -> None:
         (["--count", "0"], "at least 1"),
         (["--raster", "nosuch", "--no-memory"], "nosuch"),
         (["--ply", "/no/such.ply"], "such.ply"),
+        (["--raster", "gsplat", "--no-memory"], "raster=gsplat runs on a CUDA device, and torch finds none"),
     ],
 )
 def test_bad_input(arguments: list[str], cause: str) -> None:
+    if "gsplat" in arguments and torch.cuda.is_available():
+        pytest.skip("there is a GPU")
     with pytest.raises(InputError, match=cause):
         main(arguments)

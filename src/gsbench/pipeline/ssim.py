@@ -34,9 +34,10 @@ def as_unit_range(image: Tensor, dtype: torch.dtype) -> Tensor:
 
 def window(dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> Tensor:
     """The one-dimensional Gaussian window [11], of sum 1."""
-    offsets = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=torch.float64)
+    # Made on the device: an upload would make the host wait.
+    offsets = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=torch.float64, device=device)
     weights = torch.exp(-0.5 * (offsets / WINDOW_SIGMA) ** 2)
-    return (weights / weights.sum()).to(device=device, dtype=dtype)
+    return (weights / weights.sum()).to(dtype)
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:

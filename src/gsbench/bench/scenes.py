@@ -1,0 +1,103 @@
+"""What is timed: synthetic Gaussians, the same for one count on every machine, or a trained model; and its camera."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.gaussians.model import NUM_SH_REST, Gaussians
+from gsbench.gaussians.ply import read_ply
+from gsbench.scene.camera import Camera
+from gsbench.scene.types import Scene, View
+
+SEED = 0
+FOCAL = 0.9  # of the image width
+VIEWS = 2
+FIRST_DEPTH, DEPTH_RATIO = 2.0, 12.0  # of the trained-like scene
+# Standard deviation of the median Gaussian of 100,000, in units of depth: 1.6 px in an image 500 px wide.
+MEDIAN_SIGMA = 1.6 / (FOCAL * 500)
+SIGMA_EXPONENT = 0.4  # more Gaussians are smaller ones: sigma falls as count^-0.4
+SIGMA_SPREAD = 0.7  # of log sigma
+BOX_DEPTH, BOX_SIDE = 4.0, 4.0  # of the random scene: where its middle is, and how large
+NEIGHBOUR = 0.7  # distance to the nearest neighbours in units of count^-1/3, about
+INITIAL_OPACITY = 0.1  # 3DGS
+
+
+def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
+    """Meant to resemble a trained model without being fitted to one: ``count`` Gaussians, many small and flat, few
+    large, opacities of all kinds. They fill the view of `frontal_camera` and a margin, a few of them outside."""
+    generator = _generator(count, seed)
+    depth = FIRST_DEPTH * torch.exp(torch.rand(count, generator=generator) * math.log(DEPTH_RATIO))  # [N]
+    slopes = (torch.rand(count, 2, generator=generator) - 0.5) * torch.tensor([1.4, 1.05])  # [N, 2] x/z, y/z
+    spread = torch.exp(SIGMA_SPREAD * torch.randn(count, generator=generator))
+    sigma = MEDIAN_SIGMA * (100_000 / count) ** SIGMA_EXPONENT * spread * depth
+    shape = 0.5 * torch.randn(count, 3, generator=generator) - torch.tensor([0.0, 0.0, 1.5])  # [N, 3] flat
+    return Gaussians(
+        means=torch.cat([slopes * depth[:, None], depth[:, None]], 1),
+        log_scales=sigma.log()[:, None] + shape,
+        quaternions=torch.randn(count, 4, generator=generator),
+        opacity_logits=2.2 * torch.randn(count, generator=generator) - 0.5,
+        sh_dc=0.6 * torch.randn(count, 3, generator=generator),
+        sh_rest=0.1 * torch.randn(count, NUM_SH_REST, 3, generator=generator),
+    )
+
+
+def random_gaussians(count: int, seed: int = SEED) -> Gaussians:
+    """As a training begins: ``count`` faint balls of equal size, as large as they are apart, in a box before
+    `frontal_camera`."""
+    generator = _generator(count, seed)
+    means = BOX_SIDE * (torch.rand(count, 3, generator=generator) - 0.5)
+    means[:, 2] += BOX_DEPTH
+    return Gaussians(
+        means=means,
+        log_scales=torch.full((count, 3), math.log(NEIGHBOUR * BOX_SIDE * count ** (-1 / 3))),
+        quaternions=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        opacity_logits=torch.full((count,), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))),
+        sh_dc=torch.randn(count, 3, generator=generator),
+        sh_rest=torch.zeros(count, NUM_SH_REST, 3),
+    )
+
+
+SCENES = {"trained": trained_like_gaussians, "random": random_gaussians}
+
+
+def make_scene(kind: str, width: int, height: int, count: int, ply: Path | None = None) -> tuple[Gaussians, Scene]:
+    """The Gaussians, of a model in ``ply`` or of the ``kind`` in `SCENES`, and views of noise from their camera."""
+    if ply is not None:
+        gaussians = read_ply(ply)
+        camera = camera_before(gaussians, width, height)
+    elif kind in SCENES:
+        gaussians, camera = SCENES[kind](count), frontal_camera(width, height)
+    else:
+        raise InputError(f"--scene {kind} is not known; choose {' or '.join(SCENES)}")
+    noise = np.random.default_rng(SEED)
+    images = [noise.integers(0, 256, (height, width, 3), dtype=np.uint8) for _ in range(VIEWS)]
+    return gaussians, Scene("bench", tuple(View(f"{k}.png", camera, image) for k, image in enumerate(images)), ())
+
+
+def frontal_camera(width: int, height: int) -> Camera:
+    """A camera at the origin that looks along z."""
+    return _along_z(width, height, np.zeros(3))
+
+
+def camera_before(scene: Gaussians, width: int, height: int) -> Camera:
+    """A camera that looks along z at the middle of ``scene`` from twice the median distance of its Gaussians."""
+    middle: Tensor = scene.means.median(0).values  # [3]
+    distance = (scene.means - middle).norm(dim=-1).median().item()
+    return _along_z(width, height, -middle.double().numpy() + np.array([0.0, 0.0, 2 * distance]))
+
+
+def _along_z(width: int, height: int, translation: np.ndarray) -> Camera:
+    focal = FOCAL * width
+    return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(3), translation)
+
+
+def _generator(count: int, seed: int) -> torch.Generator:
+    if count < 1:
+        raise InputError(f"count must be at least 1, got {count}")
+    return torch.Generator().manual_seed(seed)

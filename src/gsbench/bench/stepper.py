@@ -1,0 +1,155 @@
+"""One rasterizer with a training of its own: single steps in parts, and whole steps as a training makes them."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from gsbench.bench.peer import PEER, TorchPeer
+from gsbench.bench.scenes import SEED, make_scene
+from gsbench.bench.waits import counting_waits
+from gsbench.config import TrainConfig
+from gsbench.densify import ADC
+from gsbench.errors import InputError
+from gsbench.memory import peak_memory_mb, reset_peak_memory
+from gsbench.pipeline.components import build_rasterizer, keep_float32
+from gsbench.pipeline.trainer import Trainer
+from gsbench.raster.base import Rasterizer
+from gsbench.raster.executors import find
+
+WARM_UP_STEPS = 2  # compile, and let memory pools grow
+SH_DEGREE = 3
+NEVER = 10**9  # iterations
+STANDSTILL = 1e-30  # learning rates: the work of Adam on a scene that stays as it is
+STEPS_AT_ONCE = {"cpu": 1, "cuda": 10}  # whole steps between two looks at the clock; losses are read as often
+NOWHERE = Path("/nonexistent")  # a folder that is named and never used: no snapshot is asked for
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is timed."""
+
+    scene: str  # of `bench.scenes.SCENES`
+    width: int  # px
+    height: int  # px
+    count: int  # Gaussians
+    ply: Path | None = None  # instead of ``scene`` and ``count``
+    threads: int | None = None  # None: as many as torch takes
+
+
+class Stepper:
+    """A training of ``setting`` with the rasterizer called ``raster``: an executor, an import path, or the peer."""
+
+    def __init__(self, raster: str, setting: Setting) -> None:
+        self.threads = setting.threads or torch.get_num_threads()
+        torch.set_num_threads(self.threads)
+        self.device = device_of(raster)
+        if self.device.type == "cuda":
+            keep_float32()
+        gaussians, scene = make_scene(setting.scene, setting.width, setting.height, setting.count, setting.ply)
+        self.count = len(gaussians)
+        self.is_peer = raster == PEER
+        self.trainer = Trainer(
+            scene,
+            gaussians.map(lambda tensor: tensor.detach().to(self.device)),
+            ADC(start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, max_gaussians=None),
+            make_rasterizer(raster, self.device, self.threads),
+            standing_still(),
+            SEED,
+        )
+        self.trainer.step = SH_DEGREE  # with a new degree at every iteration
+
+    def step(self) -> dict[str, float]:
+        """One step as its parts, waiting for the device after each; ms."""
+        trainer = self.trainer
+        camera, target = trainer.scene.train[0].camera, trainer.targets.get(0)
+        cpu = time.process_time()
+        marks = [self._now()]
+        image = trainer.rasterizer.render(trainer.gaussians.values, camera, SH_DEGREE, trainer.background).image
+        marks.append(self._now())
+        # The peer gives no image; its numbers stand in, so that something flows back.
+        loss = image.square().sum() if self.is_peer else trainer.loss(image, target)[0]
+        marks.append(self._now())
+        loss.backward()
+        marks.append(self._now())
+        trainer.gaussians.optimizer_step()
+        marks.append(self._now())
+        forward, loss_time, backward, adam = (1e3 * (b - a) for a, b in itertools.pairwise(marks))
+        return {
+            "forward_ms": forward,
+            "backward_ms": backward,
+            "step_ms": 1e3 * (marks[-1] - marks[0]),
+            "loss_ms": loss_time,
+            "adam_ms": adam,
+            "cpu_ms": 1e3 * (time.process_time() - cpu),
+        }
+
+    def steps_per_second(self) -> float | None:
+        """Whole training steps: the next view, render, loss, backward, statistics, Adam, losses read now and then.
+
+        None for the peer, which cannot train.
+        """
+        if self.is_peer:
+            return None
+        steps = STEPS_AT_ONCE[self.device.type]
+        begin = self._now()
+        for _ in range(steps):
+            self.trainer.iterate(NOWHERE)
+        self.trainer.losses.settle()
+        return steps / (self._now() - begin)
+
+    def waits(self) -> Counter[str] | None:
+        """What made the host wait for the device in one whole training step; None for the peer and on a CPU."""
+        if self.is_peer or self.device.type == "cpu":
+            return None
+        self.trainer.losses.settle()
+        with counting_waits() as counts:
+            self.trainer.iterate(NOWHERE)
+        return counts
+
+    def _now(self) -> float:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+
+def device_of(raster: str) -> torch.device:
+    """Where ``raster`` is timed: on a GPU if it runs on nothing else, or is a user's own class and there is one."""
+    if raster == PEER:
+        return torch.device("cpu")
+    if "." in raster:
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = torch.device("cpu" if find(raster).runs_on("cpu") else "cuda")
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"raster={raster} runs on a CUDA device, and torch finds none here")
+    return device
+
+
+def make_rasterizer(raster: str, device: torch.device, threads: int) -> Rasterizer:
+    """The executor of that name, the peer, or the class at that import path: whoever types it here trusts it."""
+    if raster == PEER:
+        return TorchPeer()
+    if "." in raster:
+        return build_rasterizer({"_target_": raster}, [raster.partition(".")[0]], device, threads)
+    return build_rasterizer({"name": raster}, [], device, threads)
+
+
+def standing_still() -> TrainConfig:
+    """Options of a training that neither ends nor changes the Gaussians."""
+    rates = ("position_initial", "position_final", "sh_dc", "sh_rest", "opacity", "scale", "rotation")
+    return TrainConfig(name="bench", iterations=NEVER, sh_interval=1, **dict.fromkeys(rates, STANDSTILL))  # type: ignore[arg-type]
+
+
+def peak_memory(raster: str, setting: Setting) -> float:
+    """Peak memory, MiB, of the warm-up steps and one more; for a process of its own."""
+    stepper = Stepper(raster, setting)
+    if stepper.device.type == "cuda":
+        reset_peak_memory(stepper.device)
+    for _ in range(WARM_UP_STEPS + 1):
+        stepper.step()
+    return peak_memory_mb(stepper.device)

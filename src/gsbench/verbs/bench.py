@@ -1,0 +1,116 @@
+"""``gsbench bench``: time rasterizers and the training step, side by side."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from gsbench.arguments import ArgumentParser
+from gsbench.errors import InputError
+from gsbench.raster.executors import EXECUTORS
+
+COLUMNS = (  # of the table
+    "raster",
+    "size",
+    "count",
+    "forward_ms",
+    "loss_ms",
+    "backward_ms",
+    "adam_ms",
+    "step_ms",
+    "step_ratio",
+    "cpu_ms",
+    "steps_per_second",
+    "waits_per_step",
+    "peak_memory_mb",
+)
+RATIO_DIGITS = 2
+
+
+def parser() -> ArgumentParser:
+    names = ", ".join(executor.name for executor in EXECUTORS)
+    made = ArgumentParser(
+        prog="gsbench bench",
+        description="Time rasterizers and the training step side by side: medians of steps that take turns.",
+    )
+    made.add_argument(
+        "--raster",
+        default="cpu",
+        help=f"names, comma between: {names}, gsplat-torch (projection only), or your own, mine.MyRasterizer",
+    )
+    made.add_argument("--size", default="500x375", help="image sizes, comma between")
+    made.add_argument("--count", default="100000", help="numbers of Gaussians, comma between")
+    made.add_argument(
+        "--scene",
+        default="trained",
+        choices=("trained", "random"),
+        help="like a trained model (default), or as one begins",
+    )
+    made.add_argument("--ply", type=Path, help="time this model instead of a synthetic scene")
+    made.add_argument("--repeats", type=_count, default=5, help="turns that count (default 5)")
+    made.add_argument("--threads", type=_count, help="CPU threads (default: as many as torch takes)")
+    made.add_argument("--json", action="store_true", help="print JSON")
+    made.add_argument("--no-memory", action="store_true", help="leave out peak memory, which takes a process each")
+    return made
+
+
+def main(argv: Sequence[str], _runs: Path | None = None) -> int:
+    """Print the table, or with ``--json`` the list of results."""
+    options = parser().parse_args(argv)
+    try:
+        sizes = [_size(text) for text in options.size.split(",")]
+        counts = [_count(text) for text in options.count.split(",")]
+    except argparse.ArgumentTypeError as error:
+        raise InputError(str(error)) from error
+    if options.ply is not None and not options.ply.is_file():
+        raise InputError(f"--ply: {options.ply} does not exist")
+    if "" not in sys.path:
+        sys.path.insert(0, os.getcwd())  # a user's own class lies beside the user
+
+    from gsbench.bench import run_bench
+
+    rows = run_bench(
+        options.raster.split(","),
+        sizes,
+        counts,
+        options.ply,
+        options.repeats,
+        options.threads,
+        not options.no_memory,
+        options.scene,
+    )
+    print(json.dumps(rows, indent=2) if options.json else table(rows))
+    return 0
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The results as columns of text; columns that no result has are left out."""
+    used = [key for key in COLUMNS if any(row.get(key) is not None for row in rows)]
+    cells = [used] + [[_cell(key, row.get(key)) for key in used] for row in rows]
+    widths = [max(len(line[k]) for line in cells) for k in range(len(used))]
+    lines = ["  ".join(text.rjust(width) for text, width in zip(line, widths, strict=True)) for line in cells]
+    notes = {f"{row['raster']}: {row['note']}" for row in rows if "note" in row}
+    return "\n".join([*lines, *sorted(notes)])
+
+
+def _cell(key: str, value: Any) -> str:
+    digits = RATIO_DIGITS if key == "step_ratio" else 1
+    return f"{value:.{digits}f}" if isinstance(value, float) else "-" if value is None else str(value)
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f"a size is WIDTHxHEIGHT, for example 500x375, got {text!r}")
+    return int(width), int(height)
+
+
+def _count(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a number of at least 1, got {text!r}")
+    return int(text)

@@ -1,0 +1,101 @@
+"""What counts as a wait for a device, and that a training step has one."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from gsbench.bench.waits import counting_waits
+from gsbench.readback import Readback
+from tests.conftest import ROOT
+
+ONE = torch.ones(4)
+WAITING = {
+    "a value": (lambda: ONE.sum().item(), {"_local_scalar_dense": 1}),
+    "a question": (lambda: bool((ONE > 0).all()), {"_local_scalar_dense": 1}),
+    "a mask": (lambda: ONE[ONE > 0], {"index": 1}),
+    "a size": (lambda: ONE.nonzero(), {"nonzero": 1}),
+    "numbers for a device": (lambda: torch.tensor([1.0, 2.0]), {"lift_fresh": 1}),
+    "a copy to another device": (lambda: ONE.to("meta"), {"_to_copy": 1}),
+}
+FREE = {
+    "arithmetic": lambda: (ONE * 2 + 1).exp().sum(),
+    "a choice": lambda: torch.where(ONE > 0, ONE, 0.0),
+    "an index": lambda: ONE[torch.arange(2)],
+    "a sort": lambda: torch.sort(ONE, stable=True),
+    "repeats of known sum": lambda: torch.repeat_interleave(torch.arange(2), output_size=1),
+    "an asynchronous copy": lambda: ONE.to("meta", non_blocking=True),
+    "a conversion": lambda: ONE.double(),
+}
+
+
+@pytest.mark.parametrize("what", list(WAITING))
+def test_what_waits(what: str) -> None:
+    work, expected = WAITING[what]
+    with counting_waits(pretend=True) as counts:
+        work()
+    assert counts == expected
+
+
+@pytest.mark.parametrize("what", list(FREE))
+def test_what_does_not(what: str) -> None:
+    with counting_waits(pretend=True) as counts:
+        FREE[what]()
+    assert counts == {}
+
+
+def test_numbers_for_the_cpu_are_free_where_it_is_the_cpu() -> None:
+    with counting_waits() as counts:
+        torch.tensor([1.0])
+    assert counts == {}
+
+
+def test_in_the_backward_pass_too() -> None:
+    class Reads(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, x):  # type: ignore[no-untyped-def]
+            return x.clone()
+
+        @staticmethod
+        def backward(ctx, g):  # type: ignore[no-untyped-def]
+            return g * g.sum().item()
+
+    leaf = torch.ones(3, requires_grad=True)
+    with counting_waits() as counts:
+        Reads.apply(leaf).sum().backward()
+    assert counts == {"_local_scalar_dense": 1}
+
+
+def test_a_readback_waits_only_if_it_has_not_arrived(monkeypatch: pytest.MonkeyPatch) -> None:
+    with counting_waits() as counts:
+        assert Readback(ONE).values().tolist() == [1, 1, 1, 1]
+    assert counts == {}
+    monkeypatch.setattr(Readback, "arrived", property(lambda self: False))
+    with counting_waits() as counts:
+        Readback(ONE).values()
+    assert counts == {"readback": 1}
+
+
+@pytest.mark.parametrize("raster", ["triton", "reference"])
+def test_one_wait_in_a_training_step(raster: str) -> None:
+    """With Triton: its look at how much there is to composite. The reference shows that others would be seen."""
+    pytest.importorskip("triton")
+    environment = os.environ | {
+        "TRITON_INTERPRET": "1",
+        "PYTHONPATH": os.pathsep.join(path for path in [str(ROOT), *sys.path] if path),
+    }
+    command = [sys.executable, "-m", "tests.pipeline.one_step", raster]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    counts = {name: count for line in done.stdout.splitlines() for name, count in json.loads(line).items()}
+    assert counts.keys() == {"adc", "absgrad", "mcmc"}
+    for name, count in counts.items():
+        if raster == "triton":
+            assert sum(count.values()) == 1, name
+        else:
+            assert sum(count.values()) > 5, name
