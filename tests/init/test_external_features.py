@@ -23,8 +23,9 @@ from gsbench.init.colmap_database import (
 from gsbench.init.extractors import build_extractor
 from gsbench.init.feature_settings import FeatureSettings
 from gsbench.init.features import Features, extract_features
-from gsbench.init.reconstruct import MappingSettings, map_images, verification_options
-from gsbench.init.sift import extract_sift, match_sift
+from gsbench.init.reconstruct import MappingSettings, Verification, map_images
+from gsbench.init.sift import extract_sift
+from gsbench.init.sift_matching import match_sift
 from gsbench.scene.types import Capture
 
 MAPPING = MappingSettings(seed=0, threads=1, min_model_size=3, two_view_tracks=False, fixed_intrinsics=False)
@@ -42,7 +43,7 @@ def own_path(bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory) -> 
     names = new_database(path, bare_photos)
     pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
     extract_sift(path, bare_photos.images, names, Sfm(), 1, no_progress)
-    match_sift(path, pairs, Sfm(), verification_options(0, 15), 1, no_progress)
+    match_sift(path, pairs, Sfm(), Verification(0, 15), 1, no_progress)
     return path, pairs
 
 
@@ -58,7 +59,7 @@ def test_sift_through_the_external_path_gives_the_same_model(
     new_database(external, bare_photos)
     write_keypoints(external, keypoints)
     write_matches(external, matches)
-    verify_pairs(external, pairs, verification_options(0, 15), no_progress)
+    verify_pairs(external, pairs, Verification(0, 15).options(), no_progress)
     assert database_counts(external) == database_counts(own)
 
     first, _ = map_images(own, bare_photos.images, tmp_path / "first", MAPPING, no_progress)

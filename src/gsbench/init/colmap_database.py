@@ -166,16 +166,22 @@ def image_ids_as_names(path: Path) -> Iterator[dict[str, str]]:
 
     COLMAP's pair lists are divided at spaces, which the names of photographs often contain.
     """
-    with pycolmap.Database.open(path) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
-    _rename_images(path, {image_id: str(image_id) for image_id in names})
+    ids = image_ids(path)
+    rename_images(path, {image_id: str(image_id) for image_id in ids.values()})
     try:
-        yield {name: str(image_id) for image_id, name in names.items()}
+        yield {name: str(image_id) for name, image_id in ids.items()}
     finally:
-        _rename_images(path, names)
+        rename_images(path, {image_id: name for name, image_id in ids.items()})
 
 
-def _rename_images(path: Path, names: Mapping[int, str]) -> None:
+def image_ids(path: Path) -> dict[str, int]:
+    """The ids of the database's images by their names."""
+    with pycolmap.Database.open(path) as database:
+        return {image.name: image.image_id for image in database.read_all_images()}
+
+
+def rename_images(path: Path, names: Mapping[int, str]) -> None:
+    """Give the database's images other names, by their ids."""
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for image in database.read_all_images():
             image.name = names[image.image_id]

@@ -69,7 +69,7 @@ class FeatureInitializer(ColmapInitializer):
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> None:
         from gsbench.init.colmap_database import verify_pairs, write_keypoints, write_matches
         from gsbench.init.extract_and_match import open_store
-        from gsbench.init.reconstruct import verification_options
+        from gsbench.init.reconstruct import Verification
 
         store = open_store(self, task.capture, task.work_dir, *self.find_weights())
         write_keypoints(task.database, {name: store.require_features(name).colmap_keypoints for name in task.names})
@@ -77,7 +77,8 @@ class FeatureInitializer(ColmapInitializer):
         matches = {pair: indices for pair, indices in matches.items() if len(indices) > 0}
         write_matches(task.database, matches)
         with timer.phase("verify"):
-            verify_pairs(task.database, sorted(matches), verification_options(self.seed, self.min_inliers), progress)
+            verification = Verification(self.seed, self.min_inliers)
+            verify_pairs(task.database, sorted(matches), verification.options(), progress)
 
     def packages(self) -> tuple[str, ...]:
         return (*super().packages(), "torch", "kornia")

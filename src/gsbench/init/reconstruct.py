@@ -34,6 +34,21 @@ class Pairing(Protocol):
 
 
 @dataclass(frozen=True)
+class Verification:
+    """COLMAP's geometric verification of a pair's matches."""
+
+    seed: int  # of each pair's RANSAC
+    min_inliers: int  # matches that must fit one geometry
+
+    def options(self) -> pycolmap.TwoViewGeometryOptions:
+        """As COLMAP takes them."""
+        options = pycolmap.TwoViewGeometryOptions()
+        options.ransac.random_seed = self.seed
+        options.min_num_inliers = self.min_inliers
+        return options
+
+
+@dataclass(frozen=True)
 class MappingSettings:
     """How COLMAP's mapper and triangulator run; see the fields of `gsbench.init.Sfm`."""
 
@@ -72,14 +87,6 @@ def select_pairs(
             raise InputError("init.pairs=spatial: the photos have neither reference cameras nor GPS: use exhaustive")
         pairs = spatial_pairs(positions, options.neighbors)
     return [(names[first], names[second]) for first, second in pairs]
-
-
-def verification_options(seed: int, min_inliers: int) -> pycolmap.TwoViewGeometryOptions:
-    """COLMAP's geometric verification, seeded."""
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = seed
-    options.min_num_inliers = min_inliers
-    return options
 
 
 def map_images(

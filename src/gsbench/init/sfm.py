@@ -41,15 +41,16 @@ class Sfm(ColmapInitializer):
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> None:
         from gsbench.init.colmap_database import database_counts
-        from gsbench.init.reconstruct import verification_options
-        from gsbench.init.sift import extract_sift, match_sift
+        from gsbench.init.reconstruct import Verification
+        from gsbench.init.sift import extract_sift
+        from gsbench.init.sift_matching import match_sift
 
         with timer.phase("extract"):
             extract_sift(task.database, task.images, task.names, self, self.num_threads, progress)
         if database_counts(task.database)["features"] == 0:
             raise InputError(f"{self.name}: no keypoint in any image: lower init.peak_threshold, or check the photos")
         with timer.phase("match"):
-            verification = verification_options(self.seed, self.min_inliers)
+            verification = Verification(self.seed, self.min_inliers)
             match_sift(task.database, task.pairs, self, verification, self.num_threads, progress)
 
 
