@@ -134,3 +134,32 @@ def test_hash_follows_the_source_of_a_users_class(tmp_path: Path, monkeypatch: p
         (tmp_path / "own_densifier.py").write_text(text)
         hashes.append(config_hash(composed(*own)))
     assert hashes[0] == hashes[2] != hashes[1]
+
+
+def test_hash_follows_the_source_of_a_users_metric_and_not_that_there_could_be_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    values = composed()
+    before = {key: value for key, value in values["eval"].items() if key != "extra"}  # as settings were without it
+    assert config_hash(values | {"eval": before}) == config_hash(values)
+    own = ["eval.extra.edges._target_=own_metric.Mine", "allow_targets=[own_metric]"]
+    hashes = []
+    for text in ("A = 1\n", "A = 2\n", "A = 1\n"):
+        (tmp_path / "own_metric.py").write_text(text)
+        hashes.append(config_hash(composed(*own)))
+    assert hashes[0] == hashes[2] != hashes[1]
+    assert config_hash(values) not in hashes
+
+
+@pytest.mark.parametrize("name", ["psnr", "lpips", "view", "Edges", "a-b"])
+def test_names_of_own_metrics_are_their_own(name: str) -> None:
+    with pytest.raises(InputError, match=rf"eval\.extra\.{name}: name your metric"):
+        composed(f"eval.extra.{name}._target_=mine.X", "allow_targets=[mine]")
+
+
+def test_an_own_metric_must_be_allowed_and_name_a_class() -> None:
+    with pytest.raises(InputError, match=r"eval\.extra\.edges\._target_=mine\.X is not gsbench's own"):
+        composed("eval.extra.edges._target_=mine.X")
+    with pytest.raises(InputError, match=r"eval\.extra\.edges must name a class"):
+        composed("eval.extra.edges=3")

@@ -23,6 +23,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
+from gsbench.eval.facts import known_keys, lpips_variants
+from gsbench.eval.protocol import PROTOCOLS
 from gsbench.raster import executors
 from gsbench.settings import Fraction, check_settings, checked
 from gsbench.source import source_of
@@ -33,6 +35,8 @@ MIN_SIZE = 16  # px: the least side of an image that is worth training on
 MAX_SIZE = 16_384  # px, of a picture of the courtyard
 MAX_SEED = 2**63 - 1  # torch's generators take no larger one
 MAX_NAME_BYTES = 100  # of a name: folders are made of two, and file systems end at 255
+METRIC_NAME = re.compile(r"[a-z][a-z0-9_]*")
+TAKEN_NAMES = (*known_keys(), "view", "lpips")  # of metrics, and what else a table of views or a list of metrics means
 IN_RUNS = ("store", "mlartifacts", "mlflow.db")  # what lies in the runs folder beside the experiments
 
 
@@ -57,6 +61,14 @@ ExperimentName = Annotated[
     doc(f"a plain folder name, and none of {', '.join(IN_RUNS)}"),
 ]
 PathName = Annotated[str, Predicate(is_path), doc("a path")]
+ProtocolName = Annotated[
+    str, Predicate(lambda name: name in PROTOCOLS), doc(" or ".join(f"'{name}'" for name in PROTOCOLS))
+]
+LpipsVariant = Annotated[
+    str,
+    Predicate(lambda name: name in lpips_variants()),
+    doc(f"{', '.join(map(repr, lpips_variants()[:-1]))} or {lpips_variants()[-1]!r}"),
+]
 DeviceName = Annotated[
     str,
     Predicate(lambda name: re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", name) is not None),
@@ -139,11 +151,10 @@ class TrainConfig:
 @dataclass
 class EvalConfig:
     name: str = MISSING
-    protocol: Literal["paper", "standard"] = MISSING
-    lpips: list[Literal["vgg_raw", "vgg", "alex", "squeeze"]] = field(
-        default_factory=lambda: ["vgg_raw", "vgg", "alex", "squeeze"]
-    )
+    protocol: ProtocolName = MISSING
+    lpips: list[LpipsVariant] = field(default_factory=lambda: list(lpips_variants()))
     flip: bool = True
+    extra: dict[str, Any] = field(default_factory=dict)  # metrics of your own: {name: {_target_: mine.MyMetric}}
     at: list[PositiveInt] = field(default_factory=list)  # iterations to measure the test views at, too
     maps: bool = False  # keep maps of depth, volume and distance to the initial cloud: where an arm helps
     weights: PathName | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
@@ -151,6 +162,14 @@ class EvalConfig:
 
     def __post_init__(self) -> None:
         check_settings(self, "eval")
+        for name, options in self.extra.items():
+            if not METRIC_NAME.fullmatch(name) or name in TAKEN_NAMES:
+                raise InputError(
+                    f"eval.extra.{name}: name your metric in small letters, digits and underscores, and none of "
+                    f"{', '.join(TAKEN_NAMES)}"
+                )
+            if not isinstance(options, Mapping) or "_target_" not in options:
+                raise InputError(f"eval.extra.{name} must name a class, as eval.extra.{name}._target_=mine.MyMetric")
 
 
 @dataclass
@@ -226,7 +245,7 @@ NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tra
 # they are left out of hashes and keys, so that nothing is computed anew for a setting that changes nothing.
 ADDED_LATER: dict[str, dict[str, Any]] = {
     "raster": {"_target_": None},
-    "eval": {"at": []},
+    "eval": {"at": [], "extra": {}},
 }
 
 
@@ -284,6 +303,8 @@ def check(config: DictConfig) -> None:
             raise InputError(f"{group}.name must be a plain folder name, got {name!r}")
     for group in (*COMPONENTS, *(["raster"] if config.raster._target_ is not None else [])):
         check_target(config[group].get("_target_"), group, config.allow_targets)
+    for name, options in config.eval.extra.items():
+        check_target(options["_target_"], f"eval.extra.{name}", config.allow_targets)
 
 
 def require_values(values: Mapping[str, Any], group: str) -> None:
@@ -347,9 +368,16 @@ def config_hash(values: dict[str, Any]) -> str:
     for key, group in kept.items():
         if isinstance(group, dict):
             kept[key] = without_later(key, {name: value for name, value in group.items() if name not in WITHOUT_EFFECT})
-            if "_target_" in kept[key]:
-                kept[key] |= source_of(group["_target_"])
-    return sha256_of(kept)
+    return sha256_of(_with_sources(kept))
+
+
+def _with_sources(values: Any) -> Any:
+    """``values`` with the source of each user's own class beside its ``_target_``, at any depth."""
+    if not isinstance(values, dict):
+        return values
+    target = values.get("_target_")
+    sources = source_of(target) if isinstance(target, str) else {}
+    return {key: _with_sources(value) for key, value in values.items()} | sources
 
 
 def without_later(group: str, values: dict[str, Any]) -> dict[str, Any]:

@@ -190,6 +190,17 @@ def test_costs_are_averaged_by_both_rules(make_experiment: Make, tmp_path: Path)
     assert any("+25.0% as a ratio of totals, +50.0% as the mean of 2 scenes" in note for note in notes)
 
 
+def test_metrics_of_earlier_iterations_have_columns_of_their_own(tmp_path: Path) -> None:
+    for seed, (early, late) in enumerate(((20.0, 27.0), (22.0, 28.0))):
+        one_trial(tmp_path, seed, psnr=late, _metrics_at={"7000": {"metrics": {"psnr": early}}})
+    experiment = load_experiment(tmp_path, "exp")
+    table = build_table(experiment, metrics=["psnr@7000", "psnr"])
+    assert [column.heading for column in table.columns] == ["PSNR at 7,000 ↑", "PSNR (dB) ↑"]
+    assert texts(table)[0][3:] == ["21.00 ± 1.41", "27.50 ± 0.71"]
+    with pytest.raises(InputError, match=r"measured at iteration '9000'; measured were \(eval\.at\) 7000"):
+        build_table(experiment, metrics=["psnr@9000"])
+
+
 def test_unknown_names_are_refused(make_experiment: Make) -> None:
     experiment = make_experiment()
     with pytest.raises(InputError, match="unknown metric 'pnsr'"):

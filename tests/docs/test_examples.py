@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import os
 import re
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from gsbench.cli import run
 from tests.conftest import ROOT
 
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -41,7 +46,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    for name in ("largest", "mine", "untiled"):
+    for name in ("gradients", "largest", "mine", "untiled"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return tmp_path
 
@@ -69,6 +74,31 @@ def test_rasterizer(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = run_blocks(ROOT / "docs" / "rasterizer.md", folder)
     assert found["status"] == 0, capsys.readouterr().err
     assert len(list(Path("runs").glob("untiled/courtyard/*/*/results.json"))) == 1
+
+
+@pytest.mark.end_to_end
+def test_metric(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = run_blocks(ROOT / "docs" / "metric.md", folder)
+    shown = capsys.readouterr()
+    assert found["status"] == 0, shown.err
+    trials = sorted(path.parent for path in Path("runs").glob("gradients/courtyard/*/*/results.json"))
+    assert len(trials) == 4
+    for trial in trials:
+        results = json.loads((trial / "results.json").read_text())
+        assert results["metric_facts"]["gradients"]["direction"] == -1
+        assert list(results["code"]["sources"]) == ["gradients.GradientError"]
+        with (trial / "per_view.csv").open(newline="") as stream:
+            rows = {row["view"]: float(row["gradients"]) for row in csv.DictReader(stream)}
+        assert results["metrics"]["gradients"] == pytest.approx(np.mean(list(rows.values())))
+        for view, value in rows.items():  # again, from the pictures that the trial left
+            pair = [np.asarray(Image.open(trial / kind / view)).astype(float) for kind in ("renders", "ground_truth")]
+            sides = [np.abs(np.diff(pair[0], axis=axis) - np.diff(pair[1], axis=axis)).mean() for axis in (0, 1)]
+            assert value == pytest.approx(np.mean(sides), rel=1e-5)
+    assert "gradient error (levels) ↓" in shown.out
+    assert "**" in shown.out.split("gradient error")[1]  # a direction is known, so the best is marked
+    assert run(["report", "gradients"]) == 0
+    report = Path("runs/gradients/report.html").read_text()
+    assert "gradient error: left of zero is better" in report.replace("gradient error (levels)", "gradient error")
 
 
 def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,13 @@ import pytest
 import torch
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.eval import protocol as protocol_module
+from gsbench.eval import evaluator as evaluator_module
+from gsbench.eval import facts
+from gsbench.eval.evaluator import Evaluator, quantize, summarize
+from gsbench.eval.facts import find
+from gsbench.eval.lpips import load_lpips
 from gsbench.eval.metrics import ssim
-from gsbench.eval.protocol import PAPER, STANDARD, Evaluator, get_protocol, quantize, summarize
+from gsbench.eval.protocol import PAPER, STANDARD, get_protocol
 
 
 @pytest.fixture(autouse=True)
@@ -70,13 +75,16 @@ def test_missing_weights_are_named_and_nothing_stands_in_for_them() -> None:
 
 @pytest.mark.shared
 def test_lpips_variants_see_the_range_that_their_name_says(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(protocol_module.LPIPS_VARIANTS, "squeeze_raw", ("squeeze", True))
+    squeeze = find("lpips_squeeze")
+    raw = replace(squeeze, key="lpips_squeeze_raw", options={"net": "squeeze", "raw": True})
+    monkeypatch.setattr(facts, "METRICS", (squeeze, raw))
+    monkeypatch.setattr(evaluator_module, "METRICS", (squeeze, raw))
     evaluator = Evaluator(PAPER, lpips=["squeeze", "squeeze_raw"], flip=False, weights=shared / "weights")
     rng = np.random.default_rng(0)
     render, truth = rng.integers(0, 256, (2, 40, 40, 3), dtype=np.uint8)
     values = evaluator.evaluate_view(render, truth)
     first, second = (torch.tensor(x).permute(2, 0, 1)[None].float() / 255 for x in (render, truth))
-    network = evaluator._networks["squeeze"]
+    network = load_lpips("squeeze", shared / "weights")
     assert values["lpips_squeeze"] == pytest.approx(float(network(first * 2 - 1, second * 2 - 1)))
     assert values["lpips_squeeze_raw"] == pytest.approx(float(network(first, second)))
     assert values["lpips_squeeze"] != pytest.approx(values["lpips_squeeze_raw"], rel=0.01)

@@ -52,7 +52,12 @@ def trial_values(*words: str) -> dict[str, Any]:
     return _composed(*words).values | {"runs": os.environ["GSBENCH_RUNS"]}
 
 
-def finish(values: dict[str, Any], seconds: float = 100.0, unavailable: dict[str, str] | None = None) -> dict[str, Any]:
+def finish(
+    values: dict[str, Any],
+    seconds: float = 100.0,
+    unavailable: dict[str, str] | None = None,
+    awaited: list[str] | None = None,
+) -> dict[str, Any]:
     """Make the files of a finished trial, with one stage result in the store and one source file."""
     paths = TrialPaths.of(values)
     paths.folder.mkdir(parents=True, exist_ok=True)
@@ -75,6 +80,7 @@ def finish(values: dict[str, Any], seconds: float = 100.0, unavailable: dict[str
         "unavailable": unavailable or {},
         "seconds": {"init": 1.0, "train": seconds, "evaluate": 0.0},
         "hashes": {"config": config_hash(values)},
+        **({} if awaited is None else {"awaited": awaited}),
     }
     record_inputs(paths.folder, values, results, [source], {"train": entry.path}, [paths.folder / "table.csv"])
     (paths.folder / "results.json").write_text(json.dumps(results))
@@ -279,6 +285,15 @@ def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do() -> None:
 
 
 # ---- plan and states
+
+
+def test_results_that_say_what_is_awaited_are_not_read_by_their_prose() -> None:
+    values = trial_values("seed=3")
+    finish(values, unavailable={"lpips_vgg": "weights not found", "own": "no reason that anyone knows"}, awaited=[])
+    assert find_finished(values) is not None
+    finish(values, unavailable={"lpips_vgg": "a view is too small"}, awaited=["lpips_vgg"])
+    assert find_finished(values) is None
+    assert find_finished(values, lambda options: ["lpips_vgg"]) is not None
 
 
 def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs: Path) -> None:

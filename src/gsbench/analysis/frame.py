@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from gsbench.analysis.cells import swept_settings
-from gsbench.analysis.quantities import METRICS
+from gsbench.analysis.quantities import metric_keys
 from gsbench.analysis.results import Experiment, Trial
 
 if TYPE_CHECKING:
@@ -38,8 +38,7 @@ def to_frame(trials: Experiment | Sequence[Trial]) -> pd.DataFrame:
 
     chosen = list(trials.trials if isinstance(trials, Experiment) else trials)
     swept = swept_settings(chosen)
-    present = {key for trial in chosen for key in trial.metrics}
-    metrics = [key for key in METRICS if key in present] + sorted(present - METRICS.keys())
+    metrics = metric_keys(chosen)
     return pd.DataFrame([_row(trial, swept, metrics) for trial in chosen]).convert_dtypes(
         convert_string=False, convert_floating=False
     )

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from gsbench.analysis.results import Trial
 from gsbench.errors import InputError
+from gsbench.eval.facts import LPIPS, find, from_record, known_keys
+from gsbench.eval.protocol import PAPER, PROTOCOLS
 
 MILLION, THOUSAND, MINUTE = 1e6, 1e3, 60.0
 
@@ -25,6 +28,7 @@ class Quantity:
     decimals: int
     read: Callable[[Trial], float | None]
     cost: bool = False
+    worthwhile: float | None = None  # the smallest difference worth resolving
 
     @property
     def heading(self) -> str:
@@ -34,30 +38,17 @@ class Quantity:
         return f"{value:.{self.decimals}f}"
 
 
-METRICS: dict[str, tuple[str, int, int]] = {  # key -> name, direction, decimals
-    "psnr": ("PSNR (dB)", 1, 2),
-    "ssim": ("SSIM", 1, 3),
-    "lpips_vgg_raw": ("LPIPS VGG raw", -1, 3),
-    "lpips_vgg": ("LPIPS VGG", -1, 3),
-    "lpips_alex": ("LPIPS Alex", -1, 3),
-    "lpips_squeeze": ("LPIPS Squeeze", -1, 3),
-    "flip": ("FLIP", -1, 3),
-}
 COSTS = ("gaussians", "train_time", "init_points", "total_time", "peak_memory_mb")
 ALIASES = {"num_gaussians": "gaussians", "seconds": "train_time", "train": "train_time"}
-PAPER_LPIPS = "lpips_vgg_raw"
-PROTOCOL_LPIPS = {"paper": PAPER_LPIPS, "standard": "lpips_vgg"}  # what a protocol means by LPIPS
+AT = "@"  # psnr@7000 is the PSNR at iteration 7000 (eval.at)
 
 
 def choose_quantities(trials: Iterable[Trial], names: Iterable[str] | None = None) -> list[Quantity]:
     """The quantities by name; by default all metrics that some trial has, the protocol's LPIPS, and the main costs."""
     trials = list(trials)
     if names is None:
-        protocols = {_protocol(trial) for trial in trials}
-        wanted = {PROTOCOL_LPIPS.get(protocol) for protocol in protocols}
-        present = {key for trial in trials for key in trial.metrics}
-        names = [key for key in METRICS if key in present or key in wanted]
-        names += [*sorted(present - METRICS.keys()), "gaussians", "train_time"]
+        wanted = {_protocol_lpips(trial) for trial in trials}
+        names = [*metric_keys(trials, wanted), "gaussians", "train_time"]
     return [quantity(name, trials) for name in names]
 
 
@@ -68,11 +59,11 @@ def quantity(name: str, trials: Iterable[Trial]) -> Quantity:
     """
     trials = list(trials)
     key = ALIASES.get(name, name)
-    if key == "lpips":
-        key = PROTOCOL_LPIPS.get(_protocol(trials[0]) if trials else "", PAPER_LPIPS)
-    if key in METRICS:
-        label, direction, decimals = METRICS[key]
-        return Quantity(key, label, direction, decimals, lambda trial: trial.metrics.get(key))
+    metric, _, step = key.partition(AT)
+    if metric == "lpips":
+        metric = _protocol_lpips(trials[0]) if trials else f"{LPIPS}{PAPER.lpips}"
+    if find(metric) is not None:
+        return _metric(metric, step, trials)
     if key == "gaussians":
         return _count(key, "Gaussians", "num_gaussians", trials)
     if key == "gaussians_millions":
@@ -87,14 +78,47 @@ def quantity(name: str, trials: Iterable[Trial]) -> Quantity:
         return _time(key, "total", lambda trial: sum(trial.data["seconds"].values()), trials)
     if key == "peak_memory_mb":
         return Quantity(key, "peak memory (MB)", -1, 0, lambda trial: trial.data.get(key), cost=True)
-    if any(name in trial.metrics for trial in trials):  # a metric of the user's own
-        return Quantity(name, name, 0, 3, lambda trial: trial.metrics.get(name))
-    raise InputError(f"unknown metric {name!r}; choose among {', '.join([*METRICS, *COSTS])}")
+    if any(metric in trial.metrics for trial in trials):  # a user's own
+        return _metric(metric, step, trials)
+    raise InputError(f"unknown metric {name!r}; choose among {', '.join([*metric_keys(trials, known_keys()), *COSTS])}")
 
 
-def _protocol(trial: Trial) -> str:
-    """The protocol's name without its version."""
-    return str(trial.data["protocol"]).rsplit("-", 1)[0]
+def metric_keys(trials: Iterable[Trial], wanted: Container[str] = ()) -> list[str]:
+    """The metrics that some trial has or that are ``wanted``, in the order of tables; a user's own come last."""
+    present = {key for trial in trials for key in trial.metrics}
+    own = sorted(key for key in present if find(key) is None)
+    return [key for key in known_keys() if key in present or key in wanted] + own
+
+
+def _metric(key: str, step: str, trials: Sequence[Trial]) -> Quantity:
+    """A metric at the end, or after the iteration ``step`` (text); a user's own is described by the trials' files."""
+    records = [trial.data.get("metric_facts", {}).get(key) for trial in trials if key in trial.metrics]
+    facts = find(key) or from_record(key, records[0] if records else None)
+    name, read = facts.name, partial(_final_value, key)
+    if step:
+        known = sorted({int(at) for trial in trials for at in trial.data.get("metrics_at", {})})
+        if step not in map(str, known):
+            there = ", ".join(map(str, known)) or "none"
+            raise InputError(f"no trial was measured at iteration {step!r}; measured were (eval.at) {there}")
+        name, read = f"{facts.label} at {int(step):,}", partial(_value_at, key, step)
+    return Quantity(
+        f"{key}{AT}{step}" if step else key, name, facts.direction, facts.decimals, read, worthwhile=facts.worthwhile
+    )
+
+
+def _final_value(key: str, trial: Trial) -> float | None:
+    return trial.metrics.get(key)
+
+
+def _value_at(key: str, step: str, trial: Trial) -> float | None:
+    value: float | None = trial.data.get("metrics_at", {}).get(step, {}).get("metrics", {}).get(key)
+    return value
+
+
+def _protocol_lpips(trial: Trial) -> str:
+    """What the trial's protocol means by LPIPS."""
+    name = str(trial.data["protocol"]).rsplit("-", 1)[0]  # without its version
+    return f"{LPIPS}{PROTOCOLS.get(name, PAPER).lpips}"
 
 
 def _count(

@@ -6,22 +6,17 @@ Images are torch tensors in [0, 1], either one image [H, W, 3] (the value is a 0
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-SsimPadding = Literal["zero", "valid"]
+from gsbench.eval.protocol import FLIP_PPD, SsimPadding
 
 # Wang et al. 2004, "Image quality assessment: from error visibility to structural similarity", for a data range of 1.
 SSIM_WINDOW = 11  # px
 SSIM_SIGMA = 1.5  # px
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
-
-# Pixels per degree of a 0.7 m wide, 3840 px display seen from 0.7 m: the default viewer of Andersson et al. 2020.
-FLIP_PPD = 67.02
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:

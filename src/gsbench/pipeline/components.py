@@ -12,6 +12,8 @@ import torch
 
 from gsbench.config import ALLOWED_TARGETS, WITHOUT_EFFECT, check_target, require_values, without_later
 from gsbench.errors import InputError
+from gsbench.eval.facts import facts_of
+from gsbench.eval.metric import Metric
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.settings import checked, unknown_setting
 from gsbench.source import has_changed_since_import, source_of
@@ -23,11 +25,12 @@ METHODS = {
     "init": ("needs_reference", "run"),
     "densify": ("prepare", "begin", "observe", "refine", "after_step"),
     "raster": ("render",),
+    "eval": ("measure",),
 }
 
 
 def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
-    """The object that ``values`` of ``group`` (init, densify, raster) describes.
+    """The object that ``values`` of ``group`` (init, densify, raster, eval.extra.NAME) describes.
 
     ``_target_`` names a class by its import path; the other keys are its arguments. For dataclasses, values are checked
     against the annotations. Raises InputError naming the key that is unknown or wrong.
@@ -72,6 +75,15 @@ def build_rasterizer(
     return rasterizer
 
 
+def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str, Metric]:
+    """The user's own metrics that the settings ``eval`` name. Raises InputError for one that cannot be used."""
+    metrics: dict[str, Metric] = {}
+    for name, options in values.get("extra", {}).items():
+        metrics[name] = build(f"eval.extra.{name}", options, allow_targets)
+        facts_of(name, metrics[name])
+    return metrics
+
+
 def rasterizer_inputs(rasterizer: Rasterizer) -> str | dict[str, Any]:
     """The rasterizer as it enters a stage's key: gsbench's own by name, a user's by class, source and options."""
     if f"{type(rasterizer).__module__}.".startswith(ALLOWED_TARGETS):
@@ -96,7 +108,7 @@ def locate(target: str, group: str) -> type:
         found = getattr(importlib.import_module(module), name)
     except Exception as error:  # importing a user's file runs it: it may raise anything
         raise InputError(f"{group}._target_={target} cannot be imported ({type(error).__name__}: {error})") from error
-    lacking = [method for method in METHODS[group] if not callable(getattr(found, method, None))]
+    lacking = [method for method in METHODS[group.partition(".")[0]] if not callable(getattr(found, method, None))]
     if not isinstance(found, type) or lacking:
         raise InputError(f"{group}._target_={target} is not a class for {group}: it has no {', '.join(lacking)}()")
     if has_changed_since_import(target):  # the first call also notes the file as it is now, while it is what runs

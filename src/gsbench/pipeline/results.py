@@ -21,6 +21,9 @@ from gsbench.pipeline.trainer import EVENTS
 from gsbench.scene.types import Scene
 from gsbench.source import sources_of
 
+# What an evaluation has beside metrics, and its name in results: of the unavailable metrics those that may still come;
+# how a user's own metrics are to be read; metrics at earlier iterations.
+EVALUATED = {"awaited": "awaited", "facts": "metric_facts", "at": "metrics_at"}
 PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")  # on whose versions a result depends
 
 
@@ -48,7 +51,7 @@ def results_of(
         "iterations": training["iterations"],
         "metrics": metrics["metrics"],
         "unavailable": metrics["unavailable"],
-        **({"metrics_at": metrics["at"]} if "at" in metrics else {}),
+        **{key: metrics[name] for name, key in EVALUATED.items() if name in metrics},
         "num_init_points": training["num_init_points"],
         "num_gaussians": training["num_gaussians"],
         "causes": training["causes"],

@@ -31,8 +31,8 @@ PROGRESS_FILE = "metrics.jsonl"
 LOCK = ".lock"
 TAIL_BYTES = 4096
 INPUTS_VERSION = 1
-# How an unavailable metric's reason starts where nothing that arrives later changes it: the settings leave it out, or
-# the pictures are too small for the network. Other reasons are missing weights or packages.
+# Results made before they had ``awaited`` tell by the reason whether an unavailable metric may still come: not where it
+# starts so.
 FOR_GOOD = ("not asked for", "a view is ")
 
 State = Literal["done", "running", "failed", "partial", "missing"]
@@ -149,7 +149,7 @@ def find_finished(
     try:
         if results["status"] != "complete" or results["hashes"]["config"] != config_hash(values):
             return None
-        lacking = {key for key, reason in results["unavailable"].items() if not str(reason).startswith(FOR_GOOD)}
+        lacking = _awaited(results)
         same = (
             record["version"] == INPUTS_VERSION
             and record["config"] == config_hash(values)
@@ -167,6 +167,13 @@ def find_finished(
     except (KeyError, TypeError, AttributeError, ValueError, OSError):
         return None
     return results if same else None
+
+
+def _awaited(results: Mapping[str, Any]) -> set[str]:
+    """The metrics that a trial lacks and that may still come, once their weights or packages are there."""
+    if "awaited" in results:
+        return set(results["awaited"])
+    return {key for key, reason in results["unavailable"].items() if not str(reason).startswith(FOR_GOOD)}
 
 
 def _stamp(path: Path) -> list[int]:

@@ -6,7 +6,7 @@ A run builds the steps, ``--dry-run`` and ``explain --stale`` only ask for their
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,10 +16,11 @@ import torch
 
 from gsbench.config import EvalConfig, SceneConfig, TrainConfig
 from gsbench.densify import Densifier
-from gsbench.eval.protocol import Evaluator
+from gsbench.eval.evaluator import Evaluator
+from gsbench.eval.metric import Metric
 from gsbench.init import Sfm
 from gsbench.init.base import Initializer
-from gsbench.pipeline.components import build, build_rasterizer, select_device
+from gsbench.pipeline.components import build, build_metrics, build_rasterizer, select_device
 from gsbench.pipeline.resources import available_threads
 from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.capture import capture_step, read_capture
@@ -45,6 +46,7 @@ class Parts:
     rasterizer: Rasterizer
     train: TrainConfig
     eval: EvalConfig
+    metrics: Mapping[str, Metric]  # the user's own
     seed: int
     device: torch.device
     threads: int
@@ -61,6 +63,7 @@ class Parts:
             rasterizer=build_rasterizer(values["raster"], values["allow_targets"], device, threads),
             train=TrainConfig(**values["train"]),
             eval=EvalConfig(**values["eval"]),
+            metrics=build_metrics(values["eval"], values["allow_targets"]),
             seed=values["seed"],
             device=device,
             threads=threads,
@@ -83,7 +86,7 @@ class Trial:
 
     @cached_property
     def evaluator(self) -> Evaluator:
-        return make_evaluator(self.parts.eval, self.parts.device)
+        return make_evaluator(self.parts.eval, self.parts.device, self.parts.metrics)
 
     def steps(self) -> Iterator[Step]:
         """The steps in order. A caller that wants results builds each before it asks for the next.

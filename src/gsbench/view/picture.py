@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from gsbench.eval.protocol import quantize
+from gsbench.eval.evaluator import quantize
 from gsbench.events import Cause
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians, quaternion_to_matrix
 from gsbench.raster.base import Rasterizer

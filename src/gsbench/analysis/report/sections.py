@@ -25,9 +25,6 @@ from gsbench.events import Cause, RefineEvent
 
 CROPS = 4  # places of each kind
 EVENTS_FILE, HISTOGRAMS_FILE = "events.jsonl", "volume_histograms.jsonl"
-# The smallest differences worth resolving, by metric: about what papers on densification claim as an improvement.
-WORTHWHILE = {"psnr": 0.1, "ssim": 0.005, "flip": 0.005}
-WORTHWHILE_LPIPS = 0.005
 COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time"}
 EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)
 CURVES = (  # key of metrics.jsonl, title, y axis
@@ -43,7 +40,6 @@ class Verdict:
 
     quantity: Quantity
     comparison: Comparison
-    worthwhile: float
     seeds: int | None  # that would resolve the worthwhile difference; None: unknown or beyond reach
 
     @property
@@ -219,11 +215,10 @@ def provenance(trials: Sequence[Trial]) -> list[dict[str, str]]:
 
 
 def _verdict(quantity: Quantity, comparison: Comparison) -> Verdict:
-    worthwhile = WORTHWHILE.get(quantity.key, WORTHWHILE_LPIPS)
     seeds = None
-    if comparison.seed_deviation is not None:
-        seeds = seeds_needed(comparison.seed_deviation, len(comparison.scenes), worthwhile)
-    return Verdict(quantity, comparison, worthwhile, seeds)
+    if comparison.seed_deviation is not None and quantity.worthwhile is not None:
+        seeds = seeds_needed(comparison.seed_deviation, len(comparison.scenes), quantity.worthwhile)
+    return Verdict(quantity, comparison, seeds)
 
 
 def _headline(verdicts: Sequence[Verdict], first: Arm, second: Arm) -> str:

@@ -9,6 +9,7 @@ from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.report.charts import Series, line_chart, short_number
 from gsbench.analysis.results import Arm, Trial
 from gsbench.analysis.tradeoffs import Curve, curve_gap, family_curve
+from gsbench.eval.facts import METRICS
 
 COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time (s)"}
 
@@ -46,7 +47,7 @@ def tradeoff_gaps(trials: Sequence[Trial], baseline: str = BASELINE) -> list[str
 
 def _main_metrics(trials: Sequence[Trial]) -> list[Quantity]:
     """PSNR, and the first perceptual metric that is at hand, beginning with the protocol's LPIPS."""
-    for name in ("lpips", "lpips_vgg", "lpips_alex", "lpips_squeeze", "flip"):
+    for name in ("lpips", *(facts.key for facts in METRICS if facts.perceptual)):
         perceptual = quantity(name, trials)
         if all(perceptual.read(trial) is not None for trial in trials):
             return [quantity("psnr", trials), perceptual]

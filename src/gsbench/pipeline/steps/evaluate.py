@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,16 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from gsbench.config import EvalConfig
-from gsbench.eval.protocol import Evaluator, get_protocol, quantize, summarize
+from gsbench.eval.evaluator import Evaluator, quantize, summarize
+from gsbench.eval.facts import to_record
+from gsbench.eval.metric import Metric
+from gsbench.eval.protocol import get_protocol
 from gsbench.files import write_json
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
+from gsbench.pipeline.components import options_of
 from gsbench.pipeline.figures import draw_ellipsoids
 from gsbench.pipeline.maps import view_maps
 from gsbench.pipeline.progress import progress
@@ -58,6 +63,8 @@ def evaluate_step(
     }
     if earlier:
         inputs["earlier"] = list(earlier)
+    if evaluator.extra:
+        inputs["extra"] = {name: options_of("eval", metric) for name, metric in evaluator.extra.items()}
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
@@ -89,17 +96,24 @@ def evaluate_step(
             write_maps(folder / "maps", scene, views.store.path(views.init), gaussians, rasterizer)
             draw_figures(folder / "figures", folder / "renders", scene, training, gaussians)
         write_per_view(folder / PER_VIEW_FILE, per_view)
-        metrics = {"metrics": summarize(per_view, evaluator.unavailable), "unavailable": evaluator.unavailable}
-        write_json(folder / METRICS_FILE, metrics | ({"at": at} if at else {}))
+        metrics = {
+            "metrics": summarize(per_view, evaluator.unavailable),
+            "unavailable": evaluator.unavailable,
+            "awaited": sorted(evaluator.awaited),
+        }
+        own = {"facts": {name: to_record(facts) for name, facts in evaluator.own.items()}} if evaluator.own else {}
+        write_json(folder / METRICS_FILE, metrics | own | ({"at": at} if at else {}))
 
     return Step(EVALUATE, inputs, build)
 
 
-def make_evaluator(options: EvalConfig, device: torch.device | str = "cpu") -> Evaluator:
-    """The evaluator that the settings ``eval`` describe; looks for its networks' weights."""
+def make_evaluator(
+    options: EvalConfig, device: torch.device | str = "cpu", extra: Mapping[str, Metric] = MappingProxyType({})
+) -> Evaluator:
+    """The evaluator that the settings ``eval`` describe, with the user's own metrics; looks for networks' weights."""
     weights = None if options.weights is None else Path(options.weights).expanduser()
     protocol = get_protocol(options.protocol)
-    return Evaluator(protocol, device, tuple(options.lpips), options.flip, weights, options.download)
+    return Evaluator(protocol, device, tuple(options.lpips), options.flip, weights, options.download, extra)
 
 
 def write_maps(folder: Path, scene: Scene, init: Path, gaussians: Gaussians, rasterizer: Rasterizer) -> None:

@@ -1,0 +1,120 @@
+"""The evaluator: applies the metrics of a protocol, and those of the user's own, to pairs of images."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsbench.errors import InputError, TrainingError
+from gsbench.eval.facts import LPIPS, METRICS, MetricFacts, facts_of, lpips_variants
+from gsbench.eval.measures import Conditions
+from gsbench.eval.metric import Metric, UnavailableError
+from gsbench.eval.protocol import Protocol
+
+
+class Evaluator:
+    """Computes the metrics of one protocol; loads every network once.
+
+    ``lpips`` names the variants to compute (see `gsbench.eval.facts.lpips_variants`); ``weights`` is a folder to look
+    in first; ``extra`` are the user's own metrics by name. ``unavailable`` maps each metric that cannot be computed to
+    its reason in one line, and ``awaited`` holds those of them that could be once their weights or packages are there;
+    both can grow while views are evaluated, and such a metric is then left out of ``summarize`` for every view.
+    ``own`` are the facts of the user's metrics.
+    """
+
+    def __init__(
+        self,
+        protocol: Protocol,
+        device: torch.device | str = "cpu",
+        lpips: Sequence[str] | None = None,
+        flip: bool = True,
+        weights: Path | None = None,
+        download: bool = True,
+        extra: Mapping[str, Metric] = MappingProxyType({}),
+    ) -> None:
+        variants = lpips_variants()
+        unknown = [variant for variant in lpips or () if variant not in variants]
+        if unknown:
+            raise InputError(f"unknown LPIPS variant {unknown[0]!r}; choose among {', '.join(variants)}")
+        self.protocol = protocol
+        self.device = torch.device(device)
+        self.unavailable: dict[str, str] = {}
+        self.awaited: set[str] = set()
+        self.extra = dict(extra)
+        self.own = {name: facts_of(name, metric) for name, metric in extra.items()}
+        wanted = {f"{LPIPS}{variant}" for variant in (variants if lpips is None else lpips)}
+        wanted |= {facts.key for facts in METRICS if not facts.setting} | ({"flip"} if flip else set())
+        conditions = Conditions(protocol, self.device, weights, download)
+        self._metrics: dict[str, Metric] = {}
+        for facts in METRICS:
+            try:
+                if facts.key not in wanted:
+                    raise UnavailableError(f"not asked for ({facts.setting})")
+                self._metrics[facts.key] = _load(facts, conditions)
+            except UnavailableError as error:
+                self._leave_out(facts.key, error)
+        self._metrics |= extra
+
+    def evaluate_view(self, render: NDArray | Tensor, ground_truth: NDArray | Tensor) -> dict[str, float]:
+        """The metrics of one view; images are [H, W, 3], uint8 or floating point in [0, 1].
+
+        A metric that cannot be computed is absent and stands in ``unavailable``. Raises ``TrainingError`` where the
+        render holds a non-finite value.
+        """
+        image, target = self._prepare(render), self._prepare(ground_truth)  # [H, W, 3]
+        values = {}
+        for key, metric in self._metrics.items():
+            if key in self.unavailable:
+                continue
+            try:
+                value = float(metric.measure(image, target))
+                if not math.isfinite(value):
+                    raise UnavailableError(f"the value of a view is {value}")
+                values[key] = value
+            except UnavailableError as error:
+                self._leave_out(key, error)
+        return values
+
+    def _leave_out(self, key: str, error: UnavailableError) -> None:
+        self.unavailable[key] = " ".join(str(error).split())
+        if error.awaited and key not in self.own:
+            self.awaited.add(key)
+
+    def _prepare(self, image: NDArray | Tensor) -> Tensor:
+        tensor = torch.as_tensor(image, device=self.device)  # [H, W, 3]
+        if tensor.dtype != torch.uint8:
+            if not bool(tensor.isfinite().all()):
+                raise TrainingError("a render holds values that are not finite: the trained model is broken")
+            if not self.protocol.eight_bit:
+                return tensor.float().clamp(0, 1)
+            tensor = quantize(tensor)
+        return tensor.float() / 255
+
+
+def _load(facts: MetricFacts, conditions: Conditions) -> Metric:
+    """What computes one of gsbench's own metrics; raises UnavailableError where it lacks something."""
+    module, _, name = facts.target.rpartition(".")
+    metric: Metric = getattr(importlib.import_module(module), name)(conditions, **facts.options)
+    return metric
+
+
+def quantize(image: Tensor) -> Tensor:
+    """Round a floating point image in [0, 1] to uint8 as it goes into a PNG: ``floor(clamp(255 x + 0.5, 0, 255))``."""
+    return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)
+
+
+def summarize(per_view: Mapping[str, Mapping[str, float]], unavailable: Mapping[str, str]) -> dict[str, float]:
+    """Means over the views of every metric that all views have and that is not in ``unavailable``."""
+    if not per_view:
+        return {}
+    views = list(per_view.values())
+    shared = [key for key in views[0] if key not in unavailable and all(key in view for view in views)]
+    return {key: float(np.mean([view[key] for view in views])) for key in shared}

@@ -1,0 +1,94 @@
+"""gsbench's own metrics as the evaluator calls them, each under the conventions of a protocol."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gsbench.eval.lpips import Lpips, load_lpips
+from gsbench.eval.metric import UnavailableError
+from gsbench.eval.metrics import flip, psnr, ssim
+from gsbench.eval.protocol import Protocol
+from gsbench.weights import MissingWeights
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What gsbench's metrics share; ``weights`` is a folder to look in first."""
+
+    protocol: Protocol
+    device: torch.device
+    weights: Path | None = None
+    download: bool = True
+    networks: dict[str, Lpips | MissingWeights] = field(default_factory=dict, repr=False)  # of LPIPS, each loaded once
+
+    def network(self, net: str) -> Lpips:
+        """The LPIPS network ``net``; raises UnavailableError where its weights are not to be had."""
+        if net not in self.networks:
+            try:
+                self.networks[net] = load_lpips(net, self.weights, self.download, self.device)
+            except MissingWeights as error:
+                self.networks[net] = error
+        found = self.networks[net]
+        if isinstance(found, MissingWeights):
+            raise UnavailableError(str(found), awaited=True)
+        return found
+
+
+class Psnr:
+    """Peak signal-to-noise ratio, dB; at most the protocol's cap, which identical images get."""
+
+    def __init__(self, conditions: Conditions) -> None:
+        self._cap = conditions.protocol.psnr_cap
+
+    def measure(self, image: Tensor, truth: Tensor) -> float:
+        return min(float(psnr(_exact(image), _exact(truth))), self._cap)
+
+
+class Ssim:
+    """Structural similarity with the protocol's padding."""
+
+    def __init__(self, conditions: Conditions) -> None:
+        self._padding = conditions.protocol.ssim_padding
+
+    def measure(self, image: Tensor, truth: Tensor) -> float:
+        return float(ssim(_exact(image), _exact(truth), self._padding))
+
+
+class LpipsMetric:
+    """LPIPS by one network, fed [-1, 1] as it is defined or, ``raw``, [0, 1]."""
+
+    def __init__(self, conditions: Conditions, net: str, raw: bool) -> None:
+        self._network, self._raw = conditions.network(net), raw
+
+    def measure(self, image: Tensor, truth: Tensor) -> float:
+        height, width = image.shape[:2]
+        smallest = self._network.backbone.min_size
+        if min(height, width) < smallest:
+            raise UnavailableError(f"a view is {width}x{height} px, below {smallest} px a side")
+        first, second = (x.permute(2, 0, 1).unsqueeze(0) for x in (image, truth))  # [1, 3, H, W] each
+        if self._raw:
+            return float(self._network(first, second))
+        return float(self._network(2 * first - 1, 2 * second - 1))
+
+
+class Flip:
+    """FLIP for the protocol's viewer."""
+
+    def __init__(self, conditions: Conditions) -> None:
+        if importlib.util.find_spec("flip_evaluator") is None:
+            reason = "the package flip-evaluator is not installed: pip install flip-evaluator"
+            raise UnavailableError(reason, awaited=True)
+        self._ppd = conditions.protocol.flip_ppd
+
+    def measure(self, image: Tensor, truth: Tensor) -> float:
+        return float(flip(image, truth, self._ppd))
+
+
+def _exact(image: Tensor) -> Tensor:
+    """In single precision, SSIM's differences of moments are off by up to 2e-4 where an image is flat."""
+    return image.to(torch.float32 if image.device.type == "mps" else torch.float64)

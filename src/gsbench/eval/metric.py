@@ -1,0 +1,33 @@
+"""What a metric is: a class that measures one image against another. docs/metric.md has an example."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from torch import Tensor
+
+
+class Metric(Protocol):
+    """Measures a render against its photograph.
+
+    A class of the user's own says as class attributes how its values are to be read: ``direction`` (1, -1 or 0),
+    ``label``, ``unit``, ``decimals`` and ``worthwhile``, as `gsbench.eval.facts.MetricFacts` explains them.
+    """
+
+    def measure(self, image: Tensor, truth: Tensor) -> float:
+        """The value of one view; both are [H, W, 3], float32 in [0, 1], on the evaluation's device.
+
+        They hold what the protocol compares: images rounded to 8 bits. May raise `UnavailableError`.
+        """
+        ...
+
+
+class UnavailableError(Exception):
+    """A metric that cannot be computed; its text, one line, is the reason that results and tables give.
+
+    ``awaited``, for gsbench's own metrics: what is missing may come, such as weights, and then the metric is computed.
+    """
+
+    def __init__(self, reason: str, awaited: bool = False) -> None:
+        super().__init__(reason)
+        self.awaited = awaited

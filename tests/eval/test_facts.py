@@ -1,0 +1,109 @@
+"""The table of metrics: one place that everything asks, and what a user's metric may say of itself."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.errors import InputError
+from gsbench.eval.evaluator import Evaluator
+from gsbench.eval.facts import METRICS, MetricFacts, facts_of, find, from_record, known_keys, lpips_variants, to_record
+from gsbench.eval.metric import UnavailableError
+from gsbench.eval.protocol import PAPER, PROTOCOLS
+
+IMAGE = np.random.default_rng(0).integers(0, 256, (24, 30, 3), dtype=np.uint8)
+
+
+def test_the_table_and_the_protocols_load_no_torch() -> None:
+    code = "import sys, gsbench.eval.facts, gsbench.eval.protocol; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("facts", METRICS, ids=lambda facts: facts.key)
+def test_every_metric_can_be_imported_and_is_described(facts: MetricFacts) -> None:
+    module, _, name = facts.target.rpartition(".")
+    assert callable(getattr(importlib.import_module(module), name).measure)
+    assert facts.direction in (-1, 1)
+    assert facts.worthwhile is not None
+    assert find(facts.key) is facts
+
+
+def test_the_evaluator_knows_exactly_the_metrics_of_the_table() -> None:
+    evaluator = Evaluator(PAPER, lpips=[])
+    values = evaluator.evaluate_view(IMAGE, IMAGE)
+    assert values.keys() | evaluator.unavailable.keys() == set(known_keys())
+    assert all(f"lpips_{protocol.lpips}" in known_keys() for protocol in PROTOCOLS.values())
+    assert set(lpips_variants()) == {"vgg_raw", "vgg", "alex", "squeeze"}
+
+
+class Brightness:
+    label, unit, direction, decimals, worthwhile = "brightness error", "levels", -1, 1, 0.5
+
+    def measure(self, image: torch.Tensor, truth: torch.Tensor) -> float:
+        assert image.dtype == truth.dtype == torch.float32
+        return float((image.mean() - truth.mean()).abs() * 255)
+
+
+def test_a_metric_of_ones_own_is_measured_beside_the_others() -> None:
+    evaluator = Evaluator(PAPER, lpips=[], flip=False, extra={"brightness": Brightness()})
+    values = evaluator.evaluate_view(np.minimum(IMAGE, 245) + 10, IMAGE)
+    expected = abs((np.minimum(IMAGE, 245) + 10).astype(float).mean() - IMAGE.mean())
+    assert values["brightness"] == pytest.approx(expected, abs=1e-3)
+    facts = evaluator.own["brightness"]
+    assert (facts.name, facts.direction, facts.decimals) == ("brightness error (levels)", -1, 1)
+    assert from_record("brightness", to_record(facts)) == facts
+
+
+def test_a_metric_of_ones_own_may_be_unavailable() -> None:
+    class Never:
+        def measure(self, image: torch.Tensor, truth: torch.Tensor) -> float:
+            raise UnavailableError("not on\na Sunday", awaited=True)
+
+    class Broken:
+        def measure(self, image: torch.Tensor, truth: torch.Tensor) -> float:
+            return float("nan")
+
+    evaluator = Evaluator(PAPER, lpips=[], flip=False, extra={"never": Never(), "broken": Broken()})
+    for _ in range(2):
+        assert evaluator.evaluate_view(IMAGE, IMAGE).keys() == {"psnr", "ssim"}
+    assert evaluator.unavailable["never"] == "not on a Sunday"
+    assert evaluator.unavailable["broken"] == "the value of a view is nan"
+    assert not evaluator.awaited  # only gsbench's own can say when what they lack has come
+
+
+def test_missing_weights_are_awaited_and_what_was_not_asked_for_is_not(
+    tmp_path: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    evaluator = Evaluator(PAPER, lpips=["vgg", "vgg_raw"], flip=False, download=False)
+    assert evaluator.awaited == {"lpips_vgg", "lpips_vgg_raw"}
+    assert evaluator.unavailable.keys() - evaluator.awaited == {"lpips_alex", "lpips_squeeze", "flip"}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("direction", 2),
+        ("direction", "up"),
+        ("decimals", -1),
+        ("label", " "),
+        ("unit", 3),
+        ("worthwhile", float("nan")),
+    ],
+)
+def test_what_a_metric_says_of_itself_is_checked(name: str, value: object) -> None:
+    metric = type("Mine", (Brightness,), {name: value})()
+    with pytest.raises(InputError, match=rf"Mine\.{name} must be "):
+        facts_of("mine", metric)
+
+
+def test_a_metric_that_says_nothing_has_no_direction() -> None:
+    facts = facts_of("plain", object())
+    assert (facts.label, facts.direction, facts.decimals, facts.worthwhile) == ("plain", 0, 3, None)
+    assert from_record("plain", None) == facts
