@@ -25,6 +25,7 @@ from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveIn
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys, lpips_variants
 from gsbench.eval.protocol import PROTOCOLS
+from gsbench.layout import IN_RUNS
 from gsbench.raster import executors
 from gsbench.settings import Fraction, check_settings, checked
 from gsbench.source import source_of
@@ -37,7 +38,6 @@ MAX_SEED = 2**63 - 1  # torch's generators take no larger one
 MAX_NAME_BYTES = 100  # of a name: folders are made of two, and file systems end at 255
 METRIC_NAME = re.compile(r"[a-z][a-z0-9_]*")
 TAKEN_NAMES = (*known_keys(), "view", "lpips")  # of metrics, and what else a table of views or a list of metrics means
-IN_RUNS = ("store", "mlartifacts", "mlflow.db")  # what lies in the runs folder beside the experiments
 
 
 def is_folder_name(value: str) -> bool:

@@ -179,7 +179,7 @@ def test_volumes_are_those_of_the_ellipsoids(experiment: Experiment) -> None:
 def test_a_truncated_point_cloud_is_refused(tmp_path: Path, experiment: Experiment) -> None:
     content = (experiment.trials[0].path / "point_cloud.ply").read_bytes()
     (tmp_path / "half.ply").write_bytes(content[: len(content) // 2])
-    with pytest.raises(InputError, match="of 2000 vertices"):
+    with pytest.raises(InputError, match=r"half\.ply is not a readable 3DGS PLY .*early end-of-file"):
         log10_volumes(tmp_path / "half.ply")
 
 

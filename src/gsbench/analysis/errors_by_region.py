@@ -20,12 +20,12 @@ from gsbench.analysis.pairing import Paired, pair_trials
 from gsbench.analysis.results import Arm, Trial
 from gsbench.analysis.statistics import Comparison, compare
 from gsbench.errors import InputError
+from gsbench.layout import GROUND_TRUTH, MAPS, RENDERS
 
 BINS = 5
 TEXTURE_SIGMA = 2.0  # px: texture energy is the gradient's square averaged over such a Gaussian
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 SAMPLES = 200_000  # pixels of a scene from which the bins' edges are taken
-RENDERS, GROUND_TRUTH, MAPS = "renders", "ground_truth", "maps"
 
 Array = NDArray[np.float64]
 # Properties that need more than the ground truth, with the array of ``maps/<view>.npz`` that holds them.

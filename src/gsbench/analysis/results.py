@@ -21,10 +21,9 @@ import yaml
 
 from gsbench.errors import InputError
 from gsbench.files import read_object
+from gsbench.layout import CONFIG, FAILED, IN_RUNS, INPUTS, PER_VIEW, RESULTS
+from gsbench.nested import flatten
 
-RESULTS, FAILED, CONFIG, PER_VIEW = "results.json", "failed.json", "config.yaml", "per_view.csv"
-INPUTS = "inputs.json"
-NOT_EXPERIMENTS = {"store", "mlartifacts"}  # what else lies in the runs folder
 TRIAL_FOLDER = re.compile(r"(?P<hash>[0-9a-f]{8})-seed(?P<seed>\d+)")
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
 
@@ -152,7 +151,7 @@ def list_experiments(runs_dir: Path) -> list[str]:
     if not runs_dir.is_dir():
         return []
     found = (entry for entry in os.scandir(runs_dir) if entry.is_dir() and not entry.name.startswith("."))
-    return sorted(entry.name for entry in found if entry.name not in NOT_EXPERIMENTS)
+    return sorted(entry.name for entry in found if entry.name not in IN_RUNS)
 
 
 def experiment_home(runs_dir: Path, name: str) -> Path:
@@ -243,17 +242,6 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
     except (OSError, UnicodeDecodeError, json.JSONDecodeError):
         pass
     return rows
-
-
-def flatten(mapping: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one with dotted keys."""
-    flat: dict[str, Any] = {}
-    for key, value in mapping.items():
-        if isinstance(value, Mapping):
-            flat |= flatten(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat
 
 
 def canonical(value: object) -> str:

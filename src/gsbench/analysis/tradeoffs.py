@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.results import Arm, Trial, read_json_lines
+from gsbench.layout import CURVES
 
 GRID = 200  # points at which two curves are compared
-METRICS_FILE = "metrics.jsonl"
 
 Array = NDArray[np.float64]
 COST_READERS: dict[str, Callable[[Trial], float | None]] = {
@@ -60,7 +60,7 @@ def training_curve(trials: Sequence[Trial], cost: str, quality: str) -> Curve:
     key = {"gaussians": "num_gaussians", "seconds": "seconds"}[cost]
     by_step: dict[int, list[tuple[float, float]]] = {}
     for trial in trials:
-        for row in read_json_lines(trial.path / METRICS_FILE):
+        for row in read_json_lines(trial.path / CURVES):
             x, y = row.get(key), row.get(quality)
             if isinstance(x, int | float) and isinstance(y, int | float):
                 by_step.setdefault(int(row["step"]), []).append((x, y))

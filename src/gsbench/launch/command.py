@@ -20,6 +20,7 @@ from gsbench.launch.plan import add_to_plan, describe_plan
 from gsbench.launch.preflight import check_components, missing_folders, need_no_check
 from gsbench.launch.queries import QUERIES, ask_hydra
 from gsbench.launch.serial import run_serial
+from gsbench.layout import STORE
 from gsbench.pipeline.stages import STAGES
 from gsbench.pipeline.stopping import stop_on_signals
 from gsbench.pipeline.store import Store
@@ -56,7 +57,7 @@ def run_trials(trials: Sequence[Composed]) -> int:
             raise InputError("; ".join(missing))
         check_components(unfinished, here=launcher != "slurm")
         make_runs_folder(runs)
-        Store(runs / "store").sweep(STAGES)
+        Store(runs / STORE).sweep(STAGES)
         add_to_plan(trials)
         if unfinished:
             if launcher == "serial":

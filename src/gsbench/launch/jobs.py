@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 from gsbench.compose import Composed
 from gsbench.errors import InputError
-from gsbench.files import write_json
+from gsbench.files import read_object, write_json
 from gsbench.install import install_command
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.pipeline.resources import assign_gpu, assign_threads, take_slot
 from gsbench.pipeline.stopping import Stopped, stop_on_signals
-from gsbench.pipeline.trial_files import TrialPaths, find_finished, read_object
+from gsbench.pipeline.trial_files import TrialPaths, find_finished
 
 if TYPE_CHECKING:
     from submitit import Executor, Job

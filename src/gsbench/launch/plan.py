@@ -17,26 +17,13 @@ from typing import Any, Literal
 
 from gsbench.compose import Composed
 from gsbench.errors import GsbenchError, InputError
-from gsbench.files import write_json
+from gsbench.files import read_object, write_json
+from gsbench.layout import CONFIG, FAILED, LOCK, PLAN, RESULTS, STORE, TRIAL_GLOB
 from gsbench.pipeline.locks import hold, read_holder
-from gsbench.pipeline.trial_files import (
-    CONFIG,
-    FAILED,
-    LOCK,
-    RESULTS,
-    State,
-    TrialPaths,
-    failure_of,
-    find_finished,
-    read_object,
-    stage_and_step,
-    state_of,
-)
+from gsbench.pipeline.trial_files import State, TrialPaths, failure_of, find_finished, stage_and_step, state_of
 from gsbench.words import counted, readable_time
 
-PLAN = "plan.json"
 PLAN_VERSION = 1
-TRIAL_GLOB = "*/*/*-seed*"
 
 
 @dataclass(frozen=True)
@@ -197,7 +184,7 @@ class Estimator:
 
 def _stage_finder(trials: Sequence[Composed]) -> Callable[[dict[str, Any]], list[str]]:
     """A function that tells which stages of a trial are in the store; loads torch only where there is such a store."""
-    store = TrialPaths.of(trials[0].values).runs / "store" if trials else None
+    store = TrialPaths.of(trials[0].values).runs / STORE if trials else None
     if store is None or not store.is_dir():
         return lambda values: []
     from gsbench.pipeline.store import Store

@@ -13,11 +13,11 @@ from gsbench import __version__
 from gsbench.config import config_hash, sha256_of
 from gsbench.events import sum_events
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
+from gsbench.layout import EVENTS
 from gsbench.pipeline.stages import EVALUATE, INIT, STAGES, TRAIN
 from gsbench.pipeline.steps.evaluate import METRICS_FILE
 from gsbench.pipeline.steps.train import TRAINING_FILE
 from gsbench.pipeline.store import MANIFEST, Entry
-from gsbench.pipeline.trainer import EVENTS
 from gsbench.scene.types import Scene
 from gsbench.source import sources_of
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from gsbench.nested import flatten
 from gsbench.pipeline.step import Step
 from gsbench.pipeline.store import MANIFEST, Store, read_manifest
 
@@ -54,12 +55,9 @@ def _differences(store: Store, step: Step) -> list[str]:
     ]
 
 
-def flat(values: Any, prefix: str = "") -> dict[str, str]:
+def flat(values: dict[str, Any]) -> dict[str, str]:
     """Nested objects as one with dotted keys and JSON text."""
-    if isinstance(values, dict) and values:
-        parts = [flat(value, f"{prefix}.{key}" if prefix else str(key)) for key, value in values.items()]
-        return {key: text for part in parts for key, text in part.items()}
-    return {prefix: json.dumps(values, sort_keys=True)}
+    return {key: json.dumps(value, sort_keys=True) for key, value in flatten(values, keep_empty=True).items()}
 
 
 def _distance(found: dict[str, str], wanted: dict[str, str]) -> int:

@@ -23,6 +23,7 @@ from gsbench.events import RefineEvent
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.pipeline.checkpoint import CheckpointWriter, load_checkpoint
 from gsbench.pipeline.loss import PhotometricLoss
 from gsbench.pipeline.losses import LossLog
@@ -34,9 +35,6 @@ from gsbench.scene.types import Scene
 
 log = logging.getLogger(__name__)
 
-METRICS = "metrics.jsonl"
-EVENTS = "events.jsonl"
-HISTOGRAMS = "volume_histograms.jsonl"
 LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, a quarter decade each
 STREAMS = ("cameras", "densify")  # every random draw of a training belongs to one
 
@@ -131,7 +129,7 @@ class Trainer:
         options = self.options
         first_step, started, before = self.step, time.perf_counter(), self.seconds
         last_checkpoint = time.monotonic()
-        with (folder / METRICS).open("a") as metrics, (folder / EVENTS).open("a") as events:
+        with (folder / CURVES).open("a") as metrics, (folder / EVENTS).open("a") as events:
             while self.step < options.iterations:
                 counts = {"num_gaussians": len(self.gaussians)}
                 event = self.iterate(folder)
@@ -251,7 +249,7 @@ class Trainer:
                 rng.set_state(state["rngs"][name])
             self.order.remaining = list(state["remaining_views"])
             log.info("going on from iteration %d", self.step)
-        for name in (METRICS, EVENTS, HISTOGRAMS):
+        for name in (CURVES, EVENTS, HISTOGRAMS):
             drop_after(folder / name, self.step)
 
 

@@ -13,30 +13,19 @@ from typing import Any
 import pycolmap  # noqa: F401 - here, so that what its import does to signals can be undone
 import torch
 
+from gsbench import layout
 from gsbench.errors import GsbenchError
-from gsbench.files import link_or_copy, remove_temporaries, storage_errors, write_json, write_text
+from gsbench.files import link_or_copy, read_object, remove_temporaries, storage_errors, write_json, write_text
 from gsbench.init.base import PICTURE_FILE, REPORT_FILE
+from gsbench.layout import BUILDING, CONFIG, FAILED, LOG, RESULTS
 from gsbench.logs import log_to
 from gsbench.pipeline.locks import hold
 from gsbench.pipeline.results import results_of
 from gsbench.pipeline.stages import EVALUATE, GROUND_TRUTH, INIT, TRAIN
 from gsbench.pipeline.step import Stage
-from gsbench.pipeline.steps.evaluate import PER_VIEW_FILE
-from gsbench.pipeline.steps.train import LINEAGE_FILE, PLY_FILE
 from gsbench.pipeline.stopping import take_signals_back
 from gsbench.pipeline.store import Entry, Store
-from gsbench.pipeline.trainer import EVENTS, HISTOGRAMS, METRICS
-from gsbench.pipeline.trial_files import (
-    BUILDING,
-    CONFIG,
-    FAILED,
-    LOG,
-    RESULTS,
-    TrialPaths,
-    find_finished,
-    read_object,
-    record_inputs,
-)
+from gsbench.pipeline.trial_files import TrialPaths, find_finished, record_inputs
 from gsbench.pipeline.wiring import Parts, Trial
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture
@@ -44,7 +33,7 @@ from gsbench.tracking import Mirror
 
 log = logging.getLogger(__name__)
 
-PUBLISHED_TRAINING = (PLY_FILE, LINEAGE_FILE, METRICS, EVENTS, HISTOGRAMS)
+PUBLISHED_TRAINING = (layout.POINT_CLOUD, layout.LINEAGE, layout.CURVES, layout.EVENTS, layout.HISTOGRAMS)
 
 
 def run_trial(values: dict[str, Any], config_yaml: str, wait: bool = True) -> dict[str, Any]:
@@ -91,7 +80,7 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
         if stage is TRAIN:
             mirror.follow(folder)
 
-    store = Store(paths.runs / "store", announce)
+    store = Store(paths.runs / layout.STORE, announce)
     write_text(paths.folder / CONFIG, config_yaml)
     (paths.folder / FAILED).unlink(missing_ok=True)
     trial = Trial(parts, store)
@@ -100,7 +89,7 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
         for step in trial.steps():
             entries[step.stage.name] = entry = store.get(step)
             if step.stage is INIT:
-                link_or_copy(entry.path / REPORT_FILE, paths.folder / "init_report.json")
+                link_or_copy(entry.path / REPORT_FILE, paths.folder / layout.INIT_REPORT)
         scene = trial.views.scene
         log.info("%s: %d training and %d test views", paths.label, len(scene.train), len(scene.test))
         results = results_of(values, trial.capture.fingerprint, scene, parts.rasterizer.name, entries)
@@ -128,13 +117,13 @@ def _publish(folder: Path, entries: Mapping[str, Entry]) -> list[Path]:
     """Show the steps' files in the trial's folder; returns what is shown."""
     init, trained, evaluated = (entries[stage.name].path for stage in (INIT, TRAIN, EVALUATE))
     links = {folder / name: trained / name for name in PUBLISHED_TRAINING if (trained / name).exists()}
-    links[folder / PER_VIEW_FILE] = evaluated / PER_VIEW_FILE
-    pictures = {name: evaluated / name for name in ("renders", "maps", "figures")}
-    for name, source in (pictures | {"ground_truth": entries[GROUND_TRUTH.name].path}).items():
+    links[folder / layout.PER_VIEW] = evaluated / layout.PER_VIEW
+    pictures = {name: evaluated / name for name in (layout.RENDERS, layout.MAPS, layout.FIGURES)}
+    for name, source in (pictures | {layout.GROUND_TRUTH: entries[GROUND_TRUTH.name].path}).items():
         files = sorted([*source.glob("*.png"), *source.glob("*.npz")])
         links |= {folder / name / file.name: file for file in files}
     if (init / PICTURE_FILE).exists():
-        links[folder / "figures" / "initial_cloud.png"] = init / PICTURE_FILE
+        links[folder / layout.FIGURES / "initial_cloud.png"] = init / PICTURE_FILE
     for link, file in links.items():
         link.parent.mkdir(exist_ok=True)
         link_or_copy(file, link)

@@ -15,20 +15,11 @@ import yaml
 from gsbench.config import config_hash, sha256_of
 from gsbench.errors import InputError
 from gsbench.files import read_object, write_json
+from gsbench.layout import BUILDING, CONFIG, CURVES, FAILED, INPUTS, LOCK, RESULTS
 from gsbench.pipeline.locks import is_held
 from gsbench.pipeline.stages import STAGES
 from gsbench.pipeline.store import read_manifest
 
-RESULTS = "results.json"
-FAILED = "failed.json"
-CONFIG = "config.yaml"
-LOG = "log.txt"
-INPUTS = (
-    "inputs.json"  # what the results were made of, so that a finished trial is recognised without reading photographs
-)
-BUILDING = "building.json"  # the stage that an unfinished trial is at, and where
-PROGRESS_FILE = "metrics.jsonl"
-LOCK = ".lock"
 TAIL_BYTES = 4096
 INPUTS_VERSION = 1
 # Results made before they had ``awaited`` tell by the reason whether an unavailable metric may still come: not where it
@@ -102,7 +93,7 @@ def stage_and_step(folder: Path) -> tuple[str, int]:
     """The stage that an unfinished trial is at ("" if none has begun), and the last iteration that it logged."""
     building = read_object(folder / BUILDING)
     try:
-        with Path(building["folder"], PROGRESS_FILE).open("rb") as stream:
+        with Path(building["folder"], CURVES).open("rb") as stream:
             stream.seek(0, os.SEEK_END)
             stream.seek(max(0, stream.tell() - TAIL_BYTES))
             steps = re.findall(rb'"step": (\d+)', stream.read())

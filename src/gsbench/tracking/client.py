@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from filelock import FileLock
 
 from gsbench.files import atomic
+from gsbench.layout import ARTIFACTS, DATABASE
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -29,7 +30,7 @@ SETTINGS = {
 
 
 def default_uri(runs: Path) -> str:
-    return f"sqlite:///{runs}/mlflow.db"
+    return f"sqlite:///{runs}/{DATABASE}"
 
 
 def connect(uri: str | None, runs: Path) -> MlflowClient:
@@ -56,7 +57,7 @@ def ensure_experiment(client: MlflowClient, name: str, runs: Path) -> str:
         found = client.get_experiment_by_name(name)
         if found is None:
             served = str(client.tracking_uri).startswith(("http:", "https:"))  # then the server says where
-            location = None if served else (runs / "mlartifacts" / name).as_uri()
+            location = None if served else (runs / ARTIFACTS / name).as_uri()
             with suppress(MlflowException):  # a rival on another machine was first, or what follows says what is wrong
                 return str(client.create_experiment(name, artifact_location=location))
             found = client.get_experiment_by_name(name)
@@ -97,5 +98,5 @@ def _create_sqlite(uri: str) -> None:
     if not name or name == ":memory:" or Path(name).exists():
         return
     with atomic(Path(name)) as temporary:
-        store = SqlAlchemyStore(f"sqlite:///{temporary}", str(Path(name).parent / "mlartifacts"))
+        store = SqlAlchemyStore(f"sqlite:///{temporary}", str(Path(name).parent / ARTIFACTS))
         store.engine.dispose()

@@ -13,10 +13,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from gsbench import layout
 from gsbench.config import sha256_of
-from gsbench.files import write_json
+from gsbench.files import read_object, write_json
+from gsbench.nested import flatten
 from gsbench.pipeline.locks import hold
-from gsbench.pipeline.trial_files import FAILED, RESULTS, read_object
 from gsbench.tracking.client import connect, ensure_experiment
 
 STATE = "mlflow.json"  # in the trial's folder: the run that mirrors it and how far
@@ -27,7 +28,7 @@ MAX_PARAMS = 100  # parameters in a batch
 MAX_METRICS = 1000  # metrics in a batch
 # Of the init's report: is the cloud to be trusted, and what does a volume threshold mean there?
 INIT_FIELDS = ("num_registered", "num_points", "mean_reprojection_error", "mean_track_length", "pose_errors", "gauge")
-CURVES = {"metrics.jsonl": "train", "events.jsonl": "events"}
+CURVES = {layout.CURVES: "train", layout.EVENTS: "events"}
 
 
 def mirror_trial(options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any]) -> bool:
@@ -37,7 +38,7 @@ def mirror_trial(options: dict[str, Any], runs: Path, folder: Path, values: dict
         if run.is_complete:
             return False
         run.add_curves([folder])
-        run.finish("FAILED" if (folder / FAILED).exists() else "FINISHED")
+        run.finish("FAILED" if (folder / layout.FAILED).exists() else "FINISHED")
     return True
 
 
@@ -80,7 +81,7 @@ class TrackedTrial:
         return state
 
     def _results_hash(self) -> str | None:
-        results = read_object(self.folder / RESULTS)
+        results = read_object(self.folder / layout.RESULTS)
         return sha256_of(results) if results else None
 
     def add_curves(self, sources: list[Path]) -> None:
@@ -113,7 +114,7 @@ class TrackedTrial:
         if self.is_complete:
             return
         run_id = self.state["run_id"]
-        results = read_object(self.folder / RESULTS)
+        results = read_object(self.folder / layout.RESULTS)
         if status != "FINISHED" or not results:
             self.client.set_terminated(run_id, "FAILED" if status == "FINISHED" else status)
             return
@@ -133,10 +134,10 @@ class TrackedTrial:
             metrics=[Metric(key, float(value), ended, 0) for key, value in numbers.items()],
             tags=[RunTag(key, value) for key, value in tags.items()],
         )
-        for name in ("config.yaml", "results.json", "init_report.json", "per_view.csv", "events.jsonl"):
+        for name in (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS):
             if (self.folder / name).exists():
                 self.client.log_artifact(run_id, str(self.folder / name))
-        for kind in ("figures", "renders", "ground_truth"):
+        for kind in (layout.FIGURES, layout.RENDERS, layout.GROUND_TRUTH):
             for picture in sorted((self.folder / kind).glob("*.png"))[: self.images]:
                 self.client.log_artifact(run_id, str(picture), kind)
         self.client.set_terminated(run_id, "FINISHED")
@@ -163,7 +164,7 @@ class TrackedTrial:
         run = found[0] if found else self.client.create_run(experiment_id, tags=tags, run_name=label)
         run_id = run.info.run_id
         params = [Param("arm", f"{values['init']['name']}-{values['densify']['name']}")]  # first in MLflow's charts
-        params += [Param(key, value[:MAX_VALUE]) for key, value in _flatten(values) if value]
+        params += [Param(key, str(value)[:MAX_VALUE]) for key, value in flatten(values).items() if str(value)]
         for start in range(0, len(params), MAX_PARAMS):
             self.client.log_batch(run_id, params=params[start : start + MAX_PARAMS], tags=[RunTag("gsbench", "1")])
         return begun | {"run_id": run_id, "logged": {}, "complete": None}
@@ -194,14 +195,6 @@ def _records(path: Path) -> Iterator[dict[str, Any]]:
             yield json.loads(line)
         except json.JSONDecodeError:  # the last line, still being written
             return
-
-
-def _flatten(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    for key, value in values.items():
-        if isinstance(value, dict):
-            yield from _flatten(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", str(value)
 
 
 def _numbers(report: dict[str, Any], names: Sequence[str]) -> Iterator[tuple[str, float]]:

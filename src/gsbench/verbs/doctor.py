@@ -17,6 +17,7 @@ from typing import Literal
 from gsbench.arguments import ArgumentParser
 from gsbench.files import explain_storage
 from gsbench.install import install_command
+from gsbench.layout import DATABASE, STORE
 from gsbench.pipeline.resources import available_threads
 
 Verdict = Literal["ok", "note", "bad"]
@@ -133,7 +134,7 @@ def check_runs(runs: Path) -> Iterator[Finding]:
 
 
 def check_tracking(runs: Path) -> Iterator[Finding]:
-    database = runs / "mlflow.db"
+    database = runs / DATABASE
     if not database.exists():
         yield Finding("ok", "tracking", f"no {database} yet: the first trial makes it")
         return
@@ -182,7 +183,7 @@ def check_store(runs: Path) -> Iterator[Finding]:
 
     sound = 0
     for stage in STAGES:
-        for folder in sorted((runs / "store" / stage.name).glob("[0-9a-f]*")):
+        for folder in sorted((runs / STORE / stage.name).glob("[0-9a-f]*")):
             try:
                 read_manifest(folder, thorough=True)
                 sound += 1

@@ -8,6 +8,7 @@ from pathlib import Path
 from gsbench.analysis.explain import ADDRESS, explain_cell
 from gsbench.arguments import ArgumentParser
 from gsbench.errors import InputError
+from gsbench.layout import CONFIG, STORE
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -36,7 +37,7 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
     from gsbench.compose import compose_trials
     from gsbench.pipeline.stale import explain_steps
     from gsbench.pipeline.store import Store
-    from gsbench.pipeline.trial_files import CONFIG, read_config
+    from gsbench.pipeline.trial_files import read_config
     from gsbench.pipeline.wiring import Parts, Trial
 
     if len(words) == 1 and (Path(words[0]) / CONFIG).exists():
@@ -45,7 +46,7 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
         raise InputError(f"{words[0]} is neither a trial's folder nor a setting like key=value")
     else:
         values = compose_trials(words)[0].values
-    store = Store(runs / "store")
+    store = Store(runs / STORE)
     for line in explain_steps(Trial(Parts.of(values), store).steps(), store):
         print(line)
     return 0

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from gsbench.arguments import ArgumentParser
 from gsbench.errors import InputError
 from gsbench.files import atomic
+from gsbench.layout import POINT_CLOUD, STORE
 
 if TYPE_CHECKING:
     from gsbench.gaussians.model import Gaussians
@@ -45,9 +46,9 @@ def main(argv: Sequence[str], runs: Path) -> int:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         if is_init:
-            export_init(trial.path.parents[3] / "store" / "init" / trial.data["hashes"]["init"], out)
+            export_init(trial.path.parents[3] / STORE / "init" / trial.data["hashes"]["init"], out)
         else:
-            export_model(trial.path / "point_cloud.ply", options.to or _format_of(out), out)
+            export_model(trial.path / POINT_CLOUD, options.to or _format_of(out), out)
     except OSError as error:
         raise InputError(f"cannot write {out} ({error.strerror or error}); give another --out") from error
     print(out)

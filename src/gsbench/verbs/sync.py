@@ -9,7 +9,7 @@ from pathlib import Path
 from gsbench.analysis.results import experiment_home, list_experiments
 from gsbench.arguments import ArgumentParser
 from gsbench.errors import GsbenchError
-from gsbench.launch.plan import TRIAL_GLOB
+from gsbench.layout import TRIAL_GLOB
 from gsbench.pipeline.trial_files import label_of, read_config, state_of
 from gsbench.tracking.process import MirrorError, MirrorProcess
 from gsbench.words import counted

@@ -12,6 +12,7 @@ from urllib.parse import quote
 
 from gsbench.arguments import ArgumentParser
 from gsbench.errors import InputError
+from gsbench.layout import DATABASE
 
 DEFAULT_PORT = 5000
 MAX_COMPARED = 100  # runs in an address; browsers limit its length
@@ -26,7 +27,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("--port", type=int, default=DEFAULT_PORT)
     parser.add_argument("--print-url", action="store_true", help="only print the address")
     options = parser.parse_args(argv)
-    if options.uri is None and not (runs / "mlflow.db").exists():
+    if options.uri is None and not (runs / DATABASE).exists():
         raise InputError(f"no MLflow database in {runs}: run a trial first, or `gsbench sync`, or give --uri")
     from gsbench.tracking import default_uri
 

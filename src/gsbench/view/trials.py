@@ -15,9 +15,9 @@ from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER, PointCloud
+from gsbench.layout import GROUND_TRUTH, LINEAGE, POINT_CLOUD, STORE
 from gsbench.pipeline.stages import INIT
 from gsbench.pipeline.steps.ground_truth import png_name
-from gsbench.pipeline.steps.train import LINEAGE_FILE, PLY_FILE
 from gsbench.pipeline.store import Store
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import PINHOLE_MODELS, pinhole_camera, points_of, read_model
@@ -81,16 +81,16 @@ def _trial_in(folder: Path) -> Trial:
 
 def load_viewed(trial: Trial, device: torch.device) -> ViewedTrial:
     """Read what the viewer draws of ``trial``; raises InputError naming the file that is missing or damaged."""
-    gaussians = read_ply(trial.path / PLY_FILE, device)
+    gaussians = read_ply(trial.path / POINT_CLOUD, device)
     runs = trial.path.parents[3]
-    model_dir = Store(runs / "store").folder(INIT, str(trial.data["hashes"]["init"])) / MODEL_FOLDER
+    model_dir = Store(runs / STORE).folder(INIT, str(trial.data["hashes"]["init"])) / MODEL_FOLDER
     if not model_dir.is_dir():
         raise InputError(f"{model_dir} is gone, which has the cameras of {trial.label}: run this trial again")
     background = trial.config.get("train.background", (0.0, 0.0, 0.0))
     return ViewedTrial(
         label=f"{trial.scene} {trial.init}-{trial.densify} seed {trial.seed}",
         gaussians=gaussians,
-        causes=read_causes(trial.path / LINEAGE_FILE, len(gaussians)),
+        causes=read_causes(trial.path / LINEAGE, len(gaussians)),
         log10_volumes=(log_volume(gaussians.log_scales).double() / np.log(10)).cpu().numpy(),
         cloud=PointCloud(*points_of(read_model(model_dir))),
         views=read_test_views(trial, model_dir),
@@ -118,7 +118,7 @@ def read_test_views(trial: Trial, model_dir: Path) -> tuple[View, ...]:
     centred = trial.config.get("scene.principal_point") == "centred"
     views = []
     for image in sorted(model.images.values(), key=lambda image: image.name):
-        path = trial.path / "ground_truth" / png_name(image.name)
+        path = trial.path / GROUND_TRUTH / png_name(image.name)
         if not (image.has_pose and path.is_file()):
             continue
         picture = read_image(path)  # [H, W, 3]

@@ -26,8 +26,7 @@ from gsbench.analysis.report.tradeoff_charts import tradeoff_charts, tradeoff_ga
 from gsbench.analysis.results import Experiment, Trial
 from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import build_table
-
-FIGURES = "figures"  # a trial's pictures for the report, such as ellipsoid overlays and initial clouds
+from gsbench.layout import FIGURES
 
 
 def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from gsbench import layout
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import short_version
 from gsbench.analysis.errors_by_region import MAP_PROPERTIES, RegionErrors, errors_by_region
@@ -24,7 +25,6 @@ from gsbench.errors import InputError
 from gsbench.events import Cause, RefineEvent
 
 CROPS = 4  # places of each kind
-EVENTS_FILE, HISTOGRAMS_FILE = "events.jsonl", "volume_histograms.jsonl"
 COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time"}
 EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)
 CURVES = (  # key of metrics.jsonl, title, y axis
@@ -115,7 +115,7 @@ def training_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
         series = []
         for arm in arms:
             own = [trial for trial in trials if trial.arm == arm]
-            points = mean_by_step([_rows(trial, "metrics.jsonl", key) for trial in own])
+            points = mean_by_step([_rows(trial, layout.CURVES, key) for trial in own])
             series.append(Series(arm_name(arm), points))
         charts.append(line_chart(title, series, "iteration", y_label))
     return [chart for chart in charts if chart]
@@ -138,7 +138,7 @@ def event_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
     for arm in arms:
         own = [trial for trial in trials if trial.arm == arm]
         series = [
-            Series(label, mean_by_step([_rows(trial, EVENTS_FILE, cause) for trial in own]))
+            Series(label, mean_by_step([_rows(trial, layout.EVENTS, cause) for trial in own]))
             for cause, label in zip(causes, labels, strict=True)
         ]
         charts.append(line_chart(f"Refinement over time: {arm_name(arm)}", series, "iteration", "Gaussians"))
@@ -320,7 +320,7 @@ def _logged_histograms(trials: Sequence[Trial]) -> dict[int, list[tuple[float, f
     """Pooled counts of ``volume_histograms.jsonl`` by iteration, as (volume at the bin's centre, share)."""
     pooled: dict[int, Counter[float]] = {}
     for trial in trials:
-        for row in read_json_lines(trial.path / HISTOGRAMS_FILE):
+        for row in read_json_lines(trial.path / layout.HISTOGRAMS):
             edges, counts = row.get("log10_edges", []), row.get("counts", [])
             for low, high, count in zip(edges, edges[1:], counts, strict=False):
                 pooled.setdefault(int(row["step"]), Counter())[10 ** ((low + high) / 2)] += count

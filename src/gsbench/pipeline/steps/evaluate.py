@@ -23,6 +23,7 @@ from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
+from gsbench.layout import FIGURES, LINEAGE, MAPS, PER_VIEW, POINT_CLOUD, RENDERS
 from gsbench.pipeline.components import options_of
 from gsbench.pipeline.figures import draw_ellipsoids
 from gsbench.pipeline.maps import view_maps
@@ -30,13 +31,11 @@ from gsbench.pipeline.progress import progress
 from gsbench.pipeline.stages import EVALUATE
 from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.ground_truth import png_name
-from gsbench.pipeline.steps.train import LINEAGE_FILE, PLY_FILE
 from gsbench.pipeline.steps.views import Views
 from gsbench.pipeline.trainer import snapshot_file
 from gsbench.raster import Rasterizer
 from gsbench.scene.types import Scene
 
-PER_VIEW_FILE = "per_view.csv"
 METRICS_FILE = "metrics.json"
 FIGURE_VOLUME = 0.03  # the paper's V_th, for baseline and idea alike
 
@@ -68,9 +67,9 @@ def evaluate_step(
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
-        gaussians = read_ply(training / PLY_FILE, device)
+        gaussians = read_ply(training / POINT_CLOUD, device)
         color = torch.tensor(list(background), device=device)  # [3]
-        (folder / "renders").mkdir(exist_ok=True)
+        (folder / RENDERS).mkdir(exist_ok=True)
 
         def measure(model: Gaussians, phase: str, renders: Path | None) -> dict[str, dict[str, float]]:
             per_view = {}
@@ -86,16 +85,16 @@ def evaluate_step(
 
         at = {}
         with progress("evaluate") as report:
-            per_view = measure(gaussians, "views", folder / "renders")
+            per_view = measure(gaussians, "views", folder / RENDERS)
             for step in earlier:
                 if (snapshot := training / snapshot_file(step)).exists():  # else a limit of time came first
                     model = read_ply(snapshot, device)
                     means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
                     at[str(step)] = {"metrics": means, "num_gaussians": len(model)}
         if maps:
-            write_maps(folder / "maps", scene, views.store.path(views.init), gaussians, rasterizer)
-            draw_figures(folder / "figures", folder / "renders", scene, training, gaussians)
-        write_per_view(folder / PER_VIEW_FILE, per_view)
+            write_maps(folder / MAPS, scene, views.store.path(views.init), gaussians, rasterizer)
+            draw_figures(folder / FIGURES, folder / RENDERS, scene, training, gaussians)
+        write_per_view(folder / PER_VIEW, per_view)
         metrics = {
             "metrics": summarize(per_view, evaluator.unavailable),
             "unavailable": evaluator.unavailable,
@@ -128,7 +127,7 @@ def write_maps(folder: Path, scene: Scene, init: Path, gaussians: Gaussians, ras
 def draw_figures(folder: Path, renders: Path, scene: Scene, training: Path, gaussians: Gaussians) -> None:
     """The voluminous Gaussians of the model, drawn over its first test view."""
     folder.mkdir(exist_ok=True)
-    with np.load(training / LINEAGE_FILE) as lineage:
+    with np.load(training / LINEAGE) as lineage:
         causes = torch.from_numpy(lineage["causes"][lineage["ids"]])  # [N]
     for view in scene.test[:1]:
         render = np.asarray(Image.open(renders / png_name(view.name)))

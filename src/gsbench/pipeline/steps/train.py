@@ -18,6 +18,7 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
+from gsbench.layout import LINEAGE, POINT_CLOUD
 from gsbench.machine import describe_machine
 from gsbench.memory import peak_memory_mb, reset_peak_memory
 from gsbench.pipeline.components import options_of, rasterizer_inputs
@@ -28,9 +29,7 @@ from gsbench.pipeline.steps.views import Views
 from gsbench.pipeline.trainer import Status, Trainer
 from gsbench.raster import Rasterizer
 
-PLY_FILE = "point_cloud.ply"
 TRAINING_FILE = "training.json"
-LINEAGE_FILE = "lineage.npz"
 # Options that cannot change the model.
 WITHOUT_EFFECT = ("name", "log_every", "checkpoint_every", "checkpoint_minutes", "volume_histogram")
 
@@ -71,9 +70,9 @@ def train_step(
                 report("iteration", status.step, options.iterations, note)
 
             gaussians = trainer.run(folder, show)
-        write_ply(gaussians, folder / PLY_FILE)
+        write_ply(gaussians, folder / POINT_CLOUD)
         lineage: dict[str, Any] = {name: tensor.numpy() for name, tensor in densifier.lineage.state_dict().items()}
-        np.savez_compressed(folder / LINEAGE_FILE, **lineage)
+        np.savez_compressed(folder / LINEAGE, **lineage)
         summary = {
             "iterations": trainer.step,
             "num_init_points": len(initial),

@@ -1,0 +1,33 @@
+"""The names of files and folders: what lies in the runs folder, and what in a trial's. Spelled here and nowhere else.
+
+A trial lies in ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>/``.
+"""
+
+from __future__ import annotations
+
+# in the runs folder, beside the experiments
+STORE = "store"  # results of stages by content
+ARTIFACTS, DATABASE = "mlartifacts", "mlflow.db"  # MLflow's mirror
+IN_RUNS = (STORE, ARTIFACTS, DATABASE)
+
+# in an experiment's folder
+PLAN = "plan.json"  # the trials that were asked for
+TRIAL_GLOB = "*/*/*-seed*"  # the trials that are there
+
+# in a trial's folder
+CONFIG = "config.yaml"
+RESULTS = "results.json"  # written last: a trial that has it is complete
+FAILED = "failed.json"  # why it failed
+LOG = "log.txt"
+LOCK = ".lock"
+INPUTS = "inputs.json"  # what the results were made of: a finished trial is recognised without reading photographs
+BUILDING = "building.json"  # the stage that an unfinished trial is at, and where
+INIT_REPORT = "init_report.json"
+PER_VIEW = "per_view.csv"
+CURVES = "metrics.jsonl"  # of the training
+EVENTS = "events.jsonl"  # what every refinement did
+HISTOGRAMS = "volume_histograms.jsonl"
+POINT_CLOUD = "point_cloud.ply"
+LINEAGE = "lineage.npz"  # for each Gaussian its parent, and the rule that made it
+RENDERS, GROUND_TRUTH, MAPS = "renders", "ground_truth", "maps"  # a file for each test view
+FIGURES = "figures"  # pictures for the report
