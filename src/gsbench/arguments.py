@@ -3,13 +3,40 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import NoReturn
 
 from gsbench.errors import InputError
+from gsbench.words import is_path
+
+MAX_PORT = 65535
 
 
 class ArgumentParser(argparse.ArgumentParser):
     """An argparse parser that raises InputError for what it does not understand; ``--help`` prints and exits."""
 
     def error(self, message: str) -> NoReturn:
-        raise InputError(f"{self.prog.removeprefix('gsbench ')}: {message} (see {self.prog} --help)")
+        verb = self.prog.removeprefix("gsbench").strip()
+        raise InputError(f"{verb}{': ' if verb else ''}{message} (see {self.prog} --help)")
+
+
+def port(text: str) -> int:
+    """A TCP port, 0 for any free one; an argument's ``type``."""
+    if not text.isascii() or not text.isdigit() or int(text) > MAX_PORT:
+        raise argparse.ArgumentTypeError(f"must be a number from 0 to {MAX_PORT}, got {text!r}")
+    return int(text)
+
+
+def path(text: str) -> Path:
+    """A path that is not empty, with ``~`` in place; an argument's ``type``."""
+    if not is_path(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is no path")
+    return Path(text).expanduser()
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Different names with commas between them; an argument's ``type``."""
+    words = tuple(word.strip() for word in text.split(","))
+    if not all(words) or len(set(words)) < len(words):
+        raise argparse.ArgumentTypeError(f"must be different names, comma between, got {text!r}")
+    return words

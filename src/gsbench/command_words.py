@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from gsbench.words import closest
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")
 NAMED_APART = ("name", "seed")  # not hashed, and yet each of their values has a trial of its own
+KEY = re.compile(r"[+~]*\w+([./]\w+)*")
 READ_OF_HYDRA = ("hydra.searchpath", "hydra.mode")
 # Of Hydra's own settings, those that people try; what they want stands beside.
 HYDRA_REFUSALS = {
@@ -59,14 +62,19 @@ def search_path(folders: Sequence[Path], overrides: Sequence[str]) -> list[str]:
         return []
     if len(folders) > 1 or any(word.startswith("hydra.searchpath=") for word in overrides):
         raise InputError("--config-dir names one folder: for several, give hydra.searchpath=[file://A,file://B] alone")
-    if folders[0] == Path() or not folders[0].is_dir():
-        raise InputError(f"--config-dir {'' if folders[0] == Path() else folders[0]}: no such folder")
+    if folders[0] == Path():
+        raise InputError("--config-dir needs a folder")
+    if not folders[0].is_dir():
+        raise InputError(f"--config-dir {folders[0]}: no such folder")
     escaped = str(folders[0].resolve()).replace("'", "\\'")
     return [f"hydra.searchpath=['file://{escaped}']"]
 
 
 def check_words(words: Sequence[str]) -> None:
     """Raise InputError, one line, for the first word that nothing would read or that Hydra would choke on."""
+    experiments = [word for word in words if word.startswith("+experiment=")]
+    if len(experiments) > 1:
+        raise InputError(f"{' '.join(experiments)}: two experiments are two sweeps: give a command for each")
     for word in words:
         override = parse_word(word)
         key = override.get_key_element().lstrip("+~")
@@ -89,14 +97,20 @@ def parse_word(word: str) -> Override:
     try:
         override = OverridesParser.create().parse_override(word)
     except HydraException as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(
-            f"{word!r} is not a setting like key=value ({reason}); a value with special characters needs quotes of its "
-            "own, as in 'scene.path=\"/a, b\"'"
-        ) from error
+        reason = re.sub(r",? expecting .*", "", str(error).splitlines()[0])
+        raise InputError(f"{word!r} is not a setting like key=value ({reason}){_quoted(word)}") from error
     if not override.key_or_group.strip():
-        raise InputError(f"{word!r} names no setting before the '='")
+        raise InputError(f"{word!r} names no setting")
     return override
+
+
+def _quoted(word: str) -> str:
+    """How a word would be read whose value has characters that mean something to Hydra."""
+    key, _, value = word.partition("=")
+    if not KEY.fullmatch(key):
+        return ""
+    quoted = f"{key}='{value}'" if '"' in value else f'{key}="{value}"'
+    return f"; special characters need quotes of their own, which the shell must leave: {shlex.quote(quoted)}"
 
 
 def is_sweep(word: str) -> bool:

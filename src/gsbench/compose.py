@@ -58,6 +58,8 @@ def compose_trials(overrides: Sequence[str], multirun: bool = False) -> list[Com
 def compose_one(overrides: Sequence[str]) -> Composed:
     """The configuration of the single trial that ``overrides`` describe, as ``Composed.overrides`` has them."""
     check_words(overrides)
+    if swept := [word for word in overrides if is_sweep(word)]:
+        raise InputError(f"{swept[0]} lists several values: choose one")
     with _hydra():
         return _composed(_compose(overrides, overrides), overrides)
 
@@ -78,7 +80,10 @@ def _sweep(words: Sequence[str], given: Sequence[str]) -> Iterator[Composed]:
         key = override.get_key_element()
         if override.is_sweep_override():
             check_sweep(override)
-            grid[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+            try:
+                grid[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+            except ValueError as error:  # such as a range of steps of 0
+                raise InputError(f"{override.input_line}: {error}") from error
             if not grid[key]:
                 raise InputError(f"{override.input_line} lists no value")
         else:
@@ -159,7 +164,7 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
         own = any(word.startswith(f"{parent}._target_=") for word in overrides)
         hint = f"; a key that only your class has is added with a plus: +{key}=…" if own else ""
         near = f"{closest(bad, known)}{hint}"
-        return f"{key} is not a setting{file}{near} ({parent or 'top level'} has: {', '.join(known)})"
+        return f"{key} is not a setting{file}{near} ({parent or 'top level'} has: {', '.join(known) or 'no settings'})"
     group = re.search(
         r"Could not override '([\w/]+)'\.?\s*(?:Did you mean to override|No match in the defaults list)", text
     )
@@ -178,6 +183,9 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
     absent = re.search(r"[Mm]issing mandatory value: ([\w.]+)", text)
     if absent:
         return f"{absent.group(1)} is not set: give it a value"
+    folder = re.search(r"provider=.* path=(.*) is not available", text)
+    if folder:
+        return f"hydra.searchpath names {folder.group(1)}: no such folder"
     place = re.search(r"full_key: ([\w.\[\]]+)", text)
     text = re.sub(r"\s*(full_key|reference_type|object_type)[:=].*", "", text)
     return (f"{place.group(1)}: " if place else "") + " ".join(text.split())[:MAX_MESSAGE]

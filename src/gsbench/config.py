@@ -27,12 +27,12 @@ from gsbench.eval.facts import known_keys, lpips_variants
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.layout import IN_RUNS
 from gsbench.raster import executors
-from gsbench.settings import Fraction, check_settings, checked
+from gsbench.scene.sizes import MIN_SIZE, check_final_size
+from gsbench.settings import Fraction, PathName, check_settings, checked
 from gsbench.source import source_of
 from gsbench.words import closest
 
 ALLOWED_TARGETS = ("gsbench.",)  # a ``_target_`` is code: only these prefixes, and those in ``allow_targets``
-MIN_SIZE = 16  # px: the least side of an image that is worth training on
 MAX_SIZE = 16_384  # px, of a picture of the courtyard
 MAX_SEED = 2**63 - 1  # torch's generators take no larger one
 MAX_NAME_BYTES = 100  # of a name: folders are made of two, and file systems end at 255
@@ -46,12 +46,14 @@ def is_folder_name(value: str) -> bool:
     return is_plain and value[:1] not in ("", ".", "-") and len(value.encode()) <= MAX_NAME_BYTES
 
 
-def is_path(value: str) -> bool:
-    """Whether a text can be a path: not empty, no control characters, no ``~user`` that is not known."""
-    try:
-        return value.strip() != "" and value.isprintable() and bool(Path(value).expanduser())
-    except RuntimeError:
-        return False
+def is_address(value: str) -> bool:
+    """Whether a text can be the address of a tracker."""
+    return re.fullmatch(r"[a-z][a-z0-9+.-]*://\S*", value) is not None and value.isprintable()
+
+
+def are_different(values: list[Any]) -> bool:
+    """Whether no value stands twice in a list."""
+    return len(set(values)) == len(values)
 
 
 FolderName = Annotated[str, Predicate(is_folder_name), doc("a plain folder name")]
@@ -60,15 +62,18 @@ ExperimentName = Annotated[
     Predicate(lambda name: is_folder_name(name) and name not in IN_RUNS),
     doc(f"a plain folder name, and none of {', '.join(IN_RUNS)}"),
 ]
-PathName = Annotated[str, Predicate(is_path), doc("a path")]
+Address = Annotated[str, Predicate(is_address), doc("an address such as http://HOST:PORT")]
+TargetName = Annotated[
+    str,
+    Predicate(lambda name: "." in name and all(part.isidentifier() for part in name.split("."))),
+    doc("the import path of a class, such as mine.MyClass"),
+]
 ProtocolName = Annotated[
     str, Predicate(lambda name: name in PROTOCOLS), doc(" or ".join(f"'{name}'" for name in PROTOCOLS))
 ]
-LpipsVariant = Annotated[
-    str,
-    Predicate(lambda name: name in lpips_variants()),
-    doc(f"{', '.join(map(repr, lpips_variants()[:-1]))} or {lpips_variants()[-1]!r}"),
-]
+AT_RULE = "a list of different iterations, at which the test views are measured beside the last"
+LPIPS_RULE = f"a list of {', '.join(lpips_variants())}, each at most once"
+LpipsVariant = Annotated[str, Predicate(lambda name: name in lpips_variants())]
 DeviceName = Annotated[
     str,
     Predicate(lambda name: re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", name) is not None),
@@ -100,12 +105,14 @@ class SceneConfig:
         check_settings(self, "scene")
         if self.kind != "courtyard" and not self.path:
             raise InputError("scene.path is not set: say where the capture lies, for example scene.path=/my/photos")
+        if self.kind == "courtyard":
+            check_final_size((self.width, self.height), self.downscale, self.max_size, "the courtyard")
 
 
 @dataclass
 class RasterConfig:
     name: str = MISSING  # auto, or an executor of gsbench.raster.executors
-    _target_: str | None = None  # a class of your own, instead; its options are further keys
+    _target_: TargetName | None = None  # a class of your own, instead; its options are further keys
 
     def __post_init__(self) -> None:
         check_settings(self, "raster")
@@ -152,10 +159,12 @@ class TrainConfig:
 class EvalConfig:
     name: str = MISSING
     protocol: ProtocolName = MISSING
-    lpips: list[LpipsVariant] = field(default_factory=lambda: list(lpips_variants()))
+    lpips: Annotated[list[LpipsVariant], Predicate(are_different), doc(LPIPS_RULE)] = field(
+        default_factory=lambda: list(lpips_variants())
+    )
     flip: bool = True
     extra: dict[str, Any] = field(default_factory=dict)  # metrics of your own: {name: {_target_: mine.MyMetric}}
-    at: list[PositiveInt] = field(default_factory=list)  # iterations to measure the test views at, too
+    at: Annotated[list[PositiveInt], Predicate(are_different), doc(AT_RULE)] = field(default_factory=list)
     maps: bool = False  # keep maps of depth, volume and distance to the initial cloud: where an arm helps
     weights: PathName | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
     download: bool = True  # fetch missing weights, checked by checksum
@@ -173,10 +182,18 @@ class EvalConfig:
 
 
 @dataclass
+class ComponentConfig:
+    """What ``init`` and ``densify`` have in common; their other keys are the options of the class."""
+
+    name: FolderName
+    _target_: TargetName
+
+
+@dataclass
 class TrackingConfig:
     name: str = MISSING
     enabled: bool = True
-    uri: str | None = None  # null: sqlite in the runs folder
+    uri: Address | None = None  # null: sqlite in the runs folder
     flush_seconds: PositiveFloat = 10.0
     patience_seconds: NonNegativeFloat = 30.0  # with a slow tracker, at the end of a trial; `gsbench sync` mends it
     images: NonNegativeInt = 4  # test renders mirrored per trial
@@ -298,9 +315,10 @@ def check(config: DictConfig) -> None:
     for group, schema in GROUP_SCHEMAS.items():
         schema(**_settings_of(config, group))
     for group in COMPONENTS:
-        name = _group(config, group).get("name")
-        if not isinstance(name, str | int | float) or not is_folder_name(str(name)):
-            raise InputError(f"{group}.name must be a plain folder name, got {name!r}")
+        values = _group(config, group)
+        checked(ComponentConfig, {key: values.get(key) for key in ("name", "_target_")}, group)
+    if late := [step for step in config.eval.at if step > config.train.iterations]:
+        raise InputError(f"eval.at names iteration {late[0]}, and train.iterations is {config.train.iterations}")
     for group in (*COMPONENTS, *(["raster"] if config.raster._target_ is not None else [])):
         check_target(config[group].get("_target_"), group, config.allow_targets)
     for name, options in config.eval.extra.items():

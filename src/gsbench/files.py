@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from gsbench.errors import GsbenchError, InputError
@@ -115,15 +116,19 @@ def checked_runs_folder(name: str) -> Path:
 
 
 def make_runs_folder(folder: Path) -> None:
-    """Make the runs folder; raises InputError where it cannot be made, and OSError on a full disk."""
+    """Make the runs folder, and see that it can be filled.
+
+    Raises InputError where it cannot, and OSError where the disk is full or writing is forbidden (`storage_errors`).
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix=".probe-", dir=folder):
+            pass
     except OSError as error:
-        if error.errno in FULL:
+        if error.errno in (*FULL, *FORBIDDEN):
             raise
-        reason = os.strerror(error.errno) if error.errno else error
         raise InputError(
-            f"the runs folder {folder} cannot be made ({reason}): set runs=FOLDER or GSBENCH_RUNS"
+            f"{folder} cannot be the runs folder ({error.strerror}): set runs=FOLDER or GSBENCH_RUNS to another folder"
         ) from error
 
 
@@ -159,6 +164,7 @@ def _free(folder: Path) -> int:
     while not place.exists() and place != place.parent:
         place = place.parent
     try:
-        return shutil.disk_usage(place).free
+        usage = shutil.disk_usage(place)
     except OSError:
         return NEARLY_NOTHING
+    return usage.free if usage.total else NEARLY_NOTHING  # a file system without a size, such as /proc, is never full

@@ -14,14 +14,17 @@ import sys
 import types
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from annotated_types import DocInfo, GroupedMetadata, Interval
+from annotated_types import DocInfo, GroupedMetadata, Interval, Predicate, doc
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from gsbench.errors import InputError
-from gsbench.words import closest
+from gsbench.words import closest, is_path
 
+PathName = Annotated[str, Predicate(is_path), doc("a path")]
+AnyPath = Annotated[str | Path, Predicate(lambda path: is_path(str(path))), doc("a path")]
 Fraction = Annotated[float, Interval(ge=0, le=1)]
 OpenFraction = Annotated[float, Interval(gt=0, lt=1)]
 
@@ -58,7 +61,8 @@ def checked(cls: type, values: Mapping[str, Any], group: str) -> dict[str, Any]:
 def unknown_setting(key: str, name: str, known: Iterable[str]) -> str:
     """The words for a ``key`` whose last part ``name`` is none of the ``known``."""
     known = list(known)
-    return f"{key} is not a setting{closest(name, known)} (there are: {', '.join(known) or 'none'})"
+    there = f"there are: {', '.join(known)}" if known else "there are no settings"
+    return f"{key} is not a setting{closest(name, known)} ({there})"
 
 
 def option_fields(cls: type) -> list[dataclasses.Field[Any]]:

@@ -1,9 +1,10 @@
-"""Numbers as people say them, and the nearest right word for a wrong one."""
+"""Numbers as people say them, the nearest right word for a wrong one, and what can be a path."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from pathlib import Path
 
 
 def counted(count: int, noun: str) -> str:
@@ -24,7 +25,8 @@ def readable_time(seconds: float) -> str:
 
 def closest(word: str, choices: Iterable[str]) -> str:
     """'; did you mean X?' where one choice is near, else ''."""
-    near = difflib.get_close_matches(word, list(choices), n=1)
+    choices = list(choices)
+    near = difflib.get_close_matches(word, choices, n=1) or difflib.get_close_matches(word.lower(), choices, n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
 
@@ -36,3 +38,11 @@ def readable_bytes(count: int | None) -> str:
         if count >= size:
             return f"{count / size:.3g} {unit}"
     return f"{count} bytes"
+
+
+def is_path(value: str) -> bool:
+    """Whether a text can be a path: not empty, no control characters, no ``~user`` that is not known."""
+    try:
+        return value.strip() != "" and value.isprintable() and bool(Path(value).expanduser())
+    except RuntimeError:
+        return False

@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.scene.images import downscaled_size, image_size, read_image, resize_image, same_up_to_rounding
+from gsbench.scene.images import image_size, read_image, resize_image, same_up_to_rounding
+from gsbench.scene.sizes import downscaled_size
 
 from .conftest import smooth_image
 

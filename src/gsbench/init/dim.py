@@ -19,7 +19,7 @@ from gsbench.init.network_weights import ALIKED_WEIGHTS, EXTRACTOR_WEIGHTS, LIGH
 from gsbench.init.relay import run_with_progress
 from gsbench.init.timer import Timer
 from gsbench.scene.types import Capture
-from gsbench.settings import Fraction
+from gsbench.settings import AnyPath, Fraction
 from gsbench.weights import find_all_weights
 
 logger = logging.getLogger(__name__)
@@ -96,7 +96,7 @@ class Dim(FeatureInitializer):
     nms_radius: Annotated[int, Interval(ge=1, le=50)] | None = None
     aliked_model: AlikedModel = "n16"
     filter_threshold: Fraction = 0.1
-    weights: str | Path | None = None
+    weights: AnyPath | None = None
     download: bool = True
 
     def __post_init__(self) -> None:

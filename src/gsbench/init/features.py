@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.scene.images import downscaled_size, read_image
+from gsbench.scene.images import read_image
+from gsbench.scene.sizes import downscaled_size
 
 GPU_MEMORY_MEND = "lower init.max_image_size or init.max_keypoints, or set init.device=cpu"
 

@@ -12,6 +12,7 @@ from gsbench.errors import InputError
 from gsbench.init.base import GAUSSIANS_FILE, InitReport, PointCloud, Progress, no_progress
 from gsbench.init.placed import PlacedCloud
 from gsbench.scene.types import Capture
+from gsbench.settings import AnyPath
 
 if TYPE_CHECKING:
     import pycolmap
@@ -26,7 +27,7 @@ class Ply(PlacedCloud):
 
     name: ClassVar[str] = "ply"
 
-    path: str | Path
+    path: AnyPath
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -55,6 +55,10 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
         raise
     except (TypeError, ValueError) as error:
         raise InputError(f"{group}: {error}") from error
+    except Exception as error:  # a user's class may raise anything
+        if target.startswith(ALLOWED_TARGETS):
+            raise
+        raise InputError(f"{group}: {target} cannot be made ({type(error).__name__}: {error})") from error
 
 
 def build_rasterizer(

@@ -5,7 +5,6 @@ Every image becomes uint8 RGB. EXIF orientation is ignored, as COLMAP ignores it
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Literal
 
@@ -60,26 +59,6 @@ def read_image(path: Path) -> NDArray[np.uint8]:
             rgba = image.convert("RGBA")
             image = Image.alpha_composite(Image.new("RGBA", rgba.size, (0, 0, 0, 255)), rgba)
         return np.array(image.convert("RGB"), dtype=np.uint8)
-
-
-def downscaled_size(width: int, height: int, downscale: int = 1, max_size: int | None = None) -> tuple[int, int]:
-    """The size after dividing by ``downscale`` and then, if need be, shrinking the longest side to ``max_size``.
-
-    Sides are rounded half up, and never below 1; the size never grows.
-
-    >>> downscaled_size(4946, 3286, downscale=4)
-    (1237, 822)
-    >>> downscaled_size(4946, 3286, max_size=1600)
-    (1600, 1063)
-    """
-    if downscale < 1:
-        raise InputError(f"scene.downscale must be at least 1, got {downscale}")
-    if max_size is not None and max_size < 1:
-        raise InputError(f"scene.max_size must be at least 1 px, got {max_size}")
-    longest = max(width, height)
-    # one fraction, so that the longest side comes out as exactly max_size
-    numerator, denominator = (max_size, longest) if max_size and max_size * downscale < longest else (1, downscale)
-    return tuple(max(1, math.floor(side * numerator / denominator + 0.5)) for side in (width, height))  # type: ignore[return-value]
 
 
 def resize_image(

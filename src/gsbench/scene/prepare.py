@@ -19,7 +19,8 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.isolate import CrashError, run_isolated
-from gsbench.scene.images import Resample, downscaled_size, read_image, resize_image
+from gsbench.scene.images import Resample, read_image, resize_image
+from gsbench.scene.sizes import downscaled_size
 
 PINHOLE_NAMES = ("SIMPLE_PINHOLE", "PINHOLE")
 _PNG_COMPRESSION = 1  # zlib level: lossless at any level, and this one writes about five times as fast as the default

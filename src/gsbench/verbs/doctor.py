@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Literal
 
 from gsbench.arguments import ArgumentParser
-from gsbench.files import explain_storage
 from gsbench.install import install_command
 from gsbench.layout import DATABASE, STORE
 from gsbench.pipeline.resources import available_threads
@@ -198,8 +197,8 @@ def _is_writable(folder: Path) -> bool:
     try:
         with tempfile.TemporaryFile(dir=_existing(folder)):
             return True
-    except OSError as error:
-        return explain_storage(error, folder) is None
+    except OSError:
+        return False
 
 
 def _existing(folder: Path) -> Path:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gsbench.arguments import ArgumentParser
+from gsbench.arguments import ArgumentParser, path
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.layout import POINT_CLOUD, STORE
@@ -35,14 +35,16 @@ def main(argv: Sequence[str], runs: Path) -> int:
         "--to", choices=list(FORMATS), help="; ".join(f"{name}: {text}" for name, text in FORMATS.items())
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="PATH", help="the file, or for init the folder, to write"
+        "--out", type=path, required=True, metavar="PATH", help="the file, or for init the folder, to write"
     )
     options = parser.parse_args(argv)
     is_init = len(options.trial) == 2 and options.trial[0] == "init"
     if len(options.trial) > 1 and not is_init:
         raise InputError(f"one TRIAL is exported, not {len(options.trial)}; for an initial model: export init TRIAL")
     trial = find_trial(options.trial[-1], runs)
-    out = options.out.expanduser()
+    out = options.out
+    if out.is_dir() and not is_init:
+        raise InputError(f"--out {out} is a folder: name the file to write")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         if is_init:

@@ -7,11 +7,12 @@ from pathlib import Path
 
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.results import load_experiment
-from gsbench.arguments import ArgumentParser
+from gsbench.arguments import ArgumentParser, path
 from gsbench.errors import InputError
 from gsbench.files import write_text
 
 REPORT_NAME = "report.html"
+FILE_SUFFIXES = (".html", ".htm")
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -20,16 +21,27 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
     parser = ArgumentParser(prog="gsbench report", description="One HTML file with the evidence of an experiment.")
     parser.add_argument("experiment")
-    parser.add_argument("--out", type=Path, metavar="FILE", help=f"default: {REPORT_NAME} in the experiment's folder")
-    parser.add_argument("--baseline", default=BASELINE, help=f"the densifier that others are held against ({BASELINE})")
+    parser.add_argument(
+        "--out", type=path, metavar="PATH", help=f"a folder or a .html file; default: {REPORT_NAME} with the experiment"
+    )
+    parser.add_argument("--baseline", help=f"the densifier that others are held against ({BASELINE})")
     options = parser.parse_args(argv)
     experiment = load_experiment(runs, options.experiment)
-    path = options.out or experiment.folder / REPORT_NAME
-    text = build_report(experiment, options.baseline)
+    densifiers = sorted({trial.densify for trial in experiment.trials})
+    if options.baseline is not None and options.baseline not in densifiers:
+        raise InputError(f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}")
+    file = experiment.folder / REPORT_NAME if options.out is None else _file_at(options.out, experiment.name)
+    text = build_report(experiment, options.baseline or BASELINE)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, text)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_text(file, text)
     except OSError as error:
-        raise InputError(f"cannot write {path} ({error.strerror}); give another --out") from None
-    print(path)
+        raise InputError(f"cannot write {file} ({error.strerror}); give another --out") from None
+    print(file)
     return 0
+
+
+def _file_at(out: Path, experiment: str) -> Path:
+    """The file that ``--out`` means: itself, or one in that folder, beside other experiments' tables and reports."""
+    is_file = out.suffix.lower() in FILE_SUFFIXES and not out.is_dir()
+    return out if is_file else out / f"{experiment}-{REPORT_NAME}"

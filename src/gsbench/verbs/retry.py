@@ -29,7 +29,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     )
     parser.add_argument("experiment")
     parser.add_argument(
-        "changes", nargs="*", metavar="KEY=VALUE", help="settings that make no other trial: launch=slurm …"
+        "changes", nargs="*", default=[], metavar="KEY=VALUE", help="settings that make no other trial: launch=slurm …"
     )
     parser.add_argument("--dry-run", action="store_true", help="only list them")
     options = parser.parse_args(argv)
@@ -57,13 +57,16 @@ def main(argv: Sequence[str], runs: Path) -> int:
 def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[str]) -> Composed:
     """The trial in ``folder``: from its planned overrides, else from the configuration that it wrote."""
     if planned is not None:
-        own = [
-            word for word in planned.overrides if word.split("=")[0] not in {change.split("=")[0] for change in changes}
-        ]
+        changed = {change.split("=")[0] for change in changes}
+        own = [word for word in planned.overrides if word.split("=")[0] not in changed]
         where = planned.cwd if Path(planned.cwd).is_dir() else os.getcwd()
         if where != os.getcwd():
             os.chdir(where)  # relative paths were meant from there, and the trials are run from there
         trial = compose_one([*own, *changes])
+        if changes and _identity(trial) != _identity(compose_one(planned.overrides)):
+            raise InputError(
+                f"{' '.join(changes)} would make other trials than those of the plan: give the sweep's own command"
+            )
         return Composed(trial.values | {"runs": str(runs)}, trial.yaml, trial.overrides)
     if changes:
         raise InputError(
@@ -71,3 +74,9 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
         )
     values = read_config(folder) | {"runs": str(runs)}
     return Composed(values, yaml.safe_dump(values, sort_keys=False), ())
+
+
+def _identity(trial: Composed) -> Path:
+    """The trial's place within any runs folder."""
+    paths = TrialPaths.of(trial.values)
+    return paths.folder.relative_to(paths.runs)

@@ -14,7 +14,7 @@ from gsbench.analysis.paper_tables import PAPER_TABLES, paper_tables
 from gsbench.analysis.results import Experiment, Trial, load_experiment
 from gsbench.analysis.table_formats import FORMATS
 from gsbench.analysis.tables import DEFAULT_ROWS, build_table
-from gsbench.arguments import ArgumentParser
+from gsbench.arguments import ArgumentParser, names, path
 from gsbench.errors import InputError
 from gsbench.files import write_text
 
@@ -48,9 +48,9 @@ def _trials(trials: Sequence[Trial], options: argparse.Namespace) -> dict[str, s
 def _tables(experiment: Experiment, trials: Sequence[Trial], options: argparse.Namespace) -> dict[str, str]:
     """The tables as text, each with what its file's name ends in."""
     layout = options.layout or (experiment.name if _is_plain(options) and experiment.name in PAPER_TABLES else "plain")
-    metrics = _words(options.metrics)
+    metrics = options.metrics
     if layout == "plain":
-        rows, columns = _words(options.rows), _words(options.columns) or ()
+        rows, columns = options.rows, options.columns or ()
         if set(rows or ()) & set(columns):
             raise InputError(
                 f"{', '.join(sorted(set(rows or ()) & set(columns)))} stands in --rows and --columns: choose one"
@@ -75,10 +75,16 @@ def _parser() -> ArgumentParser:
     parser.add_argument(
         "--format", choices=[*FORMATS, TRIALS], default="md", help=f"{TRIALS}: CSV with one row a trial instead"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write into this folder instead of printing")
-    parser.add_argument("--rows", metavar="A,B", help=f"fields or config keys (default {','.join(DEFAULT_ROWS)})")
-    parser.add_argument("--columns", metavar="A,B", help="fields or config keys, each crossed with every metric")
-    parser.add_argument("--metrics", metavar="A,B", help="such as psnr,ssim,lpips_squeeze,gaussians,train_time")
+    parser.add_argument("--out", type=path, metavar="DIR", help="write into this folder instead of printing")
+    parser.add_argument(
+        "--rows", type=names, metavar="A,B", help=f"fields or config keys (default {','.join(DEFAULT_ROWS)})"
+    )
+    parser.add_argument(
+        "--columns", type=names, metavar="A,B", help="fields or config keys, each crossed with every metric"
+    )
+    parser.add_argument(
+        "--metrics", type=names, metavar="A,B", help="such as psnr,ssim,lpips_squeeze,gaussians,train_time"
+    )
     parser.add_argument(
         "--where", action="append", default=[], metavar="KEY=VALUE", help="only such trials (repeatable)"
     )
@@ -89,10 +95,6 @@ def _parser() -> ArgumentParser:
 def _is_plain(options: argparse.Namespace) -> bool:
     """No layout of the user's own was asked for."""
     return options.rows is None and options.columns is None
-
-
-def _words(text: str | None) -> tuple[str, ...] | None:
-    return None if text is None else tuple(word.strip() for word in text.split(",") if word.strip())
 
 
 def _conditions(pairs: Sequence[str]) -> dict[str, str]:
@@ -112,6 +114,6 @@ def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
     except OSError as error:
         raise InputError(f"cannot write into {out} ({error.strerror}); give another --out") from None
     for end, text in texts.items():
-        path = out / f"{name}{end}"
-        write_text(path, text)
-        print(path)
+        file = out / f"{name}{end}"
+        write_text(file, text)
+        print(file)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from gsbench.arguments import ArgumentParser
+from gsbench.arguments import ArgumentParser, port
 from gsbench.errors import InputError
 from gsbench.layout import DATABASE
 
@@ -24,11 +24,13 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser(prog="gsbench ui", description="The MLflow dashboard, on this machine only.")
     parser.add_argument("experiment", nargs="?", help="print the address that compares its trials")
     parser.add_argument("--uri", help="the tracker's database or server; default: the one in the runs folder")
-    parser.add_argument("--port", type=int, default=DEFAULT_PORT)
+    parser.add_argument("--port", type=port, default=DEFAULT_PORT)
     parser.add_argument("--print-url", action="store_true", help="only print the address")
     options = parser.parse_args(argv)
     if options.uri is None and not (runs / DATABASE).exists():
         raise InputError(f"no MLflow database in {runs}: run a trial first, or `gsbench sync`, or give --uri")
+    if options.uri is not None and "://" not in options.uri:
+        raise InputError(f"--uri {options.uri} is no address such as sqlite:///FILE or http://HOST:PORT")
     from gsbench.tracking import default_uri
 
     uri = options.uri or default_uri(runs)

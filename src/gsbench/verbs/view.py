@@ -7,7 +7,7 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.arguments import ArgumentParser
+from gsbench.arguments import ArgumentParser, port
 from gsbench.errors import InputError
 from gsbench.install import install_command
 from gsbench.view import ADDRESS
@@ -20,7 +20,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         prog="gsbench view", description="Look at trained models in the browser: one, or two side by side."
     )
     parser.add_argument("trial", nargs="+", metavar="TRIAL", help=ADDRESS)
-    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help=f"on this machine; 0: any ({DEFAULT_PORT})")
+    parser.add_argument("--port", type=port, default=DEFAULT_PORT, help=f"on this machine; 0: any ({DEFAULT_PORT})")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:1")
     options = parser.parse_args(argv)
     if len(options.trial) > 2:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsbench.analysis.results import Trial, load_experiment
+from gsbench.analysis.results import RESULTS, Trial, load_experiment
 from gsbench.densify.volume import log_volume
 from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
@@ -70,7 +70,7 @@ def find_trial(address: str, runs: Path) -> Trial:
 
 
 def _trial_in(folder: Path) -> Trial:
-    if len(folder.parents) < 4:
+    if len(folder.parents) < 4 or not (folder / RESULTS).is_file():
         raise InputError(f"{folder} is not a trial's folder; give {ADDRESS}")
     experiment = load_experiment(folder.parents[3], folder.parents[2].name)
     for trial in experiment.trials:

@@ -10,7 +10,9 @@ from gsbench.pipeline.progress import progress
 from gsbench.pipeline.stages import CAPTURE
 from gsbench.pipeline.step import Step
 from gsbench.scene.courtyard import render_courtyard
+from gsbench.scene.images import image_size
 from gsbench.scene.readers import read_colmap, read_photos
+from gsbench.scene.sizes import check_final_size
 from gsbench.scene.types import Capture
 
 
@@ -39,8 +41,13 @@ def read_capture(options: SceneConfig, made: Path | None) -> Capture:
         return read_colmap(options.name, made, exact_poses=True, **selection)
     path = Path(str(options.path)).expanduser()
     if options.kind == "photos":
-        return read_photos(options.name, path, images=options.images, **selection)
-    return read_colmap(options.name, path, images=options.images, sparse=options.sparse, **selection)
+        capture = read_photos(options.name, path, images=options.images, **selection)
+    else:
+        capture = read_colmap(options.name, path, images=options.images, sparse=options.sparse, **selection)
+    for name in capture.image_names:
+        file = capture.images / name
+        check_final_size(image_size(file), options.downscale, options.max_size, str(file))
+    return capture
 
 
 def split_of(capture: Capture) -> str:
