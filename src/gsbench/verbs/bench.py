@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gsbench.arguments import ArgumentParser
+from gsbench.arguments import ArgumentParser, path
 from gsbench.errors import InputError
 from gsbench.raster.executors import EXECUTORS
+from gsbench.scene.sizes import MIN_SIZE
 
 COLUMNS = (  # of the table
     "raster",
@@ -30,6 +31,8 @@ COLUMNS = (  # of the table
     "peak_memory_mb",
 )
 RATIO_DIGITS = 2
+MAX_SIDE = 16_384  # px
+MAX_COUNT = 1_000_000_000
 
 
 def parser() -> ArgumentParser:
@@ -51,7 +54,7 @@ def parser() -> ArgumentParser:
         choices=("trained", "random"),
         help="like a trained model (default), or as one begins",
     )
-    made.add_argument("--ply", type=Path, help="time this model instead of a synthetic scene")
+    made.add_argument("--ply", type=path, help="time this model instead of a synthetic scene")
     made.add_argument("--repeats", type=_count, default=5, help="turns that count (default 5)")
     made.add_argument("--threads", type=_count, help="CPU threads (default: as many as torch takes)")
     made.add_argument("--json", action="store_true", help="print JSON")
@@ -105,12 +108,14 @@ def _cell(key: str, value: Any) -> str:
 
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"a size is WIDTHxHEIGHT, for example 500x375, got {text!r}")
+    if not all(side.isascii() and side.isdigit() and MIN_SIZE <= int(side) <= MAX_SIDE for side in (width, height)):
+        raise argparse.ArgumentTypeError(
+            f"a size is WIDTHxHEIGHT, sides from {MIN_SIZE} to {MAX_SIDE} px, for example 500x375, got {text!r}"
+        )
     return int(width), int(height)
 
 
 def _count(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"must be a number of at least 1, got {text!r}")
+    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= MAX_COUNT):
+        raise argparse.ArgumentTypeError(f"a count is a whole number from 1 to {MAX_COUNT}, got {text!r}")
     return int(text)
