@@ -95,8 +95,7 @@ def find(name: str) -> Executor:
         if executor.name == name:
             return executor
     raise InputError(
-        f"raster={name} is not known; choose {', '.join(executor.name for executor in EXECUTORS)}, or set "
-        "raster._target_ to a class of your own"
+        f"raster={name} is not known; choose {', '.join(names())}, or set raster._target_ to a class of your own"
     )
 
 

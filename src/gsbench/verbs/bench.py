@@ -12,7 +12,7 @@ from typing import Any
 
 from gsbench.arguments import ArgumentParser, path
 from gsbench.errors import InputError
-from gsbench.raster.executors import EXECUTORS
+from gsbench.raster.executors import AUTO, EXECUTORS
 from gsbench.scene.sizes import MIN_SIZE
 
 COLUMNS = (  # of the table
@@ -72,13 +72,16 @@ def main(argv: Sequence[str], _runs: Path | None = None) -> int:
         raise InputError(str(error)) from error
     if options.ply is not None and not options.ply.is_file():
         raise InputError(f"--ply: {options.ply} does not exist")
+    rasters = options.raster.split(",")
+    if AUTO in rasters:
+        raise InputError(f"--raster {AUTO} is a choice among executors: name those to time")
     if "" not in sys.path:
         sys.path.insert(0, os.getcwd())  # a user's own class lies beside the user
 
     from gsbench.bench import run_bench
 
     rows = run_bench(
-        options.raster.split(","),
+        rasters,
         sizes,
         counts,
         options.ply,
