@@ -120,5 +120,5 @@ def _size(text: str) -> tuple[int, int]:
 
 def _count(text: str) -> int:
     if not (text.isascii() and text.isdigit() and 1 <= int(text) <= MAX_COUNT):
-        raise argparse.ArgumentTypeError(f"a count is a whole number of at least 1 and at most {MAX_COUNT}, got {text!r}")
+        raise argparse.ArgumentTypeError(f"a count is at least 1 and at most {MAX_COUNT}, got {text!r}")
     return int(text)
