@@ -17,7 +17,7 @@ from gsbench.analysis.paper import (
     Printed,
     load_paper,
 )
-from gsbench.analysis.quantities import quantity
+from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import Experiment, Trial
 from gsbench.analysis.tables import Column, Entry, Row, Table, build_table
 from gsbench.errors import InputError
@@ -73,6 +73,29 @@ def agreement(cell: Cell, printed: Printed) -> Agreement:
     return Agreement.DIFFERS
 
 
+def compare_with_printed(
+    cell: Cell | None, printed: Printed | None, shown: Quantity, tally: Counter[Agreement]
+) -> list[Entry]:
+    """The printed number, and how far the measured cell is from it; how they agree is added to ``tally``."""
+    if printed is None or cell is None or cell.mean is None:
+        return [Entry(printed.text if printed else ""), Entry("—")]
+    found = agreement(cell, printed)
+    tally[found] += 1
+    decimals = max(shown.decimals, len(printed.text.partition(".")[2]))
+    delta = f"{cell.mean - printed.value:+.{decimals}f}".replace("-", "−")
+    return [Entry(printed.text), Entry(f"{delta} {found.value}", cell=cell)]
+
+
+def legend(tally: Counter[Agreement]) -> str:
+    """What the marks mean, and how many cells have each."""
+    return (
+        f"Δ is measured minus printed. Of {sum(tally.values())} cells {tally[Agreement.ROUNDING]} are within rounding "
+        f"(=), {tally[Agreement.INTERVAL]} within our {CONFIDENCE:.0%} t interval of the mean (≈), "
+        f"{tally[Agreement.DIFFERS]} differ (≠). The paper prints no deviation, so the spread of its own trials is not "
+        "taken into account; a single trial has no interval."
+    )
+
+
 def t_half_width(std: float, count: int) -> float:
     """Half the width of Student's 95 % interval of a mean of ``count`` values."""
     from scipy.special import stdtrit  # here, for a quick start of what needs no interval
@@ -108,25 +131,10 @@ def _differences(
             for key in compared:
                 cell = row.entries[keys.index(key) * len(arms) + place].cell
                 printed = printed_table.get((scene, *paper_arms[arm], key))
-                if printed is None or cell is None or cell.mean is None:
-                    entries += [Entry(printed.text if printed else ""), Entry("—")]
-                    continue
-                found = agreement(cell, printed)
-                tally[found] += 1
-                decimals = max(quantities[key].decimals, len(printed.text.partition(".")[2]))
-                delta = f"{cell.mean - printed.value:+.{decimals}f}".replace("-", "−")
-                entries += [Entry(printed.text), Entry(f"{delta} {found.value}", cell=cell)]
+                entries += compare_with_printed(cell, printed, quantities[key], tally)
             if any(entry.cell is not None for entry in entries):
                 rows.append(Row((scene, _arm_name(name, paper_arms[arm])), tuple(entries)))
     heads = tuple(Column(quantities[key].name, heading) for key in compared for heading in ("paper", "Δ"))
-    total = sum(tally.values())
-    legend = (
-        f"Δ is measured minus printed. Of {total} cells {tally[Agreement.ROUNDING]} are within rounding (=), "
-        f"{tally[Agreement.INTERVAL]} within our {CONFIDENCE:.0%} t interval of the mean (≈), "
-        f"{tally[Agreement.DIFFERS]} differ (≠). The paper "
-        "prints no deviation, so the spread of its own trials is not taken into account; a single trial "
-        "has no interval."
-    )
     left_out = [key for key in keys if key not in compared]
     if left_out:
         notes = [*notes, f"Not compared, since the paper prints no such number: {', '.join(left_out)}."]
@@ -135,7 +143,7 @@ def _differences(
         ("scene", "arm"),
         heads,
         tuple(rows),
-        (legend, *notes),
+        (legend(tally), *notes),
         tuple((key, heading) for key in compared for heading in ("paper", "delta")),
     )
 

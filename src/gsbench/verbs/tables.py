@@ -7,10 +7,11 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gsbench.analysis.cells import select_trials
+from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.frame import to_frame
 from gsbench.analysis.paper import inconsistencies, load_paper
 from gsbench.analysis.paper_tables import PAPER_TABLES, paper_tables
+from gsbench.analysis.published import published_names, published_table
 from gsbench.analysis.results import Experiment, Trial, load_experiment
 from gsbench.analysis.table_formats import FORMATS
 from gsbench.analysis.tables import DEFAULT_ROWS, build_table
@@ -39,7 +40,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 def _trials(trials: Sequence[Trial], options: argparse.Namespace) -> dict[str, str]:
     """One row a trial; what only a table has is refused."""
-    for name in ("rows", "columns", "metrics", "layout"):
+    for name in ("rows", "columns", "metrics", "layout", "paper"):
         if getattr(options, name) is not None:
             raise InputError(f"--format {TRIALS} shows every column of every trial, and takes no --{name}")
     return {"-trials.csv": to_frame(trials).to_csv(index=False, lineterminator="\n")}
@@ -59,8 +60,10 @@ def _tables(experiment: Experiment, trials: Sequence[Trial], options: argparse.N
     else:
         tables = paper_tables(experiment, layout, trials, metrics)
     suffix, writer = FORMATS[options.format]
-    ends = ("", "-difference")
-    return {f"{end}.{suffix}": writer(table) for end, table in zip(ends, tables, strict=False)}
+    named = dict(zip(("", "-difference"), tables, strict=False))
+    if options.paper is not None:
+        named[f"-{options.paper}"] = published_table(with_variants(trials), options.paper)
+    return {f"{end}.{suffix}": writer(table) for end, table in named.items()}
 
 
 def _parser() -> ArgumentParser:
@@ -87,6 +90,11 @@ def _parser() -> ArgumentParser:
     )
     parser.add_argument(
         "--where", action="append", default=[], metavar="KEY=VALUE", help="only such trials (repeatable)"
+    )
+    parser.add_argument(
+        "--paper",
+        metavar="NAME",
+        help=f"also hold the trials against published numbers: {', '.join(published_names())}",
     )
     parser.add_argument("--layout", choices=[*PAPER_TABLES, "plain"], help="the paper's layout for any experiment")
     return parser
