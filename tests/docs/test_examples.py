@@ -46,7 +46,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    for name in ("gradients", "largest", "mine", "untiled"):
+    for name in ("gradients", "largest", "mine", "shell", "untiled"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return tmp_path
 
@@ -99,6 +99,17 @@ def test_metric(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["report", "gradients"]) == 0
     report = Path("runs/gradients/report.html").read_text()
     assert "gradient error: left of zero is better" in report.replace("gradient error (levels)", "gradient error")
+
+
+@pytest.mark.end_to_end
+def test_initialiser(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An initialiser from one file outside gsbench, through the real program."""
+    found = run_blocks(ROOT / "docs" / "initialiser.md", folder)
+    assert found["status"] == 0, capsys.readouterr().err
+    (results,) = Path("runs").glob("shell/courtyard/shell-none/*/results.json")
+    values = json.loads(results.read_text())
+    assert values["num_init_points"] == 500
+    assert values["init_report"]["init"] == "shell"
 
 
 def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder: Path) -> None:

@@ -15,9 +15,9 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Dim, SiftKornia, read_cloud
-from gsbench.init.extractors import SUPERPOINT_BORDER, build_extractor
+from gsbench.init.extractors import SUPERPOINT_BORDER, build_extractor, extract_features
 from gsbench.init.feature_store import FeatureStore
-from gsbench.init.features import Features, extract_features
+from gsbench.init.features import Features
 from gsbench.init.matching import MutualNearest, build_matcher, match_within_memory
 from gsbench.scene.courtyard import surface_distance
 from gsbench.scene.types import Capture

@@ -20,9 +20,8 @@ from gsbench.init.colmap_database import (
     write_keypoints,
     write_matches,
 )
-from gsbench.init.extractors import build_extractor
-from gsbench.init.feature_settings import FeatureSettings
-from gsbench.init.features import Features, extract_features
+from gsbench.init.extractors import build_extractor, extract_features
+from gsbench.init.features import Features, FeatureSettings
 from gsbench.init.reconstruct import MappingSettings, Verification, map_images
 from gsbench.init.sift import extract_sift
 from gsbench.init.sift_matching import match_sift

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from annotated_types import Interval
@@ -19,6 +22,7 @@ OWN_GAUGE_FOLDER = Path("sparse_own_gauge", "0")  # the same model as its own ma
 REPORT_FILE = "report.json"
 GAUSSIANS_FILE = "gaussians.ply"  # optional: the Gaussians to start from, where there is more than points
 PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
+MIN_IMAGES = 3  # two views have no third that could contradict a wrong geometry
 Poses = Literal["shared", "own"]
 Seed = Annotated[int, Interval(ge=0, le=2**31 - 1)]  # COLMAP takes no larger one
 
@@ -31,6 +35,24 @@ class Progress(Protocol):
 
 def no_progress(phase: str, done: int, total: int) -> None:
     """The `Progress` that tells nobody."""
+
+
+@dataclass(frozen=True)
+class Timer:
+    """Adds up the wall-clock seconds of named phases."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        """Time what happens within the context; a phase may come again."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+    def rounded(self) -> dict[str, float]:
+        """Seconds by phase, to the millisecond."""
+        return {name: round(value, 3) for name, value in self.seconds.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,19 +149,41 @@ class InitReport:
         path.write_text(json.dumps(self.to_dict(), indent=2) + "\n")
 
 
-class Initializer(Protocol):
-    """Makes cameras and a first cloud of points for a capture."""
+@dataclass(frozen=True)
+class Preparation:
+    """What was done before COLMAP: its time, its counts and settings for the report, and what deserves a warning."""
+
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    counts: Mapping[str, int] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+class Initializer(ABC):
+    """Makes cameras and a first cloud of points for a capture. A dataclass: its fields are the options."""
+
+    name: ClassVar[str]  # as reports call it
 
     def needs_reference(self, capture: Capture) -> bool:
         """Whether `run` needs a ``reference`` model for this capture because it came without cameras."""
-        ...
+        return False
 
+    def content(self) -> str | None:
+        """What the result depends on beside the options and the capture: the hash of a file that an option names."""
+        return None
+
+    @abstractmethod
     def run(
-        self, capture: Capture, output_dir: Path, progress: Progress = no_progress, reference: Path | None = None
+        self,
+        capture: Capture,
+        output_dir: Path,
+        progress: Progress = no_progress,
+        reference: Path | None = None,
+        work_dir: Path | None = None,
     ) -> InitReport:
         """Write the model to `MODEL_FOLDER`, the report to `REPORT_FILE` and a picture to `PICTURE_FILE`.
 
         All are below ``output_dir``. The cameras have the sizes of the files in ``capture.images``. ``reference`` is a
-        COLMAP model of the same files whose cameras stand in for those that the capture came with.
+        COLMAP model of the same files whose cameras stand in for those that the capture came with. ``work_dir`` may
+        keep what a later run can use again. Raises ``InputError`` where the capture does not give a model.
         """
-        ...

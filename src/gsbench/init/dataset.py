@@ -7,21 +7,16 @@ from pathlib import Path
 from typing import ClassVar
 
 from gsbench.errors import InputError
-from gsbench.init.base import InitReport, Progress, no_progress
+from gsbench.init.base import Initializer, InitReport, Progress, Timer, no_progress
 from gsbench.init.relay import run_with_progress
-from gsbench.init.timer import Timer
 from gsbench.scene.types import Capture
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dataset:
+class Dataset(Initializer):
     """Takes over the capture's model: restricted to its selected images, cameras scaled to the files."""
 
     name: ClassVar[str] = "dataset"
-
-    def needs_reference(self, capture: Capture) -> bool:
-        """Never: what did not come with the capture is not the dataset's."""
-        return False
 
     def run(
         self,

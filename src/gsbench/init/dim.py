@@ -12,12 +12,12 @@ from annotated_types import Ge, Interval
 from pydantic import NonNegativeFloat, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.init.base import Progress
-from gsbench.init.colmap_initializer import MIN_DETECTION_SIZE, ColmapInitializer, DatabaseTask, Preparation
-from gsbench.init.feature_settings import FeatureSettings
+from gsbench.init.base import Preparation, Progress, Timer
+from gsbench.init.colmap_initializer import ColmapInitializer
+from gsbench.init.colmap_options import MIN_DETECTION_SIZE, DatabaseTask
+from gsbench.init.features import FeatureSettings
 from gsbench.init.network_weights import ALIKED_WEIGHTS, EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS, SUPERPOINT_LICENCE
 from gsbench.init.relay import run_with_progress
-from gsbench.init.timer import Timer
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath, Fraction
 from gsbench.weights import find_all_weights
@@ -63,7 +63,7 @@ class FeatureInitializer(ColmapInitializer):
     def prepare(self, capture: Capture, work_dir: Path, reference: Path | None, progress: Progress) -> Preparation:
         from gsbench.init.extract_and_match import NetworkJob, extract_and_match
 
-        job = NetworkJob(self, capture, reference, work_dir, *self.find_weights())
+        job = NetworkJob(self, self.feature_settings(), self.device, capture, reference, work_dir, *self.find_weights())
         return run_with_progress(extract_and_match, job, progress, what=f"{self.name}: features and matches")
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> None:
@@ -71,7 +71,7 @@ class FeatureInitializer(ColmapInitializer):
         from gsbench.init.extract_and_match import open_store
         from gsbench.init.reconstruct import Verification
 
-        store = open_store(self, task.capture, task.work_dir, *self.find_weights())
+        store = open_store(self.feature_settings(), task.capture, task.work_dir, *self.find_weights())
         write_keypoints(task.database, {name: store.require_features(name).colmap_keypoints for name in task.names})
         matches = {pair: store.require_matches(*pair) for pair in task.pairs}
         matches = {pair: indices for pair, indices in matches.items() if len(indices) > 0}

@@ -10,15 +10,13 @@ from pathlib import Path
 import torch
 
 from gsbench.errors import InputError
-from gsbench.init.base import Progress
-from gsbench.init.colmap_initializer import Preparation, select_images
-from gsbench.init.dim import FeatureInitializer
-from gsbench.init.extractors import build_extractor
+from gsbench.init.base import Preparation, Progress, Timer
+from gsbench.init.colmap_options import ColmapOptions
+from gsbench.init.extractors import build_extractor, extract_features
 from gsbench.init.feature_store import FeatureStore
-from gsbench.init.features import Features, extract_features
+from gsbench.init.features import Features, FeatureSettings
 from gsbench.init.matching import build_matcher, match_within_memory
 from gsbench.init.reconstruct import load_reference, select_pairs
-from gsbench.init.timer import Timer
 from gsbench.scene.types import Capture
 from gsbench.weights import file_sha256
 
@@ -30,7 +28,9 @@ NAMES_IN_WARNING = 5
 class NetworkJob:
     """What the isolated process needs; the weights are checked files, None where none are needed."""
 
-    options: FeatureInitializer
+    options: ColmapOptions
+    settings: FeatureSettings
+    device: str
     capture: Capture
     reference: Path | None
     work_dir: Path
@@ -39,14 +39,13 @@ class NetworkJob:
 
 
 def open_store(
-    options: FeatureInitializer,
+    settings: FeatureSettings,
     capture: Capture,
     work_dir: Path,
     extractor_weights: Path | None,
     matcher_weights: Path | None,
 ) -> FeatureStore:
-    """The store of features and matches for these options and weights."""
-    settings = options.feature_settings()
+    """The store of features and matches for these settings and weights."""
     extraction = {**settings.extraction(), "weights": _digest(extractor_weights)}
     matching = {**settings.matching(), "weights": _digest(matcher_weights)}
     return FeatureStore(work_dir, capture.images, extraction, matching)
@@ -59,10 +58,10 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     """
     options, capture = job.options, job.capture
     torch.set_num_threads(options.num_threads)
-    device = choose_device(options.device)
-    store = open_store(options, capture, job.work_dir, job.extractor_weights, job.matcher_weights)
+    device = choose_device(job.device)
+    store = open_store(job.settings, capture, job.work_dir, job.extractor_weights, job.matcher_weights)
     reference = load_reference(capture, job.reference)
-    names = select_images(options, capture, reference)
+    names = options.select_images(capture, reference)
     pairs = select_pairs(capture.images, names, options, reference)
     timer = Timer()
     with timer.phase("extract"):
@@ -89,8 +88,8 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
             "images_without_keypoints": len(empty),
         },
         settings={
-            **options.feature_settings().extraction(),
-            **options.feature_settings().matching(),
+            **job.settings.extraction(),
+            **job.settings.matching(),
             "weights_sha256": {path.name: file_sha256(path) for path in weights},
         },
         warnings=tuple(warnings),
@@ -113,7 +112,7 @@ def _extract_all(
     job: NetworkJob, store: FeatureStore, names: Sequence[str], device: torch.device, progress: Progress
 ) -> list[str]:
     """Features of all images into the store; returns the names of those without any."""
-    settings, empty = job.options.feature_settings(), []
+    settings, empty = job.settings, []
     extractor = None
     progress("extract", 0, len(names))
     for done, name in enumerate(names, start=1):
@@ -133,7 +132,7 @@ def _match_all(
     job: NetworkJob, store: FeatureStore, pairs: Sequence[tuple[str, str]], device: torch.device, progress: Progress
 ) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
     """Matches of all pairs into the store; returns the pairs without a match, and those matched in part."""
-    settings = job.options.feature_settings()
+    settings = job.settings
     matcher, without, halved = None, [], []
     read = _cached_reader(store, pairs)
     progress("match", 0, len(pairs))

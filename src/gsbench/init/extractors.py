@@ -4,17 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Protocol
 
+import numpy as np
 import torch
+from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.init.feature_settings import FeatureSettings
-from gsbench.init.features import Extractor
+from gsbench.init.features import Features, FeatureSettings
 from gsbench.install import install_command
+from gsbench.scene.images import read_image
+from gsbench.scene.sizes import downscaled_size
 from gsbench.weights import MissingWeights, load_state
 
+GPU_MEMORY_MEND = "lower init.max_image_size or init.max_keypoints, or set init.device=cpu"
 SUPERPOINT_BORDER = 4  # px without keypoints, as in deep-image-matching; its network has no margin of its own
 LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."  # of SuperPoint within a LightGlue checkpoint of transformers
+
+
+class Extractor(Protocol):
+    """Finds features in an image [1, 3, H, W], RGB in [0, 1].
+
+    Returns keypoints [K, 2] in px with the centre of the first pixel at (0, 0), descriptors [K, D] and scores [K].
+    """
+
+    def __call__(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]: ...
 
 
 def build_extractor(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
@@ -23,6 +37,31 @@ def build_extractor(settings: FeatureSettings, weights: Path | None, device: tor
     Raises ``MissingWeights`` where the file does not fit the network.
     """
     return _BUILDERS[settings.extractor](settings, weights, device)
+
+
+def extract_features(
+    path: Path, extractor: Extractor, max_image_size: int, max_keypoints: int, device: torch.device
+) -> Features:
+    """The ``max_keypoints`` strongest features of an image file, shrunk to ``max_image_size`` px for the network.
+
+    Raises ``InputError`` where the image cannot be read or the device runs out of memory.
+    """
+    pixels = read_image(path)  # [H, W, 3]
+    height, width = pixels.shape[:2]
+    network_size = downscaled_size(width, height, max_size=max_image_size)
+    if network_size != (width, height):
+        pixels = np.asarray(Image.fromarray(pixels).resize(network_size, Image.Resampling.LANCZOS))
+    image = torch.from_numpy(pixels.astype(np.float32) / 255.0).permute(2, 0, 1)[None]  # [1, 3, h, w]
+    try:
+        with torch.inference_mode():
+            keypoints, descriptors, scores = (part.float().cpu() for part in extractor(image.to(device)))
+    except torch.OutOfMemoryError as error:
+        size = f"{network_size[0]}x{network_size[1]}"
+        raise InputError(f"{path.name}: {device} ran out of memory at {size} px: {GPU_MEMORY_MEND}") from error
+    order = torch.sort(scores, descending=True, stable=True).indices[:max_keypoints]
+    return Features(
+        keypoints[order].numpy(), descriptors[order].numpy(), scores[order].numpy(), network_size, (width, height)
+    )
 
 
 def load_into(network: torch.nn.Module, state: Mapping[str, torch.Tensor], path: Path) -> None:

@@ -1,21 +1,11 @@
-"""Local features of one image: keypoints, descriptors and scores, with the image sizes that give them a meaning."""
+"""Local features of one image, with the image sizes that give them a meaning, and the settings they depend on."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from PIL import Image
-
-from gsbench.errors import InputError
-from gsbench.scene.images import read_image
-from gsbench.scene.sizes import downscaled_size
-
-GPU_MEMORY_MEND = "lower init.max_image_size or init.max_keypoints, or set init.device=cpu"
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,35 +39,35 @@ class Features:
         )
 
 
-class Extractor(Protocol):
-    """Finds features in an image [1, 3, H, W], RGB in [0, 1].
+@dataclass(frozen=True, kw_only=True)
+class FeatureSettings:
+    """Extractor and matcher by name with their settings; a field that one of them does not read has no effect on it."""
 
-    Returns keypoints [K, 2] in px with the centre of the first pixel at (0, 0), descriptors [K, D] and scores [K].
-    """
+    extractor: str
+    matcher: str
+    max_image_size: int  # px, longest side for the network
+    max_keypoints: int
+    keypoint_threshold: float = 0.0
+    nms_radius: int = 0  # px
+    aliked_model: str = "n16"
+    filter_threshold: float = 0.0  # of LightGlue
+    max_ratio: float = 1.0  # of mutual nearest neighbours
 
-    def __call__(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]: ...
+    def extraction(self) -> dict[str, object]:
+        """The part that features depend on."""
+        values: dict[str, object] = {
+            "extractor": self.extractor,
+            "max_image_size": self.max_image_size,
+            "max_keypoints": self.max_keypoints,
+            "keypoint_threshold": self.keypoint_threshold,
+            "nms_radius": self.nms_radius,
+        }
+        if self.extractor == "aliked":
+            values["aliked_model"] = self.aliked_model
+        return values
 
-
-def extract_features(
-    path: Path, extractor: Extractor, max_image_size: int, max_keypoints: int, device: torch.device
-) -> Features:
-    """The ``max_keypoints`` strongest features of an image file, shrunk to ``max_image_size`` px for the network.
-
-    Raises ``InputError`` where the image cannot be read or the device runs out of memory.
-    """
-    pixels = read_image(path)  # [H, W, 3]
-    height, width = pixels.shape[:2]
-    network_size = downscaled_size(width, height, max_size=max_image_size)
-    if network_size != (width, height):
-        pixels = np.asarray(Image.fromarray(pixels).resize(network_size, Image.Resampling.LANCZOS))
-    image = torch.from_numpy(pixels.astype(np.float32) / 255.0).permute(2, 0, 1)[None]  # [1, 3, h, w]
-    try:
-        with torch.inference_mode():
-            keypoints, descriptors, scores = (part.float().cpu() for part in extractor(image.to(device)))
-    except torch.OutOfMemoryError as error:
-        size = f"{network_size[0]}x{network_size[1]}"
-        raise InputError(f"{path.name}: {device} ran out of memory at {size} px: {GPU_MEMORY_MEND}") from error
-    order = torch.sort(scores, descending=True, stable=True).indices[:max_keypoints]
-    return Features(
-        keypoints[order].numpy(), descriptors[order].numpy(), scores[order].numpy(), network_size, (width, height)
-    )
+    def matching(self) -> dict[str, object]:
+        """The part that matches depend on beside the features."""
+        if self.matcher == "lightglue":
+            return {"matcher": self.matcher, "filter_threshold": self.filter_threshold}
+        return {"matcher": self.matcher, "max_ratio": self.max_ratio}

@@ -11,9 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
-from gsbench.init.extractors import load_into
-from gsbench.init.feature_settings import FeatureSettings
-from gsbench.init.features import GPU_MEMORY_MEND, Features
+from gsbench.init.extractors import GPU_MEMORY_MEND, load_into
+from gsbench.init.features import Features, FeatureSettings
 from gsbench.weights import load_state
 
 MIN_HALVED_KEYPOINTS = 128  # with fewer, a pair's geometry is a matter of luck

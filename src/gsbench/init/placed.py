@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from gsbench.errors import InputError
-from gsbench.init.base import InitReport, PointCloud, Progress, no_progress
+from gsbench.init.base import Initializer, InitReport, PointCloud, Progress, Timer, no_progress
 from gsbench.init.relay import run_with_progress
-from gsbench.init.timer import Timer
 from gsbench.scene.types import Capture
 from gsbench.settings import check_settings
 
@@ -18,10 +17,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-class PlacedCloud(ABC):
+class PlacedCloud(Initializer):
     """Base of `Random` and `Ply`: the reference's cameras, and a cloud that the subclass, a dataclass, makes."""
-
-    name: ClassVar[str]
 
     def __post_init__(self) -> None:
         check_settings(self, "init")

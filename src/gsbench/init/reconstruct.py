@@ -15,8 +15,7 @@ import pycolmap
 
 from gsbench.errors import InputError
 from gsbench.init.alignment import Array, Similarity, align_poses
-from gsbench.init.base import Progress
-from gsbench.init.colmap_initializer import MIN_IMAGES
+from gsbench.init.base import MIN_IMAGES, Progress
 from gsbench.init.pairs import exhaustive_pairs, gps_positions, sequential_pairs, spatial_pairs
 from gsbench.scene.colmap import read_reference
 from gsbench.scene.types import Capture
@@ -191,8 +190,8 @@ def similarity_to(model: pycolmap.Reconstruction, reference: pycolmap.Reconstruc
         return None
 
 
-def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write ``model`` in COLMAP's binary form."""
+def save_reconstruction(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write cameras, images and points of ``model`` in COLMAP's binary form."""
     folder.mkdir(parents=True, exist_ok=True)
     model.write_binary(folder)
 

@@ -15,7 +15,7 @@ import pycolmap
 from gsbench.init.alignment import Similarity, rotation_angles, transformed_rotations
 from gsbench.init.base import MODEL_FOLDER, PICTURE_FILE, REPORT_FILE, Gauge, InitReport, PoseErrors
 from gsbench.init.plot import draw_cloud
-from gsbench.init.reconstruct import common_poses, poses_by_name, write_model
+from gsbench.init.reconstruct import common_poses, poses_by_name, save_reconstruction
 from gsbench.scene.types import EXTENT_MARGIN, Capture
 
 PAPER_VOLUME_THRESHOLD = 0.03  # V_th of the paper, in raw units of its COLMAP models
@@ -116,7 +116,7 @@ def make_report(
 
 def write_result(model: pycolmap.Reconstruction, report: InitReport, output_dir: Path) -> None:
     """Write the model, the report and the picture where `gsbench.init.base.Initializer` promises them."""
-    write_model(model, output_dir / MODEL_FOLDER)
+    save_reconstruction(model, output_dir / MODEL_FOLDER)
     title = f"{report.init}, {report.poses} poses: {report.num_points:,} points, {report.num_registered} cameras"
     draw_cloud(model, output_dir / PICTURE_FILE, f"{title}, from above")
     report.write(output_dir / REPORT_FILE)

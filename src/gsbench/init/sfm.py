@@ -9,9 +9,9 @@ from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.init.base import Progress
-from gsbench.init.colmap_initializer import MIN_DETECTION_SIZE, ColmapInitializer, DatabaseTask
-from gsbench.init.timer import Timer
+from gsbench.init.base import Progress, Timer
+from gsbench.init.colmap_initializer import ColmapInitializer
+from gsbench.init.colmap_options import MIN_DETECTION_SIZE, DatabaseTask
 
 DEFAULT_PEAK_THRESHOLD = 0.02 / 3  # COLMAP's defaults
 DEFAULT_EDGE_THRESHOLD = 10.0

@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 RESERVED = ("_target_", "name")  # keys of a group that are not options of its class
 METHODS = {
-    "init": ("needs_reference", "run"),
+    "init": ("needs_reference", "content", "run"),
     "densify": ("prepare", "begin", "observe", "refine", "after_step"),
     "raster": ("render",),
     "eval": ("measure",),

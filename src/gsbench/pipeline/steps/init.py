@@ -25,7 +25,7 @@ def init_step(store: Store, capture: Capture, initializer: Initializer, referenc
         "test": split_of(capture),
         "exact_poses": capture.exact_poses,
         "options": options_of("init", initializer),
-        "content": initializer.content() if hasattr(initializer, "content") else None,
+        "content": initializer.content(),
         "reference": None if reference is None else reference.key,
         "pycolmap": version("pycolmap"),
     }
