@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+
+MAX_NAMED = 3  # names that an error or warning lists before it only counts
 
 
 def counted(count: int, noun: str) -> str:
@@ -46,3 +48,9 @@ def is_path(value: str) -> bool:
         return value.strip() != "" and value.isprintable() and bool(Path(value).expanduser())
     except RuntimeError:
         return False
+
+
+def some_of(names: Sequence[str]) -> str:
+    """The first few names and the count of the others, for messages."""
+    more = len(names) - MAX_NAMED
+    return ", ".join(names[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")

@@ -17,9 +17,8 @@ from gsbench.datasets.records import RECORDS, FileRecord, SceneRecord, add_recor
 from gsbench.datasets.remote import FetchError, Patience, RangesRefusedError, RemoteFile, download, size_of
 from gsbench.errors import InputError
 from gsbench.files import atomic
-from gsbench.scene.names import some_of
 from gsbench.weights import file_sha256
-from gsbench.words import readable_bytes
+from gsbench.words import readable_bytes, some_of
 
 log = logging.getLogger(__name__)
 

@@ -14,8 +14,7 @@ from gsbench.datasets.archive import Member, holds
 from gsbench.datasets.catalog import DATA_VARIABLE
 from gsbench.datasets.records import SceneRecord, record_key
 from gsbench.errors import InputError
-from gsbench.scene.names import some_of
-from gsbench.words import counted, readable_bytes
+from gsbench.words import counted, readable_bytes, some_of
 
 SCENE_PATH = re.compile(r"\$\{oc\.env:GSBENCH_DATA,data\}/(?P<folder>.+)")
 

@@ -24,10 +24,11 @@ from gsbench.errors import InputError
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import Resample, check_size, image_size, read_image
-from gsbench.scene.names import MIN_IMAGES, some_of
+from gsbench.scene.names import MIN_IMAGES
 from gsbench.scene.prepare import CameraModel, Intrinsics, Job, intrinsics_of, prepare_all
 from gsbench.scene.sizes import downscaled_size
 from gsbench.scene.types import Capture, Scene, View
+from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
 

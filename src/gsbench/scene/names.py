@@ -8,11 +8,11 @@ from pathlib import PurePosixPath
 
 from gsbench.errors import InputError
 from gsbench.scene.images import IMAGE_SUFFIXES
+from gsbench.words import some_of
 
 MAX_IMAGES = 200  # the paper's limit per scene
 TEST_EVERY = 8  # Mip-NeRF 360 and 3DGS hold out every 8th image, from the first
 MIN_IMAGES = 3
-_MAX_NAMED = 3  # names that an error or warning lists before it only counts
 
 
 def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
@@ -89,12 +89,6 @@ def split_names(
             f"the split leaves no test view of {len(names)}: mend the lists, or scene.test_every=0 for none"
         )
     return training, testing
-
-
-def some_of(names: Sequence[str]) -> str:
-    """The first few names and the count of the others, for messages."""
-    more = len(names) - _MAX_NAMED
-    return ", ".join(names[:_MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _stem(name: str) -> str:

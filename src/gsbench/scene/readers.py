@@ -12,8 +12,9 @@ from gsbench.datasets.catalog import how_to_get
 from gsbench.errors import InputError
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import IMAGE_SUFFIXES
-from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, TEST_EVERY, match_names, select_images, some_of, split_names
+from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, TEST_EVERY, match_names, select_images, split_names
 from gsbench.scene.types import Capture
+from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
 
