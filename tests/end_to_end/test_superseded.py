@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from gsbench.cli import run
 from tests.end_to_end.conftest import SMALL, Run
 
 pytestmark = pytest.mark.end_to_end
@@ -23,36 +24,43 @@ QUICK = ["train.iterations=20", "eval.lpips=[]", "eval.flip=false", "tracking=no
 OWN = ["densify=adc", "densify._target_=mine.Mine", "allow_targets=[mine]", "densify.name=mine", "name=edited"]
 
 
-def test_an_edited_densifier_is_never_averaged_with_what_it_was(gsbench: Run, tmp_path: Path) -> None:
-    runs = {"GSBENCH_RUNS": str(tmp_path / "runs")}
-    (tmp_path / "mine.py").write_text(MINE)
-    done = gsbench("-m", *SMALL, *QUICK, *OWN, "seed=0,1", **runs)
-    assert done.returncode == 0, done.stderr
-    assert "superseded" not in gsbench("status", "edited", **runs).stdout
-    (tmp_path / "mine.py").write_text(MINE + "# edited\n")
-    assert "2 trials: 2 superseded" in gsbench("status", "edited", **runs).stdout
-    done = gsbench(*SMALL, *QUICK, *OWN, "seed=2", **runs)
-    assert done.returncode == 0, done.stderr
+def test_an_edited_densifier_is_never_averaged_with_what_it_was(
+    gsbench: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = str(tmp_path / "runs")
+    monkeypatch.setenv("GSBENCH_RUNS", runs)
 
-    table = gsbench("tables", "edited", **runs)
-    assert table.returncode == 2
-    assert "different versions of mine.Mine" in table.stderr
-    assert "courtyard seeds 0, 1" in table.stderr
-    listed = json.loads(gsbench("status", "edited", "--json", **runs).stdout)
-    assert sorted((Path(trial["folder"]).name[-5:], trial["state"]) for trial in listed) == [
-        ("seed0", "superseded"),
-        ("seed1", "superseded"),
-        ("seed2", "done"),
-    ]
-    forgotten = gsbench("status", "edited", "--forget-superseded", **runs)
-    assert forgotten.returncode == 0, forgotten.stderr
-    assert forgotten.stdout.count("removed /") == 2
-    assert "mine.Mine was" in forgotten.stdout
-    assert gsbench("status", "edited", **runs).stdout == "1 trial: 1 done\n"
-    assert gsbench("tables", "edited", **runs).returncode == 0
+    def train(*seeds: int) -> str:
+        """Trainings run in processes of their own, which import the file as it is."""
+        done = gsbench("-m", *SMALL, *QUICK, *OWN, f"seed={','.join(map(str, seeds))}", GSBENCH_RUNS=runs)
+        assert done.returncode == 0, done.stderr
+        return done.stderr
+
+    def ask(*words: str, code: int = 0) -> str:
+        """Verbs read files only, and run here."""
+        assert run(list(words)) == code
+        said = capsys.readouterr()
+        return said.out + said.err
+
+    (tmp_path / "mine.py").write_text(MINE)
+    train(0, 1)
+    assert ask("status", "edited") == "2 trials: 2 done\n"
+    (tmp_path / "mine.py").write_text(MINE + "# edited\n")
+    assert "2 trials: 2 superseded" in ask("status", "edited")
+    train(2)
+
+    refused = ask("tables", "edited", code=2)
+    assert "different versions of mine.Mine" in refused
+    assert "courtyard seeds 0, 1" in refused
+    listed = json.loads(ask("status", "edited", "--json"))
+    states = {Path(trial["folder"]).name.partition("-")[2]: trial["state"] for trial in listed}
+    assert states == {"seed0": "superseded", "seed1": "superseded", "seed2": "done"}
+    forgotten = ask("status", "edited", "--forget-superseded")
+    assert forgotten.count("removed /") == 2
+    assert "mine.Mine was" in forgotten
+    assert ask("status", "edited") == "1 trial: 1 done\n"
+    ask("tables", "edited")
 
     (tmp_path / "mine.py").write_text(MINE)  # the old code comes back: its trials are in the store
-    again = gsbench("-m", *SMALL, *QUICK, *OWN, "seed=0,1", **runs)
-    assert again.returncode == 0, again.stderr
-    assert "iteration" not in again.stderr
-    assert "3 trials: 2 done, 1 superseded" in gsbench("status", "edited", **runs).stdout
+    assert "iteration" not in train(0, 1)
+    assert "3 trials: 2 done, 1 superseded" in ask("status", "edited")

@@ -40,7 +40,6 @@ class Finding:
 
 def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: 1 if something is bad."""
-
     parser = ArgumentParser(prog="gsbench doctor", description="Check this machine and say what is missing.")
     parser.add_argument(
         "--store", action="store_true", help="also read every stored result whole and name damaged ones"

@@ -20,7 +20,6 @@ MAX_COMPARED = 100  # runs in an address; browsers limit its length
 
 def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: serves until Ctrl-C."""
-
     parser = ArgumentParser(prog="gsbench ui", description="The MLflow dashboard, on this machine only.")
     parser.add_argument("experiment", nargs="?", help="print the address that compares its trials")
     parser.add_argument("--uri", help="the tracker's database or server; default: the one in the runs folder")
