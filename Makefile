@@ -3,11 +3,19 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.stamp-dev
 
+# Each library that chooses its instructions by the processor, told to choose the plainest. Compiled kernels keep a cache
+# for each processor, so the ordinary ones stay.
+GENERIC := NUMBA_CPU_NAME=generic OPENBLAS_CORETYPE=Prescott ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 \
+	DNNL_MAX_CPU_ISA=SSE41 NPY_DISABLE_CPU_FEATURES='X86_V3 X86_V4 AVX512_ICL'
+GENERIC_TESTS := tests/test_machine.py tests/raster/test_cpu.py tests/raster/test_contract.py tests/gaussians tests/densify \
+	tests/pipeline/test_loss.py tests/pipeline/test_trainer.py tests/pipeline/test_resume.py tests/eval/test_metrics.py \
+	tests/init/test_alignment.py tests/init/test_sfm.py
+
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint
+.PHONY: help install demo test test-generic lint
 
 help: ## show this
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 install: $(STAMP) ## set up .venv with gsbench and the development tools
 
@@ -18,6 +26,9 @@ demo: $(STAMP) ## baseline against volumetric densification on the courtyard: si
 
 test: $(STAMP) ## run the tests
 	$(BIN)/python -m pytest
+
+test-generic: $(STAMP) ## run core tests as on the plainest processor of this architecture
+	$(GENERIC) $(BIN)/python -m pytest $(GENERIC_TESTS)
 
 lint: $(STAMP) ## check style and types
 	$(BIN)/ruff check .
