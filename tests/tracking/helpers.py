@@ -38,7 +38,9 @@ def write_trial(folder: Path, values: dict[str, Any], records: int = RECORDS, ps
         "events": {"cloned": 150},
         "protocol": "paper-1",
         "raster": "cpu",
-        "hashes": {"config": "abc"},
+        "hashes": {"config": "abc", "data": "0123456789abcdef" * 4},
+        "train_views": 20,
+        "test_views": 3,
         "init_report": {
             "num_points": 5,
             "pose_errors": None,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import time
 import traceback
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -52,12 +52,18 @@ def run_trial(values: dict[str, Any], config_yaml: str, wait: bool = True) -> di
                 log.info("%s: was done", paths.label)
                 return finished
             remove_temporaries(paths.folder)
-            try:
-                with storage_errors(paths.runs):
-                    return _run(values, config_yaml, paths)
-            except Exception as error:
-                _record_failure(error, values, paths)
-                raise
+            return _run(values, config_yaml, paths)
+
+
+@contextmanager
+def _recorded_failures(values: dict[str, Any], paths: TrialPaths) -> Iterator[None]:
+    """Write down why the block failed, before anyone beside the trial is told that it did."""
+    try:
+        with storage_errors(paths.runs):
+            yield
+    except Exception as error:
+        _record_failure(error, values, paths)
+        raise
 
 
 def _record_failure(error: Exception, values: dict[str, Any], paths: TrialPaths) -> None:
@@ -71,21 +77,22 @@ def _record_failure(error: Exception, values: dict[str, Any], paths: TrialPaths)
 
 def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[str, Any]:
     """Build every step, show its files in the trial's folder, write the results."""
-    parts = Parts.of(values)
-    torch.set_num_threads(parts.threads)
-    mirror = Mirror(values["tracking"], paths.runs, paths.folder, values)
+    with _recorded_failures(values, paths):
+        parts = Parts.of(values)
+        torch.set_num_threads(parts.threads)
+        mirror = Mirror(values["tracking"], paths.runs, paths.folder, values)
 
-    def announce(stage: Stage, folder: Path) -> None:
-        write_json(paths.folder / BUILDING, {"stage": stage.name, "folder": str(folder)})
-        if stage is TRAIN:
-            mirror.follow(folder)
+        def announce(stage: Stage, folder: Path) -> None:
+            write_json(paths.folder / BUILDING, {"stage": stage.name, "folder": str(folder)})
+            if stage is TRAIN:
+                mirror.follow(folder)
 
-    store = Store(paths.runs / layout.STORE, announce)
-    write_text(paths.folder / CONFIG, config_yaml)
-    (paths.folder / FAILED).unlink(missing_ok=True)
-    trial = Trial(parts, store)
+        store = Store(paths.runs / layout.STORE, announce)
+        write_text(paths.folder / CONFIG, config_yaml)
+        (paths.folder / FAILED).unlink(missing_ok=True)
+        trial = Trial(parts, store)
     entries: dict[str, Entry] = {}
-    with mirror:
+    with mirror, _recorded_failures(values, paths):
         for step in trial.steps():
             entries[step.stage.name] = entry = store.get(step)
             if step.stage is INIT:

@@ -4,8 +4,8 @@ Files come first. A process beside the trial reads them and writes to MLflow in 
 or read-only never harms a trial; what it missed, ``gsbench sync`` adds later from the same files.
 """
 
-from gsbench.tracking.client import connect, default_uri, ensure_experiment
+from gsbench.tracking.client import connect, default_uri, ensure_experiment, tracker_uri
 from gsbench.tracking.mirror import Mirror, prepare
 from gsbench.tracking.trial_run import mirror_trial
 
-__all__ = ["Mirror", "connect", "default_uri", "ensure_experiment", "mirror_trial", "prepare"]
+__all__ = ["Mirror", "connect", "default_uri", "ensure_experiment", "mirror_trial", "prepare", "tracker_uri"]

@@ -16,6 +16,7 @@ from typing import Any
 
 from gsbench.pipeline.locks import BusyError, hold
 from gsbench.tracking.client import connect, ensure_experiment
+from gsbench.tracking.source import source_tags
 from gsbench.tracking.trial_run import LOCK, TrackedTrial, mirror_trial
 
 SECONDS_AFTER_PARENT = 10.0  # to tell the tracker that the trial's process is gone
@@ -76,11 +77,12 @@ def _with_paths(request: Request) -> Request:
 class FollowedTrial:
     """A trial in progress, mirrored now and then; a tracker that fails is tried again at the next occasion."""
 
-    def __init__(self, options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any]) -> None:
+    def __init__(self, options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any], program: str) -> None:
         self.seconds_between = float(options["flush_seconds"])
         self.sources = [folder]
-        self._trial = (options, runs, folder, values)
+        self._trial = (options, runs, folder, values, source_tags(program))
         self._run: TrackedTrial | None = None
+        self._monitor: Any = None
         self._lock = ExitStack()
 
     def catch_up(self) -> None:
@@ -91,6 +93,8 @@ class FollowedTrial:
                 stack.enter_context(hold(folder / LOCK, "mirroring", wait=False))
                 self._run = TrackedTrial(*self._trial)
                 self._lock = stack.pop_all()
+            if self._trial[0].get("system_metrics") and not self._run.is_complete:
+                self._monitor = start_system_metrics(self._run)
         self._run.add_curves(self.sources)
 
     def end(self, status: str) -> None:
@@ -98,6 +102,8 @@ class FollowedTrial:
         try:
             self.catch_up()
             assert self._run is not None
+            if self._monitor is not None:
+                self._monitor.finish()
             self._run.finish(status)
         finally:
             self._lock.close()
@@ -122,6 +128,15 @@ def _follow(trial: FollowedTrial, requests: Requests) -> Request | None:
             trial.end(request["status"])
             return {"outcome": "mirrored"}
         trial.sources = [Path(request["folder"]), *trial.sources[-1:]]
+
+
+def start_system_metrics(run: TrackedTrial) -> Any:
+    """MLflow's own monitor of processors, memory, disk, network and GPUs, which logs to ``run`` until ``finish``."""
+    from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
+
+    monitor = SystemMetricsMonitor(run.state["run_id"], resume_logging=True, tracking_uri=run.client.tracking_uri)
+    monitor.start()
+    return monitor
 
 
 def one_line(error: Exception) -> str:

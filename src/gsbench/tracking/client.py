@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
+import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 ADVISORY_LOCK = 0x67736265_6E6368  # "gsbench": the number of our lock in a PostgreSQL database
+SECONDS_FOR_SQLITE = 20.0  # patience with a writer
 # What would print, phone home or hang for minutes.
 SETTINGS = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
@@ -33,6 +35,11 @@ def default_uri(runs: Path) -> str:
     return f"sqlite:///{runs}/{DATABASE}"
 
 
+def tracker_uri(uri: str | None, runs: Path) -> str:
+    """The tracker's address: the configured ``uri``, else MLFLOW_TRACKING_URI, else the database in the runs folder."""
+    return uri or os.environ.get("MLFLOW_TRACKING_URI") or default_uri(runs)
+
+
 def connect(uri: str | None, runs: Path) -> MlflowClient:
     """A client of the tracker; creates a new database under a lock, since MLflow's own set-up races."""
     for name, value in SETTINGS.items():
@@ -41,9 +48,11 @@ def connect(uri: str | None, runs: Path) -> MlflowClient:
 
     for logger in ("mlflow", "alembic"):  # importing mlflow has set their levels
         logging.getLogger(logger).setLevel(logging.WARNING)
-    address = uri or default_uri(runs)
+    address = tracker_uri(uri, runs)
     with _set_up_lock(address, runs):
         _create_sqlite(address)
+        if address == default_uri(runs):
+            _follow_moved_artifacts(runs)
         client = mlflow.MlflowClient(tracking_uri=address)  # with the first client come the tables
         client.search_experiments(max_results=1)
     return client
@@ -100,3 +109,21 @@ def _create_sqlite(uri: str) -> None:
     with atomic(Path(name)) as temporary:
         store = SqlAlchemyStore(f"sqlite:///{temporary}", str(Path(name).parent / ARTIFACTS))
         store.engine.dispose()
+
+
+def _follow_moved_artifacts(runs: Path) -> None:
+    """Where the runs folder was moved, point its own database to where the artifacts are now.
+
+    MLflow keeps absolute addresses, of each experiment and of each run, and has no word for changing them.
+    """
+    with closing(sqlite3.connect(runs / DATABASE, timeout=SECONDS_FOR_SQLITE)) as connection, connection:
+        for number, name, old in connection.execute("SELECT experiment_id, name, artifact_location FROM experiments"):
+            new = (runs / ARTIFACTS / name).as_uri()
+            if old == new or not str(old).endswith(new.removeprefix(runs.as_uri())):  # not one of ours
+                continue
+            connection.execute("UPDATE experiments SET artifact_location = ? WHERE experiment_id = ?", (new, number))
+            connection.execute(
+                "UPDATE runs SET artifact_uri = ? || substr(artifact_uri, ?)"
+                " WHERE experiment_id = ? AND substr(artifact_uri, 1, ?) = ?",
+                (new, len(old) + 1, number, len(old) + 1, f"{old}/"),
+            )

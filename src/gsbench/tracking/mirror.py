@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import sys
 from pathlib import Path
 from typing import Any
 
+from gsbench.tracking.client import tracker_uri
 from gsbench.tracking.process import MirrorError, MirrorProcess, processes
 
 log = logging.getLogger(__name__)
@@ -21,7 +23,13 @@ class Mirror:
 
     def __init__(self, options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any]) -> None:
         self._options, self._folder = options, folder
-        self._trial = {"options": options, "runs": str(runs), "folder": str(folder), "values": values}
+        self._trial = {
+            "options": options | {"uri": tracker_uri(options["uri"], runs)},
+            "runs": str(runs),
+            "folder": str(folder),
+            "values": values,
+            "program": Path(sys.argv[0]).name or "python",
+        }
         self._process: MirrorProcess | None = None
 
     def __enter__(self) -> Mirror:
@@ -76,7 +84,7 @@ def prepare(options: dict[str, Any], runs: Path, experiment: str) -> None:
     """Create tables and ``experiment`` before many processes need them; a tracker that fails is only mentioned."""
     if not options["enabled"]:
         return
-    request = {"uri": options["uri"], "runs": str(runs), "experiment": experiment}
+    request = {"uri": tracker_uri(options["uri"], runs), "runs": str(runs), "experiment": experiment}
     try:
         with MirrorProcess() as process:
             answer = process.ask("prepare", options["patience_seconds"], **request)

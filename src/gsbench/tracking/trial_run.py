@@ -18,11 +18,18 @@ from gsbench.config import sha256_of
 from gsbench.files import read_object, write_json
 from gsbench.nested import flatten
 from gsbench.pipeline.locks import hold
-from gsbench.tracking.client import connect, ensure_experiment
+from gsbench.pipeline.trial_files import failure_of
+from gsbench.tracking.client import connect, default_uri, ensure_experiment
+from gsbench.tracking.source import user_tags
 
 STATE = "mlflow.json"  # in the trial's folder: the run that mirrors it and how far
 LOCK = ".mlflow.lock"
+OWN_DATABASE = "runs/mlflow.db"
 TOKEN_TAG = "gsbench.token"
+ERROR_TAG = "error"
+FILES = (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS)
+MAX_TAG = 5000  # characters of a tag (MLflow's limit)
+DIGEST_CHARACTERS = 16  # of the fingerprint, in a dataset's digest, for which MLflow has 36
 MAX_VALUE = 6000  # characters of a parameter (MLflow's limit)
 MAX_PARAMS = 100  # parameters in a batch
 MAX_METRICS = 1000  # metrics in a batch
@@ -31,10 +38,16 @@ INIT_FIELDS = ("num_registered", "num_points", "mean_reprojection_error", "mean_
 CURVES = {layout.CURVES: "train", layout.EVENTS: "events"}
 
 
-def mirror_trial(options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any]) -> bool:
-    """Mirror what is missing of an ended trial; False if nothing was missing. Raises what the tracker raises."""
+def mirror_trial(options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any], anew: bool = False) -> bool:
+    """Mirror what is missing of an ended trial; False if nothing was missing. Raises what the tracker raises.
+
+    With ``anew``, the run that mirrors it so far is deleted, and another made from the files alone.
+    """
     with hold(folder / LOCK, "mirroring", wait=False):
         run = TrackedTrial(options, runs, folder, values)
+        if anew:
+            run.client.delete_run(run.state["run_id"])
+            run = TrackedTrial(options, runs, folder, values)
         if run.is_complete:
             return False
         run.add_curves([folder])
@@ -45,8 +58,16 @@ def mirror_trial(options: dict[str, Any], runs: Path, folder: Path, values: dict
 class TrackedTrial:
     """The MLflow run of one trial, opened anew or gone on with."""
 
-    def __init__(self, options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any]) -> None:
-        self.folder, self.values, self.images = folder, values, int(options["images"])
+    def __init__(
+        self,
+        options: dict[str, Any],
+        runs: Path,
+        folder: Path,
+        values: dict[str, Any],
+        tags: dict[str, str] | None = None,
+    ) -> None:
+        self.runs, self.folder, self.values, self.options = runs, folder, values, options
+        self._tags = tags or {}
         self.client = connect(options["uri"], runs)
         self.state = self._known_state()
         if not self.state:
@@ -65,7 +86,7 @@ class TrackedTrial:
         from mlflow.exceptions import MlflowException
 
         state = read_object(self.folder / STATE)
-        if state.get("uri") != self._uri() or "run_id" not in state:
+        if state.get("uri") not in (self._uri(), self.client.tracking_uri) or "run_id" not in state:
             return {}
         try:
             run = self.client.get_run(state["run_id"])
@@ -116,10 +137,15 @@ class TrackedTrial:
         run_id = self.state["run_id"]
         results = read_object(self.folder / layout.RESULTS)
         if status != "FINISHED" or not results:
+            if status != "KILLED":
+                self._log_failure()
             self.client.set_terminated(run_id, "FAILED" if status == "FINISHED" else status)
             return
         from mlflow.entities import Metric, RunTag
 
+        if self.state.pop("failed", False):
+            self.client.delete_tag(run_id, ERROR_TAG)
+        self._log_dataset(results)
         ended = self._time_of({"step": results["iterations"], "seconds": results["seconds"]["train"]})
         numbers = dict(results["metrics"]) | {
             key: results[key] for key in ("num_gaussians", "num_init_points", "peak_memory_mb")
@@ -134,15 +160,51 @@ class TrackedTrial:
             metrics=[Metric(key, float(value), ended, 0) for key, value in numbers.items()],
             tags=[RunTag(key, value) for key, value in tags.items()],
         )
-        for name in (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS):
-            if (self.folder / name).exists():
-                self.client.log_artifact(run_id, str(self.folder / name))
+        self._log_files(*FILES, *([layout.POINT_CLOUD] if self.options.get("model") else []))
         for kind in (layout.FIGURES, layout.RENDERS, layout.GROUND_TRUTH):
-            for picture in sorted((self.folder / kind).glob("*.png"))[: self.images]:
+            for picture in sorted((self.folder / kind).glob("*.png"))[: int(self.options["images"])]:
                 self.client.log_artifact(run_id, str(picture), kind)
         self.client.set_terminated(run_id, "FINISHED")
         self.state["complete"] = self._results_hash()
         self._save()
+
+    def _log_failure(self) -> None:
+        """Why the trial failed, as a tag and as files."""
+        if not (self.folder / layout.FAILED).exists():
+            return
+        self.client.set_tag(self.state["run_id"], ERROR_TAG, failure_of(self.folder)[:MAX_TAG])
+        self._log_files(layout.CONFIG, layout.FAILED, layout.LOG)
+        self.state["failed"] = True
+        self._save()
+
+    def _log_files(self, *names: str) -> None:
+        for name in names:
+            if (self.folder / name).exists():
+                self.client.log_artifact(self.state["run_id"], str(self.folder / name))
+
+    def _log_dataset(self, results: dict[str, Any]) -> None:
+        """The photographs, once for each split: MLflow tells datasets apart by name and digest."""
+        from mlflow.entities import Dataset, DatasetInput, InputTag
+
+        digest = results["hashes"].get("data")
+        if digest is None:
+            return
+        scene = self.values["scene"]
+        source = json.dumps({"uri": str(scene.get("path") or scene["name"])})
+        inputs = [
+            DatasetInput(
+                Dataset(
+                    name=scene["name"],
+                    digest=f"{digest[:DIGEST_CHARACTERS]}-{split}",
+                    source_type="local",
+                    source=source,
+                    profile=json.dumps({"views": results[f"{split}_views"], "split": split}),
+                ),
+                [InputTag("mlflow.data.context", split)],
+            )
+            for split in ("train", "test")
+        ]
+        self.client.log_inputs(self.state["run_id"], inputs)
 
     def _create_run(self, experiment_id: str) -> dict[str, Any]:
         from mlflow.entities import Param, RunTag
@@ -157,8 +219,10 @@ class TrackedTrial:
             "init": values["init"]["name"],
             "densify": values["densify"]["name"],
             "seed": str(values["seed"]),
-            "folder": str(self.folder),
+            "folder": self.folder.relative_to(self.runs).as_posix(),
             TOKEN_TAG: begun["token"],
+            **user_tags(),
+            **self._tags,
         }
         found = self.client.search_runs([experiment_id], f"tags.`{TOKEN_TAG}` = '{begun['token']}'", max_results=1)
         run = found[0] if found else self.client.create_run(experiment_id, tags=tags, run_name=label)
@@ -183,7 +247,9 @@ class TrackedTrial:
         return int(self.state["started"] + 1000 * float(record.get("seconds", record["step"] / 1000)))
 
     def _uri(self) -> str:
-        return str(self.client.tracking_uri)
+        """Where the run is: the tracker's address, or a word for the runs folder's own, which may move with it."""
+        uri = str(self.client.tracking_uri)
+        return OWN_DATABASE if uri == default_uri(self.runs) else uri
 
     def _save(self) -> None:
         write_json(self.folder / STATE, self.state)

@@ -137,9 +137,9 @@ def check_tracking(runs: Path) -> Iterator[Finding]:
         yield Finding("ok", "tracking", f"no {database} yet: the first trial makes it")
         return
     try:
-        from gsbench.tracking import connect
+        from gsbench.tracking import connect, default_uri
 
-        count = len(connect(None, runs).search_experiments())
+        count = len(connect(default_uri(runs), runs).search_experiments())
     except Exception as error:  # noqa: BLE001 - SQLAlchemy, alembic and MLflow each raise their own kinds
         text = f"{database} cannot be used ({_first_line(error)}): move it away, and `gsbench sync` makes it anew"
         yield Finding("note", "tracking", text)

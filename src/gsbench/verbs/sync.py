@@ -11,6 +11,7 @@ from gsbench.arguments import ArgumentParser
 from gsbench.errors import GsbenchError
 from gsbench.layout import TRIAL_GLOB
 from gsbench.pipeline.trial_files import label_of, read_config, state_of
+from gsbench.tracking.client import tracker_uri
 from gsbench.tracking.process import MirrorError, MirrorProcess
 from gsbench.words import counted
 
@@ -20,6 +21,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser(prog="gsbench sync", description="Mirror finished and failed trials to MLflow, once.")
     parser.add_argument("experiment", nargs="?", help="its name; without one, all")
     parser.add_argument("--uri", help="the tracker, such as http://127.0.0.1:5000; without it, each trial's own")
+    parser.add_argument("--rebuild", action="store_true", help="delete what MLflow shows of the trials, mirror anew")
     options = parser.parse_args(argv)
     homes = (
         [experiment_home(runs, options.experiment)]
@@ -31,7 +33,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         for home in homes:
             for folder in sorted(home.glob(TRIAL_GLOB)):
                 if state_of(folder) in ("done", "failed"):
-                    if _sync_one(process, folder, runs, options.uri):
+                    if _sync_one(process, folder, runs, options.uri, options.rebuild):
                         new += 1
                         print(f"mirrored {label_of(folder)}")
                     else:
@@ -40,12 +42,13 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
-def _sync_one(process: MirrorProcess, folder: Path, runs: Path, uri: str | None) -> bool:
+def _sync_one(process: MirrorProcess, folder: Path, runs: Path, uri: str | None, anew: bool) -> bool:
     """Whether something of the trial was missing. Raises GsbenchError where the tracker does not take it."""
     values = read_config(folder)
-    tracking = values["tracking"] | ({} if uri is None else {"uri": uri})
+    tracking = values["tracking"] | {"uri": tracker_uri(uri or values["tracking"]["uri"], runs)}
+    trial = {"options": tracking, "runs": str(runs), "folder": str(folder), "values": values}
     try:
-        answer = process.ask("sync", None, options=tracking, runs=str(runs), folder=str(folder), values=values)
+        answer = process.ask("sync", None, anew=anew, **trial)
     except MirrorError as error:
         raise GsbenchError(f"{error}; the files are complete: try again") from error
     if answer["outcome"] == "failed":

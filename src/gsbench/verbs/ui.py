@@ -22,17 +22,22 @@ def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: serves until Ctrl-C."""
     parser = ArgumentParser(prog="gsbench ui", description="The MLflow dashboard, on this machine only.")
     parser.add_argument("experiment", nargs="?", help="print the address that compares its trials")
-    parser.add_argument("--uri", help="the tracker's database or server; default: the one in the runs folder")
+    parser.add_argument(
+        "--uri", help="the tracker's database or server; default: $MLFLOW_TRACKING_URI, or that of the runs folder"
+    )
     parser.add_argument("--port", type=port, default=DEFAULT_PORT)
     parser.add_argument("--print-url", action="store_true", help="only print the address")
     options = parser.parse_args(argv)
-    if options.uri is None and not (runs / DATABASE).exists():
-        raise InputError(f"no MLflow database in {runs}: run a trial first, or `gsbench sync`, or give --uri")
     if options.uri is not None and "://" not in options.uri:
         raise InputError(f"--uri {options.uri} is no address such as sqlite:///FILE or http://HOST:PORT")
-    from gsbench.tracking import default_uri
+    from gsbench.tracking import connect, default_uri, tracker_uri
 
-    uri = options.uri or default_uri(runs)
+
+    uri = tracker_uri(options.uri, runs)
+    if uri == default_uri(runs):
+        if not (runs / DATABASE).exists():
+            raise InputError(f"no MLflow database in {runs}: run a trial first, or `gsbench sync`, or give --uri")
+        connect(uri, runs)  # which follows a runs folder that was moved
     base = uri if uri.startswith("http") else f"http://127.0.0.1:{options.port}"
     print(base if options.experiment is None else comparison_url(base, uri, runs, options.experiment), flush=True)
     if options.print_url or uri.startswith("http"):

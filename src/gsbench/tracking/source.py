@@ -1,0 +1,47 @@
+"""Who started a trial, from which program and which state of the code: the tags by which MLflow knows them."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import subprocess
+from pathlib import Path
+
+SECONDS_FOR_GIT = 10
+
+
+def user_tags() -> dict[str, str]:
+    """The user's name, where the system has one."""
+    try:
+        return {"mlflow.user": getpass.getuser()}
+    except (KeyError, OSError, ImportError):  # a container's nameless user; Windows
+        return {}
+
+
+def source_tags(program: str) -> dict[str, str]:
+    """The name of the ``program``, and commit and dirty flag of the code: of the folder that it runs in, which holds a
+    user's own classes and settings, or else of gsbench's checkout."""
+    tags = {"mlflow.source.type": "LOCAL", "mlflow.source.name": program}
+    for folder in (Path.cwd(), Path(__file__).resolve().parent):
+        commit = _git(folder, "rev-parse", "HEAD")
+        if commit:
+            changes = _git(folder, "status", "--porcelain", "--untracked-files=no")
+            dirty = {} if changes is None else {"mlflow.source.git.dirty": "true" if changes else "false"}
+            return tags | {"mlflow.source.git.commit": commit} | dirty
+    return tags
+
+
+def _git(folder: Path, *words: str) -> str | None:
+    """What git says; None where there is no git, no repository, or no answer."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *words],
+            env=os.environ | {"GIT_OPTIONAL_LOCKS": "0"},  # look, and touch nothing
+            capture_output=True,
+            text=True,
+            timeout=SECONDS_FOR_GIT,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()

@@ -1,0 +1,187 @@
+"""What people who know MLflow look for: address, user, source, dataset, reasons of failures, files that are found."""
+
+from __future__ import annotations
+
+import getpass
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.tracking import Mirror, connect, default_uri, mirror_trial, prepare, tracker_uri
+from gsbench.tracking.process import MirrorProcesses
+from gsbench.tracking.source import source_tags
+from tests.tracking.helpers import RECORDS, found_runs, history, options, trial_values, write_trial
+
+SECONDS = 240  # within which what never comes is told from a slow machine
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A runs folder with a database; making one takes MLflow seconds."""
+    folder = tmp_path_factory.mktemp("runs")
+    prepare(options(), folder, "tracked")
+    return folder
+
+
+def mirrored(runs: Path, seed: int, **more: Any) -> tuple[Any, Any]:
+    """A client, and the run of a finished trial."""
+    values = trial_values(runs, seed)
+    folder = TrialPaths.of(values).folder
+    write_trial(folder, values)
+    (folder / "point_cloud.ply").write_text("ply\n")
+    assert mirror_trial(options() | more, runs, folder, values)
+    client = connect(None, runs)
+    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == str(seed)]
+    return client, run
+
+
+def artifacts(client: Any, run: Any) -> set[str]:
+    return {item.path for item in client.list_artifacts(run.info.run_id)}
+
+
+def test_the_address_is_the_configured_one_then_the_environments_then_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    assert tracker_uri(None, tmp_path) == default_uri(tmp_path) == f"sqlite:///{tmp_path}/mlflow.db"
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:1")
+    assert tracker_uri(None, tmp_path) == "http://127.0.0.1:1"
+    assert tracker_uri("http://127.0.0.1:2", tmp_path) == "http://127.0.0.1:2"
+
+
+def test_a_trial_goes_where_the_environment_says(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", default_uri(runs))
+    values = trial_values(tmp_path, seed=20)
+    folder = TrialPaths.of(values).folder
+    folder.mkdir(parents=True)
+    with Mirror(options(), tmp_path, folder, values):
+        write_trial(folder, values)
+    assert not (tmp_path / "mlflow.db").exists()
+    (run,) = [run for run in found_runs(connect(None, runs), "tracked") if run.data.tags["seed"] == "20"]
+    assert run.info.status == "FINISHED"
+    assert run.data.tags["mlflow.source.name"] == Path(sys.argv[0]).name
+    assert run.data.tags["mlflow.user"] == getpass.getuser()
+
+
+def git(folder: Path, *words: str) -> str:
+    identity = ("-c", "user.name=x", "-c", "user.email=x@localhost", "-c", "commit.gpgsign=false")
+    return subprocess.run(
+        ["git", "-C", str(folder), *identity, *words], check=True, capture_output=True, text=True
+    ).stdout
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_commit_and_dirty_flag_are_those_of_the_folder_that_one_works_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    git(tmp_path, "init")
+    (tmp_path / "mine.py").write_text("x = 1\n")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-m", "first")
+    (tmp_path / "notes.txt").touch()  # untracked: no part of the code
+    monkeypatch.chdir(tmp_path)
+    tags = source_tags("gsbench")
+    assert tags["mlflow.source.git.commit"] == git(tmp_path, "rev-parse", "HEAD").strip()
+    assert tags["mlflow.source.git.dirty"] == "false"
+    (tmp_path / "mine.py").write_text("x = 2\n")
+    assert source_tags("gsbench")["mlflow.source.git.dirty"] == "true"
+    monkeypatch.setenv("PATH", str(tmp_path))  # no git
+    assert source_tags("gsbench") == {"mlflow.source.type": "LOCAL", "mlflow.source.name": "gsbench"}
+
+
+def test_the_photographs_are_the_dataset_of_a_run(runs: Path) -> None:
+    _, run = mirrored(runs, seed=21)
+    found = {item.tags[0].value: item.dataset for item in run.inputs.dataset_inputs}
+    assert set(found) == {"train", "test"}
+    for split, views in (("train", 20), ("test", 3)):
+        assert found[split].name == "a_scene"
+        assert found[split].digest == f"0123456789abcdef-{split}"
+        assert json.loads(found[split].profile) == {"views": views, "split": split}
+
+
+def test_a_failed_run_holds_its_reason_until_it_is_mended(runs: Path) -> None:
+    values = trial_values(runs, seed=22)
+    folder = TrialPaths.of(values).folder
+    folder.mkdir(parents=True)
+    (folder / "log.txt").write_text("what happened\n")
+    with pytest.raises(RuntimeError), Mirror(options(), runs, folder, values):  # noqa: PT012
+        (folder / "failed.json").write_text(json.dumps({"message": "the loss became nan", "traceback": "…"}))
+        raise RuntimeError
+    client = connect(None, runs)
+    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "22"]
+    assert run.info.status == "FAILED"
+    assert run.data.tags["error"] == "the loss became nan"
+    assert artifacts(client, run) == {"failed.json", "log.txt"}
+    (folder / "failed.json").unlink()
+    with Mirror(options(), runs, folder, values):
+        write_trial(folder, values)
+    run = client.get_run(run.info.run_id)
+    assert run.info.status == "FINISHED"
+    assert "error" not in run.data.tags
+
+
+def test_the_model_is_an_artifact_if_asked_for(runs: Path) -> None:
+    client, run = mirrored(runs, seed=23)
+    assert "point_cloud.ply" not in artifacts(client, run)
+    client, run = mirrored(runs, seed=24, model=True)
+    assert "point_cloud.ply" in artifacts(client, run)
+
+
+def test_system_metrics_are_logged_if_asked_for(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MLFLOW_SYSTEM_METRICS_SAMPLING_INTERVAL", "0.2")
+    monkeypatch.setattr("gsbench.tracking.mirror.processes", MirrorProcesses())  # one that has this environment
+    client = connect(None, runs)
+    values = trial_values(runs, seed=25)
+    folder = TrialPaths.of(values).folder
+    folder.mkdir(parents=True)
+    seen: set[str] = set()
+    with Mirror(options() | {"system_metrics": True}, runs, folder, values):
+        deadline = time.monotonic() + SECONDS
+        while not seen and time.monotonic() < deadline:
+            time.sleep(0.2)
+            found = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "25"]
+            seen = {key for run in found for key in run.data.metrics if key.startswith("system/")}
+        write_trial(folder, values)
+    assert "system/cpu_utilization_percentage" in seen
+
+
+def test_a_moved_runs_folder_keeps_its_runs_and_their_files(runs: Path, tmp_path: Path) -> None:
+    client, run = mirrored(runs, seed=26)
+    moved = tmp_path / "moved"
+    shutil.copytree(runs, moved)
+    shutil.rmtree(runs / "mlartifacts")
+    try:
+        values = trial_values(moved, seed=26)
+        folder = TrialPaths.of(values).folder
+        assert not mirror_trial(options(), moved, folder, values)  # the same run, and it is known
+        client = connect(None, moved)
+        assert "results.json" in artifacts(client, run)
+        assert client.get_run(run.info.run_id).info.artifact_uri.startswith(
+            (moved / "mlartifacts" / "tracked").as_uri()
+        )
+        values = trial_values(moved, seed=27)
+        folder = TrialPaths.of(values).folder
+        write_trial(folder, values)
+        mirror_trial(options(), moved, folder, values)
+        assert not (runs / "mlartifacts").exists()
+    finally:
+        shutil.copytree(moved / "mlartifacts", runs / "mlartifacts", dirs_exist_ok=True)
+
+
+def test_a_rebuilt_mirror_shows_each_trial_once(runs: Path) -> None:
+    client, run = mirrored(runs, seed=28)
+    client.set_tag(run.info.run_id, "psnr", "meddled")
+    values = trial_values(runs, seed=28)
+    assert mirror_trial(options(), runs, TrialPaths.of(values).folder, values, anew=True)
+    (again,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "28"]
+    assert again.info.run_id != run.info.run_id
+    assert "psnr" not in again.data.tags
+    assert history(client, again.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
+    assert "results.json" in artifacts(client, again)
