@@ -184,9 +184,7 @@ def test_a_tracker_may_go_at_any_moment(tracker: tuple[Gate, str], tmp_path: Pat
     gate.passed = 0
     assert "tracking" not in mirror_a_trial(tmp_path, uri, seed=0, patience=SECONDS)
     whole = gate.passed
-    for seed, (share, then) in enumerate(
-        [(0.1, "hang"), (0.3, "close"), (0.5, "hang"), (0.7, "close"), (0.9, "hang")], 1
-    ):
+    for seed, (share, then) in enumerate([(0.2, "hang"), (0.5, "close"), (0.8, "hang")], 1):
         gate.passed, gate.then, gate.limit = 0, then, int(share * whole)
         assert "gsbench sync" in mirror_a_trial(tmp_path, uri, seed, patience=PATIENCE)
         gate.mended()
@@ -194,7 +192,7 @@ def test_a_tracker_may_go_at_any_moment(tracker: tuple[Gate, str], tmp_path: Pat
         mirror_trial(options(uri), tmp_path, TrialPaths.of(values).folder, values)
     client = connect(uri, tmp_path)
     found = found_runs(client, "tracked")
-    assert sorted(run.data.tags["seed"] for run in found) == [str(seed) for seed in range(6)]
+    assert sorted(run.data.tags["seed"] for run in found) == [str(seed) for seed in range(4)]
     for run in found:
         assert run.info.status == "FINISHED"
         assert history(client, run.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]

@@ -13,10 +13,12 @@ from typing import Any
 
 import pytest
 
+from gsbench.errors import InputError
 from gsbench.pipeline.trial_files import TrialPaths
 from gsbench.tracking import Mirror, connect, default_uri, mirror_trial, prepare, tracker_uri
 from gsbench.tracking.process import MirrorProcesses
 from gsbench.tracking.source import source_tags
+from gsbench.verbs.ui import address_of
 from tests.tracking.helpers import RECORDS, found_runs, history, options, trial_values, write_trial
 
 SECONDS = 240  # within which what never comes is told from a slow machine
@@ -173,6 +175,20 @@ def test_a_moved_runs_folder_keeps_its_runs_and_their_files(runs: Path, tmp_path
         assert not (runs / "mlartifacts").exists()
     finally:
         shutil.copytree(moved / "mlartifacts", runs / "mlartifacts", dirs_exist_ok=True)
+
+
+def test_the_comparison_shows_final_metrics_first(runs: Path) -> None:
+    client, run = mirrored(runs, seed=29)
+    url = address_of("http://127.0.0.1:5000", default_uri(runs), runs, "tracked")
+    assert f"/experiments/{run.info.experiment_id}/runs?viewStateShareKey=gsbench&" in url
+    view = json.loads(client.get_experiment(run.info.experiment_id).tags["mlflow.sharedViewState.gsbench"])
+    (section,) = view["compareRunSections"]
+    assert {chart["metricSectionId"] for chart in view["compareRunCharts"]} == {section["uuid"]}
+    bars = [chart["metricKey"] for chart in view["compareRunCharts"] if chart["type"] == "BAR"]
+    assert bars[0] == "psnr"
+    assert {"psnr", "num_gaussians", "seconds_train"} <= set(bars) & run.data.metrics.keys()
+    with pytest.raises(InputError, match=r"no experiment 'nothing'; it has .*tracked"):
+        address_of("http://127.0.0.1:5000", default_uri(runs), runs, "nothing")
 
 
 def test_a_rebuilt_mirror_shows_each_trial_once(runs: Path) -> None:

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from urllib.parse import quote
 
 from gsbench.arguments import ArgumentParser, port
 from gsbench.errors import InputError
 from gsbench.layout import DATABASE
 
 DEFAULT_PORT = 5000
-MAX_COMPARED = 100  # runs in an address; browsers limit its length
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -39,27 +36,23 @@ def main(argv: Sequence[str], runs: Path) -> int:
             raise InputError(f"no MLflow database in {runs}: run a trial first, or `gsbench sync`, or give --uri")
         connect(uri, runs)  # which follows a runs folder that was moved
     base = uri if uri.startswith("http") else f"http://127.0.0.1:{options.port}"
-    print(base if options.experiment is None else comparison_url(base, uri, runs, options.experiment), flush=True)
+    print(base if options.experiment is None else address_of(base, uri, runs, options.experiment), flush=True)
     if options.print_url or uri.startswith("http"):
         return 0
     return serve(uri, options.port)
 
 
-def comparison_url(base: str, uri: str, runs: Path, experiment: str) -> str:
-    """The address of MLflow's page that compares the finished trials of ``experiment``."""
+def address_of(base: str, uri: str, runs: Path, experiment: str) -> str:
+    """The address of the page that compares the trials of ``experiment``. Raises InputError where there is none."""
     from gsbench.tracking import connect
+    from gsbench.tracking.comparison import comparison_url
 
     client = connect(uri, runs)
     found = client.get_experiment_by_name(experiment)
     if found is None:
         names = sorted(e.name for e in client.search_experiments())
         raise InputError(f"MLflow has no experiment {experiment!r}; it has {', '.join(names)}; see `gsbench sync`")
-    runs_found = client.search_runs(
-        [found.experiment_id], "tags.kind = 'trial' and attributes.status = 'FINISHED'", max_results=MAX_COMPARED
-    )
-    ids = quote(json.dumps([run.info.run_id for run in runs_found], separators=(",", ":")))
-    experiments = quote(json.dumps([found.experiment_id]))
-    return f"{base}/#/compare-runs?runs={ids}&experiments={experiments}"
+    return comparison_url(base, client, found.experiment_id)
 
 
 def serve(uri: str, port: int) -> int:
