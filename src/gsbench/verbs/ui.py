@@ -29,7 +29,6 @@ def main(argv: Sequence[str], runs: Path) -> int:
         raise InputError(f"--uri {options.uri} is no address such as sqlite:///FILE or http://HOST:PORT")
     from gsbench.tracking import connect, default_uri, tracker_uri
 
-
     uri = tracker_uri(options.uri, runs)
     if uri == default_uri(runs):
         if not (runs / DATABASE).exists():
