@@ -45,6 +45,9 @@ class RefineEvent:
     budget refused. ``isotropic_resplit`` counts parents split by volume whose children are still above the threshold,
     so that they are split again at the next refinement; ``vanished`` counts parents split by volume whose children are
     far below a pixel. ``relocated`` moves dead Gaussians and changes no count (3DGS-MCMC).
+
+    Under ``cap=governor``, ``target`` is the count that was aimed at, ``strictness`` the factor on the thresholds of
+    growth and ``cull`` that on the opacity below which Gaussians are pruned.
     """
 
     GROWN: ClassVar[tuple[str, ...]] = ("cloned", "split_gradient", "split_volume", "added")
@@ -65,6 +68,9 @@ class RefineEvent:
     vanished: int = 0
     opacity_reset: bool = False
     volume_threshold: float | None = None
+    target: int | None = None
+    strictness: float | None = None
+    cull: float | None = None
 
     def balances(self) -> bool:
         """Whether the counts explain ``after``."""
@@ -78,9 +84,8 @@ class RefineEvent:
     @staticmethod
     def count_names() -> tuple[str, ...]:
         """The fields that can be summed over a trial."""
-        return tuple(
-            f.name for f in fields(RefineEvent) if f.name not in ("step", "before", "after", "volume_threshold")
-        )
+        names = (f.name for f in fields(RefineEvent) if f.default is not None)
+        return tuple(name for name in names if name not in ("step", "before", "after"))
 
 
 def sum_events(events: list[dict[str, object]]) -> dict[str, int]:

@@ -152,6 +152,7 @@ def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path: Pa
         ({"max_gaussians": 50_000, "cap": "soft"}, (3, 0), True),  # one budget for both
         ({"max_gaussians": None, "cap": None, "seconds": 60}, (0, 0), False),  # who knows what it would have become
         ({"max_gaussians": None, "cap": None}, (None, 0), False),  # no count of what was refused
+        ({"max_gaussians": 1000, "cap": "governor"}, (0, 0), False),  # it steers also where it refuses nothing
     ],
 )
 def test_arms_are_compared_under_one_budget_or_under_none_that_acted(

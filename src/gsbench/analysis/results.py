@@ -99,11 +99,12 @@ class Trial:
 
     @property
     def budget_acted(self) -> bool:
-        """Whether the trial's budget may have changed it: a cap that refused something, or a limit of time."""
+        """Whether the trial's budget may have changed it: a cap that refused or steers, or a limit of time."""
         budget, events = self.data.get("budget"), self.data.get("events")
         if not isinstance(budget, dict) or not isinstance(events, dict):
             return True
-        return budget.get("seconds") is not None or events.get("blocked_by_cap") != 0
+        steered = budget.get("cap") == "governor"
+        return steered or budget.get("seconds") is not None or events.get("blocked_by_cap") != 0
 
 
 @dataclass(frozen=True)

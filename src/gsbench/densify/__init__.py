@@ -2,6 +2,7 @@
 
 from gsbench.densify.adc import ADC
 from gsbench.densify.base import Densifier, DensifyContext, NoDensifier, Refinement, Rule
+from gsbench.densify.budgeted import Budgeted
 from gsbench.densify.lineage import Lineage
 from gsbench.densify.mcmc import MCMC
 from gsbench.densify.volumetric import Volumetric
@@ -10,6 +11,7 @@ from gsbench.events import Cause, RefineEvent
 __all__ = [
     "ADC",
     "MCMC",
+    "Budgeted",
     "Cause",
     "Densifier",
     "DensifyContext",

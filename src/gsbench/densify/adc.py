@@ -4,26 +4,34 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import torch
 from annotated_types import Ge, Interval
-from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import Densifier, DensifyContext, Refinement, Rule
-from gsbench.densify.budget import CapKind, admit, allowance, check_room, limit_at
-from gsbench.errors import InputError
+from gsbench.densify.base import Refinement, Rule
+from gsbench.densify.budget import admit
+from gsbench.densify.budgeted import Budgeted
+from gsbench.densify.operations import revised_logits
 from gsbench.events import Cause
-from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction
 
-PAPER_CAP = 3_400_000  # the paper's, for the baseline and its own rule alike
+LOCKED_ROUNDS = 5  # after an opacity reset the governor does not raise the cull; our choice
+
+
+class Grown(NamedTuple):
+    """What a Gaussian becomes in a round, before pruning."""
+
+    number: Tensor  # [N]
+    log_scales: Tensor  # [N, 3]
+    opacity_logits: Tensor  # [N]
 
 
 @dataclass
-class ADC(Densifier):
+class ADC(Budgeted):
     """Clone what is small, split what is large, prune what is faint or huge (Kerbl et al. 2023, section 5).
 
     Sizes are fractions of the scene extent; ``gradient_threshold`` is in NDC units, averaged over the iterations in
@@ -36,9 +44,6 @@ class ADC(Densifier):
         "max_radii": torch.int32,  # px
     }
 
-    start: NonNegativeInt = 500  # refine where start < step < stop and step % interval == 0
-    stop: int = 15_000
-    interval: PositiveInt = 100
     gradient: Literal["signed", "absolute"] = "signed"  # absolute: AbsGS, arXiv 2404.10484
     gradient_threshold: PositiveFloat = 2e-4
     threshold_inclusive: bool = True  # >= as 3DGS; False: > as gsplat
@@ -51,24 +56,10 @@ class ADC(Densifier):
     prune_screen_radius: PositiveFloat | None = None  # px; 3DGS means 20 but zeroes the radii first, so it never acts
     opacity_reset_interval: PositiveInt = 3000
     opacity_reset_value: OpenFraction = 0.01
-    max_gaussians: PositiveInt | None = PAPER_CAP  # None: no limit, as 3DGS
-    cap: CapKind = "soft"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.stop <= self.start:
-            raise InputError(f"densify.stop must be above densify.start ({self.start}), got {self.stop}")
-        if self.cap == "curve" and self.max_gaussians is None:
-            raise InputError("densify.max_gaussians must be set for densify.cap=curve")
 
     @property
     def needs_absolute_gradient(self) -> bool:  # type: ignore[override]
         return self.gradient == "absolute"
-
-    def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
-        if self.max_gaussians is not None:
-            check_room(self.max_gaussians, len(gaussians))
-        super().begin(gaussians, context)
 
     def observe(self, step: int, render: RenderOutput) -> None:
         if step >= self.stop:
@@ -83,16 +74,14 @@ class ADC(Densifier):
         statistics["visible_count"] += visible
         statistics["max_radii"] = torch.maximum(statistics["max_radii"], render.radii)
 
-    def due(self, step: int) -> bool:
-        """Whether a round of growth and pruning is due."""
-        return self.start < step < self.stop and step % self.interval == 0
-
     def rules(self, refinement: Refinement) -> list[Rule]:
         """A round in the order of the baseline, and its opacity reset."""
         step = refinement.step
         rules: list[Rule] = []
-        if self.due(step):
-            rules += [self.grow_by_gradient, self.prune, self.reset_statistics]
+        if self.due(step) and self.frozen(refinement):
+            rules.append(self.stand_still)
+        elif self.due(step):
+            rules += [*self.governing(), self.grow_by_gradient, self.prune, self.reset_statistics]
         periodic = step % self.opacity_reset_interval == 0
         if step < self.stop and (periodic or (self.context.white_background and step == self.start)):
             rules.append(self.reset_opacity)
@@ -102,12 +91,34 @@ class ADC(Densifier):
         """[N] NDC, over the iterations in which a Gaussian was visible; 0 where it never was."""
         return self.statistics["gradient_sum"] / self.statistics["visible_count"].clamp_min(1)
 
+    def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
+        """Two masks [N]: those whose mean gradient reaches the threshold, and those to split rather than clone."""
+        mean, threshold = self.mean_gradient(), self.gradient_threshold * self.strictness
+        log_scales = refinement.gaussians.values.log_scales
+        large = log_scales.amax(-1) > math.log(self.split_size * self.context.extent)
+        return mean >= threshold if self.threshold_inclusive else mean > threshold, large
+
+    def grown(self, refinement: Refinement) -> Grown:
+        """What growth would make of each Gaussian."""
+        values = refinement.gaussians.values
+        over, large = self.candidates(refinement)
+        logits = torch.where(over, revised_logits(values.opacity_logits), values.opacity_logits)
+        return Grown(
+            torch.where(over, torch.where(large, self.split_children, 2), 1),
+            values.log_scales - math.log(self.split_shrink) * (over & large).unsqueeze(-1),
+            logits if self.revised_opacity else values.opacity_logits,
+        )
+
+    def forecast(self, refinement: Refinement) -> int:
+        grown = self.grown(refinement)
+        gone = self.faint(grown.opacity_logits) | self.huge(refinement.step, grown.log_scales)
+        return int(grown.number[~gone].sum())
+
     def grow_by_gradient(self, refinement: Refinement) -> None:
         """Clone the small and split the large of those whose mean gradient reaches the threshold."""
         gaussians, event = refinement.gaussians, refinement.event
         mean = self.mean_gradient()
-        over = mean >= self.gradient_threshold if self.threshold_inclusive else mean > self.gradient_threshold
-        large = gaussians.values.log_scales.amax(-1) > math.log(self.split_size * self.context.extent)  # [N]
+        over, large = self.candidates(refinement)
         allowed = self.allowance(refinement)
         selected, blocked = admit(over, mean, max(1, self.split_children - 1), allowed)
         event.blocked_by_cap += blocked
@@ -123,23 +134,30 @@ class ADC(Densifier):
             self.revised_opacity,
         )
 
-    def allowance(self, refinement: Refinement) -> int | None:
-        """How many Gaussians may be added now; None for no limit."""
-        initial = self.lineage.initial_count
-        limit = limit_at(refinement.step, self.start, self.stop, initial, self.max_gaussians, self.cap)
-        return allowance(len(refinement.gaussians), limit, self.cap)
+    def faint(self, opacity_logits: Tensor) -> Tensor:
+        """Mask [N] of those to prune by opacity."""
+        return opacity_logits.sigmoid() < self.prune_opacity * self.cull
+
+    def huge(self, step: int, log_scales: Tensor) -> Tensor:
+        """Mask [N] of those to prune by size, after the first opacity reset."""
+        if step <= self.opacity_reset_interval:
+            return log_scales.new_zeros(len(log_scales), dtype=torch.bool)
+        huge = log_scales.amax(-1) > math.log(self.prune_size * self.context.extent)
+        if self.prune_screen_radius is not None:
+            huge |= self.statistics["max_radii"] > self.prune_screen_radius
+        return huge
+
+    def may_cull(self, step: int) -> bool:
+        """Not in the first rounds after an opacity reset."""
+        since_reset = step % self.opacity_reset_interval
+        return step <= self.opacity_reset_interval or not 0 < since_reset <= LOCKED_ROUNDS * self.interval
 
     def prune(self, refinement: Refinement) -> None:
         """Remove the faint, and after the first opacity reset the huge."""
-        values, event = refinement.gaussians.values, refinement.event
-        faint = values.opacities < self.prune_opacity  # [N]
-        huge = torch.zeros_like(faint)
-        if refinement.step > self.opacity_reset_interval:
-            huge = values.log_scales.amax(-1) > math.log(self.prune_size * self.context.extent)
-            if self.prune_screen_radius is not None:
-                huge |= self.statistics["max_radii"] > self.prune_screen_radius
-        event.pruned_opacity += int(faint.sum())
-        event.pruned_size += int((huge & ~faint).sum())
+        values = refinement.gaussians.values
+        faint, huge = self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
+        refinement.event.pruned_opacity += int(faint.sum())
+        refinement.event.pruned_size += int((huge & ~faint).sum())
         self.edit(refinement, keep=~(faint | huge))
 
     def reset_opacity(self, refinement: Refinement) -> None:

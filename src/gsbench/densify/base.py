@@ -70,6 +70,8 @@ class Densifier:
     context: DensifyContext
     lineage: Lineage
     statistics: dict[str, Tensor]
+    strictness: float = 1.0  # factor on the thresholds of growth, moved by a governor (`Budgeted`)
+    cull: float = 1.0  # factor on the opacity below which Gaussians are pruned
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)

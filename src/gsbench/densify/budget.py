@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -9,7 +11,8 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 
-CapKind = Literal["soft", "hard", "curve"]
+CapKind = Literal["soft", "freeze", "hard", "curve", "governor"]
+SETTLE_STEPS = 40  # halvings of a range of the logarithm: far below the distance of neighbouring float32 scores
 
 
 def check_room(max_gaussians: int, num_initial: int) -> None:
@@ -36,9 +39,10 @@ def allowance(num_gaussians: int, max_gaussians: int | None, cap: CapKind) -> in
     """How many Gaussians a growth step may add; None for no limit.
 
     ``soft``: no limit up to ``max_gaussians``, nothing beyond it, so one step may overshoot (the paper's cap, whose
-    counts end at 3.41 to 3.57 M for 3.4 M). ``hard`` and ``curve``: never beyond it.
+    counts end at 3.41 to 3.57 M for 3.4 M). ``hard`` and ``curve``: never beyond it. ``freeze`` and ``governor`` set no
+    limit within a round.
     """
-    if max_gaussians is None:
+    if max_gaussians is None or cap in ("freeze", "governor"):
         return None
     if cap == "soft":
         return None if num_gaussians <= max_gaussians else 0
@@ -59,3 +63,18 @@ def admit(candidates: Tensor, score: Tensor, gain: int, allowed: int | None) -> 
     admitted = torch.zeros_like(candidates)
     admitted[best] = True
     return admitted, count - places
+
+
+def settle(count: Callable[[float], int], target: int, low: float, high: float) -> float:
+    """The factor in [``low``, ``high``] at which ``count``, which falls with it, is nearest to ``target`` from below;
+    ``high`` where it never falls so far."""
+    if count(low) <= target:
+        return low
+    a, b = math.log(low), math.log(high)
+    for _ in range(SETTLE_STEPS):
+        middle = (a + b) / 2
+        reached = count(math.exp(middle))
+        if reached == target:
+            return math.exp(middle)
+        a, b = (middle, b) if reached > target else (a, middle)
+    return min(high, math.exp(b))

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import Densifier, DensifyContext, Refinement, Rule
-from gsbench.densify.budget import check_room
+from gsbench.densify.base import Refinement, Rule
+from gsbench.densify.budgeted import Budgeted
 from gsbench.densify.operations import standard_normal
-from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
@@ -25,17 +24,15 @@ GATE_STEEPNESS = 100.0  # of the sigmoid that keeps noise off opaque Gaussians
 
 
 @dataclass
-class MCMC(Densifier):
+class MCMC(Budgeted):
     """Dead Gaussians move to where opaque ones are, a few are added until ``max_gaussians``, and means get noise.
 
     Copies share opacity and size so that the picture stays the same (eq. 9 of the paper). The cap is always exact.
     """
 
-    start: NonNegativeInt = 500
     stop: int = 25_000
-    interval: PositiveInt = 100
     max_gaussians: PositiveInt = 1_000_000
-    cap: Literal["hard"] = "hard"
+    cap: Literal["hard", "governor"] = "hard"
     growth: NonNegativeFloat = 0.05  # of the present count, at each refinement
     min_opacity: OpenFraction = 0.005  # dead at and below it
     noise_rate: NonNegativeFloat = 5e5  # times the learning rate of the means
@@ -44,11 +41,6 @@ class MCMC(Densifier):
     initial_opacity: OpenFraction = 0.5
     initial_scale: PositiveFloat = 0.1  # of the distance to the neighbours
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.stop <= self.start:
-            raise InputError(f"densify.stop must be above densify.start ({self.start}), got {self.stop}")
-
     def prepare(self, gaussians: Gaussians) -> Gaussians:
         changed = {
             "opacity_logits": torch.full_like(gaussians.opacity_logits, _logit(self.initial_opacity)),
@@ -56,16 +48,19 @@ class MCMC(Densifier):
         }
         return Gaussians(**(gaussians.tensors() | changed))
 
-    def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
-        check_room(self.max_gaussians, len(gaussians))
-        super().begin(gaussians, context)
-
     def regularizer(self, gaussians: Gaussians) -> Tensor:
         return self.opacity_weight * gaussians.opacities.mean() + self.scale_weight * gaussians.scales.mean()
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        due = self.start < refinement.step < self.stop and refinement.step % self.interval == 0
-        return [self.relocate, self.add] if due else []
+        return [*self.governing(), self.relocate, self.add] if self.due(refinement.step) else []
+
+    def forecast(self, refinement: Refinement) -> int:
+        """The count after a round, without the cap; what ``strictness`` divides is the share that is added."""
+        return int((1 + self.growth / self.strictness) * len(refinement.gaussians))
+
+    def may_cull(self, step: int) -> bool:
+        """Never: the dead are not pruned but moved."""
+        return False
 
     @torch.no_grad()
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
@@ -96,9 +91,9 @@ class MCMC(Densifier):
         gaussians, event = refinement.gaussians, refinement.event
         if event.relocated == 0 and (gaussians.values.opacities <= self.min_opacity).all():
             return  # nobody lives
-        wanted = int((1 + self.growth) * len(gaussians)) - len(gaussians)
+        wanted = self.forecast(refinement) - len(gaussians)
         event.added = min(wanted, max(0, self.max_gaussians - len(gaussians)))
-        event.blocked_by_cap = wanted - event.added
+        event.blocked_by_cap += wanted - event.added
         if event.added == 0:
             return
         sources = _draw(gaussians.values.opacities.detach(), event.added, refinement.rng)  # [A]

@@ -10,11 +10,12 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+import torch
 from annotated_types import Ge
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.adc import ADC
+from gsbench.densify.adc import ADC, Grown
 from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.budget import admit
 from gsbench.densify.volume import ConditionOf, child_log_scales, log_volume
@@ -63,13 +64,14 @@ class Volumetric(ADC):
     def rules(self, refinement: Refinement) -> list[Rule]:
         """Those of ADC, and the split by volume at the place that ``volume_order`` says."""
         rules = super().rules(refinement)
-        if self.due(refinement.step) and self.volume_due(refinement.step):
+        if self.volume_due(refinement.step):
             follower = {
                 "before_adc": self.grow_by_gradient,
                 "after_adc": self.prune,
                 "after_prune": self.reset_statistics,
             }[self.volume_order]
-            rules.insert(rules.index(follower), self.split_by_volume)
+            if follower in rules:  # a round that is not frozen
+                rules.insert(rules.index(follower), self.split_by_volume)
         return rules
 
     def volume_due(self, step: int) -> bool:
@@ -78,6 +80,38 @@ class Volumetric(ADC):
         stop = self.stop if self.volume_stop is None else self.volume_stop
         return start < step < stop and step % (self.volume_interval or self.interval) == 0
 
+    @property
+    def volume_gain(self) -> int:
+        """How many Gaussians a split by volume adds."""
+        return self.volume_children - (0 if self.keep_parent else 1)
+
+    def voluminous(self, log_scales: Tensor) -> Tensor:
+        """Mask [N] of the Gaussians to split by volume."""
+        volumes = log_volume(log_scales)
+        threshold = self.log_threshold(volumes)
+        if self.split_isotropic:
+            return volumes > threshold
+        children = log_volume(child_log_scales(log_scales, self.condition_of, self.max_condition))
+        return (volumes > threshold) & (children <= threshold)
+
+    def grown(self, refinement: Refinement) -> Grown:
+        """As if all parents were replaced."""
+        grown = super().grown(refinement)
+        if not self.volume_due(refinement.step):
+            return grown
+        number, log_scales = grown.number, grown.log_scales
+        if self.volume_order == "before_adc":  # the gradient rule knows nothing of the children
+            own = refinement.gaussians.values.log_scales
+            large = self.voluminous(own)
+            number, log_scales = torch.where(large, 1, number), torch.where(large.unsqueeze(-1), own, log_scales)
+        else:
+            large = self.voluminous(log_scales)
+        number = torch.where(large, (1 + self.volume_gain) * number, number)
+        if self.volume_order != "after_prune":
+            children = child_log_scales(log_scales, self.condition_of, self.max_condition)
+            log_scales = torch.where(large.unsqueeze(-1), children, log_scales)
+        return grown._replace(number=number, log_scales=log_scales)
+
     def split_by_volume(self, refinement: Refinement) -> None:
         """Split every Gaussian with V > V_th (eq. 5 to 7)."""
         event = refinement.event
@@ -85,12 +119,8 @@ class Volumetric(ADC):
         volumes = log_volume(log_scales)  # [N]
         threshold = self.log_threshold(volumes)
         children = child_log_scales(log_scales, self.condition_of, self.max_condition)  # [N, 3]
-        selected = volumes > threshold
         again = log_volume(children) > threshold  # [N] children that the next round would select too
-        if not self.split_isotropic:
-            selected &= ~again
-        gain = self.volume_children - (0 if self.keep_parent else 1)
-        selected, blocked = admit(selected, volumes, gain, self.allowance(refinement))
+        selected, blocked = admit(self.voluminous(log_scales), volumes, self.volume_gain, self.allowance(refinement))
         event.volume_threshold = math.exp(threshold)
         event.blocked_by_cap += blocked
         event.isotropic_resplit += int((selected & again).sum())
@@ -106,7 +136,10 @@ class Volumetric(ADC):
         )
 
     def log_threshold(self, volumes: Tensor) -> float:
-        """log V_th for Gaussians with log volumes [N], by ``threshold_mode``."""
+        """log V_th for Gaussians with log volumes [N], by ``threshold_mode``, times ``strictness``."""
+        return self._own_log_threshold(volumes) + math.log(self.strictness)
+
+    def _own_log_threshold(self, volumes: Tensor) -> float:
         if self.threshold_mode == "absolute":
             return math.log(self.volume_threshold)
         if self.threshold_mode == "extent_relative":

@@ -142,7 +142,19 @@ def event_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
             for cause, label in zip(causes, labels, strict=True)
         ]
         charts.append(line_chart(f"Refinement over time: {arm_name(arm)}", series, "iteration", "Gaussians"))
+    charts.append(_strictness_chart(trials, arms))
     return [chart for chart in charts if chart]
+
+
+def _strictness_chart(trials: Sequence[Trial], arms: Sequence[Arm]) -> str:
+    """How a governor moved the thresholds; empty where none did."""
+    series = []
+    for arm in arms:
+        own = [trial for trial in trials if trial.arm == arm]
+        points = mean_by_step([_rows(trial, EVENTS_FILE, "strictness") for trial in own])
+        series.append(Series(arm_name(arm), points))
+    title = "Thresholds of growth under the governor, as multiples of their settings"
+    return line_chart(title, series, "iteration", "factor", log_y=True)
 
 
 def _origin_chart(trials: Sequence[Trial], arms: Sequence[Arm]) -> str:

@@ -1,0 +1,208 @@
+"""Caps: freeze leaves a round out, the governor steers to a count; against counting one Gaussian at a time."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.densify import ADC, MCMC, Budgeted, Cause, DensifyContext, Refinement, Volumetric
+from gsbench.densify.budget import settle
+from gsbench.errors import InputError
+from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from tests.densify.test_rounds import EXTENT, prepared, to_rows
+from tests.gaussians.helpers import random_gaussians
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def at(step: int, trainable: TrainableGaussians) -> Refinement:
+    return Refinement(step, trainable, generator(0), event=None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", [ADC, Volumetric])
+def test_a_frozen_round_neither_grows_nor_prunes(kind: type[ADC]) -> None:
+    """And the optimiser's step of that iteration is not lost, as it is after an edit."""
+    densifier = kind(max_gaussians=60, cap="freeze")
+    trainable, _ = prepared(densifier, 3, count=60)
+    assert densifier.refine(600, trainable, generator(0)).after > 60  # at the limit a round may go beyond it
+    trainable.values.opacity_logits.data[:5] = -9.0  # to be pruned
+    for tensor in trainable.values.tensors().values():
+        tensor.grad = torch.ones_like(tensor)
+    densifier.statistics["gradient_sum"] += 1e-3
+    densifier.statistics["visible_count"] += 1
+    before = to_rows(trainable)
+    event = densifier.refine(700, trainable, generator(0))
+    for old, new in zip(before, to_rows(trainable), strict=True):
+        assert all(np.array_equal(old[name], new[name]) for name in old)
+    assert (event.pruned_opacity, event.cloned, event.split_gradient, event.split_volume) == (0, 0, 0, 0)
+    assert trainable.values.means.grad is not None
+    assert event.after == event.before
+    assert event.balances()
+
+    twin = kind(cap="soft")
+    twin.begin(trainable.values.detach(), DensifyContext(EXTENT))
+    twin.statistics = densifier.statistics
+    unlimited = twin.refine(700, trainable, generator(0))
+    assert unlimited.pruned_opacity >= 5
+    assert event.blocked_by_cap == unlimited.after - (unlimited.before - 5) > 0
+
+
+def test_a_frozen_training_still_resets_its_opacities() -> None:
+    densifier = ADC(max_gaussians=60, cap="freeze")
+    trainable, _ = prepared(densifier, 3, count=60)
+    densifier.refine(2900, trainable, generator(0))
+    event = densifier.refine(3000, trainable, generator(0))
+    assert event.before == event.after > 60
+    assert event.opacity_reset
+    assert float(trainable.values.opacities.detach().max()) < 0.0101
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_settling_is_as_good_as_trying_every_factor(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    scores = draw.lognormal(0, 2, 200)
+    target = int(draw.integers(0, 200))
+
+    def count(factor: float) -> int:
+        return int((scores > factor).sum())
+
+    best = min(abs(count(f) - target) for f in scores)
+    found = settle(count, target, 1e-3, 1e3)
+    assert abs(count(found) - target) == best == 0
+    assert settle(count, 0, 1e-3, 1e-2) == pytest.approx(1e-2)  # never so few: the strictest
+    assert settle(count, 300, 1e-3, 1e3) == 1e-3  # never so many: the least strict
+
+
+COMBINATIONS = [
+    (ADC, {}),
+    (ADC, {"split_children": 3, "revised_opacity": True}),
+    (ADC, {"gradient": "absolute", "threshold_inclusive": False}),
+    (Volumetric, {}),
+    (Volumetric, {"split_isotropic": False, "max_condition": 4.0}),
+    (Volumetric, {"volume_order": "before_adc", "condition_of": "scales"}),
+    (Volumetric, {"volume_order": "after_prune", "volume_children": 3}),
+    (Volumetric, {"threshold_mode": "extent_relative", "volume_threshold": 3e-4}),
+    (Volumetric, {"volume_interval": 200}),
+]
+
+
+@pytest.mark.parametrize(("kind", "options"), COMBINATIONS, ids=lambda value: getattr(value, "__name__", str(value)))
+def test_the_forecast_is_what_a_round_does(kind: type[ADC], options: dict[str, object]) -> None:
+    for seed, (step, strictness, cull) in enumerate([(600, 1, 1), (3100, 0.3, 4), (3300, 5, 1), (3200, 0.01, 2)]):
+        densifier = kind(**options)  # type: ignore[arg-type]
+        trainable, _ = prepared(densifier, seed, count=200)
+        densifier.strictness, densifier.cull = strictness, cull
+        foreseen = densifier.forecast(at(step, trainable))
+        assert densifier.refine(step, trainable, generator(seed)).after == foreseen
+
+
+@pytest.mark.parametrize("kind", [ADC, Volumetric, MCMC])
+def test_who_keeps_to_the_curve_ends_at_the_limit(kind: type[Budgeted]) -> None:
+    densifier = kind(start=500, stop=1500, interval=100, max_gaussians=1100, cap="governor")  # type: ignore[call-arg]
+    count, counts = 100, []
+    for step in range(600, 1500, 100):
+        count = densifier.target(at(step, range(count)))  # type: ignore[arg-type]
+        counts.append(count)
+    progress = np.arange(1, 10) / 9  # the ninth round is the last
+    np.testing.assert_allclose(counts, 100 + 1000 * (2 * progress - progress**2), atol=1.0)
+    assert counts[-1] == 1100
+    late = densifier.target(at(1200, range(300)))  # type: ignore[arg-type]
+    assert late == 300 + round(800 * (1 - (2 / 3) ** 2))  # two rounds are left after it
+    assert densifier.target(at(1400, range(late))) == 1100  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", [ADC, Volumetric])
+def test_a_governed_round_ends_at_its_target(kind: type[ADC]) -> None:
+    """The same strictness multiplies every threshold, and the event says what it was."""
+    densifier = kind(max_gaussians=450, cap="governor", stop=1200)
+    trainable, gradient = prepared(densifier, 2, count=300)
+    scales = np.array([row["log_scales"] for row in to_rows(trainable)])
+    opacities = trainable.values.opacities.detach().numpy()
+    event = densifier.refine(900, trainable, generator(0))
+    assert event.target == 300 + round(150 * (1 - (2 / 3) ** 2))
+    assert abs(event.after - event.target) <= 2
+    assert event.balances()
+    assert event.cull == 1
+    cloned = (gradient >= 2e-4 * event.strictness) & (np.exp(scales.max(-1)) <= 0.01 * EXTENT)
+    assert event.cloned == cloned.sum()
+    assert event.pruned_opacity >= (opacities < 0.005).sum()
+    if kind is Volumetric:
+        assert event.volume_threshold == pytest.approx(0.03 * event.strictness)
+    json.loads(json.dumps(event.as_dict(), allow_nan=False))
+
+
+def test_far_over_its_target_a_round_prunes_more_of_the_faint() -> None:
+    densifier = ADC(max_gaussians=60, cap="governor", gradient_threshold=1.0, prune_size=100.0)
+    trainable, _ = prepared(densifier, 5, count=60)
+    densifier.max_gaussians = 30
+    trainable.values.opacity_logits.data.copy_(torch.logit(torch.linspace(0.006, 0.06, 60, dtype=torch.float64)))
+    rounds_after_a_reset = range(3100, 3800, 100)
+    assert [densifier.may_cull(step) for step in (3000, *rounds_after_a_reset)] == [True] + [False] * 5 + [True] * 2
+    opacities = trainable.values.opacities.detach().clone()
+    event = densifier.refine(14_900, trainable, generator(0))  # the last round
+    assert event.target == 30
+    assert event.strictness == pytest.approx(1e3)
+    assert 1 < event.cull <= 10
+    assert event.pruned_opacity == int((opacities < 0.005 * event.cull).sum()) > 0
+    assert event.after == 60 - event.pruned_opacity == 30
+
+
+def test_a_governed_mcmc_adds_what_is_missing() -> None:
+    gaussians = random_gaussians(40)
+    densifier = MCMC(start=0, stop=301, interval=100, max_gaussians=100, cap="governor")
+    densifier.begin(gaussians, DensifyContext(1.0))
+    trainable = TrainableGaussians(gaussians, LearningRates(), 1.0)
+    events = [densifier.refine(step, trainable, generator(step)) for step in (100, 200, 300)]
+    assert [event.after for event in events] == [event.target for event in events]
+    assert events[-1].after == 100
+    assert all(event.cull == 1 for event in events)
+
+
+@dataclass
+class Brightest(Budgeted):
+    """A user's own: clones the opaque."""
+
+    threshold: float = 0.5
+
+    def opaque(self, refinement: Refinement) -> torch.Tensor:
+        return refinement.gaussians.values.opacities > self.threshold * self.strictness
+
+    def forecast(self, refinement: Refinement) -> int:
+        return len(refinement.gaussians) + int(self.opaque(refinement).sum())
+
+    def rules(self, refinement):  # type: ignore[no-untyped-def]
+        return [*self.governing(), self.clone_opaque] if self.due(refinement.step) else []
+
+    def clone_opaque(self, refinement: Refinement) -> None:
+        refinement.event.cloned += self.clone(refinement, self.opaque(refinement), Cause.CLONE)
+
+
+def test_a_class_of_ones_own_is_governed_by_one_method() -> None:
+    gaussians = random_gaussians(100)
+    densifier = Brightest(start=0, stop=500, max_gaussians=150, cap="governor")
+    densifier.begin(gaussians, DensifyContext(1.0))
+    trainable = TrainableGaussians(gaussians, LearningRates(), 1.0)
+    counts = []
+    for step in (100, 200, 300, 400):
+        counts.append(densifier.refine(step, trainable, generator(0)).after)
+        trainable.values.opacity_logits.data += 0.1 * torch.randn(len(trainable), generator=generator(step))
+    assert counts[-1] == pytest.approx(150, rel=0.02)
+    assert counts[0] == pytest.approx(100 + 50 * (1 - (3 / 4) ** 2), abs=2)
+
+
+@pytest.mark.parametrize("cap", ["freeze", "governor"])
+def test_who_cannot_say_where_a_round_leads_is_not_governed(cap: str) -> None:
+    @dataclass
+    class Silent(Budgeted):
+        pass
+
+    with pytest.raises(InputError, match=rf"densify\.cap={cap} needs the method forecast, which Silent lacks"):
+        Silent(cap=cap)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=rf"densify\.max_gaussians must be set for densify\.cap={cap}"):
+        ADC(cap=cap, max_gaussians=None)  # type: ignore[arg-type]
