@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import ADC, MCMC, Budgeted, Cause, DensifyContext, Refinement, Volumetric
+from gsbench.densify import ADC, MCMC, Budgeted, DensifyContext, Refinement, Volumetric
 from gsbench.densify.budget import settle
 from gsbench.errors import InputError
 from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
@@ -162,38 +162,6 @@ def test_a_governed_mcmc_adds_what_is_missing() -> None:
     assert [event.after for event in events] == [event.target for event in events]
     assert events[-1].after == 100
     assert all(event.cull == 1 for event in events)
-
-
-@dataclass
-class Brightest(Budgeted):
-    """A user's own: clones the opaque."""
-
-    threshold: float = 0.5
-
-    def opaque(self, refinement: Refinement) -> torch.Tensor:
-        return refinement.gaussians.values.opacities > self.threshold * self.strictness
-
-    def forecast(self, refinement: Refinement) -> int:
-        return len(refinement.gaussians) + int(self.opaque(refinement).sum())
-
-    def rules(self, refinement):  # type: ignore[no-untyped-def]
-        return [*self.governing(), self.clone_opaque] if self.due(refinement.step) else []
-
-    def clone_opaque(self, refinement: Refinement) -> None:
-        refinement.event.cloned += self.clone(refinement, self.opaque(refinement), Cause.CLONE)
-
-
-def test_a_class_of_ones_own_is_governed_by_one_method() -> None:
-    gaussians = random_gaussians(100)
-    densifier = Brightest(start=0, stop=500, max_gaussians=150, cap="governor")
-    densifier.begin(gaussians, DensifyContext(1.0))
-    trainable = TrainableGaussians(gaussians, LearningRates(), 1.0)
-    counts = []
-    for step in (100, 200, 300, 400):
-        counts.append(densifier.refine(step, trainable, generator(0)).after)
-        trainable.values.opacity_logits.data += 0.1 * torch.randn(len(trainable), generator=generator(step))
-    assert counts[-1] == pytest.approx(150, rel=0.02)
-    assert counts[0] == pytest.approx(100 + 50 * (1 - (3 / 4) ** 2), abs=2)
 
 
 @pytest.mark.parametrize("cap", ["freeze", "governor"])

@@ -46,7 +46,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    for name in ("gradients", "largest", "mine", "shell", "untiled"):
+    for name in ("gradients", "largest", "mine", "opaque", "shell", "untiled"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return tmp_path
 
@@ -152,6 +152,25 @@ def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder: 
         assert torch.equal(resumed[0]["gaussians"][name], tensor), name
     for name, tensor in through[1]["lineage"].items():
         assert torch.equal(resumed[1]["lineage"][name], tensor), name
+
+
+def test_governed_class_of_the_document_ends_at_its_limit(folder: Path) -> None:
+    from gsbench.densify import DensifyContext
+    from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+    from tests.gaussians.helpers import random_gaussians
+
+    (code,) = (b for b in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text()) if b.startswith("# opaque.py"))
+    (folder / "opaque.py").write_text(code)
+    import opaque  # type: ignore[import-not-found]
+
+    gaussians, rng = random_gaussians(100), torch.Generator().manual_seed(0)
+    densifier = opaque.CloneOpaque(start=0, stop=500, max_gaussians=150, cap="governor")
+    densifier.begin(gaussians, DensifyContext(1.0))
+    trainable = TrainableGaussians(gaussians, LearningRates(), 1.0)
+    for step in (100, 200, 300, 400):
+        event = densifier.refine(step, trainable, rng)
+        trainable.values.opacity_logits.data += 0.1 * torch.randn(len(trainable), generator=rng)
+    assert abs(event.after - 150) <= 3
 
 
 @pytest.mark.parametrize("document", ["README.md", *(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))])

@@ -151,7 +151,7 @@ def _strictness_chart(trials: Sequence[Trial], arms: Sequence[Arm]) -> str:
     series = []
     for arm in arms:
         own = [trial for trial in trials if trial.arm == arm]
-        points = mean_by_step([_rows(trial, EVENTS_FILE, "strictness") for trial in own])
+        points = mean_by_step([_rows(trial, layout.EVENTS, "strictness") for trial in own])
         series.append(Series(arm_name(arm), points))
     title = "Thresholds of growth under the governor, as multiples of their settings"
     return line_chart(title, series, "iteration", "factor", log_y=True)
