@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from gsbench.errors import InputError
@@ -21,6 +24,12 @@ COLUMNS = (
     + [f"scale_{i}" for i in range(3)]
     + [f"rot_{i}" for i in range(4)]
 )
+
+REST = re.compile(r"f_rest_\d{1,2}")
+MAX_HEADER = 1 << 16  # bytes
+MIN_TEXT_BYTES = 2  # of a value in an ASCII file: a digit and a space
+SIZES = {"short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4}
+SIZES |= {"float": 4, "float32": 4, "double": 8, "float64": 8}  # bytes; all other types have one
 
 
 def write_ply(gaussians: Gaussians, path: Path) -> None:
@@ -43,21 +52,52 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
 
 
+def _read_vertices(path: Path) -> NDArray[Any]:
+    try:
+        _check_length(path)
+        return PlyData.read(str(path))["vertex"].data
+    except (OSError, LookupError, PlyParseError, ValueError, TypeError, OverflowError, MemoryError) as error:
+        raise InputError(f"{path}: not a readable PLY of Gaussians ({error})") from error
+
+
+def _check_length(path: Path) -> None:
+    """Raise ValueError where the header promises more than the file can hold, which would be allocated unread."""
+    with path.open("rb") as stream:
+        header, found, _ = stream.read(MAX_HEADER).partition(b"end_header")
+    if not found:
+        raise ValueError("it has no header")
+    is_text = b"format ascii" in header
+    promised = count = 0
+    for line in header.decode("ascii").splitlines():
+        words = line.split()
+        if words[:1] == ["element"]:
+            count = int(words[2])
+            if count < 0:
+                raise ValueError("it counts below zero")
+        elif words[:1] == ["property"] and len(words) > 2:
+            promised += count * (MIN_TEXT_BYTES if is_text else SIZES.get(words[1], 1))
+    if promised > path.stat().st_size:
+        raise ValueError(f"it is cut short: its header promises {promised} bytes or more")
+
+
 def read_ply(path: Path, device: torch.device | str = "cpu") -> Gaussians:
     """Read a 3DGS PLY of SH degree 0 to 3 (missing higher coefficients become zero), float32.
 
-    Raises InputError where the file is not a PLY or lacks a property.
+    Raises InputError where the file is not a PLY, lacks a property, or holds values that are no Gaussians.
     """
-    try:
-        vertices = PlyData.read(str(path))["vertex"].data
-    except (OSError, KeyError, PlyParseError, ValueError) as error:
-        raise InputError(f"{path}: not a readable PLY of Gaussians ({error})") from error
-    present = set(vertices.dtype.names)
-    rest = sorted((name for name in present if name.startswith("f_rest_")), key=lambda name: int(name.split("_")[2]))
+    vertices = _read_vertices(path)
+    present = set(vertices.dtype.names or ())
+    rest = sorted((name for name in present if REST.fullmatch(name)), key=lambda name: int(name.split("_")[2]))
     required = [name for name in COLUMNS if not name.startswith(("f_rest_", "n"))]
     missing = [name for name in required if name not in present]
-    if missing or len(rest) % 3 or len(rest) > NUM_REST:
-        raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {', '.join(missing) or 'f_rest_*'}")
+    if missing or len(rest) % 3 or len(rest) > NUM_REST or len(vertices) == 0:
+        odd = ", ".join(missing) or ("f_rest_*" if len(vertices) else "all, for it is empty")
+        raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {odd}")
+    for name in (*required, *rest):
+        if vertices[name].dtype.kind not in "fiu" or not np.isfinite(vertices[name]).all():
+            raise InputError(f"{path}: {name} is not a finite number everywhere: export the model again")
+    if not np.any([vertices[f"rot_{i}"] != 0 for i in range(4)], axis=0).all():
+        raise InputError(f"{path}: a Gaussian has a rotation of (0, 0, 0, 0): export the model again")
 
     def columns(names: list[str]) -> torch.Tensor:
         return torch.from_numpy(np.stack([vertices[name].astype(np.float32) for name in names], axis=1)).to(device)

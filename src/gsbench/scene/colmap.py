@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.scene.camera import Camera
-from gsbench.scene.colmap_files import check_binary_model, model_files
+from gsbench.scene.colmap_files import check_model
 from gsbench.scene.images import check_size, image_size
 from gsbench.scene.names import match_names
 from gsbench.scene.types import Capture
@@ -26,14 +26,12 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
 
     Raises `InputError`, one line, if it is missing or damaged.
     """
-    files = model_files(folder)
-    if files[0].suffix == ".bin":
-        check_binary_model(folder)
+    check_model(folder)
     try:
         model = pycolmap.Reconstruction(folder)
         for image in model.images.values():
-            if image.has_pose:
-                image.cam_from_world()
+            if image.has_pose and not np.isfinite(image.cam_from_world().matrix()).all():
+                raise ValueError(f"image {image.name} has no finite pose")
     except (ValueError, IndexError, RuntimeError, TypeError, MemoryError) as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(f"{folder}: the COLMAP model cannot be read ({reason}): export it again") from error

@@ -1,16 +1,19 @@
-"""The files of a COLMAP model: which there are, and whether binary ones are whole.
+"""The files of a COLMAP model: which there are, and whether what they hold makes sense.
 
-pycolmap trusts the counts that a binary file states: on a truncated or foreign file it may loop for minutes or read
-nonsense. Walking the records first (layout: COLMAP's ``src/colmap/scene/reconstruction_io_binary.cc``) costs little and
-finds that at once.
+pycolmap trusts its files: on a truncated or foreign one it may loop for minutes or read nonsense, and it takes a zero
+quaternion or a NaN without a word. Walking the records first costs little and finds that at once. Layouts: COLMAP's
+``src/colmap/scene/reconstruction_io_binary.cc`` and ``reconstruction_io_text.cc``.
 """
 
 from __future__ import annotations
 
+import math
 import struct
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from gsbench.errors import InputError
+from gsbench.scene.colmap_checks import ModelChecks
 
 REQUIRED = ("cameras", "images", "points3D")
 OPTIONAL = ("rigs", "frames")  # since COLMAP 3.12
@@ -21,10 +24,14 @@ _IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, camera id; then 
 _FRAME = struct.Struct("<II7dI")  # id, rig id, pose; then the number of its images
 _FRAME_DATA_BYTES = 16  # sensor type, sensor id, image id
 _POINT2D_BYTES = 24  # x, y, id of the 3D point
-_POINT3D_BYTES = 43  # id, position, colour, error
-_TRACK_ELEMENT_BYTES = 8
-# parameters of each camera model by its id: COLMAP's src/colmap/sensor/models.h
-_PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16}
+_POINT3D = struct.Struct("<Q3d3Bd")  # id, position, colour, error; then the length of its track
+_TRACK_ELEMENT = struct.Struct("<II")  # image id, index of the 2D point
+# names and numbers of parameters of the camera models by their ids: COLMAP's src/colmap/sensor/models.h
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+}  # fmt: skip
 
 
 def model_files(folder: Path) -> list[Path]:
@@ -39,57 +46,134 @@ def model_files(folder: Path) -> list[Path]:
     raise InputError(f"{folder}: no COLMAP model here: expected cameras, images and points3D as .bin or .txt")
 
 
-def check_binary_model(folder: Path) -> None:
-    """Raise `InputError` if a binary file of the model is truncated or has bytes left over."""
-    for stem, walk in _WALKS.items():
-        file = folder / f"{stem}.bin"
-        if stem in OPTIONAL and not file.is_file():
+def check_model(folder: Path) -> None:
+    """Raise `InputError`, one line, if a file of the model is truncated, has bytes left over, or holds nonsense."""
+    files = {file.stem: file for file in model_files(folder)}
+    walks = _BINARY_WALKS if files["cameras"].suffix == ".bin" else _TEXT_WALKS
+    checks = ModelChecks()
+    for stem, walk in walks.items():
+        if stem not in files:
             continue
-        data = file.read_bytes()
+        file = files[stem]
         try:
-            (count,) = _COUNT.unpack_from(data)
-            end = walk(data, count)
-        except (struct.error, ValueError) as error:
+            walk(file, checks)
+        except (struct.error, ValueError, IndexError, OverflowError) as error:
+            if isinstance(error, InputError):
+                raise InputError(f"{file}: {error}: copy or export it again") from error
             raise InputError(f"{file}: the file is truncated or damaged: copy or export it again") from error
+        except OSError as error:
+            raise InputError(f"{file}: cannot be read ({error.strerror})") from error
+
+
+def _walk_binary(walk: Callable[[bytes, int, ModelChecks], int]) -> Callable[[Path, ModelChecks], None]:
+    def walk_file(file: Path, checks: ModelChecks) -> None:
+        data = file.read_bytes()
+        (count,) = _COUNT.unpack_from(data)
+        end = walk(data, count, checks)
         if end != len(data):
-            surplus = "many" if end < len(data) else "few"
-            raise InputError(f"{file}: {abs(len(data) - end)} bytes too {surplus}: copy or export it again")
+            raise InputError(f"{abs(len(data) - end)} bytes too {'many' if end < len(data) else 'few'}")
+
+    return walk_file
 
 
-def _walk_cameras(data: bytes, count: int) -> int:
+def _binary_cameras(data: bytes, count: int, checks: ModelChecks) -> int:
     offset = _COUNT.size
     for _ in range(count):
-        _, model, _, _ = _CAMERA.unpack_from(data, offset)
-        if model not in _PARAMETERS:
-            return len(data)  # a model newer than this table: pycolmap will know
-        offset += _CAMERA.size + 8 * _PARAMETERS[model]
+        camera_id, model, width, height = _CAMERA.unpack_from(data, offset)
+        if model not in _MODELS:
+            raise InputError(f"camera {camera_id} is of an unknown model ({model})")
+        name, length = _MODELS[model]
+        params = struct.unpack_from(f"<{length}d", data, offset + _CAMERA.size)
+        checks.camera(camera_id, name, width, height, params)
+        offset += _CAMERA.size + 8 * length
     return offset
 
 
-def _walk_images(data: bytes, count: int) -> int:
+def _binary_images(data: bytes, count: int, checks: ModelChecks) -> int:
     offset = _COUNT.size
     for _ in range(count):
-        _IMAGE.unpack_from(data, offset)
-        offset = data.index(b"\0", offset + _IMAGE.size) + 1
-        (points,) = _COUNT.unpack_from(data, offset)
-        offset += _COUNT.size + points * _POINT2D_BYTES
+        image_id, *pose, camera_id = _IMAGE.unpack_from(data, offset)
+        end = data.index(b"\0", offset + _IMAGE.size)
+        name = data[offset + _IMAGE.size : end].decode()
+        (points,) = _COUNT.unpack_from(data, end + 1)
+        checks.image(image_id, pose, camera_id, name, points)
+        offset = end + 1 + _COUNT.size + points * _POINT2D_BYTES
+        if offset > len(data):
+            raise InputError(f"{offset - len(data)} bytes too few")
     return offset
 
 
-def _walk_points(data: bytes, count: int) -> int:
+def _binary_points(data: bytes, count: int, checks: ModelChecks) -> int:
     offset = _COUNT.size
     for _ in range(count):
-        (track,) = _COUNT.unpack_from(data, offset + _POINT3D_BYTES)
-        offset += _POINT3D_BYTES + _COUNT.size + track * _TRACK_ELEMENT_BYTES
+        point_id, x, y, z, *_ = _POINT3D.unpack_from(data, offset)
+        (length,) = _COUNT.unpack_from(data, offset + _POINT3D.size)
+        start = offset + _POINT3D.size + _COUNT.size
+        offset = start + length * _TRACK_ELEMENT.size
+        if offset > len(data):
+            raise InputError(f"{offset - len(data)} bytes too few")
+        checks.point(point_id, (x, y, z), _TRACK_ELEMENT.iter_unpack(data[start:offset]))
     return offset
 
 
-def _walk_frames(data: bytes, count: int) -> int:
+def _binary_frames(data: bytes, count: int, checks: ModelChecks) -> int:
     offset = _COUNT.size
     for _ in range(count):
-        *_, images = _FRAME.unpack_from(data, offset)
+        frame_id, _, *pose, images = _FRAME.unpack_from(data, offset)
+        checks.pose(f"frame {frame_id}", pose)
         offset += _FRAME.size + images * _FRAME_DATA_BYTES
     return offset
 
 
-_WALKS = {"cameras": _walk_cameras, "images": _walk_images, "points3D": _walk_points, "frames": _walk_frames}
+def _lines(file: Path) -> Iterator[list[str]]:
+    """The words of every line that is no comment; empty lines give no words."""
+    for line in file.read_text(encoding="utf-8").split("\n"):
+        if not line.lstrip().startswith("#"):
+            yield line.split()
+
+
+def _numbers(words: Sequence[str]) -> list[float]:
+    return [float(word) for word in words]
+
+
+def _text_cameras(file: Path, checks: ModelChecks) -> None:
+    lengths = dict(_MODELS.values())
+    for words in filter(None, _lines(file)):
+        if words[1] not in lengths or len(words) != 4 + lengths[words[1]]:
+            raise InputError(f"camera {words[0]} is of an unknown model or lacks parameters")
+        checks.camera(int(words[0]), words[1], int(words[2]), int(words[3]), _numbers(words[4:]))
+
+
+def _text_images(file: Path, checks: ModelChecks) -> None:
+    lines = _lines(file)
+    for words in lines:
+        if not words:
+            continue
+        points = next(lines, [])
+        if len(words) < 10 or len(points) % 3 or not all(map(math.isfinite, _numbers(points))):
+            raise InputError(f"image {words[0]} lacks numbers")
+        checks.image(int(words[0]), _numbers(words[1:8]), int(words[8]), words[9], len(points) // 3)
+
+
+def _text_points(file: Path, checks: ModelChecks) -> None:
+    for words in filter(None, _lines(file)):
+        track = [int(word) for word in words[8:]]
+        if len(words) < 8 or len(track) % 2 or not all(0 <= int(word) <= 255 for word in words[4:7]):
+            raise InputError(f"point {words[0]} lacks numbers or has no colour")
+        x, y, z, *_ = _numbers([*words[1:4], words[7]])
+        checks.point(int(words[0]), (x, y, z), zip(track[::2], track[1::2], strict=True))
+
+
+def _text_frames(file: Path, checks: ModelChecks) -> None:
+    for words in filter(None, _lines(file)):
+        checks.pose(f"frame {words[0]}", _numbers(words[2:9]))
+
+
+# in the order in which what a record refers to comes before it
+_BINARY_WALKS = {
+    "cameras": _walk_binary(_binary_cameras),
+    "images": _walk_binary(_binary_images),
+    "points3D": _walk_binary(_binary_points),
+    "frames": _walk_binary(_binary_frames),
+}
+_TEXT_WALKS = {"cameras": _text_cameras, "images": _text_images, "points3D": _text_points, "frames": _text_frames}

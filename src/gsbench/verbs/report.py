@@ -30,7 +30,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     densifiers = sorted({trial.densify for trial in experiment.trials})
     if options.baseline is not None and options.baseline not in densifiers:
         raise InputError(f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}")
-    file = experiment.folder / REPORT_NAME if options.out is None else _file_at(options.out, experiment.name)
+    file = experiment.folder / REPORT_NAME if options.out is None else file_at(options.out, experiment.name)
     text = build_report(experiment, options.baseline or BASELINE)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -41,7 +41,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
-def _file_at(out: Path, experiment: str) -> Path:
+def file_at(out: Path, experiment: str) -> Path:
     """The file that ``--out`` means: itself, or one in that folder, beside other experiments' tables and reports."""
     is_file = out.suffix.lower() in FILE_SUFFIXES and not out.is_dir()
     return out if is_file else out / f"{experiment}-{REPORT_NAME}"

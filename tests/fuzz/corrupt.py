@@ -1,0 +1,65 @@
+"""Ways in which files come to harm: cut, flipped, doubled, filled with NaN, infinities, zeros or huge counts."""
+
+from __future__ import annotations
+
+import struct
+from random import Random
+
+VALUES = (
+    struct.pack("<d", float("nan")), struct.pack("<d", float("inf")), struct.pack("<d", -1.0), struct.pack("<d", 0.0),
+    struct.pack("<f", float("nan")), struct.pack("<f", float("-inf")), struct.pack("<Q", 2**63),
+    struct.pack("<Q", 2**40), b"\xff" * 8, b"\0" * 32, struct.pack("<I", 2**32 - 1), struct.pack("<i", -1),
+)  # fmt: skip
+WORDS = (b"nan", b"inf", b"-1", b"0", b"99999999999999999999", b"", b"x", b"1e400", b"-", b"\xff", b"1 2 3", b"\n")
+
+
+def corrupt(data: bytes, rng: Random) -> bytes:
+    """``data`` with one to three injuries, mostly one."""
+    for _ in range(rng.choice((1, 1, 1, 2, 3))):
+        injury = rng.choice((_cut, _flip, _overwrite, _insert, _remove, _word, _noise))
+        data = injury(data, rng)
+    return data
+
+
+def _place(data: bytes, rng: Random) -> int:
+    """A position; near the start, where counts and headers are, half of the time."""
+    end = min(len(data), 64) if rng.random() < 0.5 else len(data)
+    return rng.randrange(end + 1)
+
+
+def _cut(data: bytes, rng: Random) -> bytes:
+    return data[: _place(data, rng)]
+
+
+def _flip(data: bytes, rng: Random) -> bytes:
+    changed = bytearray(data)
+    for _ in range(rng.randint(1, 8)):
+        if changed:
+            changed[min(_place(data, rng), len(changed) - 1)] ^= 1 << rng.randrange(8)
+    return bytes(changed)
+
+
+def _overwrite(data: bytes, rng: Random) -> bytes:
+    at, value = _place(data, rng), rng.choice(VALUES)
+    return data[:at] + value + data[at + len(value) :]
+
+
+def _insert(data: bytes, rng: Random) -> bytes:
+    at = _place(data, rng)
+    return data[:at] + rng.randbytes(rng.randint(1, 16)) + data[at:]
+
+
+def _remove(data: bytes, rng: Random) -> bytes:
+    at = _place(data, rng)
+    return data[:at] + data[at + rng.randint(1, 16) :]
+
+
+def _word(data: bytes, rng: Random) -> bytes:
+    """Another word for one of a text file's."""
+    words = data.split(b" ")
+    words[rng.randrange(len(words))] = rng.choice(WORDS)
+    return b" ".join(words)
+
+
+def _noise(data: bytes, rng: Random) -> bytes:
+    return rng.randbytes(rng.randint(0, 200)) if rng.random() < 0.2 else data + rng.randbytes(rng.randint(1, 40))

@@ -1,0 +1,103 @@
+"""Damaged COLMAP models and PLY files, read one after the other; run as a program, so that a crash is seen as one.
+
+    python -m tests.fuzz.models FOLDER FIRST COUNT
+
+prints how many cases were refused and how many were read, and the case that ended in anything else.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+import numpy as np
+
+from gsbench.errors import InputError
+from gsbench.gaussians.ply import read_ply, write_ply
+from gsbench.scene.colmap import read_model
+from tests.fuzz.corrupt import corrupt
+from tests.gaussians.helpers import random_gaussians
+
+SLOW_SECONDS = 20.0
+KINDS = ("colmap.bin", "colmap.txt", "ply")
+
+
+def write_originals(folder: Path) -> None:
+    """A small model with points and tracks in both formats, and a PLY file."""
+    import pycolmap
+
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_frames_per_rig, options.num_points3D = 4, 12
+    model = pycolmap.synthesize_dataset(options)
+    for kind in KINDS[:2]:
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+    model.write_binary(folder / KINDS[0])
+    model.write_text(folder / KINDS[1])
+    write_ply(random_gaussians(5, seed=1), folder / "model.ply")
+
+
+def run_case(originals: Path, work: Path, case: int) -> bool:
+    """Whether a damaged file was refused (True) or read as something that makes sense (False)."""
+    rng = Random(case)
+    kind = KINDS[case % len(KINDS)]
+    if kind == "ply":
+        target = work / "case.ply"
+        target.write_bytes(corrupt((originals / "model.ply").read_bytes(), rng))
+        return _refused(lambda: _check_gaussians(target))
+    target = work / kind
+    target.mkdir(exist_ok=True)
+    files = sorted((originals / kind).iterdir())
+    legacy = rng.random() < 0.5  # the three files of the older layout
+    hurt = rng.choice([file for file in files if not legacy or file.stem not in ("rigs", "frames")])
+    for file in target.iterdir():
+        file.unlink()
+    for file in files:
+        if not (legacy and file.stem in ("rigs", "frames")):
+            data = file.read_bytes()
+            (target / file.name).write_bytes(corrupt(data, rng) if file == hurt else data)
+    return _refused(lambda: _check_model(target))
+
+
+def _check_model(folder: Path) -> None:
+    model = read_model(folder)
+    poses = [image.cam_from_world().matrix() for image in model.images.values() if image.has_pose]
+    points = [point.xyz for point in model.points3D.values()]
+    assert all(np.isfinite(value).all() for value in (*poses, *points))
+    assert all(min(camera.width, camera.height, camera.focal_length_x) > 0 for camera in model.cameras.values())
+
+
+def _check_gaussians(path: Path) -> None:
+    gaussians = read_ply(path)
+    assert len(gaussians) > 0
+    assert all(np.isfinite(tensor.numpy()).all() for tensor in gaussians.tensors().values())
+
+
+def _refused(read: Callable[[], None]) -> bool:
+    refusal = None
+    try:
+        read()
+    except InputError as error:
+        refusal = str(error)
+    assert refusal is None or len(refusal.splitlines()) == 1
+    return refusal is not None
+
+
+def main(folder: Path, first: int, count: int) -> None:
+    """Run the cases ``first`` to ``first + count - 1``."""
+    write_originals(folder)
+    work = folder / "work"
+    work.mkdir(exist_ok=True)
+    refused = 0
+    for case in range(first, first + count):
+        (folder / "current").write_text(str(case))
+        start = time.monotonic()
+        refused += run_case(folder, work, case)
+        assert time.monotonic() - start < SLOW_SECONDS, f"case {case} took too long"
+    print(f"{count} cases: {refused} refused, {count - refused} read")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))

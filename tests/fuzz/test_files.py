@@ -1,0 +1,72 @@
+"""Damaged COLMAP models and PLY files end in one line or in a right result: never in a crash, a hang or nonsense."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from gsbench import cli
+from tests.fuzz.models import write_originals
+
+ROOT = Path(__file__).resolve().parents[2]
+CASES = 240  # in CI; `python -m tests.fuzz.models FOLDER 0 10000` tries more
+
+
+def test_damaged_files_are_refused_or_read_right(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tests.fuzz.models", str(tmp_path), "0", str(CASES)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    case = (tmp_path / "current").read_text()
+    assert done.returncode == 0, f"case {case}: {done.stderr[-2000:]}"
+    assert done.stdout.startswith(f"{CASES} cases: ")
+
+
+def replaced(data: bytes, at: int, layout: str, *values: float) -> bytes:
+    return data[:at] + struct.pack(layout, *values) + data[at + struct.calcsize(layout) :]
+
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("file", "harm", "words"),
+    [
+        ("images.bin", lambda data: replaced(data, 12, "<4d", 0, 0, 0, 0), "has no pose that can be used"),
+        ("images.bin", lambda data: replaced(data, 12, "<d", NAN), "has no pose that can be used"),
+        ("images.bin", lambda data: replaced(data, 44, "<d", NAN), "has no pose that can be used"),
+        ("cameras.bin", lambda data: replaced(data, 32, "<d", -300.0), "is damaged"),
+        ("cameras.bin", lambda data: replaced(data, 16, "<Q", 0), "is damaged"),
+        ("points3D.bin", lambda data: replaced(data, 16, "<d", NAN), "lies nowhere"),
+        ("points3D.bin", lambda data: replaced(data, 0, "<Q", 2**60), "truncated or damaged"),
+        ("images.bin", lambda data: replaced(data, 0, "<Q", 2**60), "truncated or damaged"),
+        ("cameras.bin", lambda data: data[:-3], "truncated or damaged"),
+        ("images.bin", lambda data: bytes(range(256)) * 20, "images.bin"),
+        ("points3D.bin", lambda data: data + b"\0", "1 bytes too many"),
+    ],
+)
+def test_the_program_names_the_file(
+    file: str,
+    harm: Callable[[bytes], bytes],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    write_originals(tmp_path)
+    (tmp_path / "sparse").mkdir()
+    model = (tmp_path / "colmap.bin").rename(tmp_path / "sparse" / "0")
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (32, 24)).save(tmp_path / "images" / "x.png")
+    (model / file).write_bytes(harm((model / file).read_bytes()))
+    words_given = ["scene=colmap", f"scene.path={tmp_path}", "init=dataset", "tracking=none"]
+    assert cli.run(words_given) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len([line for line in lines if line.startswith("gsbench:")]) == 1
+    assert file in lines[-1]
+    assert words in lines[-1]

@@ -1,0 +1,284 @@
+"""Every word on the command line is understood, or refused before any work: exit code 2 and one line that says why."""
+
+from __future__ import annotations
+
+import copy
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gsbench import cli
+from gsbench.compose import compose_trials, compose_values
+from gsbench.config import GROUP_SCHEMAS, check_values, config_hash, plain
+from gsbench.errors import InputError
+from gsbench.settings import option_fields
+
+REFUSED = {  # command line: a part of the line that refuses it
+    # words that nothing reads
+    "=3": "names no setting",
+    "+extra=1": "extra is not a setting",
+    "++train.extra=1": "train.extra is not a setting",
+    "+scene.sede=1": "did you mean seed?",
+    "+densify.grad=1": "did you mean gradient?",
+    "+init.colour=red": "init.colour is not a setting",
+    "SEED=1": "did you mean seed?",
+    "seed.x=1": "seed.x is not a setting",
+    "densify=none densify.start=4": "densify.start is not a setting",
+    "hydra.run.dir=x": "runs=FOLDER",
+    "hydra.sweep.dir=x": "runs=FOLDER",
+    "hydra.job.chdir=true": "where the command was given",
+    "hydra.verbose=true": "log.txt",
+    "+hydra.callbacks.x._target_=os.system": "no callback is called",
+    "hydra/job_logging=default": "does not read hydra/job_logging",
+    "hydra/launcher=joblib": "launch=serial, local or slurm",
+    "hydra.sweeper.params.seed=1": "-m seed=0,1,2",
+    "hydra.searchpath=[file:///nosuch]": "no such folder",
+    "--config-dir . --config-dir .": "names one folder",
+    "--config-dir nosuch": "no such folder",
+    "--config-dir": "needs a folder",
+    "--dry-rum": "did you mean --dry-run?",
+    "scene@foo=courtyard": "leave out the @",
+    "~seed": "cannot be taken away",
+    "~train": "cannot be taken away",
+    "~train.iterations": "cannot be taken away",
+    "tabels x": "did you mean tables?",
+    # choices
+    "densify=null": "choose one by its name",
+    "scene=[courtyard]": "choose one by its name",
+    "densify=vol": "densify=vol does not exist",
+    "experiment=demo": "write +experiment=NAME",
+    "-m +experiment=demo,threshold": "two experiments are two sweeps",
+    "+experiment=[demo,threshold]": "two experiments are two sweeps",
+    "+experiment=demo +experiment=threshold": "two experiments are two sweeps",
+    # sweeps
+    "seed=1,2": "add -m",
+    "-m seed=range(0,0)": "lists no value",
+    "-m seed=range(0,3,0)": "must not be zero",
+    "-m seed=interval(0,1)": "a sweep is a list of values",
+    "-m seed=0,-1": "seed must be a whole number",
+    "-m device=cpu,cuda": "makes no other trial",
+    "-m launch=serial,local": "makes no other trial",
+    "-m init.threads=1,2": "makes no other trial",
+    # values
+    "seed=-1": "seed must be a whole number in [0,",
+    "seed=true": "got true",
+    "seed=1e30": "seed must be",
+    "seed=${nosuch}": "Interpolation key 'nosuch' not found",
+    "seed=${": "is not a setting like key=value",
+    "seed=": "got ''",
+    "name=größe": "name=\"größe\"",
+    "name=store": "none of store",
+    "name=../up": "a plain folder name",
+    "name=a:b": "a plain folder name",
+    f"name={'a' * 300}": "a plain folder name",
+    "densify.name=a/b": "densify.name must be a plain folder name",
+    "init.name=null": "init.name must be a plain folder name",
+    "device=gpu": "auto, cpu, cuda or cuda:1",
+    "threads=true": "threads must be",
+    "runs=": "runs must be a path",
+    "train.opacity=inf": "train.opacity must be a number above 0, got inf",
+    "train.ssim_weight=nan": "got nan",
+    "train.background=[0,0]": "train.background must be a list of 3",
+    "train.iterations=2.5": "a whole number above 0, got 2.5",
+    "train.iterations=null": "got null",
+    "train.densify_stop=100": "densify.stop must be above densify.start",
+    "eval.lpips=[nosuch]": "eval.lpips must be a list of",
+    "eval.lpips=[vgg,vgg]": "at most once",
+    "eval.at=[99999]": "train.iterations is 2000",
+    "eval.weights=nosuch": "no such folder",
+    "init=dim init.weights=": "init.weights must be a path",
+    "tracking.uri=nosuch": "an address such as http://HOST:PORT",
+    "launch=slurm launch.timeout_min=1": "launch.signal_seconds must be below",
+    "launch=slurm launch.sbatch=3": "a mapping {key: value}",
+    "scene.downscale=4000 scene.max_size=100": "leaves 1x1 px",
+    "scene.width=1e9": "scene.width must be",
+    "scene=photos": "scene.path is not set",
+    "scene=photos scene.path=nosuch": "does not exist",
+    "scene=photos scene.path=~/x": "quotes of their own",
+    "init=ply": "init.path is not set",
+    # components
+    "densify.start=-1": "densify.start must be a whole number of at least 0, got -1",
+    "densify.volume_interval=150": "a multiple of densify.interval (100)",
+    "-m densify.volume_threshold=0.03,-1": "densify.volume_threshold must be a number above 0, got -1",
+    "--dry-run densify.volume_threshold=-1": "densify.volume_threshold must be",
+    "densify._target_=gsbench.errors.InputError": "not a class for densify",
+    "densify._target_=os.system": "allow_targets=[os]",
+    "densify._target_=nosuch.X allow_targets=[nosuch]": "No module named 'nosuch'",
+    "densify._target_=broken.X allow_targets=[broken]": "SyntaxError",
+    "densify=adc densify._target_=own.Raises allow_targets=[own]": "own.Raises cannot be made (KeyError",
+    "densify=adc densify._target_=own.Own allow_targets=[own] +densify.patiense=1": "did you mean patience?",
+    "densify=adc densify._target_=own.Own allow_targets=[own] +densify.patience=x": "must be a whole number, got 'x'",
+    "init._target_=5": "the import path of a class",
+    # verbs and questions
+    "tables": "required: experiment",
+    "tables x --format pdf": "invalid choice: 'pdf'",
+    "tables x --metrics psnr,psnr": "must be different names",
+    "tables nosuch": "no experiment 'nosuch'",
+    "report x --out ''": "is no path",
+    "retry x foo": "no experiment 'x'",
+    "view x --port 99999": "from 0 to 65535",
+    "view .": "is not a trial's folder",
+    "ui --uri nosuch": "is no address",
+    "bench --size 999999999x999999999": "a size is WIDTHxHEIGHT",
+    "bench --raster auto": "name those to time",
+    "--cfg job nosuch=1": "nosuch is not a setting",
+    "--cfg job train.iterations=abc": "train.iterations must be",
+    "--cfg job -m seed=1": "unrecognized arguments: -m",
+    "--cfg nosuch": "invalid choice",
+    "--resolve": "ask one thing",
+}  # fmt: skip
+OWN = """
+from dataclasses import dataclass
+from gsbench.densify import ADC
+
+@dataclass
+class Own(ADC):
+    patience: int = 5
+
+class Raises(ADC):
+    def __post_init__(self):
+        raise KeyError("two\\nlines")
+"""
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "own.py").write_text(OWN)
+    (tmp_path / "broken.py").write_text("def (:\n")
+    for module in ("own", "broken"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    return tmp_path
+
+
+@pytest.mark.parametrize("command", REFUSED)
+def test_what_is_not_understood_is_refused(command: str, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(shlex.split(command)) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("gsbench: ")
+    assert REFUSED[command] in line
+    assert not (place / "runs").exists()  # nothing was begun
+
+
+@pytest.mark.parametrize("command", ["seed=1", "status", "tables x"])
+@pytest.mark.parametrize("runs", ["file", "file/below", "~nosuchuser/x", ""])
+def test_a_runs_folder_that_cannot_be(
+    runs: str, command: str, place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (place / "file").touch()
+    monkeypatch.setenv("GSBENCH_RUNS", runs)
+    assert cli.run(shlex.split(command)) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "runs" in line
+    assert "full" not in line
+
+
+def test_a_runs_folder_that_cannot_be_made(capsys: pytest.CaptureFixture[str]) -> None:
+    if not Path("/proc/self").exists():
+        pytest.skip("needs /proc, where nobody can make a folder")
+    assert cli.run(["runs=/proc/nowhere", "tracking=none"]) == 2
+    assert "/proc/nowhere cannot be the runs folder" in capsys.readouterr().err
+
+
+def test_a_few_through_a_process_of_their_own(place: Path) -> None:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    for command in ("+extra=1", "-m seed=range(0,0)", "=3"):
+        argv = [sys.executable, "-m", "gsbench.cli", *shlex.split(command)]
+        done = subprocess.run(argv, capture_output=True, text=True, env=environment, timeout=120, check=False)
+        assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), done.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["launch=slurm", "launch.sbatch={constraint: a100}"],
+        ["launch=slurm", "launch.sbatch.constraint=a100"],
+        ["train.iterations=1e3", "densify.max_gaussians=1e5"],
+        ["scene.downscale=4", "scene.max_size=100"],
+        ['name="größe"'],
+        ["~densify.cap"],
+    ],
+)
+def test_what_is_meant_is_understood(words: list[str]) -> None:
+    (trial,) = compose_trials(words)
+    assert trial.values["launch"]["sbatch"] == ({"constraint": "a100"} if words[0] == "launch=slurm" else {})
+
+
+def test_glob_lists_the_options_of_a_group() -> None:
+    trials = compose_trials(["densify=glob(a*)"], multirun=True)
+    assert [trial.values["densify"]["name"] for trial in trials] == ["absgrad", "adc"]
+
+
+def test_report_writes_into_a_folder_as_tables_does(place: Path) -> None:
+    from gsbench.verbs.report import file_at
+
+    (place / "folder.html").mkdir()
+    assert file_at(Path("a/page.html"), "x") == Path("a/page.html")
+    assert file_at(Path("a"), "x") == Path("a/x-report.html")
+    assert file_at(Path("folder.html"), "x") == Path("folder.html/x-report.html")
+
+
+# ---- property: any value of any setting is taken and then stays, or refused in one line
+
+SCHEMA_KEYS = [(group, entry.name) for group, schema in GROUP_SCHEMAS.items() for entry in option_fields(schema)]
+VALUES: st.SearchStrategy[Any] = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text("aB1./~é \n", max_size=6),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from("abc"), inner, max_size=2),
+    max_leaves=5,
+)
+
+
+@pytest.fixture(scope="module")
+def composed() -> Any:
+    return compose_values([])
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@given(key=st.sampled_from(SCHEMA_KEYS), value=VALUES)
+def test_any_value_of_any_setting(composed: Any, key: tuple[str, str], value: Any) -> None:
+    config = copy.deepcopy(composed)
+    group, name = key
+    config[group][name] = value
+    refusal = None
+    try:
+        check_values(config)
+    except InputError as error:
+        refusal = str(error)
+    if refusal is not None:
+        assert refusal.startswith(f"{group}.{name} ")
+        assert len(refusal.splitlines()) == 1
+        return
+    once = plain(config)
+    check_values(config)
+    assert plain(config) == once
+
+
+# ---- what was valid keeps its identity: hashes as the code had them before settings carried their rules
+
+HASHES = {
+    (): "089f8fe73f7d068f5cddb439ebddb88b428ebd959313e2309132f0c369410bb4",
+    ("scene=photos", "scene.path=/data/p", "scene.max_size=800", "densify=adc", "train=paper", "eval=standard"):
+        "c88fe781b7d6829abab6b6329f85bec05358daaa28a0c1f836518d18ba79e99d",
+    ("train.opacity=1", "train.max_seconds=60", "train.background=[1,1,1]", "densify.prune_size=1", "eval.lpips=[vgg]",
+     "train.volume_histogram=[]", "init.peak_threshold=1"):
+        "840fdece05bd4cdc42368131662f3ec437b18ee3351da8f55bb491e36b847bbe",
+    ("densify=mcmc", "init=random", "densify.max_gaussians=1e5", "scene.downscale=2", "launch=local", "tracking=none"):
+        "d737b31f8cda218edae551b490d80763c07425326b67c3e8230393b07026a977",
+    ("scene.name=2024", "scene.train_list=a.txt", "eval.weights=null", "threads=3", "seed=7", "densify.name=0.5"):
+        "78181317581b772879495c39231680bc2c05a8e73eebda6a05d522b35e578b1c",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", HASHES)
+def test_hashes_of_valid_configurations_stay(words: tuple[str, ...]) -> None:
+    (trial,) = compose_trials(words)
+    assert config_hash(trial.values) == HASHES[words]
