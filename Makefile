@@ -1,7 +1,7 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-STAMP  := $(VENV)/.stamp-dev
+PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 # Each library that chooses its instructions by the processor, told to choose the plainest. Compiled kernels keep a cache
 # for each processor, so the ordinary ones stay.
@@ -17,26 +17,31 @@ GENERIC_TESTS := tests/test_machine.py tests/raster/test_cpu.py tests/raster/tes
 help: ## show this
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-install: $(STAMP) ## set up .venv with gsbench and the development tools
+install: $(VENV)/.stamp-dev ## set up .venv with gsbench and the development tools
 
-demo: $(STAMP) ## baseline against volumetric densification on the courtyard: six trials, the table, the report
+demo: $(VENV)/.stamp-run ## baseline against volumetric densification on the courtyard: six trials, the table, the report
 	$(BIN)/gsbench +experiment=demo
 	$(BIN)/gsbench tables demo
 	$(BIN)/gsbench report demo
 
-test: $(STAMP) ## run the tests
+test: $(VENV)/.stamp-dev ## run the tests
 	$(BIN)/python -m pytest
 
-test-generic: $(STAMP) ## run core tests as on the plainest processor of this architecture
+test-generic: $(VENV)/.stamp-dev ## run core tests as on the plainest processor of this architecture
 	$(GENERIC) $(BIN)/python -m pytest $(GENERIC_TESTS)
 
-lint: $(STAMP) ## check style and types
+lint: $(VENV)/.stamp-dev ## check style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-$(STAMP): pyproject.toml constraints.txt
+# What running needs, and no more; development tools come on top.
+$(VENV)/.stamp-run: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "gsbench needs Python 3.11 or newer: make PYTHON=python3.12 ...")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(PIP) -e .
+	@touch $@
+
+$(VENV)/.stamp-dev: $(VENV)/.stamp-run
+	$(PIP) -e '.[dev]'
 	@touch $@
