@@ -4,6 +4,7 @@ from gsbench.densify.adc import ADC
 from gsbench.densify.base import Densifier, DensifyContext, NoDensifier, Refinement, Rule
 from gsbench.densify.budgeted import Budgeted
 from gsbench.densify.lineage import Lineage
+from gsbench.densify.long_axis import LongAxis
 from gsbench.densify.mcmc import MCMC
 from gsbench.densify.volumetric import Volumetric
 from gsbench.events import Cause, RefineEvent
@@ -16,6 +17,7 @@ __all__ = [
     "Densifier",
     "DensifyContext",
     "Lineage",
+    "LongAxis",
     "NoDensifier",
     "RefineEvent",
     "Refinement",
