@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import os
 import shutil
 import sys
 import tempfile
@@ -15,12 +14,16 @@ from pathlib import Path
 from typing import Literal
 
 from gsbench.arguments import ArgumentParser
+from gsbench.datasets.catalog import DATA_VARIABLE, data_dir, read_catalog
 from gsbench.install import install_command
 from gsbench.layout import DATABASE, STORE
-from gsbench.pipeline.resources import available_threads
+from gsbench.pipeline.resources import available_threads, installed_gpus
+from gsbench.raster.executors import EXECUTORS, resolve
+from gsbench.words import counted, readable_bytes
 
 Verdict = Literal["ok", "note", "bad"]
 LITTLE_SPACE_GB = 5.0
+TRITON_CAPABILITY = (8, 0)  # "NVIDIA GPUs (Compute Capability 8.0+)", in Triton's README
 OPTIONAL = {  # package -> what needs it, and the extra that brings it
     "transformers": ("init=dim", "dim"),
     "gsplat": ("raster=gsplat and export --to compressed", "gsplat"),
@@ -48,9 +51,12 @@ def main(argv: Sequence[str], runs: Path) -> int:
     checks: list[Callable[[], Iterator[Finding]]] = [
         check_python,
         check_torch,
+        check_gpu,
         check_torchvision,
         check_packages,
         check_kernels,
+        check_executors,
+        check_data,
         lambda: check_runs(runs),
         lambda: check_tracking(runs),
         check_weights,
@@ -79,12 +85,34 @@ def check_torch() -> Iterator[Finding]:
         yield Finding("bad", "torch", f"cannot be imported ({_first_line(error)}): pip install torch")
         return
     yield Finding("ok", "torch", str(torch.__version__))
+
+
+def check_gpu() -> Iterator[Finding]:
+    """The GPUs that torch can use, or what keeps it from one that is there."""
+    import torch
+
+    for index in range(torch.cuda.device_count() if torch.cuda.is_available() else 0):
+        free, total = torch.cuda.mem_get_info(index)
+        text = f"{torch.cuda.get_device_name(index)}, {readable_bytes(free)} of {readable_bytes(total)} free"
+        if torch.version.hip is not None:
+            yield Finding("note", "gpu", f"{text}: an AMD GPU, on which gsbench was never tested")
+        elif torch.cuda.get_device_capability(index) < TRITON_CAPABILITY:
+            yield Finding("note", "gpu", f"{text}: older than Triton supports; if raster=triton fails, take gsplat")
+        else:
+            yield Finding("ok", "gpu", text)
     if torch.cuda.is_available():
-        names = [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]
-        yield Finding("ok", "gpu", ", ".join(names))
+        return
+    listed = len(installed_gpus())
+    if torch.version.cuda is None and listed:
+        text = (
+            f"{counted(listed, 'NVIDIA GPU')} here, but this torch is a build for CPUs: install one for CUDA, "
+            "see pytorch.org/get-started"
+        )
+    elif torch.version.cuda is None:
+        text = "none (this torch is a build for CPUs): raster=auto uses the CPU"
     else:
-        reason = "this torch has no CUDA" if torch.version.cuda is None else "torch finds no usable NVIDIA driver"
-        yield Finding("note", "gpu", f"none ({reason}): raster=auto uses the CPU")
+        text = "none (torch finds no usable NVIDIA driver; does nvidia-smi run?): raster=auto uses the CPU"
+    yield Finding("note", "gpu", text)
 
 
 def check_torchvision() -> Iterator[Finding]:
@@ -112,14 +140,46 @@ def check_packages() -> Iterator[Finding]:
 
 
 def check_kernels() -> Iterator[Finding]:
-    """Where numba keeps compiled kernels; without such a place every start compiles anew."""
-    places = [os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).resolve().parents[1] / "raster" / "cpu" / "__pycache__"]
-    place = next(Path(entry) for entry in places if entry)
-    if _is_writable(place):
-        yield Finding("ok", "kernels", f"compiled ones are kept in {place}")
-    else:
-        text = f"{place} may not be written to: kernels are kept in the user's cache, or set NUMBA_CACHE_DIR"
+    """Where the CPU's compiled kernels are kept; without such a place every start compiles anew."""
+    from gsbench.raster.cpu.jit import TEMPORARY_PREFIX, cache_base
+
+    place = cache_base()
+    if place.name.startswith(TEMPORARY_PREFIX):
+        text = "the user's cache may not be written to, so every start compiles anew: set NUMBA_CACHE_DIR to a folder"
         yield Finding("note", "kernels", text)
+    else:
+        yield Finding("ok", "kernels", f"those for the CPU are kept in {place}")
+
+
+def check_executors() -> Iterator[Finding]:
+    """Which rasterizers run here, and which is taken if none is chosen."""
+    import torch
+
+    here = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    for executor in EXECUTORS:
+        obstacles = {device: executor.obstacle(device) for device in here}
+        usable = [device for device, obstacle in obstacles.items() if obstacle is None]
+        if usable:
+            text = f"raster={executor.name} on {' and '.join(usable)}: {executor.text}"
+            yield Finding("ok", "rasterizer", text)
+        elif executor.runs_on(here[-1]):
+            yield Finding("note", "rasterizer", f"raster={executor.name} {obstacles[here[-1]]}")
+        else:
+            needed = " or ".join(executor.devices)
+            yield Finding("note", "rasterizer", f"raster={executor.name} needs a {needed} device, and there is none")
+    chosen = [f"{resolve('auto', device).name} on {device}" for device in here]
+    yield Finding("ok", "rasterizer", f"raster=auto is {' and '.join(chosen)}")
+
+
+def check_data() -> Iterator[Finding]:
+    """The public scenes that are at hand."""
+    for dataset in read_catalog().values():
+        places = {scene: folder for archive in dataset.archives for scene, folder in archive.scenes.items()}
+        found = [scene for scene, folder in sorted(places.items()) if (data_dir() / folder).is_dir()]
+        text = f"{len(found)} of {counted(len(places), 'scene')} of {dataset.title} in {data_dir().absolute()}"
+        if len(found) < len(places):
+            text += f"; `gsbench fetch {dataset.name}` brings what is missing (or set {DATA_VARIABLE})"
+        yield Finding("ok" if found else "note", "data", text)
 
 
 def check_runs(runs: Path) -> Iterator[Finding]:

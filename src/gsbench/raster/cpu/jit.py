@@ -18,6 +18,7 @@ from gsbench.raster.cpu.imports import PACKAGE, import_closure
 
 FIRST_COMPILE_SECONDS = 10  # about; measured 7.5 s of processor time on a 2024 server core
 DIGEST_CHARACTERS = 16
+TEMPORARY_PREFIX = "gsbench-numba-"  # of the folder where no other can be written
 
 njit: Any = numba.njit
 config: Any = numba.config
@@ -41,7 +42,7 @@ def cache_base() -> Path:
             continue
         if os.access(base, os.W_OK):
             return base
-    return Path(tempfile.mkdtemp(prefix="gsbench-numba-"))
+    return Path(tempfile.mkdtemp(prefix=TEMPORARY_PREFIX))
 
 
 def cache_folder(source: Path, package: Path = PACKAGE) -> Path:
