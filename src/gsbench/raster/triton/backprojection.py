@@ -39,7 +39,7 @@ from gsbench.raster.triton.layout import (
 )
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["units"])
 def sum_units(pair_ends, unit_widths, units, rows, GROUP: tl.constexpr):
     """Add the ``rows`` [pairs, 16] of each unit into the first of them. Its slots are neighbours."""
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
@@ -88,7 +88,7 @@ def _store_vector(array, index, values, mask):
     tl.store(array + 3 * index + 2, values[2], mask=mask)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "v"])
 def backproject(
     means,
     log_scales,

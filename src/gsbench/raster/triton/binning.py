@@ -62,7 +62,7 @@ def _span(records, place, row, first, past, mask):
     return tl.maximum(low, first), tl.minimum(high, past)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "blocks_x", "capacity"])
 def find_units(
     order,
     count,
@@ -102,7 +102,7 @@ def find_units(
         tl.store(unit_widths + unit + k, tl.maximum(high - low, 0), mask=active)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "capacity"])
 def summarise(unit_ends, count, pair_ends, capacity, flags, background, status):
     """``status`` [3] int64: the number of units, of pairs (if the units fit), and whether a value is bad."""
     units = tl.load(unit_ends + count - 1, mask=count > 0, other=0)
@@ -115,7 +115,7 @@ def summarise(unit_ends, count, pair_ends, capacity, flags, background, status):
     tl.store(status + 2, bad.to(tl.int64))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["units"])
 def write_pairs(unit_owners, unit_blocks, unit_widths, pair_ends, units, keys, owners, GROUP: tl.constexpr):
     """For each slot its block (``keys``) and its Gaussian (``owners``), both [pairs]; a lane a unit."""
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]

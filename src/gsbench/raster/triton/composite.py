@@ -30,37 +30,34 @@ from gsbench.raster.triton.layout import (
     ROW,
     SHEAR,
     STEPS,
-    SUM_ABS_T,
-    SUM_ABS_Y,
-    SUM_BLUE,
-    SUM_GREEN,
-    SUM_H,
-    SUM_H_T,
-    SUM_H_TT,
-    SUM_H_TY,
-    SUM_H_Y,
-    SUM_H_YY,
-    SUM_RED,
 )
 
 ALPHA_MAX = tl.constexpr(CONSTANTS.alpha_max)
 TRANSMITTANCE_MIN = tl.constexpr(CONSTANTS.transmittance_min)
-CHUNK = tl.constexpr(8)  # list entries between two looks at whether all pixels have stopped
+UNROLL = tl.constexpr(4)  # entries between two looks at whether all pixels have stopped
+UNROLL_BACK = tl.constexpr(2)  # entries of one round of the backward pass
 TO_PRECISION = tl.constexpr(2 * math.log(2.0))  # -curve to entry of the inverse covariance, up to sign
 
 
 @triton.jit
-def _pixels(block, blocks_x):
-    """The pixels of a block: the first column and row, and within it the columns [STEPS, LANES] and rows [LANES]."""
+def _pixels(block, blocks_x, width, height):
+    """Of the pixels of a block: which are in the image, their numbers in it (both [STEPS, LANES]), and the column of
+    each lane's first and the row of all (both [LANES], px)."""
     lane, step = tl.arange(0, LANES), tl.arange(0, STEPS)
-    columns = (lane % LANE_COLUMNS)[None, :] + step[:, None] * LANE_COLUMNS
-    return block % blocks_x * BLOCK_WIDTH, block // blocks_x * BLOCK_HEIGHT, columns, lane // LANE_COLUMNS
+    x = block % blocks_x * BLOCK_WIDTH + lane % LANE_COLUMNS
+    y = block // blocks_x * BLOCK_HEIGHT + lane // LANE_COLUMNS
+    columns = x[None, :] + step[:, None] * LANE_COLUMNS
+    inside = (columns < width) & (y < height)[None, :]
+    return inside, y[None, :] * width + columns, x.to(tl.float32), y.to(tl.float32)
 
 
 @triton.jit
 def _places():
-    """Where the pixels of a block stand in its memory, [STEPS, LANES]."""
-    return tl.arange(0, STEPS)[:, None] * LANES + tl.arange(0, LANES)[None, :]
+    """Where the pixels of a block stand in its memory, [STEPS, LANES]: those of a lane side by side.
+
+    Triton then lays out all [STEPS, LANES] so that sums over steps stay within a lane.
+    """
+    return tl.arange(0, STEPS)[:, None] + tl.arange(0, LANES)[None, :] * STEPS
 
 
 @triton.jit
@@ -80,25 +77,26 @@ def _record(records, entry):
 
 
 @triton.jit
-def _log2_alpha(record, left, columns, y):
-    """log2(alpha) [STEPS, LANES] before it is clamped, t [STEPS, LANES] and dy [LANES].
+def _log2_alpha(record, x, y):
+    """log2(alpha) [STEPS, LANES] before it is clamped, t [STEPS, LANES] and dy [LANES], at ``_pixels``' x and y.
 
-    Columns count from ``left``, so that no digits are lost far from pixel 0. Every rounding is spelled out: the forward
-    and the backward kernel have to agree on each pixel that is skipped.
+    Every rounding is spelled out: the forward and the backward kernel have to agree on each pixel that is skipped.
     """
     mean_x, mean_y, shear, curve_t, curve_y, log2_opacity, _, _, _ = record
     dy = y - mean_y
-    t = columns + tl.fma(dy, shear, left - mean_x)[None, :]
+    along = (tl.arange(0, STEPS) * LANE_COLUMNS).to(tl.float32)
+    t = tl.fma(dy, shear, x - mean_x)[None, :] + along[:, None]
     power = tl.fma(curve_t * t, t, tl.fma(curve_y * dy, dy, log2_opacity)[None, :])
     return power, t, dy
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["closing", "width", "height", "blocks_x"])
 def composite(
     order,
     starts,
     entries,
     records,
+    closing,
     background,
     width,
     height,
@@ -111,51 +109,48 @@ def composite(
 ):
     """Blend the block that ``order`` [blocks] has at the place of this program.
 
-    In: ``starts`` [blocks + 1], ``entries`` [pairs] the Gaussians of the lists, ``records`` [N, 16]. Out: ``image``
-    [H, W, 3], ``alpha`` [H, W]; for the backward pass, by block, step and lane, the final ``transmittance`` and
-    ``last``, past the last entry that was looked at before the pixel stopped; ``past`` [blocks], their maximum.
+    In: ``starts`` [blocks + 1], ``entries`` [pairs] the Gaussians of the lists, ``records`` [N + 1, 16] with one that
+    cannot be seen at ``closing``. Out: ``image`` [H, W, 3], ``alpha`` [H, W]; for the backward pass, by block, lane and
+    step, the final ``transmittance`` and ``last``, past the last entry that was looked at before the pixel stopped;
+    ``past`` [blocks], their maximum.
     """
     block = tl.load(order + tl.program_id(0)).to(tl.int32)
-    left, top, columns, rows = _pixels(block, blocks_x)
+    inside, pixel, x, y = _pixels(block, blocks_x, width, height)
     begin, end = tl.load(starts + block), tl.load(starts + block + 1)
-    inside = (left + columns < width) & (top + rows < height)[None, :]
-    first_x, x, y = left.to(tl.float32), columns.to(tl.float32), (top + rows).to(tl.float32)
     # A pixel that has stopped, or lies outside, has its transmittance with a minus sign: it stays as it is.
     light = tl.where(inside, 1.0, -1.0)
     red, green, blue = tl.zeros_like(light), tl.zeros_like(light), tl.zeros_like(light)
     seen = tl.where(inside, begin, 0)
 
-    # The records are loaded one entry ahead, the entries two.
-    ahead = _record(records, tl.load(entries + begin, mask=begin < end, other=0))
-    entry = tl.load(entries + begin + 1, mask=begin + 1 < end, other=0)
+    # Records are loaded one entry ahead, entries two; past the end of the list stands what cannot be seen.
+    ahead = _record(records, tl.load(entries + begin, mask=begin < end, other=closing))
+    entry = tl.load(entries + begin + 1, mask=begin + 1 < end, other=closing)
     alive = True
     position = begin
     while (position < end) & alive:
-        stop = tl.minimum(position + CHUNK, end)
-        for k in range(position, stop):
+        for _ in tl.static_range(UNROLL):
             record = ahead
             ahead = _record(records, entry)
-            entry = tl.load(entries + k + 2, mask=k + 2 < end, other=0)
-            power, _, _ = _log2_alpha(record, first_x, x, y)
+            entry = tl.load(entries + position + 2, mask=position + 2 < end, other=closing)
+            position += 1
+            power, _, _ = _log2_alpha(record, x, y)
             opacity = tl.where(power >= LOG2_ALPHA_MIN, tl.minimum(tl.exp2(power), ALPHA_MAX), 0.0)
             weight = light * opacity
             after = light - weight
             stopped = after < TRANSMITTANCE_MIN
             weight = tl.where(stopped, 0.0, weight)
             light = tl.where(stopped, -tl.abs(light), after)
-            seen = tl.where(stopped, seen, k + 1)
+            seen = tl.where(stopped, seen, position)
             red = tl.fma(weight, record[6], red)
             green = tl.fma(weight, record[7], green)
             blue = tl.fma(weight, record[8], blue)
-        position = stop
         alive = tl.max(tl.max((light > 0).to(tl.int32), 0), 0) > 0
 
     light = tl.abs(light)
     state = block * BLOCK_PIXELS + _places()
     tl.store(transmittance + state, light)
     tl.store(last + state, seen)
-    tl.store(past + block, tl.max(tl.max(seen, 0), 0))
-    pixel = (top + rows)[None, :] * width + left + columns
+    tl.store(past + block, tl.minimum(tl.max(tl.max(seen, 0), 0), end))
     tl.store(alpha + pixel, 1.0 - light, mask=inside)
     tl.store(image + 3 * pixel, tl.fma(light, tl.load(background), red), mask=inside)
     tl.store(image + 3 * pixel + 1, tl.fma(light, tl.load(background + 1), green), mask=inside)
@@ -163,18 +158,69 @@ def composite(
 
 
 @triton.jit
-def _total(values):
-    """The sum over a block's pixels: first within each lane."""
-    return tl.sum(tl.sum(values, 0), 0)
+def _fold(a, b, lane, BIT: tl.constexpr):
+    """Sums over lanes that differ in ``BIT``: of ``a`` in the lanes without it, of ``b`` in those with it; all [LANES].
+
+    Two sums for one exchange between lanes, where sums of one and the other would take two.
+    """
+    low = (lane & BIT) == 0
+    return tl.where(low, a, b) + tl.gather(tl.where(low, b, a), lane ^ BIT, 0)
 
 
 @triton.jit
+def _sum_over(a, lane, BIT: tl.constexpr):
+    """Sums over lanes that differ in ``BIT``."""
+    return a + tl.gather(a, lane ^ BIT, 0)
+
+
+@triton.jit
+def _number_of_sum(lane, ABSOLUTE: tl.constexpr):
+    """Which sum ``_sums_over_lanes`` leaves in each lane, and which lanes are to store theirs."""
+    four, three, two, one = (lane >> 4) & 1, (lane >> 3) & 1, (lane >> 2) & 1, (lane >> 1) & 1
+    if ABSOLUTE:
+        further = tl.where(three == 1, 10, 8 + four)
+        stores = (lane & 1 == 0) & ((one == 0) | ((two == 0) & (three + four < 2)))
+    else:
+        further = tl.full([LANES], 8, tl.int32)
+        stores = (lane & 1 == 0) & ((one == 0) | (lane == 2))
+    return tl.where(one == 0, four + 2 * three + 4 * two, further), stores
+
+
+@triton.jit
+def _sums_over_lanes(sums, lane, ABSOLUTE: tl.constexpr):
+    """The sums over all lanes of the nine (or eleven) ``sums``, each in the lanes that ``_number_of_sum`` says."""
+    first = _fold(_fold(sums[0], sums[1], lane, 16), _fold(sums[2], sums[3], lane, 16), lane, 8)
+    second = _fold(_fold(sums[4], sums[5], lane, 16), _fold(sums[6], sums[7], lane, 16), lane, 8)
+    if ABSOLUTE:
+        further = _fold(_fold(sums[8], sums[9], lane, 16), _sum_over(sums[10], lane, 16), lane, 8)
+    else:
+        further = _sum_over(_sum_over(sums[8], lane, 16), lane, 8)
+    return _sum_over(_fold(_fold(first, second, lane, 4), _sum_over(further, lane, 4), lane, 2), lane, 1)
+
+
+@triton.jit
+def _lane_sums(h, weight, t, dy, g, record, ABSOLUTE: tl.constexpr):
+    """The nine (or eleven) gradient sums over the pixels of each lane, [LANES], in the order of a row."""
+    ht = h * t
+    sum_h, sum_ht = tl.sum(h, 0), tl.sum(ht, 0)
+    sum_hy = sum_h * dy  # within a lane dy is the same for all pixels
+    moments = (sum_h, sum_ht, sum_hy, tl.sum(ht * t, 0), sum_ht * dy, sum_hy * dy)
+    sums = moments + (tl.sum(weight * g[0], 0), tl.sum(weight * g[1], 0), tl.sum(weight * g[2], 0))  # noqa: RUF005
+    if ABSOLUTE:
+        # d power / d mean_y = shear a t + e dy, with a and e from the curves: curve = -log2(e)/2 a
+        slope = tl.fma(record[2] * record[3], ht, record[4] * (h * dy[None, :]))
+        sums = sums + (tl.sum(tl.abs(ht), 0), tl.sum(tl.abs(slope), 0) * TO_PRECISION)  # noqa: RUF005
+    return sums
+
+
+@triton.jit(do_not_specialize=["closing", "width", "height", "blocks_x"])
 def decomposite(
     order,
     starts,
     entries,
     slots,
     records,
+    closing,
     background,
     width,
     height,
@@ -195,67 +241,54 @@ def decomposite(
     cancels. ``slots`` [pairs] has the row of each entry. ``g_alpha`` is read if ``HAS_ALPHA``.
     """
     block = tl.load(order + tl.program_id(0)).to(tl.int32)
-    left, top, columns, rows = _pixels(block, blocks_x)
+    inside, pixel, x, y = _pixels(block, blocks_x, width, height)
     begin, end, stop = tl.load(starts + block), tl.load(starts + block + 1), tl.load(past + block)
-    number = tl.arange(0, ROW)
+    lane = tl.arange(0, LANES)
+    number, stores = _number_of_sum(lane, ABSOLUTE)
 
     # Entries that no pixel came to.
     stop = tl.maximum(stop, begin)
     for first in range(stop, end, LANES):
-        position = first + tl.arange(0, LANES)
-        slot = tl.load(slots + position, mask=position < end, other=0)
-        place = rows_out + slot[:, None] * ROW + number[None, :]
-        tl.store(place, tl.zeros([LANES, ROW], tl.float32), mask=(position < end)[:, None])
+        skipped = first + lane
+        place = rows_out + tl.load(slots + skipped, mask=skipped < end, other=0)[:, None] * ROW
+        tl.store(place + tl.arange(0, ROW)[None, :], tl.zeros([LANES, ROW], tl.float32), mask=(skipped < end)[:, None])
 
-    inside = (left + columns < width) & (top + rows < height)[None, :]
-    first_x, x, y = left.to(tl.float32), columns.to(tl.float32), (top + rows).to(tl.float32)
-    pixel = (top + rows)[None, :] * width + left + columns
-    g_red = tl.load(g_image + 3 * pixel, mask=inside, other=0.0)
-    g_green = tl.load(g_image + 3 * pixel + 1, mask=inside, other=0.0)
-    g_blue = tl.load(g_image + 3 * pixel + 2, mask=inside, other=0.0)
+    g = (
+        tl.load(g_image + 3 * pixel, mask=inside, other=0.0),
+        tl.load(g_image + 3 * pixel + 1, mask=inside, other=0.0),
+        tl.load(g_image + 3 * pixel + 2, mask=inside, other=0.0),
+    )
     state = block * BLOCK_PIXELS + _places()
     light = tl.load(transmittance + state)
     seen = tl.load(last + state)
-    behind = g_red * tl.load(background) + g_green * tl.load(background + 1) + g_blue * tl.load(background + 2)
+    behind = g[0] * tl.load(background) + g[1] * tl.load(background + 1) + g[2] * tl.load(background + 2)
     if HAS_ALPHA:
         behind -= tl.load(g_alpha + pixel, mask=inside, other=0.0)
     behind *= light
 
-    ahead = _record(records, tl.load(entries + stop - 1, mask=begin < stop, other=0))
-    entry = tl.load(entries + stop - 2, mask=begin + 1 < stop, other=0)
-    for back in range(0, stop - begin):
-        k = stop - 1 - back
-        record = ahead
-        ahead = _record(records, entry)
-        entry = tl.load(entries + k - 2, mask=k - 2 >= begin, other=0)
-        slot = tl.load(slots + k)
-        power, t, dy = _log2_alpha(record, first_x, x, y)
-        raw = tl.where((power >= LOG2_ALPHA_MIN) & (k < seen), tl.exp2(power), 0.0)
-        opacity = tl.minimum(raw, ALPHA_MAX)
-        root = tl.rsqrt(1.0 - opacity)
-        inverse = root * root  # cheaper than a division
-        shine = tl.fma(g_red, record[6], tl.fma(g_green, record[7], g_blue * record[8]))
-        h = raw * inverse * tl.fma(light, shine, -behind)
-        light *= inverse
-        weight = light * opacity
-        behind = tl.fma(weight, shine, behind)
+    ahead = _record(records, tl.load(entries + stop - 1, mask=begin < stop, other=closing))
+    entry = tl.load(entries + stop - 2, mask=begin + 1 < stop, other=closing)
+    position = stop
+    while position > begin:
+        for _ in tl.static_range(UNROLL_BACK):
+            position -= 1
+            record = ahead
+            ahead = _record(records, entry)
+            entry = tl.load(entries + position - 2, mask=position - 2 >= begin, other=closing)
+            slot = tl.load(slots + position, mask=position >= begin, other=0)
+            power, t, dy = _log2_alpha(record, x, y)
+            raw = tl.where((power >= LOG2_ALPHA_MIN) & (position < seen), tl.exp2(power), 0.0)
+            opacity = tl.minimum(raw, ALPHA_MAX)
+            root = tl.rsqrt(1.0 - opacity)
+            inverse = root * root  # cheaper than a division
+            shine = tl.fma(g[0], record[6], tl.fma(g[1], record[7], g[2] * record[8]))
+            h = raw * inverse * tl.fma(light, shine, -behind)
+            light *= inverse
+            weight = light * opacity
+            behind = tl.fma(weight, shine, behind)
 
-        ht = h * t
-        # Within a lane dy is the same for all pixels.
-        sum_h, sum_ht, sum_htt = tl.sum(h, 0), tl.sum(ht, 0), tl.sum(ht * t, 0)  # [LANES]
-        sum_hy = sum_h * dy
-        row = tl.where(number == SUM_H, tl.sum(sum_h, 0), 0.0)
-        row = tl.where(number == SUM_H_T, tl.sum(sum_ht, 0), row)
-        row = tl.where(number == SUM_H_Y, tl.sum(sum_hy, 0), row)
-        row = tl.where(number == SUM_H_TT, tl.sum(sum_htt, 0), row)
-        row = tl.where(number == SUM_H_TY, tl.sum(sum_ht * dy, 0), row)
-        row = tl.where(number == SUM_H_YY, tl.sum(sum_hy * dy, 0), row)
-        row = tl.where(number == SUM_RED, _total(weight * g_red), row)
-        row = tl.where(number == SUM_GREEN, _total(weight * g_green), row)
-        row = tl.where(number == SUM_BLUE, _total(weight * g_blue), row)
-        if ABSOLUTE:
-            # d power / d mean_y = shear a t + e dy, with a and e from the curves: curve = -log2(e)/2 a
-            slope = tl.fma(record[2] * record[3], ht, record[4] * (h * dy[None, :]))
-            row = tl.where(number == SUM_ABS_T, _total(tl.abs(ht)), row)
-            row = tl.where(number == SUM_ABS_Y, _total(tl.abs(slope)) * TO_PRECISION, row)
-        tl.store(rows_out + slot * ROW + number, row)
+            tl.store(
+                rows_out + slot * ROW + number,
+                _sums_over_lanes(_lane_sums(h, weight, t, dy, g, record, ABSOLUTE), lane, ABSOLUTE),
+                mask=stores & (position >= begin),
+            )

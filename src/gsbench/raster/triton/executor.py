@@ -69,7 +69,7 @@ class _Frame:
     degree: int
     units: int
     pairs: int
-    records: Tensor  # [N, 16]
+    records: Tensor  # [N + 1, 16] the last cannot be seen
     row_counts: Tensor  # [N] int32 units of each Gaussian
     first_units: Tensor  # [N] int64
     unit_widths: Tensor  # [units] int32 pairs of each unit
@@ -97,13 +97,13 @@ def _forward(
     """Project, sort, bin, composite into ``image``, ``alpha`` and ``radii``."""
     view = make_view(camera)
     count, blocks = len(gaussians), view.blocks
-    records = frame_memory.take("records", max(count, 1) * RECORD.value, torch.float32)
+    records = frame_memory.take("records", (count + 1) * RECORD.value, torch.float32)
     row_counts = frame_memory.take("row_counts", count, torch.int32)
     keys = scratch.take("depth_keys", count, torch.int32)
     flags = scratch.take("flags", 1, torch.int32).zero_()
     record_ints = records.view(torch.int32)
     parameters = [tensor.detach() for tensor in gaussians.tensors().values()]
-    launch(project, count, 128)(
+    launch(project, count + 1, 128)(
         *parameters, count, view, records, record_ints, keys, row_counts, radii, flags, DEGREE=degree
     )
 
@@ -184,6 +184,7 @@ def _forward(
         starts,
         entries,
         records,
+        count,
         background,
         view.width,
         view.height,
@@ -216,6 +217,7 @@ def _backward(
         frame.entries,
         frame.slots,
         frame.records,
+        count,
         background,
         view.width,
         view.height,

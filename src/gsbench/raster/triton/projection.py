@@ -53,6 +53,7 @@ MAX_VARIANCE = tl.constexpr(1e18)  # px^2; nor can a standard deviation; squares
 MIN_SQUARED_NORM = tl.constexpr(MIN_QUATERNION_NORM**2)
 CONTOUR_MARGIN = tl.constexpr(0.01)  # px, and relative: rounding of the contour alpha = 1/255 must not lose a pixel
 LAST_KEY = tl.constexpr(2**31 - 1)  # sorts behind every depth
+UNSEEN = tl.constexpr(-1e9)  # log2(opacity)
 
 
 @triton.jit
@@ -64,7 +65,7 @@ def _tile_range(low, high, tiles, SIZE: tl.constexpr):
     return first, past
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "v"])
 def project(
     means,
     log_scales,
@@ -83,9 +84,10 @@ def project(
     DEGREE: tl.constexpr,
     GROUP: tl.constexpr,
 ):
-    """Fill ``radii`` [N]; of every Gaussian that can be seen its record, elsewhere rubbish; ``keys`` [N] by which depth
-    is sorted; ``row_counts`` [N], the rows of blocks that its contour can touch. ``flags`` [1] becomes 1 where a value
-    is not finite or a quaternion has no length. ``record_ints`` is the memory of ``records`` [N, 16]."""
+    """Fill ``radii`` [N]; of every Gaussian that can be seen its record, elsewhere rubbish, and at N one that cannot be
+    seen; ``keys`` [N] by which depth is sorted; ``row_counts`` [N], the rows of blocks that its contour can touch.
+    ``flags`` [1] becomes 1 where a value is not finite or a quaternion has no length. ``record_ints`` is the memory of
+    ``records`` [N + 1, 16]."""
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = index < count
     mean, log_scale = load_vector(means, index, inside), load_vector(log_scales, index, inside)
@@ -141,6 +143,8 @@ def project(
     clamped = (red < 0).to(tl.int32) + 2 * (green < 0).to(tl.int32) + 4 * (blue < 0).to(tl.int32)
 
     place = index * RECORD
+    seen |= index == count
+    log2_opacity = tl.where(inside, log2_opacity, UNSEEN)
     tl.store(records + place + MEAN_X, column, mask=seen)
     tl.store(records + place + MEAN_Y, row, mask=seen)
     tl.store(records + place + SHEAR, -xy / yy, mask=seen)
