@@ -2,29 +2,51 @@
 
 from __future__ import annotations
 
+import gc
+import json
+import weakref
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
+from gsbench.config import TrainConfig
+from gsbench.densify import ADC
+from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
-from gsbench.raster.base import RenderOutput
+from gsbench.pipeline.loss_triton import TritonLoss
+from gsbench.pipeline.ssim import torch_photometric_loss
+from gsbench.pipeline.trainer import Trainer
+from gsbench.raster.base import Rasterizer, RenderOutput
 from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.raster.triton import TritonRasterizer
+from gsbench.raster.triton import executor
+from gsbench.raster.triton.executor import TritonRasterizer
+from gsbench.scene.camera import Camera
+from gsbench.scene.types import Scene, View
+from tests.gaussians.helpers import random_gaussians
 
 BLACK = torch.zeros(3)
+TINY = Case(7, 5, 20, sh_degree=3)
 SMALL = Case(33, 49, 50, sh_degree=3)
 
 
-def _bits(output: RenderOutput, gradients: dict[str, torch.Tensor]) -> list[bytes]:
+def bits(output: RenderOutput, gradients: dict[str, Tensor]) -> list[bytes]:
     tensors = [output.image, output.alpha, output.radii, *gradients.values()]
     return [tensor.detach().numpy().tobytes() for tensor in tensors]
 
 
+def leaves(case: Case) -> Gaussians:
+    return case.gaussians().map(lambda tensor: tensor.float().requires_grad_())
+
+
 def test_the_same_bits_on_every_run() -> None:
     rasterizer = TritonRasterizer()
-    expected = _bits(*render_with_gradients(rasterizer, SMALL, torch.float32))
-    assert _bits(*render_with_gradients(rasterizer, SMALL, torch.float32)) == expected  # memory that was used before
-    assert _bits(*render_with_gradients(TritonRasterizer(), SMALL, torch.float32)) == expected
+    expected = bits(*render_with_gradients(rasterizer, SMALL, torch.float32))
+    assert bits(*render_with_gradients(rasterizer, SMALL, torch.float32)) == expected  # memory that was used before
+    assert bits(*render_with_gradients(TritonRasterizer(), SMALL, torch.float32)) == expected
 
 
 def test_equal_depths_are_blended_in_the_order_of_the_index() -> None:
@@ -38,11 +60,241 @@ def test_equal_depths_are_blended_in_the_order_of_the_index() -> None:
     )
     camera = SMALL.camera()
     image = TritonRasterizer().render(gaussians, camera, 0, BLACK).image
-    reference = ReferenceRasterizer().render(gaussians.map(torch.Tensor.double), camera, 0, BLACK.double()).image
+    reference = ReferenceRasterizer().render(gaussians.map(Tensor.double), camera, 0, BLACK.double()).image
     assert (image - reference).abs().max() < 1e-5
     assert reference.max() > 0.5
+
+
+def test_needles_keep_their_gradients() -> None:
+    """Long thin Gaussians, in float32 throughout: nothing cancels."""
+    gaussians = Case(50, 40, 20, sh_degree=0).gaussians()
+    gaussians.log_scales[:, 0] = 0.5
+    gaussians.log_scales[:, 1:] = -9.0
+    results = []
+    for rasterizer, dtype in ((TritonRasterizer(), torch.float32), (ReferenceRasterizer(), torch.float64)):
+        copy = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
+        rasterizer.render(copy, Case(50, 40, 20, 0).camera(), 0, BLACK.to(dtype)).image.square().sum().backward()
+        results.append(copy.log_scales.grad.double())
+    assert results[1].abs().max() > 0
+    assert (results[0] - results[1]).abs().max() < 1e-4 * results[1].abs().max()
+
+
+def test_far_from_the_origin_nothing_is_lost() -> None:
+    """A scene and its camera moved by 1,000 units, by amounts that float32 holds exactly."""
+    shift = torch.tensor([1024.0, -512.0, 256.0])
+    here, camera = TINY.gaussians(), TINY.camera()
+    here.means = (here.means * 2**10).round() / 2**10
+    there = here.map(Tensor.clone)
+    there.means += shift
+    moved = Camera(
+        camera.width,
+        camera.height,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        camera.rotation,
+        camera.translation - camera.rotation @ shift.double().numpy(),
+    )
+    images = [
+        TritonRasterizer().render(gaussians.map(Tensor.float), view, 0, BLACK).image
+        for gaussians, view in ((here, camera), (there, moved))
+    ]
+    assert (images[0] - images[1]).abs().max() < 1e-4
+    assert images[0].std() > 0.01
+
+
+def test_renders_may_be_differentiated_late_and_twice() -> None:
+    """Two graphs at once, in the opposite order, and one of them twice: none may use the memory of another."""
+    rasterizer = TritonRasterizer()
+    cases = (TINY, SMALL)
+    alone = [render_with_gradients(rasterizer, case, torch.float32)[1]["means"] for case in cases]
+    parameters = [leaves(case) for case in cases]
+    background = torch.tensor([0.2, 0.5, 0.9])
+    outputs = [rasterizer.render(g, case.camera(), 3, background) for g, case in zip(parameters, cases, strict=True)]
+    for k in (1, 0, 0):
+        case = cases[k]
+        weights = torch.randn(
+            case.height, case.width, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64
+        ).float()
+        parameters[k].means.grad = None
+        loss = (outputs[k].image * weights[..., :3]).sum() + (outputs[k].alpha * weights[..., 3]).sum()
+        loss.backward(retain_graph=True)
+        assert torch.equal(parameters[k].means.grad.double(), alone[k])
+
+
+def test_results_that_are_kept_are_not_overwritten() -> None:
+    rasterizer = TritonRasterizer()
+    output, gradients = render_with_gradients(rasterizer, TINY, torch.float32)
+    kept = bits(output, gradients)
+    image = output.image.detach()
+    before = image.clone()
+    render_with_gradients(rasterizer, TINY, torch.float32)
+    assert bits(output, gradients) == kept
+    del output
+    rasterizer.render(leaves(SMALL), TINY.camera(), 0, BLACK)
+    assert torch.equal(image, before)
+
+
+def test_strided_parameters_and_the_gradient_of_the_background() -> None:
+    gaussians = TINY.gaussians().map(Tensor.float)
+    strided = gaussians.map(lambda tensor: torch.stack([tensor, tensor], -1)[..., 0])
+    assert not strided.means.is_contiguous()
+    rasterizer = TritonRasterizer()
+    background = torch.tensor([0.1, 0.5, 0.7], requires_grad=True)
+    output = rasterizer.render(strided, TINY.camera(), 3, background)
+    assert torch.equal(output.image, rasterizer.render(gaussians, TINY.camera(), 3, background).image)
+    output.image.sum().backward()
+    assert background.grad[0].item() == pytest.approx((1 - output.alpha).sum().item(), rel=1e-5)
+
+
+def test_a_step_leaves_nothing_alive() -> None:
+    """Without Python's collector of cycles: what a step made is freed as soon as its names are gone."""
+    rasterizer, loss = TritonRasterizer(), TritonLoss(0.2)
+    parameters = leaves(TINY)
+    target = torch.zeros(TINY.height, TINY.width, 3, dtype=torch.uint8)
+    alive = []
+    collecting = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(3):
+            output = rasterizer.render(parameters, TINY.camera(), 3, BLACK, absolute_gradient=True)
+            value = loss(output.image, target)[0]
+            value.backward()
+            kept = [output.image, output.alpha, output.radii, output.screen_points, output.screen_gradient_abs, value]
+            alive += [weakref.ref(tensor) for tensor in [*kept, output.image.grad_fn, value.grad_fn]]
+            del output, value, kept
+        assert [reference() for reference in alive if reference() is not None] == []
+        assert [len(free) for pool in (rasterizer._frames, loss.pool) for free in pool._free.values()] == [1, 1]
+    finally:
+        if collecting:
+            gc.enable()
+
+
+def test_more_rows_than_were_expected() -> None:
+    """Gaussians as large as the image: the memory for their rows grows, and the result is that of a second render."""
+    gaussians = random_gaussians(6, seed=1, log_scale=(0.5, 1.0)).map(Tensor.float)
+    camera = Camera(90, 120, 90, 90, 45, 60, np.eye(3), np.zeros(3))
+    rasterizer = TritonRasterizer()
+    first = rasterizer.render(gaussians, camera, 0, BLACK)
+    second = rasterizer.render(gaussians, camera, 0, BLACK)
+    reference = ReferenceRasterizer().render(gaussians.map(Tensor.double), camera, 0, BLACK.double())
+    assert (reference.radii > 60).any()
+    assert torch.equal(first.image, second.image)
+    assert (first.image - reference.image).abs().max() < 1e-5
+
+
+def test_many_blocks_are_numbered_in_more_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = bits(*render_with_gradients(TritonRasterizer(), TINY, torch.float32))
+    monkeypatch.setattr(executor, "MAX_INT16", 0)
+    assert bits(*render_with_gradients(TritonRasterizer(), TINY, torch.float32)) == expected
+
+
+def test_more_pairs_than_can_be_sorted_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(executor, "MAX_INT32", 3)
+    with pytest.raises(ValueError, match="more than 3"):
+        TritonRasterizer().render(leaves(TINY), TINY.camera(), 0, BLACK)
 
 
 def test_float64_is_refused() -> None:
     with pytest.raises(ValueError, match="float32"):
         TritonRasterizer().render(SMALL.gaussians(), SMALL.camera(), 0, BLACK.double())
+
+
+def test_a_background_that_is_not_finite_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a device it is not looked at before the kernels do."""
+    monkeypatch.setattr(executor, "check_settings", lambda *_: None)
+    with pytest.raises(ValueError, match="background"):
+        TritonRasterizer().render(leaves(TINY), TINY.camera(), 0, torch.tensor([0.0, torch.nan, 0.0]))
+
+
+def orbit_camera(angle: float) -> Camera:
+    center = np.array([4 * np.sin(angle), 0.0, 4 - 4 * np.cos(angle)])
+    forward = (np.array([0.0, 0.0, 4.0]) - center) / 4
+    right = np.cross(np.array([0.0, 1.0, 0.0]), forward)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Camera(18, 14, 18.0, 18.0, 9.0, 7.0, rotation, -rotation @ center)
+
+
+def tiny_scene(truth: Gaussians) -> Scene:
+    views = []
+    for i, angle in enumerate((-0.4, 0.0, 0.4)):
+        camera = orbit_camera(angle)
+        image = ReferenceRasterizer().render(truth, camera, 0, BLACK).image
+        views.append(View(f"{i}.png", camera, (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()))
+    return Scene("tiny", tuple(views), tuple(views[:1]))
+
+
+def test_a_training_equals_the_references(tmp_path: Path) -> None:
+    """Thirty iterations, of which the twentieth refines.
+
+    The initial Gaussians are round: the gradients of their rotations are rounding errors, which Adam takes for a
+    direction. That shows once a split places the halves along rotated axes.
+    """
+    truth = random_gaussians(10, seed=2, log_scale=(-2.0, -1.0)).map(Tensor.float)
+    truth.opacity_logits += 2
+    scene = tiny_scene(truth)
+    options = TrainConfig(
+        name="test", iterations=30, sh_interval=10, position_steps=30, checkpoint_every=100, log_every=1
+    )  # type: ignore[call-arg]
+    colors = torch.full((len(truth), 3), 127, dtype=torch.uint8)
+
+    def train(rasterizer: Rasterizer) -> tuple[Gaussians, list[float]]:
+        folder = tmp_path / rasterizer.name
+        folder.mkdir()
+        cloud = gaussians_from_cloud(truth.means.double().numpy(), colors.numpy())
+        densifier = ADC(start=15, stop=29, interval=20, opacity_reset_interval=1000)
+        gaussians = Trainer(scene, cloud, densifier, rasterizer, options, 0).run(folder)
+        return gaussians, [json.loads(line)["loss"] for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+    gaussians, losses = train(TritonRasterizer())
+    expected, expected_losses = train(ReferenceRasterizer())
+    assert len(losses) == 30
+    assert losses[:20] == pytest.approx(expected_losses[:20], rel=2e-5)
+    assert losses[20:] == pytest.approx(expected_losses[20:], rel=5e-3)
+    assert losses[-1] < 0.8 * losses[0]
+    assert len(gaussians) == len(expected) > len(truth)
+
+
+def picture(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """A smooth picture with noise and, as target, an 8-bit picture like it."""
+    generator = torch.Generator().manual_seed(height)
+    y, x = torch.meshgrid(torch.arange(height) / 9, torch.arange(width) / 7, indexing="ij")
+    smooth = torch.stack([x.sin(), y.cos(), (x + y).sin()], -1) * 0.3 + 0.5
+    image = (smooth + 0.1 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1.2)
+    return image, (smooth.clamp(0, 1) * 255).to(torch.uint8)
+
+
+@pytest.mark.parametrize(
+    ("size", "weight"), [((3, 4), 0.2), ((11, 16), 0.0), ((11, 16), 1.0), ((37, 53), 0.2)], ids=str
+)
+def test_the_loss_matches_float64(size: tuple[int, int], weight: float) -> None:
+    """The last size is more than one strip of numbers and more than one of rows."""
+    image, target = picture(*size)
+    for wanted in (target, target / 255):
+        leaf, precise = image.clone().requires_grad_(), image.double().requires_grad_()
+        values = TritonLoss(weight)(leaf, wanted)
+        expected = torch_photometric_loss(precise, target.double() / 255, weight)
+        for value, reference in zip(values, expected, strict=True):
+            assert value.item() == pytest.approx(reference.item(), abs=2e-6)
+        (3 * values[0]).backward()
+        (3 * expected[0]).backward()
+        error = (leaf.grad - precise.grad).abs().max() / precise.grad.abs().max()
+        assert error < 1e-4
+        assert not values[1].requires_grad
+        assert not values[2].requires_grad
+
+
+def test_the_loss_of_equal_images_and_without_gradient() -> None:
+    image, target = picture(11, 16)
+    leaf = image.clone().requires_grad_()
+    loss, l1, similarity = TritonLoss(0.2)(leaf, image)
+    assert l1 == 0
+    assert similarity.item() == pytest.approx(1, abs=1e-6)
+    loss.backward()
+    assert leaf.grad.abs().max() < 1e-6  # L1's gradient at 0 is 0, SSIM is at its maximum
+    transposed = image.transpose(0, 1).contiguous().transpose(0, 1)
+    value = TritonLoss(0.2)(transposed, target)[0]
+    assert not value.requires_grad
+    assert value == TritonLoss(0.2)(leaf, target)[0]

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from gsbench.pipeline.ssim import SSIM_WEIGHT, torch_photometric_loss
+from gsbench.raster.executors import find
 
-if TYPE_CHECKING:
-    from gsbench.pipeline.loss_cpu import CompiledLoss
+Loss = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT) -> tuple[Tensor, Tensor, Tensor]:
@@ -23,9 +24,10 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = SSIM_WE
 
 
 class PhotometricLoss:
-    """``photometric_loss`` as an object: CPU float32 images go through the compiled kernel on ``threads`` threads.
+    """``photometric_loss`` as an object: float32 images go through compiled kernels.
 
-    The compiled path gives the same bits for any number of threads. Any other device or dtype goes through torch.
+    On a CPU these run on ``threads`` threads, with the same bits for any number of them; on a GPU where Triton is
+    installed they read nothing back. Any other device or dtype goes through torch.
     """
 
     def __init__(self, ssim_weight: float = SSIM_WEIGHT, threads: int | None = None) -> None:
@@ -33,17 +35,28 @@ class PhotometricLoss:
             raise ValueError(f"ssim_weight: must be between 0 and 1, got {ssim_weight}")
         self.ssim_weight = ssim_weight
         self._threads = threads
-        self._compiled: CompiledLoss | None = None
+        self._compiled: dict[str, Loss] = {}  # by type of device
 
     def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         if image.dim() != 3 or image.shape[-1] != 3 or image.shape != target.shape:
             raise ValueError(
                 f"image {tuple(image.shape)} and target {tuple(target.shape)} must be of one shape [H, W, 3]"
             )
-        if image.device.type != "cpu" or image.dtype != torch.float32:
+        if image.dtype != torch.float32:
             return torch_photometric_loss(image, target, self.ssim_weight)
-        if self._compiled is None:
-            from gsbench.pipeline.loss_cpu import CompiledLoss  # loads numba, which other devices need not have
+        kind = image.device.type
+        if kind not in self._compiled:
+            self._compiled[kind] = self._compile(kind)
+        return self._compiled[kind](image, target)
 
-            self._compiled = CompiledLoss(self.ssim_weight, self._threads)
-        return self._compiled(image, target)
+    def _compile(self, device_type: str) -> Loss:
+        """Loads the packages that this type of device needs, and no others."""
+        if device_type == "cpu":
+            from gsbench.pipeline.loss_cpu import CompiledLoss
+
+            return CompiledLoss(self.ssim_weight, self._threads)
+        if find("triton").obstacle(device_type) is None:
+            from gsbench.pipeline.loss_triton import TritonLoss
+
+            return TritonLoss(self.ssim_weight)
+        return partial(torch_photometric_loss, ssim_weight=self.ssim_weight)

@@ -65,7 +65,7 @@ EXECUTORS = (
     ),
     Executor(
         "triton",
-        "gsbench.raster.triton.TritonRasterizer",
+        "gsbench.raster.triton.executor.TritonRasterizer",
         devices=("cuda", "cpu") if os.environ.get("TRITON_INTERPRET") == "1" else ("cuda",),  # tests
         text="Triton kernels, compiled at first use by what torch brings along; the same bits on every run",
         package="triton",

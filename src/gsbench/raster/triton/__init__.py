@@ -1,5 +1,1 @@
 """The rasterizer for GPUs, in Triton kernels: needs nothing but torch and the Triton that torch brings along."""
-
-from gsbench.raster.triton.executor import TritonRasterizer
-
-__all__ = ["TritonRasterizer"]

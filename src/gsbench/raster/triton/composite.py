@@ -205,12 +205,13 @@ def _lane_sums(h, weight, t, dy, g, record, ABSOLUTE: tl.constexpr):
     sum_h, sum_ht = tl.sum(h, 0), tl.sum(ht, 0)
     sum_hy = sum_h * dy  # within a lane dy is the same for all pixels
     moments = (sum_h, sum_ht, sum_hy, tl.sum(ht * t, 0), sum_ht * dy, sum_hy * dy)
-    sums = moments + (tl.sum(weight * g[0], 0), tl.sum(weight * g[1], 0), tl.sum(weight * g[2], 0))  # noqa: RUF005
+    colors = (tl.sum(weight * g[0], 0), tl.sum(weight * g[1], 0), tl.sum(weight * g[2], 0))
     if ABSOLUTE:
         # d power / d mean_y = shear a t + e dy, with a and e from the curves: curve = -log2(e)/2 a
         slope = tl.fma(record[2] * record[3], ht, record[4] * (h * dy[None, :]))
-        sums = sums + (tl.sum(tl.abs(ht), 0), tl.sum(tl.abs(slope), 0) * TO_PRECISION)  # noqa: RUF005
-    return sums
+        return moments + colors + (tl.sum(tl.abs(ht), 0), tl.sum(tl.abs(slope), 0) * TO_PRECISION)
+    else:  # Triton compiles what follows a return, too
+        return moments + colors
 
 
 @triton.jit(do_not_specialize=["closing", "width", "height", "blocks_x"])

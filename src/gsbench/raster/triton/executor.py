@@ -17,6 +17,7 @@ from gsbench.raster.triton.composite import composite, decomposite
 from gsbench.raster.triton.launch import launch
 from gsbench.raster.triton.layout import BLOCK_PIXELS, RECORD, ROW, TILE, View, make_view
 from gsbench.raster.triton.projection import project
+from gsbench.raster.triton.toolchain import load_driver
 from gsbench.raster.triton.workspace import Workspace, WorkspacePool
 from gsbench.raster.validate import check_settings, raise_for_values
 from gsbench.readback import Readback
@@ -53,6 +54,8 @@ class TritonRasterizer:
         check_settings(gaussians, camera, sh_degree, background)
         if gaussians.means.dtype != torch.float32:
             raise ValueError(f"means: raster=triton needs float32, got {gaussians.means.dtype}")
+        if gaussians.means.device.type == "cuda":
+            load_driver()
         screen_points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         absolute = torch.zeros_like(screen_points) if absolute_gradient else None
         image, alpha, radii = _Render.apply(

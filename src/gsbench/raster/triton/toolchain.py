@@ -1,0 +1,44 @@
+"""What Triton needs when it first runs on a machine: it compiles the piece of C that starts its kernels."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import sysconfig
+from functools import cache
+from pathlib import Path
+
+from gsbench.errors import InputError
+
+
+def missing_tools() -> list[str]:
+    """What is not here of a C compiler and Python's headers, each with the package that has it. Loads neither torch nor
+    Triton."""
+    missing = []
+    compiler = os.environ.get("CC")
+    found = shutil.which(compiler.split()[0]) if compiler else shutil.which("gcc") or shutil.which("clang")
+    if found is None:
+        named = f" (CC is {compiler}, which is not there)" if compiler else ""
+        missing.append(f"a C compiler{named}: install the package gcc")
+    scheme = sysconfig.get_default_scheme()
+    if scheme == "posix_local":  # Debian's own; the headers are where they always were
+        scheme = "posix_prefix"
+    header = Path(sysconfig.get_paths(scheme=scheme)["include"]) / "Python.h"
+    if not header.exists():
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+        missing.append(f"{header}: install the package python{version}-dev (python{version}-devel on Fedora)")
+    return missing
+
+
+@cache
+def load_driver() -> None:
+    """Let Triton find the GPU and load its launcher, compiling it if need be; InputError says what is missing."""
+    from triton.runtime import driver
+
+    try:
+        driver.active.get_current_target()
+    except (RuntimeError, OSError, AssertionError, ImportError) as error:
+        missing = missing_tools()
+        reason = "Triton needs " + " and ".join(missing) if missing else f"Triton cannot start: {error}"
+        raise InputError(f"raster=triton: {reason}") from error
