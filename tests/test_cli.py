@@ -285,6 +285,27 @@ def test_doctor_names_a_torchvision_that_does_not_fit(tmp_path: Path, monkeypatc
     assert "pip uninstall torchvision" in finding.text
 
 
+def test_doctor_names_the_packages_that_triton_compiles_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_version", lambda package: "3.7.1")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    (finding,) = doctor.check_triton()
+    assert finding.verdict == "note"
+    assert "a C compiler: install the package gcc" in finding.text
+    (tmp_path / "gcc").write_text("")
+    (tmp_path / "gcc").chmod(0o755)
+    monkeypatch.setattr("sysconfig.get_paths", lambda scheme: {"include": str(tmp_path)})
+    (finding,) = doctor.check_triton()
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    assert f"Python.h: install the package python{version}-dev" in finding.text
+    (tmp_path / "Python.h").write_text("")
+    (finding,) = doctor.check_triton()
+    assert finding.verdict == "ok"
+    monkeypatch.setenv("CC", "nosuchcc -O2")
+    (finding,) = doctor.check_triton()
+    assert "CC is nosuchcc -O2, which is not there" in finding.text
+
+
 def test_doctor_on_a_runs_folder(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert next(doctor.check_runs(runs)).verdict in ("ok", "note")
     assert next(doctor.check_runs(Path("/proc/nowhere"))).verdict == "bad"

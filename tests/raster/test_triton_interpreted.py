@@ -136,6 +136,16 @@ def test_results_that_are_kept_are_not_overwritten() -> None:
     assert torch.equal(image, before)
 
 
+def test_a_render_for_inference_does_not_spoil_the_memory_for_training() -> None:
+    rasterizer = TritonRasterizer()
+    with torch.inference_mode():
+        image = rasterizer.render(leaves(TINY), TINY.camera(), 3, BLACK).image
+    _, expected = render_with_gradients(TritonRasterizer(), TINY, torch.float32)
+    output, gradients = render_with_gradients(rasterizer, TINY, torch.float32)
+    assert image.shape == output.image.shape
+    assert torch.equal(gradients["means"], expected["means"])
+
+
 def test_strided_parameters_and_the_gradient_of_the_background() -> None:
     gaussians = TINY.gaussians().map(Tensor.float)
     strided = gaussians.map(lambda tensor: torch.stack([tensor, tensor], -1)[..., 0])

@@ -54,6 +54,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         check_gpu,
         check_torchvision,
         check_packages,
+        check_triton,
         check_kernels,
         check_executors,
         check_data,
@@ -137,6 +138,20 @@ def check_packages() -> Iterator[Finding]:
         installed = _version(name)
         text = installed or f"not installed; needed for {purpose}: {install_command(extra)}"
         yield Finding("ok" if installed else "note", name, text)
+
+
+def check_triton() -> Iterator[Finding]:
+    """What raster=triton compiles with at its first run on a GPU."""
+    from gsbench.raster.triton.toolchain import missing_tools
+
+    installed = _version("triton")
+    if installed is None:  # torch for CUDA would have brought it along
+        return
+    if missing := missing_tools():
+        yield Finding("note", "triton", f"{installed}; at its first run on a GPU it needs {' and '.join(missing)}")
+    else:
+        text = f"{installed}; the C compiler and Python.h that it needs at its first run on a GPU are here"
+        yield Finding("ok", "triton", text)
 
 
 def check_kernels() -> Iterator[Finding]:

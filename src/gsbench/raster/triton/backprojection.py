@@ -88,7 +88,7 @@ def _store_vector(array, index, values, mask):
     tl.store(array + 3 * index + 2, values[2], mask=mask)
 
 
-@triton.jit(do_not_specialize=["count", "v"])
+@triton.jit(do_not_specialize=["count"])
 def backproject(
     means,
     log_scales,
@@ -156,7 +156,7 @@ def backproject(
     # Mean on the image: d power / d mean = (a t, shear a t + e dy).
     g_column = a * h_t
     g_row = shear * g_column + e * h_y
-    half_width, half_height = 0.5 * v.width.to(tl.float32), 0.5 * v.height.to(tl.float32)
+    half_width, half_height = 0.5 * v.width, 0.5 * v.height
     tl.store(g_screen + 2 * index, g_column * half_width, mask=seen)
     tl.store(g_screen + 2 * index + 1, g_row * half_height, mask=seen)
     if ABSOLUTE:

@@ -15,7 +15,7 @@ from gsbench.raster.triton.backprojection import backproject, sum_units
 from gsbench.raster.triton.binning import find_units, summarise, write_pairs
 from gsbench.raster.triton.composite import composite, decomposite
 from gsbench.raster.triton.launch import launch
-from gsbench.raster.triton.layout import BLOCK_PIXELS, RECORD, ROW, TILE, View, make_view
+from gsbench.raster.triton.layout import BLOCK_PIXELS, RECORD, ROW, TILE, Grid, View, make_grid, make_view
 from gsbench.raster.triton.projection import project
 from gsbench.raster.triton.toolchain import load_driver
 from gsbench.raster.triton.workspace import Workspace, WorkspacePool
@@ -68,6 +68,7 @@ class TritonRasterizer:
 class _Frame:
     """What the forward pass leaves for the backward pass; the memory belongs to a workspace."""
 
+    grid: Grid
     view: View
     degree: int
     units: int
@@ -98,8 +99,8 @@ def _forward(
     radii: Tensor,
 ) -> _Frame:
     """Project, sort, bin, composite into ``image``, ``alpha`` and ``radii``."""
-    view = make_view(camera)
-    count, blocks = len(gaussians), view.blocks
+    grid, view = make_grid(camera), make_view(camera)
+    count, blocks = len(gaussians), grid.blocks
     records = frame_memory.take("records", (count + 1) * RECORD.value, torch.float32)
     row_counts = frame_memory.take("row_counts", count, torch.int32)
     keys = scratch.take("depth_keys", count, torch.int32)
@@ -129,7 +130,7 @@ def _forward(
             unit_ends,
             records,
             record_ints,
-            view.blocks_x,
+            grid.blocks_x,
             capacity,
             first_units,
             owners,
@@ -165,6 +166,7 @@ def _forward(
     torch.sort(starts[1:] - starts[:-1], descending=True, stable=True, out=(lengths, order))
 
     frame = _Frame(
+        grid,
         view,
         degree,
         units,
@@ -189,9 +191,9 @@ def _forward(
         records,
         count,
         background,
-        view.width,
-        view.height,
-        view.blocks_x,
+        grid.width,
+        grid.height,
+        grid.blocks_x,
         image,
         alpha,
         frame.transmittance,
@@ -212,9 +214,9 @@ def _backward(
     absolute: Tensor | None,
 ) -> tuple[list[Tensor], Tensor]:
     """The gradients of the six tensors and of ``screen_points``; fills ``absolute`` [N, 2] if it is given."""
-    view, count = frame.view, len(gaussians)
+    grid, count = frame.grid, len(gaussians)
     rows = scratch.take("rows", frame.pairs * ROW.value, torch.float32)
-    decomposite[(view.blocks,)](
+    decomposite[(grid.blocks,)](
         frame.order,
         frame.starts,
         frame.entries,
@@ -222,9 +224,9 @@ def _backward(
         frame.records,
         count,
         background,
-        view.width,
-        view.height,
-        view.blocks_x,
+        grid.width,
+        grid.height,
+        grid.blocks_x,
         frame.transmittance,
         frame.last,
         frame.past,
@@ -246,7 +248,7 @@ def _backward(
         logits,
         sh_rest,
         count,
-        view,
+        frame.view,
         frame.records.view(torch.int32),
         frame.row_counts,
         frame.first_units,
@@ -301,9 +303,9 @@ class _Render(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
         alpha, background, *tensors = ctx.saved_tensors
-        view: View = ctx.frame.view
+        grid: Grid = ctx.frame.grid
         if g_image is None:
-            g_image = background.new_zeros(view.height, view.width, 3)
+            g_image = background.new_zeros(grid.height, grid.width, 3)
         g_image = g_image.contiguous()
         g_alpha = None if g_alpha is None else g_alpha.contiguous()
         holder = _Holder()

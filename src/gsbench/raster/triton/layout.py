@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import triton.language as tl
@@ -48,13 +49,32 @@ ALPHA_MIN = tl.constexpr(CONSTANTS.alpha_min)
 LOG2_ALPHA_MIN = tl.constexpr(math.log2(CONSTANTS.alpha_min))
 
 
-class View(NamedTuple):
-    """A camera as plain numbers for the kernels; float32 once they get there."""
+@dataclass(frozen=True)
+class Grid:
+    """An image and its blocks."""
 
-    width: int
+    width: int  # px
     height: int
     blocks_x: int
     blocks_y: int
+
+    @property
+    def blocks(self) -> int:
+        return self.blocks_x * self.blocks_y
+
+
+class View(NamedTuple):
+    """A camera and its grid as plain numbers for the kernels, where they are float32.
+
+    None is an integer: Triton would compile a kernel anew for a 1, and for what 16 divides.
+    """
+
+    width: float  # px
+    height: float
+    tiles_x: float
+    tiles_y: float
+    blocks_x: float
+    blocks_y: float
     fx: float
     fy: float
     pixel_cx: float  # px, integer pixel centres
@@ -76,15 +96,23 @@ class View(NamedTuple):
     center_y: float
     center_z: float
 
-    @property
-    def blocks(self) -> int:
-        return self.blocks_x * self.blocks_y
+
+def make_grid(camera: Camera) -> Grid:
+    width, height = int(camera.width), int(camera.height)
+    return Grid(width, height, -(-width // BLOCK_WIDTH.value), -(-height // BLOCK_HEIGHT.value))
 
 
 def make_view(camera: Camera, constants: RasterConstants = CONSTANTS) -> View:
+    grid = make_grid(camera)
     margin_x = constants.fov_margin * camera.width / (2 * camera.fx)
     margin_y = constants.fov_margin * camera.height / (2 * camera.fy)
     numbers = [
+        grid.width,
+        grid.height,
+        -(-grid.width // TILE.value),
+        -(-grid.height // TILE.value),
+        grid.blocks_x,
+        grid.blocks_y,
         camera.fx,
         camera.fy,
         camera.cx - 0.5,
@@ -96,5 +124,4 @@ def make_view(camera: Camera, constants: RasterConstants = CONSTANTS) -> View:
         *camera.rotation.ravel(),
         *camera.center,
     ]
-    blocks = -(-camera.width // BLOCK_WIDTH.value), -(-camera.height // BLOCK_HEIGHT.value)
-    return View(camera.width, camera.height, *blocks, *map(float, numbers))
+    return View(*map(float, numbers))

@@ -59,13 +59,12 @@ UNSEEN = tl.constexpr(-1e9)  # log2(opacity)
 @triton.jit
 def _tile_range(low, high, tiles, SIZE: tl.constexpr):
     """First and past-the-last tile of ``SIZE`` px for the pixels ``low`` to ``high`` - 1, within the grid; int32."""
-    limit = tiles.to(tl.float32)
-    first = tl.floor(tl.minimum(tl.maximum(low * (1.0 / SIZE), 0.0), limit)).to(tl.int32)
-    past = tl.floor(tl.minimum(tl.maximum((high + (SIZE - 1)) * (1.0 / SIZE), 0.0), limit)).to(tl.int32)
+    first = tl.floor(tl.minimum(tl.maximum(low * (1.0 / SIZE), 0.0), tiles)).to(tl.int32)
+    past = tl.floor(tl.minimum(tl.maximum((high + (SIZE - 1)) * (1.0 / SIZE), 0.0), tiles)).to(tl.int32)
     return first, past
 
 
-@triton.jit(do_not_specialize=["count", "v"])
+@triton.jit(do_not_specialize=["count"])
 def project(
     means,
     log_scales,
@@ -114,9 +113,8 @@ def project(
     # middle^2 - det as a sum of squares
     largest = (xx + yy) * 0.5 + tl.sqrt(tl.maximum(half * half + xy * xy, EIGENVALUE_FLOOR))
     radius = tl.minimum(tl.ceil(tl.sqrt(largest) * SIGMA_EXTENT), MAX_RADIUS)
-    tiles_y = (v.height + TILE - 1) // TILE
-    first_x, past_x = _tile_range(column - radius, column + radius, v.blocks_x, TILE)
-    first_y, past_y = _tile_range(row - radius, row + radius, tiles_y, TILE)
+    first_x, past_x = _tile_range(column - radius, column + radius, v.tiles_x, TILE)
+    first_y, past_y = _tile_range(row - radius, row + radius, v.tiles_y, TILE)
     visible &= (first_x < past_x) & (first_y < past_y)
     tl.store(radii + index, tl.where(visible, radius, 0.0).to(tl.int32), mask=inside)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import sys
@@ -10,6 +11,8 @@ from functools import cache
 from pathlib import Path
 
 from gsbench.errors import InputError
+
+log = logging.getLogger(__name__)
 
 
 def missing_tools() -> list[str]:
@@ -34,11 +37,14 @@ def missing_tools() -> list[str]:
 @cache
 def load_driver() -> None:
     """Let Triton find the GPU and load its launcher, compiling it if need be; InputError says what is missing."""
+    from triton import knobs
     from triton.runtime import driver
 
+    if not Path(knobs.cache.dir).exists():
+        log.info("compiling the GPU kernels, once: they are kept in %s", knobs.cache.dir)
     try:
         driver.active.get_current_target()
     except (RuntimeError, OSError, AssertionError, ImportError) as error:
         missing = missing_tools()
         reason = "Triton needs " + " and ".join(missing) if missing else f"Triton cannot start: {error}"
-        raise InputError(f"raster=triton: {reason}") from error
+        raise InputError(reason) from error

@@ -21,7 +21,8 @@ class Workspace:
         if count > self.capacity(name):
             grown = max(count, 2 * self.capacity(name))
             self._buffers.pop(name, None)  # before the new one is made
-            self._buffers[name] = torch.empty(grown, dtype=dtype, device=self.device)
+            with torch.inference_mode(False):  # it will be written to in other modes
+                self._buffers[name] = torch.empty(grown, dtype=dtype, device=self.device)
         elif name not in self._buffers:
             return torch.empty(0, dtype=dtype, device=self.device)
         return self._buffers[name][:count]
