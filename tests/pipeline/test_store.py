@@ -181,9 +181,11 @@ def test_killed_at_random_moments_the_work_is_finished_and_right(store: Store) -
     rng = random.Random(1)
     kills = 0
     for _ in range(100):
-        process = toy(store, 3, "--slow")  # six seconds of pauses, on any machine: more than three waits
+        process = toy(store, 3, "--slow", "--ready")  # six seconds of pauses, on any machine: more than three waits
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"  # a busy machine may need longer to start than to be killed
         try:
-            process.wait(rng.uniform(0.4, 1.8))
+            process.wait(rng.uniform(0.0, 1.4))
             break
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)
@@ -198,7 +200,8 @@ def test_killed_at_random_moments_the_work_is_finished_and_right(store: Store) -
     for number in range(3):
         entry = store.get(Step(TOY, toy_inputs(number), refuse))
         assert (entry.path / "lines.txt").read_text() == expected_text(number)
-    left = {path.name for path in (store.root / "toy").iterdir() if not path.name.endswith(".lock")}
+    # Who held a lock may stand beside it, where its holder was killed between publishing and letting go.
+    left = {path.name for path in (store.root / "toy").iterdir() if not path.name.endswith((".lock", ".lock.holder"))}
     assert left == {TOY.key(toy_inputs(number)) for number in range(3)}
 
 

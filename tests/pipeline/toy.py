@@ -1,6 +1,6 @@
 """A stage that is slow enough to be killed and loads no torch: it writes numbered lines, going on where it was stopped.
 
-Run as a program: ``python -m tests.pipeline.toy STORE COUNT [--slow]``.
+Run as a program: ``python -m tests.pipeline.toy STORE COUNT [--slow] [--ready]``; the last says so when it begins.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ def build(folder: Path, number: int, pause: float) -> None:
 
 def main(argv: list[str]) -> int:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    if "--ready" in argv:
+        print("ready", flush=True)
     store = Store(Path(argv[0]))
     store.sweep([TOY])
     cached = []
