@@ -105,7 +105,9 @@ def test_metric(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_initialiser(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """An initialiser from one file outside gsbench, through the real program."""
     found = run_blocks(ROOT / "docs" / "initialiser.md", folder)
-    assert found["status"] == 0, capsys.readouterr().err
+    assert found["status"] == found["scan_status"] == 0, capsys.readouterr().err
+    (scan,) = Path("runs").glob("scan/courtyard/points-none/*/results.json")
+    assert json.loads(scan.read_text())["num_init_points"] == 900
     (results,) = Path("runs").glob("shell/courtyard/shell-none/*/results.json")
     values = json.loads(results.read_text())
     assert values["num_init_points"] == 500

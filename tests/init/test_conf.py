@@ -14,8 +14,11 @@ from gsbench.config import sha256_of, without_later
 
 FOLDER = Path(__file__).parents[2] / "conf" / "init"
 NAMES = sorted(path.stem for path in FOLDER.glob("*.yaml"))
-REQUIRED = {"ply": ["init.path=a.ply"]}
-DELIBERATE: dict[str, dict[str, Any]] = {}  # presets: a class under another name, with other values than its defaults
+REQUIRED = {"ply": ["init.path=a.ply"], "points": ["init.path=a.ply"]}
+# presets: a class under another name, with other values than its defaults
+DELIBERATE: dict[str, dict[str, Any]] = {
+    "sfm_preview": {"pairs": "auto", "max_image_size": 1000, "max_num_features": 4096, "first_octave": 0},
+}
 # sha256 of the group as the first version composed it, when each file still named all of its options
 FIRST = {
     "dataset": "76fad1aa8d9e900c14b239716654f3a0a30b1a1dce3b4459064bbd7055a6f4b0",

@@ -12,9 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsbench.init import Sfm
-from gsbench.init.base import no_progress
+from gsbench.init import MODEL_FOLDER, Sfm
+from gsbench.init.base import Timer, no_progress
 from gsbench.init.colmap_database import create_database, guessed_groups
+from gsbench.init.colmap_options import DatabaseTask
+from gsbench.init.preview import best_pairs
 from gsbench.init.reconstruct import Verification
 from gsbench.init.sift import extract_sift
 from gsbench.init.sift_matching import deal, divide, match_sift
@@ -122,3 +124,31 @@ def test_colmaps_matcher_never_gets_a_second_thread(
     monkeypatch.setattr(pycolmap, "match_image_pairs", noting)
     match_sift(tmp_path / "database.db", pairs, Sfm(), Verification(0, 15), 1, no_progress)
     assert set(threads) == {1}
+
+
+def test_auto_leaves_out_what_a_preview_does_not_propose(
+    features: tuple[Path, list[tuple[str, str]]], bare_photos: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Few images: all pairs, to the bit. More than that (here: more than five): each with its best partners."""
+    exhaustive = Sfm(threads=1).run(bare_photos, tmp_path / "all")
+    auto = Sfm(threads=1, pairs="auto").run(bare_photos, tmp_path / "auto")
+    assert auto.counts["pairs_left_out"] == 0
+    assert {**auto.counts, "pairs_matched": exhaustive.counts["pairs_matched"]}.items() >= exhaustive.counts.items()
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        written = (tmp_path / "auto" / MODEL_FOLDER / name).read_bytes()
+        assert written == (tmp_path / "all" / MODEL_FOLDER / name).read_bytes()
+
+    database, pairs = features
+    shutil.copy(database, tmp_path / "database.db")
+    names = sorted({name for pair in pairs for name in pair})
+    task = DatabaseTask(tmp_path / "database.db", bare_photos.images, names, pairs, bare_photos, tmp_path)
+    monkeypatch.setattr("gsbench.init.preview.ALL_PAIRS_UP_TO", 5)
+    monkeypatch.setattr("gsbench.init.preview.best_pairs", lambda descriptors: best_pairs(descriptors, 2))
+    monkeypatch.setattr("gsbench.init.sift.extract_sift", lambda *_: None)
+    counts = Sfm(threads=1, pairs="auto").fill_database(task, no_progress, Timer())
+    assert counts["pairs_selected"] + counts["pairs_left_out"] == len(pairs)
+    assert counts["pairs_left_out"] > 10
+    matched = read_matches(task.database)[0]
+    assert len(matched) == counts["pairs_selected"]
+    kept = {tuple(sorted(pycolmap.pair_id_to_image_pair(pair))) for pair in matched}
+    assert {(index, index + 1) for index in range(1, len(names))} <= kept  # neighbours on the arc agree best

@@ -17,6 +17,7 @@ from gsbench.init.base import (
 from gsbench.init.dataset import Dataset
 from gsbench.init.dim import Dim, SiftKornia
 from gsbench.init.ply import Ply
+from gsbench.init.points import Points
 from gsbench.init.random import Random
 from gsbench.init.sfm import Sfm, SfmDense
 
@@ -33,6 +34,7 @@ __all__ = [
     "Initializer",
     "Ply",
     "PointCloud",
+    "Points",
     "PoseErrors",
     "Progress",
     "Random",

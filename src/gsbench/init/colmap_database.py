@@ -188,6 +188,17 @@ def rename_images(path: Path, names: Mapping[int, str]) -> None:
             database.update_image(image)
 
 
+def strongest_descriptors(path: Path, name: str, count: int) -> NDArray[np.uint8]:
+    """The descriptors [K, 128] of an image's ``count`` features of the largest scales, largest first."""
+    image_id = image_ids(path)[name]
+    with pycolmap.Database.open(path) as database:
+        keypoints, descriptors = database.read_keypoints(image_id), database.read_descriptors(image_id).data
+    if len(keypoints) == 0:
+        return np.zeros((0, descriptors.shape[1]), dtype=np.uint8)
+    scales = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])  # of the affine shape
+    return np.asarray(descriptors)[np.argsort(-scales, kind="stable")[:count]]
+
+
 def database_counts(path: Path) -> dict[str, int]:
     """How many features, matched and verified pairs and inlier matches the database holds."""
     with pycolmap.Database.open(path) as database:

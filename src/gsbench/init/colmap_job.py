@@ -46,8 +46,8 @@ def build_model(job: Job, progress: Progress) -> InitReport:
     names = list(colmap_database.create_database(database, cameras))
     pairs = reconstruct.select_pairs(capture.images, names, options, reference)
     task = DatabaseTask(database, images, names, pairs, capture, job.work_dir)
-    options.fill_database(task, progress, timer)
-    counts = {**job.preparation.counts, **colmap_database.database_counts(database)}
+    counts = options.fill_database(task, progress, timer)
+    counts = {**job.preparation.counts, **counts, **colmap_database.database_counts(database)}
     if counts["pairs_verified"] == 0:
         raise InputError(
             f"{options.name}: no pair of images shares enough matches: the photos need more overlap or texture"

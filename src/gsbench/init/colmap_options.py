@@ -70,8 +70,8 @@ class ColmapOptions(ABC):
         check_settings(self, "init")
 
     @abstractmethod
-    def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> None:
-        """Write features, matches and verified geometries; runs in the isolated process."""
+    def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
+        """Write features, matches and verified geometries; runs in the isolated process. Returns counts to report."""
 
     @property
     def num_threads(self) -> int:

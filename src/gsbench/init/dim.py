@@ -66,19 +66,21 @@ class FeatureInitializer(ColmapInitializer):
         job = NetworkJob(self, self.feature_settings(), self.device, capture, reference, work_dir, *self.find_weights())
         return run_with_progress(extract_and_match, job, progress, what=f"{self.name}: features and matches")
 
-    def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> None:
+    def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
         from gsbench.init.colmap_database import verify_pairs, write_keypoints, write_matches
-        from gsbench.init.extract_and_match import open_store
+        from gsbench.init.extract_and_match import choose_pairs, open_store
         from gsbench.init.reconstruct import Verification
 
         store = open_store(self.feature_settings(), task.capture, task.work_dir, *self.find_weights())
         write_keypoints(task.database, {name: store.require_features(name).colmap_keypoints for name in task.names})
-        matches = {pair: store.require_matches(*pair) for pair in task.pairs}
+        pairs = choose_pairs(self, store, task.names, task.pairs)
+        matches = {pair: store.require_matches(*pair) for pair in pairs}
         matches = {pair: indices for pair, indices in matches.items() if len(indices) > 0}
         write_matches(task.database, matches)
         with timer.phase("verify"):
             verification = Verification(self.seed, self.min_inliers)
             verify_pairs(task.database, sorted(matches), verification.options(), progress)
+        return {}
 
     def packages(self) -> tuple[str, ...]:
         return (*super().packages(), "torch", "kornia")

@@ -16,6 +16,7 @@ from gsbench.init.extractors import build_extractor, extract_features
 from gsbench.init.feature_store import FeatureStore
 from gsbench.init.features import Features, FeatureSettings
 from gsbench.init.matching import build_matcher, match_within_memory
+from gsbench.init.preview import STRONGEST, proposed_pairs
 from gsbench.init.reconstruct import load_reference, select_pairs
 from gsbench.scene.types import Capture
 from gsbench.weights import file_sha256
@@ -70,6 +71,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
         raise InputError(
             f"{options.name}: no keypoint in any image: lower init.keypoint_threshold, or check the photos"
         )
+    candidates, pairs = len(pairs), choose_pairs(options, store, names, pairs)
     with timer.phase("match"):
         without, halved = _match_all(job, store, pairs, device, progress)
     if len(without) == len(pairs):
@@ -84,6 +86,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
         seconds=timer.seconds,
         counts={
             "pairs_selected": len(pairs),
+            **({"pairs_left_out": candidates - len(pairs)} if options.pairs == "auto" else {}),
             "pairs_without_matches": len(without),
             "images_without_keypoints": len(empty),
         },
@@ -94,6 +97,15 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
         },
         warnings=tuple(warnings),
     )
+
+
+def choose_pairs(
+    options: ColmapOptions, store: FeatureStore, names: Sequence[str], pairs: list[tuple[str, str]]
+) -> list[tuple[str, str]]:
+    """Those of ``pairs`` to be matched, now that the features of the images ``names`` are in the store."""
+    if options.pairs != "auto":
+        return pairs
+    return proposed_pairs(names, lambda name: store.require_features(name).strongest(STRONGEST).descriptors)
 
 
 def choose_device(name: str) -> torch.device:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Pair = tuple[int, int]
 
-Pairing = Literal["exhaustive", "sequential", "spatial"]
+Pairing = Literal["exhaustive", "auto", "sequential", "spatial"]
 EARTH_RADIUS_M = 6_371_000.0
 _GPS_IFD = 0x8825  # EXIF tags
 _GPS_LATITUDE_REF, _GPS_LATITUDE, _GPS_LONGITUDE_REF, _GPS_LONGITUDE, _GPS_ALTITUDE = 1, 2, 3, 4, 6

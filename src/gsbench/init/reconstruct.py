@@ -70,9 +70,11 @@ def select_pairs(
 ) -> list[tuple[str, str]]:
     """The pairs of image names to match; ``spatial`` goes by the reference's camera centres, else by EXIF GPS.
 
+    For ``auto`` these are all, of which features will tell the best (`gsbench.init.preview`).
+
     Raises ``InputError`` where ``spatial`` has neither.
     """
-    if options.pairs == "exhaustive":
+    if options.pairs in ("exhaustive", "auto"):
         pairs = exhaustive_pairs(len(names))
     elif options.pairs == "sequential":
         pairs = sequential_pairs(len(names), options.overlap)

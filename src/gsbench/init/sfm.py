@@ -39,8 +39,9 @@ class Sfm(ColmapInitializer):
     cross_check: bool = True
     guided_matching: bool = False
 
-    def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> None:
-        from gsbench.init.colmap_database import database_counts
+    def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
+        from gsbench.init.colmap_database import database_counts, strongest_descriptors
+        from gsbench.init.preview import STRONGEST, proposed_pairs
         from gsbench.init.reconstruct import Verification
         from gsbench.init.sift import extract_sift
         from gsbench.init.sift_matching import match_sift
@@ -49,9 +50,15 @@ class Sfm(ColmapInitializer):
             extract_sift(task.database, task.images, task.names, self, self.num_threads, progress)
         if database_counts(task.database)["features"] == 0:
             raise InputError(f"{self.name}: no keypoint in any image: lower init.peak_threshold, or check the photos")
+        pairs, counts = task.pairs, {}
+        if self.pairs == "auto":
+            with timer.phase("preview"):
+                pairs = proposed_pairs(task.names, lambda name: strongest_descriptors(task.database, name, STRONGEST))
+            counts = {"pairs_selected": len(pairs), "pairs_left_out": len(task.pairs) - len(pairs)}
         with timer.phase("match"):
             verification = Verification(self.seed, self.min_inliers)
-            match_sift(task.database, task.pairs, self, verification, self.num_threads, progress)
+            match_sift(task.database, pairs, self, verification, self.num_threads, progress)
+        return counts
 
 
 @dataclass(frozen=True, kw_only=True)

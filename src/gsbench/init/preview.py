@@ -1,0 +1,77 @@
+"""Which pairs of images are worth matching, told by a quick match of their few strongest features.
+
+Wu, "Towards Linear-time Incremental Structure from Motion" (3DV 2013), matches the features of the largest scales first
+and leaves out pairs in which few of them agree. Here the agreement ranks each image's partners, and the best are kept:
+what a pair of distant views adds to a track, its nearer views mostly hold already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbench.init.pairs import Pair, exhaustive_pairs
+
+ALL_PAIRS_UP_TO = 30  # images: 435 pairs take no longer than a preview is worth
+STRONGEST = 256  # features of an image in the preview
+PARTNERS = 24  # of each image: 98 % of the points of all pairs and more, on the scenes that were tried
+SQUARED_RATIO = 0.8**2  # of the distances to best and second-best match
+QUANTUM = 512.0  # a descriptor of unit length in whole numbers, as COLMAP's SIFT has them
+
+
+def best_pairs(descriptors: Sequence[NDArray[np.generic]], partners: int = PARTNERS) -> list[Pair]:
+    """Each image with the ``partners`` that agree best with it; sorted pairs (i, j), i < j.
+
+    ``descriptors`` are those of each image's strongest features [K, D], at most `STRONGEST` of which are read: whole
+    numbers, or floats of unit length. Of equal partners those nearer in the order of images come first.
+    """
+    agreement = count_agreements(descriptors)
+    agreement += agreement.T
+    count = len(descriptors)
+    pairs: set[Pair] = set()
+    for i in range(count):
+        order = np.lexsort((np.abs(np.arange(count) - i), -agreement[i]))
+        pairs.update((min(i, j), max(i, j)) for j in order[order != i][:partners].tolist())
+    return sorted(pairs)
+
+
+def proposed_pairs(names: Sequence[str], strongest: Callable[[str], NDArray[np.generic]]) -> list[tuple[str, str]]:
+    """What ``pairs=auto`` matches of the images ``names``: all pairs of a few, of more the `best_pairs`.
+
+    ``strongest`` gives the descriptors of an image's strongest features.
+    """
+    if len(names) <= ALL_PAIRS_UP_TO:
+        pairs = exhaustive_pairs(len(names))
+    else:
+        pairs = best_pairs([strongest(name) for name in names])
+    return [(names[first], names[second]) for first, second in pairs]
+
+
+def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.int64]:
+    """How many features of images i < j are each other's nearest and pass the ratio test; [N, N], upper triangle.
+
+    Descriptors are whole numbers here, and their products stay below 2^24: exact in float32, so every machine and any
+    number of threads count the same.
+    """
+    count = len(descriptors)
+    width = max(part.shape[1] for part in descriptors)
+    table = np.zeros((count, STRONGEST, width), dtype=np.float32)
+    squares = np.full((count, STRONGEST), np.inf, dtype=np.float32)  # of what is not there: never the nearest
+    for index, part in enumerate(descriptors):
+        strongest = part[:STRONGEST].astype(np.float32)
+        if part.dtype.kind == "f":
+            strongest = (QUANTUM * strongest).round()
+        table[index, : len(strongest)] = strongest
+        squares[index, : len(strongest)] = (strongest**2).sum(axis=1)
+    agreements = np.zeros((count, count), dtype=np.int64)
+    rows = np.arange(STRONGEST)
+    for i in range(count):
+        for j in range(i + 1, count):
+            distances = squares[i][:, None] + squares[j] - 2 * (table[i] @ table[j].T)  # [S, S]
+            nearest = distances.argmin(axis=1)
+            best, second = np.partition(distances, 1, axis=1)[:, :2].T
+            mutual = distances.argmin(axis=0)[nearest] == rows
+            agreements[i, j] = np.count_nonzero(mutual & (best < SQUARED_RATIO * second))
+    return agreements

@@ -1,0 +1,171 @@
+"""Clouds of points from files of every kind, checked against arrays that were written and pycolmap's projection."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from plyfile import PlyData, PlyElement
+from scipy.spatial.transform import Rotation
+
+from gsbench.errors import InputError
+from gsbench.init import MODEL_FOLDER, Points, read_cloud
+from gsbench.init.point_files import read_points, read_similarity
+from gsbench.init.points import GREY, one_in_each_voxel, seen_colors
+from gsbench.scene.images import read_image
+from gsbench.scene.types import Capture
+
+RNG = np.random.default_rng(0)
+XYZ = RNG.uniform(-2, 2, (40, 3)).astype(np.float32).astype(np.float64)
+RGB = RNG.integers(0, 256, (40, 3))
+MATRIX = np.eye(4)
+MATRIX[:3, :3] = 2.5 * Rotation.from_rotvec([0.3, -1.0, 0.2]).as_matrix()
+MATRIX[:3, 3] = [1.0, -2.0, 3.0]
+
+
+def write(path: Path, properties: list[tuple[str, str]], values: dict[str, np.ndarray], text: bool, order: str) -> Path:
+    table = np.zeros(len(XYZ), dtype=[(name, kind) for name, kind in properties])
+    for name, column in values.items():
+        table[name] = column
+    PlyData([PlyElement.describe(table, "vertex")], text=text, byte_order=order).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(
+    ("names", "kind", "scale"),
+    [(("red", "green", "blue"), "u1", 1), (("r", "g", "b"), "f4", 1 / 255), (("red", "green", "blue"), "u2", 257)],
+)
+def test_ply_of_any_order_and_type(tmp_path: Path, text: bool, order: str, names, kind: str, scale: float):
+    properties = [
+        (names[2], kind),
+        ("z", "f8"),
+        ("nx", "f4"),
+        ("x", "f4"),
+        (names[0], kind),
+        ("y", "f8"),
+        (names[1], kind),
+    ]
+    values = dict(zip("xyz", XYZ.T, strict=True)) | {name: RGB[:, i] * scale for i, name in enumerate(names)}
+    points, colors = read_points(write(tmp_path / "cloud.ply", properties, values, text, order))
+    np.testing.assert_allclose(points, XYZ, rtol=1e-6)
+    np.testing.assert_array_equal(colors, RGB)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".xyz", ".csv"])
+@pytest.mark.parametrize("colored", [False, True])
+def test_tables(tmp_path: Path, suffix: str, colored: bool):
+    table = np.concatenate([XYZ, RGB], axis=1) if colored else XYZ
+    path = tmp_path / f"cloud{suffix}"
+    if suffix == ".npy":
+        np.save(path, table)
+    else:
+        np.savetxt(path, table, fmt="%.17g", delimiter="," if suffix == ".csv" else " ")
+    points, colors = read_points(path)
+    np.testing.assert_array_equal(points, XYZ)
+    if colored:
+        np.testing.assert_array_equal(colors, RGB)
+    else:
+        assert colors is None
+
+
+def test_one_point_in_each_voxel_by_brute_force():
+    points, colors = one_in_each_voxel(XYZ, RGB.astype(np.uint8), 1.5)
+    cubes: dict[tuple[int, ...], list[int]] = {}
+    for index, point in enumerate(XYZ):
+        cubes.setdefault(tuple(np.floor(point / 1.5).astype(int)), []).append(index)
+    np.testing.assert_allclose(points, [XYZ[members].mean(axis=0) for members in cubes.values()], atol=1e-12)
+    np.testing.assert_allclose(colors, [RGB[members].mean(axis=0) for members in cubes.values()], atol=0.5)
+    assert len(points) < len(XYZ)
+
+
+def test_similarity_is_pycolmaps(tmp_path: Path):
+    np.savetxt(tmp_path / "matrix.txt", MATRIX)
+    expected = pycolmap.Sim3d(MATRIX[:3]) * XYZ
+    np.testing.assert_allclose(read_similarity(tmp_path / "matrix.txt")(XYZ), expected, atol=1e-9)
+
+
+def test_colours_are_those_of_the_nearest_photograph(courtyard: Capture):
+    model = pycolmap.Reconstruction(courtyard.model)
+    points = RNG.uniform(-6, 6, (60, 3))
+    found = seen_colors(points, courtyard, model)
+    for point, color in zip(points, found, strict=True):
+        images = [model.find_image_with_name(name) for name in courtyard.train_names]
+        images.sort(key=lambda image: np.linalg.norm(image.projection_center() - point))
+        expected = np.full(3, -1)
+        for image in images:
+            pixel = image.project_point(point)
+            camera = model.cameras[image.camera_id]
+            if pixel is not None and 0 <= pixel[0] < camera.width and 0 <= pixel[1] < camera.height:
+                expected = read_image(courtyard.images / image.name)[int(pixel[1]), int(pixel[0])]
+                break
+        np.testing.assert_array_equal(color, expected)
+    assert 5 < (found[:, 0] >= 0).sum() < 60
+
+
+def test_a_cloud_is_registered_thinned_and_placed(courtyard: Capture, tmp_path: Path):
+    there = np.linalg.inv(MATRIX)
+    np.save(tmp_path / "scan.npy", XYZ @ there[:3, :3].T + there[:3, 3])
+    np.savetxt(tmp_path / "matrix.txt", MATRIX)
+    options = Points(path=tmp_path / "scan.npy", transform=tmp_path / "matrix.txt", max_points=30, seed=1)
+    report = options.run(courtyard, tmp_path / "out")
+    cloud = read_cloud(tmp_path / "out" / MODEL_FOLDER)
+    assert report.num_points == len(cloud) == 30
+    distances = np.linalg.norm(cloud.points[:, None] - XYZ[None], axis=2).min(axis=1)
+    assert distances.max() < 1e-9
+    assert len(np.unique(cloud.points, axis=0)) == 30
+    seen = seen_colors(cloud.points, courtyard, pycolmap.Reconstruction(courtyard.model))
+    np.testing.assert_array_equal(cloud.colors, np.where(seen < 0, GREY, seen))
+    first = options.content()
+    np.savetxt(tmp_path / "matrix.txt", 2 * MATRIX)
+    assert options.content() != first
+
+
+def bad_ply(path: Path) -> None:
+    path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n2\n3\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "message"),
+    [
+        ("a.ply", bad_ply, "no property y, z"),
+        ("a.ply", lambda path: path.write_bytes(b"no cloud"), "not a readable file of points"),
+        ("a.npy", lambda path: np.save(path, XYZ[:, :2]), "3 or 6 columns"),
+        ("a.npy", lambda path: np.save(path, XYZ[:0]), "holds no point"),
+        ("a.npy", lambda path: np.save(path, np.where(XYZ > 1.9, np.nan, XYZ)), "no finite numbers"),
+        ("a.xyz", lambda path: path.write_text("1 2 x\n"), "not a readable file of points"),
+        ("a.las", lambda path: path.write_bytes(b"LASF"), "known are .ply"),
+        ("a.npy", lambda path: np.save(path, XYZ + 1e6), "no point is in view of a training camera"),
+    ],
+)
+def test_bad_files_in_one_line(courtyard: Capture, tmp_path: Path, name: str, make, message: str):
+    make(tmp_path / name)
+    with pytest.raises(InputError, match=message) as caught:
+        Points(path=tmp_path / name).cloud(courtyard, pycolmap.Reconstruction(courtyard.model))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (np.eye(3), "4 rows of 4 numbers"),
+        (np.diag([1.0, 1, -1, 1]), "mirrors"),
+        (np.diag([1.0, 2, 1, 1]), "unevenly"),
+        (np.diag([1.0, 1, 1, 2]), "last 0 0 0 1"),
+    ],
+)
+def test_matrices_that_are_no_similarity(tmp_path: Path, matrix: np.ndarray, message: str):
+    np.savetxt(tmp_path / "matrix.txt", matrix)
+    with pytest.raises(InputError, match=message):
+        read_similarity(tmp_path / "matrix.txt")
+
+
+def test_a_file_that_is_not_there_and_photos_without_cameras(bare_photos: Capture, tmp_path: Path):
+    with pytest.raises(InputError, match=r"init\.path=nowhere\.ply is no file"):
+        Points(path="nowhere.ply")
+    np.save(tmp_path / "a.npy", XYZ)
+    assert Points(path=tmp_path / "a.npy").needs_reference(replace(bare_photos))
