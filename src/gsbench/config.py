@@ -263,6 +263,7 @@ NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tra
 # Settings that are younger than the first results, with the default at which a result is what it was before them. There
 # they are left out of hashes and keys, so that nothing is computed anew for a setting that changes nothing.
 ADDED_LATER: dict[str, dict[str, Any]] = {
+    "init": {"min_inlier_ratio": 0.0},
     "raster": {"_target_": None},
     "eval": {"at": [], "extra": {}},
 }

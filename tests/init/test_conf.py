@@ -17,6 +17,7 @@ NAMES = sorted(path.stem for path in FOLDER.glob("*.yaml"))
 REQUIRED = {"ply": ["init.path=a.ply"], "points": ["init.path=a.ply"]}
 # presets: a class under another name, with other values than its defaults
 DELIBERATE: dict[str, dict[str, Any]] = {
+    "dim_paper": {"pairs": "lowres", "max_keypoints": 4096, "min_inlier_ratio": 0.25},
     "sfm_preview": {"pairs": "auto", "max_image_size": 1000, "max_num_features": 4096, "first_octave": 0},
 }
 # sha256 of the group as the first version composed it, when each file still named all of its options

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import shutil
 from dataclasses import replace
@@ -14,7 +15,9 @@ import torch
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.init import MODEL_FOLDER, Dim, SiftKornia, read_cloud
+from gsbench.init import MODEL_FOLDER, Dim, SiftKornia, extract_and_match, read_cloud
+from gsbench.init.base import no_progress
+from gsbench.init.extract_and_match import NetworkJob, at_low_resolution, choose_pairs, open_store
 from gsbench.init.extractors import SUPERPOINT_BORDER, build_extractor, extract_features
 from gsbench.init.feature_store import FeatureStore
 from gsbench.init.features import Features
@@ -71,6 +74,27 @@ class TestUntrained:
         assert report.counts["inlier_matches"] > 30
         assert len(report.settings["weights_sha256"]) == 2
         assert sum("noncommercial" in message for message in caplog.messages) == 1
+
+
+def test_pairs_of_few_matches_at_low_resolution_are_left_out(
+    few: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    init = SiftKornia(max_keypoints=300, max_ratio=0.9, threads=1, pairs="lowres")
+    job = NetworkJob(init, init.feature_settings(), "cpu", few, None, tmp_path, None, None)
+    for name, value in (("LOWRES_SIZE", 160), ("LOWRES_KEYPOINTS", 120)):
+        monkeypatch.setattr(extract_and_match, name, value)
+    small = at_low_resolution(job)
+    assert (small.settings.max_image_size, small.settings.max_keypoints) == (160, 120)
+    preparation = extract_and_match.extract_and_match(job, no_progress)
+    pairs = list(itertools.combinations(few.image_names, 2))
+    shared = {pair: len(open_store(small).require_matches(*pair)) for pair in pairs}
+    threshold = sorted(shared.values())[2]
+    monkeypatch.setattr(extract_and_match, "LOWRES_MATCHES", threshold)
+    assert choose_pairs(job, few.image_names, pairs) == [pair for pair in pairs if shared[pair] > threshold]
+    assert 0 < len(choose_pairs(job, few.image_names, pairs)) < 6
+    assert preparation.counts["pairs_selected"] == sum(count > 20 for count in shared.values())
+    assert preparation.counts["pairs_selected"] + preparation.counts["pairs_left_out"] == 6
+    assert "preselect" in preparation.seconds
 
 
 class TestStore:

@@ -111,3 +111,26 @@ def test_keypoints_scale_with_each_side():
         file_size=(400, 201),
     )
     np.testing.assert_allclose(features.colmap_keypoints, [[2.0, 2.01], [398.0, 198.99]], rtol=1e-6)
+
+
+def test_a_pair_must_keep_a_share_of_its_matches(
+    own_path: tuple[Path, list[tuple[str, str]]], bare_photos: Capture, tmp_path: Path
+):
+    """Pairs below the ratio are dropped, those above are what they were."""
+    with pycolmap.Database.open(own_path[0]) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        keypoints = {name: database.read_keypoints(image_id)[:, :2] for name, image_id in ids.items()}
+        matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in own_path[1]}
+    inliers = {}
+    for ratio in (0.0, 0.8):
+        path = tmp_path / f"{ratio}.db"
+        new_database(path, bare_photos)
+        write_keypoints(path, keypoints)
+        write_matches(path, matches)
+        verify_pairs(path, own_path[1], Verification(0, 15, ratio).options(), no_progress)
+        with pycolmap.Database.open(path) as database:
+            found = {pair: database.read_two_view_geometry(ids[pair[0]], ids[pair[1]]) for pair in own_path[1]}
+        inliers[ratio] = {pair: len(geometry.inlier_matches) for pair, geometry in found.items()}
+    expected = {pair: n if n >= 0.8 * max(len(matches[pair]), 1) else 0 for pair, n in inliers[0.0].items()}
+    assert inliers[0.8] == expected
+    assert 0 < sum(n > 0 for n in expected.values()) < sum(n > 0 for n in inliers[0.0].values())

@@ -14,7 +14,7 @@ from gsbench.cores import available_cores
 from gsbench.init.base import Poses, Progress, Seed, Timer
 from gsbench.init.pairs import Pairing
 from gsbench.scene.types import Capture
-from gsbench.settings import check_settings
+from gsbench.settings import Fraction, check_settings
 
 if TYPE_CHECKING:
     import pycolmap
@@ -60,6 +60,7 @@ class ColmapOptions(ABC):
     overlap: Annotated[int, Interval(ge=1, le=60)] = 10
     neighbors: PositiveInt = 20
     min_inliers: Annotated[int, Ge(7)] = 15  # a fundamental matrix takes seven
+    min_inlier_ratio: Fraction = 0.0
     min_model_size: Annotated[int, Ge(2)] = 3
     two_view_tracks: bool = False
     seed: Seed = 0

@@ -17,6 +17,7 @@ from gsbench.init.colmap_initializer import ColmapInitializer
 from gsbench.init.colmap_options import MIN_DETECTION_SIZE, DatabaseTask
 from gsbench.init.features import FeatureSettings
 from gsbench.init.network_weights import ALIKED_WEIGHTS, EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS, SUPERPOINT_LICENCE
+from gsbench.init.pairs import Pairing
 from gsbench.init.relay import run_with_progress
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath, Fraction
@@ -40,6 +41,7 @@ class FeatureInitializer(ColmapInitializer):
     image and by pair, so a killed run goes on there.
     """
 
+    pairs: Pairing | Literal["lowres"] = "exhaustive"  # type: ignore[assignment]  # one way more than SIFT has
     max_keypoints: PositiveInt = 2048
     max_image_size: Annotated[int, Ge(MIN_DETECTION_SIZE)] = 1600
     max_ratio: Annotated[float, Interval(gt=0, le=1)] = 0.95
@@ -68,17 +70,19 @@ class FeatureInitializer(ColmapInitializer):
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
         from gsbench.init.colmap_database import verify_pairs, write_keypoints, write_matches
-        from gsbench.init.extract_and_match import choose_pairs, open_store
+        from gsbench.init.extract_and_match import NetworkJob, choose_pairs, open_store
         from gsbench.init.reconstruct import Verification
 
-        store = open_store(self.feature_settings(), task.capture, task.work_dir, *self.find_weights())
+        weights = self.find_weights()
+        job = NetworkJob(self, self.feature_settings(), self.device, task.capture, None, task.work_dir, *weights)
+        store = open_store(job)
         write_keypoints(task.database, {name: store.require_features(name).colmap_keypoints for name in task.names})
-        pairs = choose_pairs(self, store, task.names, task.pairs)
+        pairs = choose_pairs(job, task.names, task.pairs)
         matches = {pair: store.require_matches(*pair) for pair in pairs}
         matches = {pair: indices for pair, indices in matches.items() if len(indices) > 0}
         write_matches(task.database, matches)
         with timer.phase("verify"):
-            verification = Verification(self.seed, self.min_inliers)
+            verification = Verification(self.seed, self.min_inliers, self.min_inlier_ratio)
             verify_pairs(task.database, sorted(matches), verification.options(), progress)
         return {}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -23,6 +23,11 @@ from gsbench.weights import file_sha256
 
 CACHE_BYTES = 1 << 30  # of descriptors held in memory while pairs are matched
 NAMES_IN_WARNING = 5
+# deep-image-matching's `matching_lowres`, its default way to choose pairs (pairs_generator.py, state of December 2024)
+LOWRES_SIZE = 1000  # px
+LOWRES_KEYPOINTS = 2048
+LOWRES_FILTER = 0.3  # least score of a match
+LOWRES_MATCHES = 20  # a pair with more is matched at full size
 
 
 @dataclass(frozen=True)
@@ -39,17 +44,11 @@ class NetworkJob:
     matcher_weights: Path | None
 
 
-def open_store(
-    settings: FeatureSettings,
-    capture: Capture,
-    work_dir: Path,
-    extractor_weights: Path | None,
-    matcher_weights: Path | None,
-) -> FeatureStore:
-    """The store of features and matches for these settings and weights."""
-    extraction = {**settings.extraction(), "weights": _digest(extractor_weights)}
-    matching = {**settings.matching(), "weights": _digest(matcher_weights)}
-    return FeatureStore(work_dir, capture.images, extraction, matching)
+def open_store(job: NetworkJob) -> FeatureStore:
+    """The store of features and matches for the job's settings and weights."""
+    extraction = {**job.settings.extraction(), "weights": _digest(job.extractor_weights)}
+    matching = {**job.settings.matching(), "weights": _digest(job.matcher_weights)}
+    return FeatureStore(job.work_dir, job.capture.images, extraction, matching)
 
 
 def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
@@ -60,7 +59,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     options, capture = job.options, job.capture
     torch.set_num_threads(options.num_threads)
     device = choose_device(job.device)
-    store = open_store(job.settings, capture, job.work_dir, job.extractor_weights, job.matcher_weights)
+    store = open_store(job)
     reference = load_reference(capture, job.reference)
     names = options.select_images(capture, reference)
     pairs = select_pairs(capture.images, names, options, reference)
@@ -71,10 +70,15 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
         raise InputError(
             f"{options.name}: no keypoint in any image: lower init.keypoint_threshold, or check the photos"
         )
-    candidates, pairs = len(pairs), choose_pairs(options, store, names, pairs)
+    if options.pairs == "lowres":
+        with timer.phase("preselect"):
+            small = at_low_resolution(job)
+            _extract_all(small, open_store(small), names, device, progress)
+            _match_all(small, open_store(small), pairs, device, progress)
+    candidates, pairs = len(pairs), choose_pairs(job, names, pairs)
     with timer.phase("match"):
         without, halved = _match_all(job, store, pairs, device, progress)
-    if len(without) == len(pairs):
+    if len(without) == len(pairs):  # where no pair was selected, too
         raise InputError(f"{options.name}: no pair of images has a match: the photos need more overlap or texture")
     warnings = []
     if empty:
@@ -86,7 +90,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
         seconds=timer.seconds,
         counts={
             "pairs_selected": len(pairs),
-            **({"pairs_left_out": candidates - len(pairs)} if options.pairs == "auto" else {}),
+            **({"pairs_left_out": candidates - len(pairs)} if options.pairs in ("auto", "lowres") else {}),
             "pairs_without_matches": len(without),
             "images_without_keypoints": len(empty),
         },
@@ -99,13 +103,27 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     )
 
 
-def choose_pairs(
-    options: ColmapOptions, store: FeatureStore, names: Sequence[str], pairs: list[tuple[str, str]]
-) -> list[tuple[str, str]]:
+def choose_pairs(job: NetworkJob, names: Sequence[str], pairs: list[tuple[str, str]]) -> list[tuple[str, str]]:
     """Those of ``pairs`` to be matched, now that the features of the images ``names`` are in the store."""
-    if options.pairs != "auto":
-        return pairs
-    return proposed_pairs(names, lambda name: store.require_features(name).strongest(STRONGEST).descriptors)
+    if job.options.pairs == "auto":
+        store = open_store(job)
+        return proposed_pairs(names, lambda name: store.require_features(name).strongest(STRONGEST).descriptors)
+    if job.options.pairs == "lowres":
+        small = open_store(at_low_resolution(job))
+        matches = {pair: small.read_matches(*pair) for pair in pairs}  # none where memory did not suffice for all
+        return [pair for pair, found in matches.items() if found is None or len(found) > LOWRES_MATCHES]
+    return pairs
+
+
+def at_low_resolution(job: NetworkJob) -> NetworkJob:
+    """The same job on small images, for a look at which pairs overlap."""
+    settings = replace(
+        job.settings,
+        max_image_size=min(job.settings.max_image_size, LOWRES_SIZE),
+        max_keypoints=min(job.settings.max_keypoints, LOWRES_KEYPOINTS),
+        filter_threshold=max(job.settings.filter_threshold, LOWRES_FILTER),
+    )
+    return replace(job, settings=settings)
 
 
 def choose_device(name: str) -> torch.device:

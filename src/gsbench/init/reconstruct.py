@@ -38,12 +38,14 @@ class Verification:
 
     seed: int  # of each pair's RANSAC
     min_inliers: int  # matches that must fit one geometry
+    min_inlier_ratio: float = 0.0  # … and as a share of all of the pair
 
     def options(self) -> pycolmap.TwoViewGeometryOptions:
         """As COLMAP takes them."""
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = self.seed
         options.min_num_inliers = self.min_inliers
+        options.min_inlier_ratio = self.min_inlier_ratio
         return options
 
 
@@ -70,11 +72,11 @@ def select_pairs(
 ) -> list[tuple[str, str]]:
     """The pairs of image names to match; ``spatial`` goes by the reference's camera centres, else by EXIF GPS.
 
-    For ``auto`` these are all, of which features will tell the best (`gsbench.init.preview`).
+    For ``auto`` and ``lowres`` these are all, of which features will tell those that are worth it.
 
     Raises ``InputError`` where ``spatial`` has neither.
     """
-    if options.pairs in ("exhaustive", "auto"):
+    if options.pairs in ("exhaustive", "auto", "lowres"):
         pairs = exhaustive_pairs(len(names))
     elif options.pairs == "sequential":
         pairs = sequential_pairs(len(names), options.overlap)

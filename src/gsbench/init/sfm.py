@@ -56,7 +56,7 @@ class Sfm(ColmapInitializer):
                 pairs = proposed_pairs(task.names, lambda name: strongest_descriptors(task.database, name, STRONGEST))
             counts = {"pairs_selected": len(pairs), "pairs_left_out": len(task.pairs) - len(pairs)}
         with timer.phase("match"):
-            verification = Verification(self.seed, self.min_inliers)
+            verification = Verification(self.seed, self.min_inliers, self.min_inlier_ratio)
             match_sift(task.database, pairs, self, verification, self.num_threads, progress)
         return counts
 
