@@ -33,6 +33,7 @@ def composed(*overrides: str) -> dict[str, Any]:
 def test_every_option_composes(group: str, option: str) -> None:
     extra = ["scene.path=/data/capture"] if group == "scene" else []
     extra += ["init.path=/data/model.ply"] if option == "ply" else []
+    extra += ["densify=none"] if (group, option) == ("train", "none") else []
     values = composed(f"{group}={option}", *extra)
     assert values[group]["name"] == option
 
@@ -163,3 +164,11 @@ def test_an_own_metric_must_be_allowed_and_name_a_class() -> None:
         composed("eval.extra.edges._target_=mine.X")
     with pytest.raises(InputError, match=r"eval\.extra\.edges must name a class"):
         composed("eval.extra.edges=3")
+
+
+def test_no_training_needs_no_densifier() -> None:
+    with pytest.raises(InputError, match="add densify=none"):
+        composed("train=none", "densify=adc")
+    assert composed("train=none", "densify=none")["train"]["iterations"] == 0
+    with pytest.raises(InputError, match=r"train\.iterations must be a whole number of at least 0"):
+        composed("train.iterations=-1")

@@ -23,6 +23,10 @@ VERBS = {
         "gsbench.verbs.fetch",
         "bring public scenes here: Mip-NeRF 360, Tanks and Temples, Deep Blending",
     ),
+    "evaluate": (
+        "gsbench.verbs.evaluate",
+        "measure renders of any program; --as enters them beside an experiment's arms",
+    ),
     "tables": ("gsbench.verbs.tables", "Markdown, CSV, LaTeX or HTML tables of an experiment"),
     "report": ("gsbench.verbs.report", "one HTML file with the evidence of an experiment"),
     "explain": ("gsbench.verbs.explain", "how a table's number came about; with --stale, why a stage is computed anew"),

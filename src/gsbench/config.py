@@ -33,6 +33,7 @@ from gsbench.source import source_of
 from gsbench.words import closest
 
 ALLOWED_TARGETS = ("gsbench.",)  # a ``_target_`` is code: only these prefixes, and those in ``allow_targets``
+NO_DENSIFIER = "gsbench.densify.NoDensifier"
 MAX_SIZE = 16_384  # px, of a picture of the courtyard
 MAX_SEED = 2**63 - 1  # torch's generators take no larger one
 MAX_NAME_BYTES = 100  # of a name: folders are made of two, and file systems end at 255
@@ -126,7 +127,7 @@ class RasterConfig:
 @dataclass
 class TrainConfig:
     name: str = MISSING
-    iterations: PositiveInt = 30_000
+    iterations: NonNegativeInt = 30_000  # 0: what the initialiser gives is evaluated as it is
     sh_interval: PositiveInt = 1000  # spherical harmonics gain a degree so often
     ssim_weight: Fraction = 0.2  # loss = 0.8 L1 + 0.2 (1 - SSIM)
     background: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
@@ -322,6 +323,8 @@ def check(config: DictConfig) -> None:
         checked(ComponentConfig, {key: values.get(key) for key in ("name", "_target_")}, group)
     if late := [step for step in config.eval.at if step > config.train.iterations]:
         raise InputError(f"eval.at names iteration {late[0]}, and train.iterations is {config.train.iterations}")
+    if config.train.iterations == 0 and config.densify.get("_target_") != NO_DENSIFIER:
+        raise InputError("train.iterations=0 trains nothing, so nothing grows: add densify=none")
     for group in (*COMPONENTS, *(["raster"] if config.raster._target_ is not None else [])):
         check_target(config[group].get("_target_"), group, config.allow_targets)
     for name, options in config.eval.extra.items():

@@ -66,3 +66,12 @@ def test_a_file_that_is_no_ply_is_named(tmp_path: Path) -> None:
     path.write_text("not a ply")
     with pytest.raises(InputError, match=r"b\.ply"):
         read_ply(path)
+
+
+def test_a_torn_ply_is_named(tmp_path: Path) -> None:
+    write_ply(random_gaussians(20, dtype=torch.float32), tmp_path / "a.ply")
+    whole = (tmp_path / "a.ply").read_bytes()
+    for length in (10, 400, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "torn.ply").write_bytes(whole[:length])
+        with pytest.raises(InputError, match=r"torn\.ply: not a"):
+            read_ply(tmp_path / "torn.ply")

@@ -29,7 +29,7 @@ def differing_conditions(trials: Sequence[Trial]) -> dict[str, list[str]]:
     for part, versions in differing_code(trials).items():
         seen[part] = {short_version(version) for version in versions}
     if not any(trial.budget_acted for trial in trials):
-        del seen["budget"]
+        seen.pop("budget", None)
     return {key: sorted(values) for key, values in seen.items() if len(values) > 1}
 
 

@@ -84,7 +84,7 @@ def _paper_lines(name: str, scene: str, trial: Trial, shown: Quantity, cell: Cel
 def _baseline_lines(experiment: Experiment, trial: Trial) -> list[str]:
     """The settings in which the arm differs from the baseline of the same scene and initialiser."""
     others = [t for t in experiment.trials if (t.scene, t.init, t.densify) == (trial.scene, trial.init, BASELINE)]
-    if not others or trial.densify == BASELINE:
+    if not others or trial.densify == BASELINE or trial.from_renders:
         return []
     base = next((other for other in others if other.seed == trial.seed), others[0])
     settings = differing_settings([base, trial])
@@ -98,7 +98,10 @@ def _trial_lines(trial: Trial, shown: Quantity) -> list[str]:
     value = shown.read(trial)
     data = trial.data
     text = "n/a" if value is None else f"{value:.6g}"
-    counts = f"{data['num_gaussians']:,} Gaussians from {data.get('num_init_points') or 0:,} points"
+    if trial.from_renders:
+        counts = ", ".join(f"{key} {value}" for key, value in data.get("renders", {}).items())
+    else:
+        counts = f"{data['num_gaussians']:,} Gaussians from {data.get('num_init_points') or 0:,} points"
     lines = [
         f"  seed {trial.seed}: {text}",
         f"    folder    {trial.path}",

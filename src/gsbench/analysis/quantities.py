@@ -75,7 +75,7 @@ def quantity(name: str, trials: Iterable[Trial]) -> Quantity:
     if key == "train_time":
         return _time(key, "train", lambda trial: trial.data["seconds"].get("train"), trials)
     if key == "total_time":
-        return _time(key, "total", lambda trial: sum(trial.data["seconds"].values()), trials)
+        return _time(key, "total", _total_seconds, trials)
     if key == "peak_memory_mb":
         return Quantity(key, "peak memory (MB)", -1, 0, lambda trial: trial.data.get(key), cost=True)
     if any(metric in trial.metrics for trial in trials):  # a user's own
@@ -119,6 +119,10 @@ def _protocol_lpips(trial: Trial) -> str:
     """What the trial's protocol means by LPIPS."""
     name = str(trial.data["protocol"]).rsplit("-", 1)[0]  # without its version
     return f"{LPIPS}{PROTOCOLS.get(name, PAPER).lpips}"
+
+
+def _total_seconds(trial: Trial) -> float | None:
+    return None if trial.made_elsewhere else sum(trial.data["seconds"].values())
 
 
 def _count(

@@ -31,6 +31,9 @@ Arm = tuple[str, str]  # initialiser, densifier
 
 TEXT_KEYS = ("experiment", "scene", "init", "densify", "raster", "protocol")
 COUNT_KEYS = ("seed", "iterations", "num_gaussians")
+# What ``evaluated_from`` says of a trial that gsbench did not train: its model was rendered here, or renders are all.
+FROM_MODEL, FROM_RENDERS = "model", "renders"
+MADE_ELSEWHERE = "made by another program"  # how the reason of a quantity starts that nobody can know of such a trial
 
 
 @dataclass(frozen=True)
@@ -87,19 +90,34 @@ class Trial:
         return (self.path / RESULTS).stat().st_mtime
 
     def conditions(self) -> dict[str, str]:
-        """What trials must share before their numbers may be averaged, as comparable text."""
-        return {
+        """What trials must share before their numbers may be averaged, as comparable text, as far as it is known."""
+        known = {
             "protocol": str(self.data["protocol"]),
-            "raster": str(self.data["raster"]),
-            "iterations": str(self.data["iterations"]),
             "resolution": _size_text(self.data.get("resolution")),
-            "budget": canonical(self.data.get("budget")),
             "data": str(self.data.get("hashes", {}).get("data")),
         }
+        if not self.from_renders:
+            known["raster"] = str(self.data["raster"])
+        if not self.made_elsewhere:
+            known["iterations"] = str(self.data["iterations"])
+            known["budget"] = canonical(self.data.get("budget"))
+        return known
+
+    @property
+    def from_renders(self) -> bool:
+        """Whether another program's renders were measured, whose model was not seen."""
+        return self.data.get("evaluated_from") == FROM_RENDERS
+
+    @property
+    def made_elsewhere(self) -> bool:
+        """Whether another program made the model or the renders, in a time and with a budget that nobody knows."""
+        return self.data.get("evaluated_from") in (FROM_MODEL, FROM_RENDERS)
 
     @property
     def budget_acted(self) -> bool:
         """Whether the trial's budget may have changed it: a cap that refused or steers, or a limit of time."""
+        if self.made_elsewhere:
+            return False
         budget, events = self.data.get("budget"), self.data.get("events")
         if not isinstance(budget, dict) or not isinstance(events, dict):
             return True
@@ -286,6 +304,8 @@ def _check_content(data: object) -> None:
         if not isinstance(data.get(key), str):
             raise _UnusableError(f"damaged, {RESULTS} lacks {key!r}")
     for key in COUNT_KEYS:
+        if key == "num_gaussians" and data.get("evaluated_from") == FROM_RENDERS:
+            continue
         if not isinstance(data.get(key), int) or isinstance(data[key], bool):
             raise _UnusableError(f"damaged, {RESULTS} has no whole number {key!r}")
     for group in ("metrics", "seconds"):

@@ -24,7 +24,7 @@ from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.origins import cloud_notes, machine_notes
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import Experiment, Trial
+from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS, Experiment, Trial
 from gsbench.words import counted
 
 DEFAULT_ROWS = ("scene", "init", "densify")
@@ -121,8 +121,8 @@ def build_table(
     arms = [" + ".join(names.get(value, value) for value in arm) for arm in arm_keys]
     keys = tuple((quantity.key, "+".join(arm)) for quantity in quantities for arm in arm_keys)
     heads = tuple(Column(q.heading, arm) if columns else Column("", q.heading) for q in quantities for arm in arms)
-    notes += _reading_notes(grid, quantities, expected, "scene" in fields) + _cost_notes(trials)
-    notes += machine_notes(trials) + cloud_notes(trials) + _left_out(experiment)
+    notes += _reading_notes(grid, quantities, expected, "scene" in fields) + _origin_notes(trials)
+    notes += _cost_notes(trials) + machine_notes(trials) + cloud_notes(trials) + _left_out(experiment)
     return Table(title or f"Experiment {experiment.name}", tuple(rows), heads, tuple(shown), tuple(notes), keys)
 
 
@@ -232,6 +232,20 @@ def _reading_notes(
     return notes
 
 
+def _origin_notes(trials: Sequence[Trial]) -> list[str]:
+    """Which arms gsbench did not train, and what of them it saw."""
+    notes = []
+    for what, origin in (
+        ("A model that another program trained, rendered here", FROM_MODEL),
+        ("Renders of another program, measured as they are", FROM_RENDERS),
+    ):
+        own = [trial for trial in trials if trial.data.get("evaluated_from") == origin]
+        if own:
+            arms = ", ".join(sorted({f"{trial.init}-{trial.densify}" for trial in own}))
+            notes.append(f"{what} (its conditions are not known): {arms}.")
+    return notes
+
+
 def _cost_notes(trials: Sequence[Trial]) -> list[str]:
     """For every densifier against the baseline, the change of the costs by both averaging rules, over common scenes."""
     notes = []
@@ -274,7 +288,7 @@ def change_words(of_totals: float, of_scenes: float, scenes: int) -> str:
 
 
 _COSTS: dict[str, Callable[[Trial], float | None]] = {
-    "Gaussians": lambda trial: trial.data["num_gaussians"],
+    "Gaussians": lambda trial: trial.data.get("num_gaussians"),
     "Training time": lambda trial: trial.data["seconds"].get("train"),
 }
 

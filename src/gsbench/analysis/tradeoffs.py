@@ -19,7 +19,7 @@ GRID = 200  # points at which two curves are compared
 
 Array = NDArray[np.float64]
 COST_READERS: dict[str, Callable[[Trial], float | None]] = {
-    "gaussians": lambda trial: trial.data["num_gaussians"],
+    "gaussians": lambda trial: trial.data.get("num_gaussians"),
     "seconds": lambda trial: trial.data["seconds"].get("train"),
 }
 

@@ -225,7 +225,7 @@ def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
             else:
                 assert estimator is not None
                 estimate = estimator.estimate(trial.values)
-                done = stage_and_step(paths.folder)[1] / trial.values["train"]["iterations"]
+                done = stage_and_step(paths.folder)[1] / max(1, trial.values["train"]["iterations"])
                 remaining += estimate.seconds * (1 - min(1.0, done))
                 learned = max(learned, estimate.learned_from)
                 if built := built_stages(trial.values):

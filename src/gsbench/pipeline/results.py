@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench import __version__
+from gsbench.analysis.results import FROM_MODEL, MADE_ELSEWHERE
 from gsbench.config import config_hash, sha256_of
 from gsbench.events import sum_events
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
@@ -39,7 +40,7 @@ def results_of(
     metrics = _read(evaluated.path / METRICS_FILE)
     events = [json.loads(line) for line in (trained.path / EVENTS).read_text().splitlines()]
     sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]}, reverse=True)
-    return {
+    results = {
         "status": "complete",
         "experiment": values["name"],
         "scene": values["scene"]["name"],
@@ -79,6 +80,18 @@ def results_of(
         "code": {"sources": sources_of(values), "stages": {stage.name: stage.version for stage in STAGES}},
         "machine": training.get("machine"),  # None of a training before it was recorded
         "versions": versions(),
+    }
+    return results if training["iterations"] else _without_training(results)
+
+
+def _without_training(results: dict[str, Any]) -> dict[str, Any]:
+    """The results of a model that came as it is: what its training took is not known, rather than nothing."""
+    unknown = dict.fromkeys(("train_time", "total_time"), f"{MADE_ELSEWHERE}: not trained here")
+    seconds = {stage: taken for stage, taken in results["seconds"].items() if stage != TRAIN.name}
+    return results | {
+        "evaluated_from": FROM_MODEL,
+        "seconds": seconds,
+        "unavailable": results["unavailable"] | unknown,
     }
 
 

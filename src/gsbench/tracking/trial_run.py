@@ -146,9 +146,11 @@ class TrackedTrial:
         if self.state.pop("failed", False):
             self.client.delete_tag(run_id, ERROR_TAG)
         self._log_dataset(results)
-        ended = self._time_of({"step": results["iterations"], "seconds": results["seconds"]["train"]})
+        ended = self._time_of({"step": results["iterations"], "seconds": results["seconds"].get("train", 0.0)})
         numbers = dict(results["metrics"]) | {
-            key: results[key] for key in ("num_gaussians", "num_init_points", "peak_memory_mb")
+            key: results[key]
+            for key in ("num_gaussians", "num_init_points", "peak_memory_mb")
+            if results[key] is not None  # not known of renders that another program made
         }
         numbers |= {f"seconds_{key}": value for key, value in results["seconds"].items()}
         numbers |= {f"total/{key}": value for key, value in results["events"].items()}

@@ -35,6 +35,7 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("trial", nargs="+", help="a trial's folder, or the settings of one (scene=... densify=...)")
     words = parser.parse_args(argv).trial
     from gsbench.compose import compose_trials
+    from gsbench.pipeline.entered import is_entered
     from gsbench.pipeline.stale import explain_steps
     from gsbench.pipeline.store import Store
     from gsbench.pipeline.trial_files import read_config
@@ -42,6 +43,8 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
 
     if len(words) == 1 and (Path(words[0]) / CONFIG).exists():
         values = read_config(Path(words[0]))
+        if is_entered(values):
+            raise InputError(f"{words[0]} was entered from renders: it has no stages")
     elif "=" not in words[0]:
         raise InputError(f"{words[0]} is neither a trial's folder nor a setting like key=value")
     else:

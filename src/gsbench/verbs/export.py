@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from gsbench.arguments import ArgumentParser, path
 from gsbench.errors import InputError
 from gsbench.files import atomic
-from gsbench.layout import POINT_CLOUD, STORE
+from gsbench.layout import STORE
 
 if TYPE_CHECKING:
     from gsbench.gaussians.model import Gaussians
@@ -23,7 +23,7 @@ FORMATS = {
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    from gsbench.view.trials import ADDRESS, find_trial
+    from gsbench.view.trials import ADDRESS, find_trial, model_file
 
     parser = ArgumentParser(
         prog="gsbench export",
@@ -50,7 +50,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         if is_init:
             export_init(trial.path.parents[3] / STORE / "init" / trial.data["hashes"]["init"], out)
         else:
-            export_model(trial.path / POINT_CLOUD, options.to or _format_of(out), out)
+            export_model(model_file(trial), options.to or _format_of(out), out)
     except OSError as error:
         raise InputError(f"cannot write {out} ({error.strerror or error}); give another --out") from error
     print(out)

@@ -79,9 +79,16 @@ def _trial_in(folder: Path) -> Trial:
     raise InputError(f"{folder} is not a complete trial; give {ADDRESS}")
 
 
+def model_file(trial: Trial) -> Path:
+    """The PLY of a trial's Gaussians; raises InputError for a trial that has none."""
+    if trial.from_renders:
+        raise InputError(f"{trial.label} was evaluated from renders: it has no model")
+    return trial.path / POINT_CLOUD
+
+
 def load_viewed(trial: Trial, device: torch.device) -> ViewedTrial:
     """Read what the viewer draws of ``trial``; raises InputError naming the file that is missing or damaged."""
-    gaussians = read_ply(trial.path / POINT_CLOUD, device)
+    gaussians = read_ply(model_file(trial), device)
     runs = trial.path.parents[3]
     model_dir = Store(runs / STORE).folder(INIT, str(trial.data["hashes"]["init"])) / MODEL_FOLDER
     if not model_dir.is_dir():

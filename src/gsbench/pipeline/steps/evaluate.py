@@ -95,15 +95,21 @@ def evaluate_step(
             write_maps(folder / MAPS, scene, views.store.path(views.init), gaussians, rasterizer)
             draw_figures(folder / FIGURES, folder / RENDERS, scene, training, gaussians)
         write_per_view(folder / PER_VIEW, per_view)
-        metrics = {
-            "metrics": summarize(per_view, evaluator.unavailable),
-            "unavailable": evaluator.unavailable,
-            "awaited": sorted(evaluator.awaited),
-        }
-        own = {"facts": {name: to_record(facts) for name, facts in evaluator.own.items()}} if evaluator.own else {}
-        write_json(folder / METRICS_FILE, metrics | own | ({"at": at} if at else {}))
+        write_json(folder / METRICS_FILE, summary_of(evaluator, per_view) | ({"at": at} if at else {}))
 
     return Step(EVALUATE, inputs, build)
+
+
+def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """What results keep of an evaluation: the means, what is missing and why, and the facts of a user's metrics."""
+    summary: dict[str, Any] = {
+        "metrics": summarize(per_view, evaluator.unavailable),
+        "unavailable": evaluator.unavailable,
+        "awaited": sorted(evaluator.awaited),
+    }
+    if evaluator.own:
+        summary["facts"] = {name: to_record(facts) for name, facts in evaluator.own.items()}
+    return summary
 
 
 def make_evaluator(
@@ -135,7 +141,7 @@ def draw_figures(folder: Path, renders: Path, scene: Scene, training: Path, gaus
         picture.save(folder / "ellipsoids.png")
 
 
-def write_per_view(path: Path, per_view: dict[str, dict[str, float]]) -> None:
+def write_per_view(path: Path, per_view: Mapping[str, Mapping[str, float]]) -> None:
     """One row a view, in order; a metric that a view lacks is left empty."""
     names = sorted({name for row in per_view.values() for name in row})
     with path.open("w", newline="") as stream:

@@ -1,0 +1,43 @@
+"""Measuring pictures that some program rendered against the photographs of their views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsbench.errors import InputError
+from gsbench.eval.evaluator import Evaluator
+from gsbench.scene.images import image_size, read_image
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A view with the files of its photograph and of what was rendered for it."""
+
+    view: str
+    photograph: Path
+    picture: Path
+
+
+def check_sizes(pairs: Sequence[Pair]) -> None:
+    """Raise `InputError` for a picture of another size than its photograph: none is ever resized."""
+    for pair in pairs:
+        (width, height), (wanted_width, wanted_height) = image_size(pair.picture), image_size(pair.photograph)
+        if (width, height) != (wanted_width, wanted_height):
+            raise InputError(
+                f"{pair.picture} is {width}x{height} px, but its photograph {pair.photograph} "
+                f"{wanted_width}x{wanted_height}: sizes are never changed here, so render at the photographs' size"
+            )
+
+
+def measure(
+    pairs: Sequence[Pair], evaluator: Evaluator, report: Callable[[int, int], None] = lambda done, total: None
+) -> dict[str, dict[str, float]]:
+    """The metrics of every view, in the pairs' order. Raises `InputError` for damaged files and unequal sizes."""
+    check_sizes(pairs)
+    per_view = {}
+    for done, pair in enumerate(pairs, 1):
+        per_view[pair.view] = evaluator.evaluate_view(read_image(pair.picture), read_image(pair.photograph))
+        report(done, len(pairs))
+    return per_view

@@ -1,0 +1,203 @@
+"""Renders and models of other programs, measured by our protocol and entered beside our arms."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsbench.cli import run
+from tests.end_to_end.conftest import SMALL, Run
+
+pytestmark = pytest.mark.end_to_end
+EVAL = ["eval.lpips=[squeeze]", "eval.download=false"]
+SCENE = ["scene.views=12", "scene.width=96", "scene.height=72"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str]) -> Path:
+    """A runs folder with two trials of one arm."""
+    runs = tmp_path_factory.mktemp("trained")
+    changed = environment | {"GSBENCH_RUNS": str(runs)}
+    command = [sys.executable, "-m", "gsbench.cli", "-m", *SMALL, "name=small", "densify=adc", "seed=0,1"]
+    done = subprocess.run(command, cwd=runs, env=changed, capture_output=True, text=True, timeout=400, check=False)
+    assert done.returncode == 0, done.stderr
+    return runs
+
+
+@pytest.fixture
+def runs(trained: Path, tmp_path: Path) -> Path:
+    """A copy that the test may change."""
+    return Path(shutil.copytree(trained, tmp_path / "runs", copy_function=os.link))
+
+
+def trial(runs: Path, arm: str = "random-adc", seed: int = 0) -> Path:
+    return next(runs.glob(f"small/courtyard/{arm}/*-seed{seed}"))
+
+
+def results(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "results.json").read_text())
+
+
+def views(folder: Path) -> dict[str, dict[str, str]]:
+    with (folder / "per_view.csv").open() as stream:
+        return {row.pop("view"): row for row in csv.DictReader(stream)}
+
+
+def better_renders(runs: Path, folder: Path, seed: int) -> Path:
+    """Renders nearer to the photographs than those of our arm, under the names that another program gives."""
+    folder.mkdir()
+    own = trial(runs, seed=seed)
+    for file in (own / "renders").glob("*.png"):
+        mixed = Image.blend(Image.open(file), Image.open(own / "ground_truth" / file.name), 0.5 + 0.05 * seed)
+        mixed.save(folder / f"render_{int(file.stem)}.png")
+    return folder
+
+
+def test_a_trials_own_renders_have_its_metrics_to_the_last_digit(gsbench: Run, runs: Path) -> None:
+    own = trial(runs)
+    for truth, settings in ((str(own), []), ("small:courtyard:adc:0", []), ("courtyard", SCENE + EVAL)):
+        done = gsbench("evaluate", str(own / "renders"), "--truth", truth, *settings, "--json", GSBENCH_RUNS=str(runs))
+        assert done.returncode == 0, done.stderr
+        found = json.loads(done.stdout)
+        assert found["metrics"] == results(own)["metrics"]
+        assert found["protocol"] == "paper-1"
+        for view, row in views(own).items():
+            assert {key: repr(value) for key, value in found["views"][view].items()} == row
+    shown = gsbench("evaluate", str(own / "renders"), "--truth", str(own / "ground_truth"), "--protocol", "standard",
+                    GSBENCH_RUNS=str(runs))  # fmt: skip
+    assert "protocol standard-1" in shown.stdout
+
+
+def test_renders_stand_in_the_table_with_a_verdict(
+    gsbench: Run,
+    runs: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for seed in (0, 1):
+        folder = better_renders(runs, tmp_path / f"theirs{seed}", seed)
+        done = gsbench(
+            "evaluate", str(folder), "--truth", "courtyard", "--as", "small:theirs", "--seed", str(seed),
+            GSBENCH_RUNS=str(runs),
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert "names matched apart from leading zeros" in done.stdout
+    entered = trial(runs, "random-theirs", 1)
+    found = results(entered)
+    assert found["evaluated_from"] == "renders"
+    assert found["num_gaussians"] is None
+    assert list(views(entered)) == list(views(trial(runs)))
+    picture = np.asarray(Image.open(entered / "renders" / "0008.png"))
+    np.testing.assert_array_equal(picture, np.asarray(Image.open(tmp_path / "theirs1" / "render_8.png")))
+
+    table = gsbench("tables", "small", GSBENCH_RUNS=str(runs))
+    assert table.returncode == 0, table.stderr
+    assert (
+        "Renders of another program, measured as they are (its conditions are not known): random-theirs."
+        in table.stdout
+    )
+    row = next(line for line in table.stdout.splitlines() if "theirs" in line)
+    assert row.count("n/a") == 3  # LPIPS (not asked for), Gaussians, time
+    assert "**" in row  # compared, and best
+    report = gsbench("report", "small", GSBENCH_RUNS=str(runs))
+    assert report.returncode == 0, report.stderr
+    text = (runs / "small" / "report.html").read_text()
+    assert "random-theirs against random-adc, on this scene: better in PSNR" in text
+    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    for words in (["status", "small"], ["explain", "small:courtyard:psnr:theirs"], ["sync", "small"]):
+        assert run(words) == 0
+    for words in (["view"], ["export", "--out", "x.ply"], ["explain", "--stale"]):
+        capsys.readouterr()
+        assert run([*words, str(entered) if "--stale" in words else "small:courtyard:theirs"]) == 2
+        assert "renders" in capsys.readouterr().err
+
+
+def test_entered_twice_is_entered_once_and_a_place_is_taken_once(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    first, other = better_renders(runs, tmp_path / "first", 0), better_renders(runs, tmp_path / "other", 1)
+    words = ["--truth", "small:courtyard:adc:0", "--as", "small:theirs"]
+    for _ in range(2):
+        assert run(["evaluate", str(first), *words]) == 0
+    assert len(list(runs.glob("small/courtyard/random-theirs/*"))) == 1
+    assert run(["evaluate", str(other), *words]) == 2
+    assert "seed 0 of random-theirs on courtyard is taken" in capsys.readouterr().err
+
+
+def test_two_folders_and_no_trial_at_all(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without any scene: photographs in one folder, the renders of two methods in two others."""
+    truth = Path(shutil.copytree(trial(runs) / "ground_truth", tmp_path / "photographs"))
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "empty"))
+    for arm, seed in (("ours", 0), ("theirs", 1)):
+        folder = better_renders(runs, tmp_path / arm, seed)
+        assert run(["evaluate", str(folder), "--truth", str(truth), "--as", f"new:{arm}", "--scene", "toy", *EVAL]) == 0
+    capsys.readouterr()
+    assert run(["tables", "new"]) == 0
+    assert "| toy | renders | theirs | **" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["RENDERS", "--truth", "nowhere"], "is no folder, no trial"),
+        (["RENDERS", "--truth", "gardn"], "did you mean garden?"),
+        (["nowhere", "--truth", "small:courtyard:adc"], "nowhere is no folder of renders"),
+        (["RENDERS", "--truth", "small:courtyard:adc", "scene.views=3"], "only eval.… can be set here"),
+        (["RENDERS", "--truth", "PHOTOGRAPHS", "--as", "small:x"], "give it with --scene"),
+        (["RENDERS", "--truth", "small:courtyard:adc", "--as", "small"], "is not EXPERIMENT:ARM"),
+        (["RENDERS", "--truth", "PHOTOGRAPHS", "--as", "small:x", "--scene", "courtyard"], "on other photographs"),
+        (["SMALLER", "--truth", "small:courtyard:adc"], "sizes are never changed"),
+        (["FEWER", "--truth", "small:courtyard:adc"], "1 of 2 photographs have no picture of their name (0008.png)"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_bad_requests_are_one_line(
+    runs: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    said: str,
+) -> None:
+    folders = {name: tmp_path / name.lower() for name in ("RENDERS", "PHOTOGRAPHS", "SMALLER", "FEWER")}
+    for folder in folders.values():
+        shutil.copytree(trial(runs) / "renders", folder)
+    for file in folders["SMALLER"].glob("*.png"):
+        Image.open(file).resize((48, 36)).save(file)
+    (folders["FEWER"] / "0008.png").unlink()
+    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    assert run(["evaluate", *(str(folders.get(word, word)) for word in words), *EVAL]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("gsbench: ") == 1
+
+
+def test_somebodys_model(gsbench: Run, runs: Path, tmp_path: Path) -> None:
+    """train=none init=ply: a PLY from anywhere, rendered here; our own gives our own numbers back."""
+    model = tmp_path / "theirs.ply"
+    shutil.copyfile(trial(runs) / "point_cloud.ply", model)
+    scene = [word for word in SMALL if word.startswith(("scene", "eval"))]
+    words = [*scene, "init=ply", "init.name=random", f"init.path={model}", "train=none", "densify=none", "name=small"]
+    done = gsbench(*words, "densify.name=model", GSBENCH_RUNS=str(runs))
+    assert done.returncode == 0, done.stderr
+    found = results(trial(runs, "random-model"))
+    assert found["metrics"] == results(trial(runs))["metrics"]
+    assert found["evaluated_from"] == "model"
+    assert found["num_gaussians"] == results(trial(runs))["num_gaussians"]
+    table = gsbench("tables", "small", GSBENCH_RUNS=str(runs))
+    assert "A model that another program trained, rendered here" in table.stdout
+    assert "not compared" not in table.stdout
