@@ -17,7 +17,7 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan, describe_plan
-from gsbench.launch.preflight import check_components, missing_folders, need_no_check
+from gsbench.launch.preflight import check_components, missing_folders, missing_weights, need_no_check
 from gsbench.launch.queries import QUERIES, ask_hydra
 from gsbench.launch.serial import run_serial
 from gsbench.layout import STORE
@@ -51,6 +51,8 @@ def run_trials(trials: Sequence[Composed]) -> int:
     """Run what is not done among ``trials`` by the launcher that they name; the exit code."""
     runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
     with storage_errors(runs), stop_on_signals():
+        if launcher != "slurm" and (missing := missing_weights(trials)):  # also where all is done and none is needed
+            raise InputError("; ".join(missing))
         outcomes, unfinished = _skip_finished(trials)
         # A node of a cluster may have folders and devices that this machine lacks.
         if launcher != "slurm" and (missing := missing_folders(unfinished)):

@@ -24,10 +24,11 @@ def missing_folders(trials: Sequence[Composed]) -> list[str]:
     folders = [(name, Path(path).expanduser()) for name, path in sorted(scenes, key=str)]
     missing = [(name, folder) for name, folder in folders if not folder.is_dir()]
     lines = [missing_folder(name, folder) for name, folder in missing]
-    return lines + ([how_to_get(missing)] if missing else []) + _missing_weights(trials)
+    return lines + ([how_to_get(missing)] if missing else []) + missing_weights(trials)
 
 
-def _missing_weights(trials: Sequence[Composed]) -> list[str]:
+def missing_weights(trials: Sequence[Composed]) -> list[str]:
+    """A line for each folder of weights that the trials name and that is not there."""
     named = {
         (group, str(folder))
         for group in ("eval", "init")
