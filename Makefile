@@ -15,7 +15,7 @@ GENERIC_TESTS := tests/test_machine.py tests/raster/test_cpu.py tests/raster/tes
 .PHONY: help install demo test test-generic lint
 
 help: ## show this
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
 install: $(VENV)/.stamp-dev ## set up .venv with gsbench and the development tools
 
