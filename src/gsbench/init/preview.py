@@ -67,11 +67,15 @@ def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.i
         squares[index, : len(strongest)] = (strongest**2).sum(axis=1)
     agreements = np.zeros((count, count), dtype=np.int64)
     rows = np.arange(STRONGEST)
-    for i in range(count):
-        for j in range(i + 1, count):
-            distances = squares[i][:, None] + squares[j] - 2 * (table[i] @ table[j].T)  # [S, S]
-            nearest = distances.argmin(axis=1)
-            best, second = np.partition(distances, 1, axis=1)[:, :2].T
-            mutual = distances.argmin(axis=0)[nearest] == rows
-            agreements[i, j] = np.count_nonzero(mutual & (best < SQUARED_RATIO * second))
+    for i in range(count - 1):
+        products = table[i] @ table[i + 1 :].reshape(-1, width).T  # one large product: small ones are slow
+        distances = squares[i][:, None] + squares[i + 1 :].reshape(-1) - 2 * products
+        distances = distances.reshape(STRONGEST, -1, STRONGEST)  # [S, J, S]
+        nearest = distances.argmin(axis=2)  # [S, J]
+        nearest_back = distances.argmin(axis=0)  # [J, S]
+        mutual = np.take_along_axis(nearest_back, nearest.T, axis=1) == rows  # [J, S]
+        best = np.take_along_axis(distances, nearest[..., None], axis=2)[..., 0]
+        np.put_along_axis(distances, nearest[..., None], np.inf, axis=2)
+        distinct = best < SQUARED_RATIO * distances.min(axis=2)  # [S, J]
+        agreements[i, i + 1 :] = np.count_nonzero(mutual & distinct.T, axis=1)
     return agreements
