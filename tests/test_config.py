@@ -10,8 +10,9 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from gsbench.config import TrainConfig, check, check_target, conf_dir, config_hash, plain, register_schemas
+from gsbench.config import TrainConfig, check, check_target, conf_dir, plain, register_schemas
 from gsbench.errors import InputError
+from gsbench.hashing import config_hash
 from gsbench.pipeline.components import build
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch")

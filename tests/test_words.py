@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 
 from gsbench import cli
 from gsbench.compose import compose_trials, compose_values
-from gsbench.config import GROUP_SCHEMAS, check_values, config_hash, plain
+from gsbench.config import GROUP_SCHEMAS, check_values, plain
 from gsbench.errors import InputError
+from gsbench.hashing import config_hash
 from gsbench.settings import option_fields
 
 REFUSED = {  # command line: a part of the line that refuses it

@@ -11,8 +11,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
-from gsbench.config import COMPONENTS, NOT_HASHED, WITHOUT_EFFECT, conf_dir
+from gsbench.config import COMPONENTS, conf_dir
 from gsbench.errors import InputError
+from gsbench.hashing import NOT_HASHED, WITHOUT_EFFECT
 from gsbench.words import closest
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")

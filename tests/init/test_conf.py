@@ -10,7 +10,7 @@ import pytest
 
 import gsbench.init
 from gsbench.compose import compose_one
-from gsbench.config import sha256_of, without_later
+from gsbench.hashing import sha256_of, without_later
 
 FOLDER = Path(__file__).parents[2] / "conf" / "init"
 NAMES = sorted(path.stem for path in FOLDER.glob("*.yaml"))

@@ -13,9 +13,10 @@ import pytest
 
 from gsbench.command_words import GROUPS, options, parse
 from gsbench.compose import Composed, compose_one, compose_trials
-from gsbench.config import check_target, config_hash
+from gsbench.config import check_target
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError, explain_storage
+from gsbench.hashing import config_hash
 from gsbench.launch import serial
 from gsbench.launch.command import launch, run_trials
 from gsbench.launch.outcome import Outcome

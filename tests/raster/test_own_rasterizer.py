@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.config import config_hash
 from gsbench.errors import InputError
+from gsbench.hashing import config_hash
 from gsbench.pipeline.components import build_rasterizer, rasterizer_inputs
 from gsbench.raster import create_rasterizer
 from tests.conftest import ROOT

@@ -10,10 +10,11 @@ from typing import Any
 
 import torch
 
-from gsbench.config import ALLOWED_TARGETS, WITHOUT_EFFECT, check_target, require_values, without_later
+from gsbench.config import ALLOWED_TARGETS, check_target, require_values
 from gsbench.errors import InputError
 from gsbench.eval.facts import facts_of
 from gsbench.eval.metric import Metric
+from gsbench.hashing import WITHOUT_EFFECT, without_later
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.settings import checked, unknown_setting
 from gsbench.source import has_changed_since_import, source_of

@@ -15,11 +15,12 @@ import yaml
 from PIL import Image
 
 from gsbench.analysis.results import FROM_RENDERS, MADE_ELSEWHERE, Trial, read_experiment
-from gsbench.config import is_folder_name, sha256_of
+from gsbench.config import is_folder_name
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.pictures import Pair
 from gsbench.files import atomic, write_json, write_text
+from gsbench.hashing import sha256_of
 from gsbench.layout import CONFIG, GROUND_TRUTH, PER_VIEW, RENDERS, RESULTS
 from gsbench.pipeline.results import EVALUATED, versions
 from gsbench.pipeline.stages import EVALUATE

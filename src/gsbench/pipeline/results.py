@@ -11,8 +11,8 @@ from typing import Any
 
 from gsbench import __version__
 from gsbench.analysis.results import FROM_MODEL, MADE_ELSEWHERE
-from gsbench.config import config_hash, sha256_of
 from gsbench.events import sum_events
+from gsbench.hashing import config_hash, sha256_of
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.layout import EVENTS
 from gsbench.pipeline.stages import EVALUATE, INIT, STAGES, TRAIN

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from gsbench.config import sha256_of
+from gsbench.hashing import sha256_of
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from gsbench import __version__
-from gsbench.config import sha256_of
 from gsbench.files import remove_temporaries, storage_errors, sync_to_disk, write_json
+from gsbench.hashing import sha256_of
 from gsbench.pipeline.locks import BusyError, hold
 from gsbench.pipeline.step import Stage, Step
 from gsbench.weights import file_sha256

@@ -12,9 +12,9 @@ from typing import Any, Literal
 
 import yaml
 
-from gsbench.config import config_hash, sha256_of
 from gsbench.errors import InputError
 from gsbench.files import read_object, write_json
+from gsbench.hashing import config_hash, sha256_of
 from gsbench.layout import BUILDING, CONFIG, CURVES, FAILED, INPUTS, LOCK, RESULTS
 from gsbench.pipeline.locks import is_held
 from gsbench.pipeline.stages import STAGES

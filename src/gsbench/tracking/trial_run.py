@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from gsbench import layout
-from gsbench.config import sha256_of
 from gsbench.files import read_object, write_json
+from gsbench.hashing import sha256_of
 from gsbench.nested import flatten
 from gsbench.pipeline.locks import hold
 from gsbench.pipeline.trial_files import failure_of

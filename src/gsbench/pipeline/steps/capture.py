@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from gsbench.config import SceneConfig, sha256_of
+from gsbench.config import SceneConfig
+from gsbench.hashing import sha256_of
 from gsbench.pipeline.progress import progress
 from gsbench.pipeline.stages import CAPTURE
 from gsbench.pipeline.step import Step

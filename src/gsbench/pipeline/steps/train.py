@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsbench.config import TrainConfig, without_later
+from gsbench.config import TrainConfig
 from gsbench.densify import Densifier
 from gsbench.files import write_json
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
+from gsbench.hashing import without_later
 from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.layout import LINEAGE, POINT_CLOUD
