@@ -33,7 +33,7 @@ def composed(*overrides: str) -> dict[str, Any]:
 @pytest.mark.parametrize(("group", "option"), [(group, option) for group in GROUPS for option in options(group)])
 def test_every_option_composes(group: str, option: str) -> None:
     extra = ["scene.path=/data/capture"] if group == "scene" else []
-    extra += ["init.path=/data/model.ply"] if option == "ply" else []
+    extra += ["init.path=/data/model.ply"] if option in ("ply", "points") else []
     extra += ["densify=none"] if (group, option) == ("train", "none") else []
     values = composed(f"{group}={option}", *extra)
     assert values[group]["name"] == option
@@ -53,7 +53,7 @@ def test_every_densifier_can_be_built_and_matches_its_class(option: str) -> None
 @pytest.mark.parametrize("option", options("init"))
 def test_every_initialiser_shows_all_its_options(option: str, tmp_path: Path) -> None:
     (tmp_path / "model.ply").touch()
-    extra = [f"init.path={tmp_path / 'model.ply'}"] if option == "ply" else []
+    extra = [f"init.path={tmp_path / 'model.ply'}"] if option in ("ply", "points") else []
     values = composed(f"init={option}", *extra)["init"]
     initializer = build("init", values, [])
     names = {field.name for field in dataclasses.fields(initializer) if field.init}
