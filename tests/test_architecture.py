@@ -23,7 +23,7 @@ MAY_IMPORT = {
     "raster": {"gaussians", "scene"},
     "densify": {"gaussians", "raster"},
     "init": {"gaussians", "scene"},
-    "eval": set(),
+    "eval": {"scene"},  # names of photographs, to match renders with
     "analysis": {"eval.facts", "eval.protocol"},  # tables of facts, which load no torch
 }
 
