@@ -154,7 +154,7 @@ def test_name_seed_and_machine_are_in_no_hash_and_settings_are() -> None:
         (["train.iterations=many"], ["train.iterations must be a whole number of at least 0, got 'many'"]),
         (["train.iterations=0"], ["train.iterations=0 trains nothing", "add densify=none"]),
         (["raster=gpu"], ["raster=gpu does not exist", "gsplat"]),
-        (["eval.lpips=3"], ["eval.lpips must be a list of vgg_raw, vgg, alex and squeeze", "got 3"]),
+        (["eval.lpips=3"], ["eval.lpips must be a list of vgg_raw, vgg, alex, squeeze", "got 3"]),
         (["seed=0,1"], ["seed=0,1 lists several values", "-m"]),
         (["foo"], ["'foo' is not a setting like key=value"]),
         (["experiment=table1"], ["+experiment=NAME", "table2"]),
