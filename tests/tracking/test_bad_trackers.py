@@ -20,6 +20,7 @@ import pytest
 from gsbench.pipeline.trial_files import TrialPaths
 from gsbench.tracking import connect, mirror_trial, prepare
 from tests.end_to_end.conftest import SMALL
+from tests.processes import heed_interrupts
 from tests.tracking.helpers import (
     RECORDS,
     child_environment,
@@ -125,6 +126,7 @@ def test_sync_can_be_stopped_while_the_tracker_hangs(runs: Path) -> None:
             env=child_environment() | {"GSBENCH_RUNS": str(runs)},
             stderr=subprocess.PIPE,
             text=True,
+            preexec_fn=heed_interrupts,
         )
         mirrors = mirrors_of(program)
         wait_until(lambda: bool(tracker.connections))
