@@ -96,13 +96,10 @@ def _unavailable_metrics(options: dict[str, Any]) -> frozenset[str]:
 @cache
 def _unavailable(options: str) -> frozenset[str]:
     """The metrics that cannot be computed here and now; weights are looked for, and fetched, once for a sweep."""
-    from gsbench.eval.evaluator import Evaluator
-    from gsbench.eval.protocol import get_protocol
+    from gsbench.config import EvalConfig
+    from gsbench.pipeline.components import make_evaluator
 
-    chosen = json.loads(options)
-    weights = None if chosen["weights"] is None else Path(chosen["weights"]).expanduser()
-    protocol, lpips = get_protocol(chosen["protocol"]), tuple(chosen["lpips"])
-    return frozenset(Evaluator(protocol, "cpu", lpips, chosen["flip"], weights, chosen["download"]).awaited)
+    return frozenset(make_evaluator(EvalConfig(**json.loads(options))).awaited)
 
 
 def summarize(outcomes: Sequence[Outcome], trials: Sequence[Composed]) -> int:

@@ -1,4 +1,4 @@
-"""From configuration to objects: initialisers, densifiers, rasterizers, devices, with errors that name the key."""
+"""From configuration to objects: components, evaluators and devices, with errors that name the key."""
 
 from __future__ import annotations
 
@@ -6,14 +6,19 @@ import dataclasses
 import importlib
 import inspect
 import logging
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
 
-from gsbench.config import ALLOWED_TARGETS, check_target, require_values
+from gsbench.config import ALLOWED_TARGETS, EvalConfig, check_target, require_values
 from gsbench.errors import InputError
+from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import facts_of
 from gsbench.eval.metric import Metric
+from gsbench.eval.protocol import get_protocol
 from gsbench.hashing import WITHOUT_EFFECT, without_later
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.settings import checked, unknown_setting
@@ -140,6 +145,15 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
+
+
+def make_evaluator(
+    options: EvalConfig, device: torch.device | str = "cpu", extra: Mapping[str, Metric] = MappingProxyType({})
+) -> Evaluator:
+    """The evaluator that the settings ``eval`` describe, with the user's own metrics; looks for networks' weights."""
+    weights = None if options.weights is None else Path(options.weights).expanduser()
+    protocol = get_protocol(options.protocol)
+    return Evaluator(protocol, device, tuple(options.lpips), options.flip, weights, options.download, extra)
 
 
 def select_device(name: str) -> torch.device:

@@ -20,11 +20,11 @@ from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.metric import Metric
 from gsbench.init import Sfm
 from gsbench.init.base import Initializer
-from gsbench.pipeline.components import build, build_metrics, build_rasterizer, select_device
+from gsbench.pipeline.components import build, build_metrics, build_rasterizer, make_evaluator, select_device
 from gsbench.pipeline.resources import available_threads
 from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.capture import capture_step, read_capture
-from gsbench.pipeline.steps.evaluate import evaluate_step, make_evaluator
+from gsbench.pipeline.steps.evaluate import evaluate_step
 from gsbench.pipeline.steps.ground_truth import ground_truth_step
 from gsbench.pipeline.steps.init import init_step
 from gsbench.pipeline.steps.train import train_step

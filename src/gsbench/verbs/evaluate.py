@@ -21,11 +21,10 @@ from gsbench.eval.matching import Matching, match_by_order, match_pictures
 from gsbench.eval.pictures import Pair, measure
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.files import storage_errors
-from gsbench.pipeline.components import build_metrics, select_device
+from gsbench.pipeline.components import build_metrics, make_evaluator, select_device
 from gsbench.pipeline.entered import check_place, enter, find_place
 from gsbench.pipeline.progress import progress
 from gsbench.pipeline.resources import available_threads
-from gsbench.pipeline.steps.evaluate import make_evaluator
 from gsbench.pipeline.truth import Truth, find_truth, truth_of_trial
 from gsbench.scene.names import some_of
 from gsbench.scene.readers import list_images

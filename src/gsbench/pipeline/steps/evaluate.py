@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -13,11 +12,8 @@ import torch
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from gsbench.config import EvalConfig
 from gsbench.eval.evaluator import Evaluator, quantize, summarize
 from gsbench.eval.facts import to_record
-from gsbench.eval.metric import Metric
-from gsbench.eval.protocol import get_protocol
 from gsbench.files import write_json
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import read_ply
@@ -110,15 +106,6 @@ def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]
     if evaluator.own:
         summary["facts"] = {name: to_record(facts) for name, facts in evaluator.own.items()}
     return summary
-
-
-def make_evaluator(
-    options: EvalConfig, device: torch.device | str = "cpu", extra: Mapping[str, Metric] = MappingProxyType({})
-) -> Evaluator:
-    """The evaluator that the settings ``eval`` describe, with the user's own metrics; looks for networks' weights."""
-    weights = None if options.weights is None else Path(options.weights).expanduser()
-    protocol = get_protocol(options.protocol)
-    return Evaluator(protocol, device, tuple(options.lpips), options.flip, weights, options.download, extra)
 
 
 def write_maps(folder: Path, scene: Scene, init: Path, gaussians: Gaussians, rasterizer: Rasterizer) -> None:
