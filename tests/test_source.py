@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.source import has_changed_since_import, source_of, sources_of
+from gsbench.source import has_changed_since_import, source_of, source_on_disk, sources_of
 
 
 @pytest.fixture
@@ -52,3 +52,18 @@ def test_own_classes_are_found_at_any_depth(own: Path) -> None:
         "eval": {"extra": {"sharp": {"_target_": "nowhere_to_be_found.X"}}},
     }
     assert sources_of(values) == {"own_code.Mine": digest(own), "own_code.Other": digest(own)}
+
+
+def test_the_file_of_another_folder_is_found_whatever_this_process_has_imported(own: Path, tmp_path: Path) -> None:
+    importlib.import_module("own_code")
+    other = tmp_path / "elsewhere"
+    (other / "inner").mkdir(parents=True)
+    for place in (other / "own_code.py", other / "inner" / "own_code.py"):
+        place.write_text(f"# {place}\nclass Mine: ...\n")
+        (place.parent / "__init__.py").touch()
+    assert source_on_disk("own_code.Mine", str(other)) == digest(other / "own_code.py")
+    assert source_on_disk("inner.own_code.Mine", str(other)) == digest(other / "inner" / "own_code.py")
+    assert source_on_disk("own_code.Mine", str(tmp_path)) == digest(own)
+    own.unlink()
+    assert source_on_disk("own_code.Mine", str(tmp_path)) is None
+    assert source_on_disk("inner.nosuch.Mine", str(other)) is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import importlib.util
 import sys
 from collections.abc import Iterator, Mapping
@@ -41,6 +42,23 @@ def has_changed_since_import(target: str) -> bool:
     """Whether the file of a class is no longer the one that this process has imported, and therefore runs."""
     spec, source = _spec(target), source_of(target)
     return bool(source) and spec is not None and _hash(str(spec.origin)) != source["source"]
+
+
+def source_on_disk(target: str, folder: str) -> str | None:
+    """The hash of the file of a user's class as a program started in ``folder`` would find it, else None.
+
+    What this process has imported under that name, perhaps from elsewhere, does not count.
+    """
+    importlib.invalidate_caches()  # the file may be younger than what a finder remembers of its folder
+    names, path, spec = target.split(".")[:-1], [folder, *sys.path], None
+    for depth in range(1, len(names) + 1):
+        name = ".".join(names[:depth])
+        found = (finder.find_spec(name, path, None) for finder in sys.meta_path)
+        spec = next((one for one in found if one is not None), None)
+        if spec is None:
+            return None
+        path = list(spec.submodule_search_locations or [])
+    return _hash(spec.origin) if spec and spec.origin and Path(spec.origin).is_file() else None
 
 
 def sources_of(values: Mapping[str, Any]) -> dict[str, str]:

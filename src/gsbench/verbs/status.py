@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +13,7 @@ from gsbench.analysis.superseded import find_superseded
 from gsbench.arguments import ArgumentParser
 from gsbench.launch.plan import TrialState, forget, progress_of_experiment, read_plan, remove
 from gsbench.pipeline.trial_files import label_of
-from gsbench.source import source_of
+from gsbench.source import source_on_disk
 from gsbench.words import counted, readable_time
 
 ORDER = ("failed", "running", "partial", "missing", "superseded", "done")
@@ -64,7 +63,7 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
     places = {trial.folder: trial.cwd for trial in read_plan(home)}
 
     def present(target: str, trial: Trial) -> str | None:
-        return present_source(target, places[trial.path]) if trial.path in places else None
+        return source_on_disk(target, places[trial.path]) if trial.path in places else None
 
     reasons = find_superseded(read_experiment(home).trials, present)
     return [
@@ -73,16 +72,6 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
         else trial
         for trial in progress_of_experiment(home)
     ]
-
-
-def present_source(target: str, folder: str) -> str | None:
-    """The hash of the file of a user's class as it is found from ``folder``; None where it is not."""
-    saved = list(sys.path)
-    sys.path.insert(0, folder)
-    try:
-        return source_of(target).get("source")
-    finally:
-        sys.path[:] = saved
 
 
 def lines_of(trials: list[TrialState], everything: bool) -> list[str]:
