@@ -9,6 +9,12 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch is imported,
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# The same examples on every machine and however loaded it is: `pytest --hypothesis-profile=explore` tries new ones.
+settings.register_profile("gsbench", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("explore", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("gsbench")
 
 ROOT = Path(__file__).resolve().parents[1]
 
