@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import logging
+import os
 import pickle
+import subprocess
+import sys
+import threading
 import time
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
@@ -73,6 +80,58 @@ def test_download_is_checked_and_kept(tmp_path: Path, empty_caches: Path):
     assert found.read_bytes() == b"good"
     source.unlink()
     assert find_weights(spec(b"good", source.as_uri())) == found
+
+
+def test_download_says_how_far_it_is(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    caplog.set_level(logging.INFO, "gsbench")
+    source = tmp_path / "served.bin"
+    source.write_bytes(b"g" * 2_500_000)
+    find_weights(spec(source.read_bytes(), source.as_uri()))
+    lines = [record.getMessage() for record in caplog.records]
+    assert lines == [
+        "weights: net.pth 1048576/2500000 1.05 MB of 2.5 MB",
+        "weights: net.pth 2500000/2500000 2.5 MB of 2.5 MB",
+    ]
+
+
+def test_download_shows_a_bar_on_a_terminal(tmp_path: Path):
+    pty = pytest.importorskip("pty", reason="needs terminals as Unix has them")
+    source = tmp_path / "served.bin"
+    source.write_bytes(b"g" * 2_500_000)
+    code = (
+        "from gsbench.weights import WeightsFile, find_weights\n"
+        f"find_weights(WeightsFile(('net.pth',), {source.as_uri()!r}, None, 'free', 'example.org'))"
+    )
+    ours, theirs = pty.openpty()
+    environment = dict(os.environ) | {"TERM": "xterm", "COLUMNS": "100"}
+    with subprocess.Popen([sys.executable, "-c", code], stderr=theirs, env=environment):
+        os.close(theirs)
+        shown = b""
+        with contextlib.suppress(OSError):  # Linux: the other end is closed
+            while piece := os.read(ours, 1 << 16):
+                shown += piece
+    os.close(ours)
+    assert b"weights: net.pth" in shown
+    assert b"2.5 MB of 2.5 MB" in shown
+    assert "━".encode() in shown
+
+
+def test_download_that_ends_early_is_no_file(empty_caches: Path):
+    class Short(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Length", "100")
+            self.end_headers()
+            self.wfile.write(b"x" * 40)
+
+        def log_message(self, *words: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Short) as server:
+        threading.Thread(target=server.handle_request, daemon=True).start()
+        with pytest.raises(MissingWeights, match="the connection ended after 40 of 100 bytes"):
+            find_weights(spec(url=f"http://127.0.0.1:{server.server_port}/net.pth"))
+    assert list(empty_caches.iterdir()) == []
 
 
 def test_damaged_download_leaves_nothing(tmp_path: Path, empty_caches: Path):

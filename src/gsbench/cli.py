@@ -11,34 +11,15 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from gsbench import __version__
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder
 from gsbench.logs import set_up_logging
+from gsbench.verbs import VERBS
 from gsbench.words import closest
 
 DONE, TRIAL_FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
-VERBS = {
-    "fetch": (
-        "gsbench.verbs.fetch",
-        "bring public scenes here: Mip-NeRF 360, Tanks and Temples, Deep Blending",
-    ),
-    "evaluate": (
-        "gsbench.verbs.evaluate",
-        "measure renders of any program; --as enters them beside an experiment's arms",
-    ),
-    "tables": ("gsbench.verbs.tables", "Markdown, CSV, LaTeX or HTML tables of an experiment"),
-    "report": ("gsbench.verbs.report", "one HTML file with the evidence of an experiment"),
-    "explain": ("gsbench.verbs.explain", "how a table's number came about; with --stale, why a stage is computed anew"),
-    "status": ("gsbench.verbs.status", "what an experiment has done, runs, failed and misses"),
-    "retry": ("gsbench.verbs.retry", "run what failed, was stopped or is missing of an experiment"),
-    "bench": ("gsbench.verbs.bench", "time rasterizers and the training step"),
-    "sync": ("gsbench.verbs.sync", "mirror to MLflow what it missed"),
-    "ui": ("gsbench.verbs.ui", "open the MLflow dashboard on this machine"),
-    "export": ("gsbench.verbs.export", "copy a trained model or an initial cloud to where another program reads it"),
-    "view": ("gsbench.verbs.view", "look at trained models in the browser: one, or two side by side"),
-    "doctor": ("gsbench.verbs.doctor", "check this machine and say what is missing"),
-}
 
 
 def main() -> None:
@@ -54,6 +35,9 @@ def run(argv: list[str]) -> int:
     try:
         if argv and argv[0] in ("help", "--help", "-h"):
             return _help()
+        if argv == ["--version"]:
+            print(f"gsbench {__version__}")
+            return DONE
         if argv and not set(argv[0][:1]) & set("-+~") and "=" not in argv[0]:
             return _verb(argv[0], argv[1:])
         return _trials(argv)
@@ -109,7 +93,8 @@ def _help() -> int:
     print(
         "  gsbench +experiment=table1 --dry-run                           list the trials and their state; run nothing"
     )
-    print("  gsbench --cfg job [settings]                                   show the configuration\n")
+    print("  gsbench --cfg job [settings]                                   show the configuration")
+    print("  gsbench --version                                              say which gsbench this is\n")
     print("Verbs (gsbench VERB --help):")
     for name, (_, text) in VERBS.items():
         print(f"  {name:<10} {text}")

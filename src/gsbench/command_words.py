@@ -18,6 +18,7 @@ from gsbench.words import closest
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")
 NAMED_APART = ("name", "seed")  # not hashed, and yet each of their values has a trial of its own
+OPTIONS = ("-m", "--multirun", "--dry-run", "--config-dir", "--cfg", "--info", "--help", "--version")
 KEY = re.compile(r"[+~]*\w+([./]\w+)*")
 READ_OF_HYDRA = ("hydra.searchpath", "hydra.mode")
 # Of Hydra's own settings, those that people try; what they want stands beside.
@@ -47,7 +48,7 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
         elif word.split("=")[0] in ("--config-dir", "-cd"):
             folders.append(Path(word.partition("=")[2] or next(words, "")))
         elif word.startswith("-"):
-            known = ("-m", "--multirun", "--dry-run", "--config-dir", "--cfg", "--info", "--help")
+            known = OPTIONS
             raise InputError(
                 f"{word} is not an option{closest(word, known)} "
                 "(there are -m, --dry-run, --config-dir FOLDER, --cfg job, --info, --help)"

@@ -42,7 +42,7 @@ def compose_trials(overrides: Sequence[str], multirun: bool = False) -> list[Com
     """
     check_words(overrides)
     swept = [word for word in overrides if is_sweep(word)]
-    with _hydra():
+    with composing():
         master = _compose([word for word in overrides if word not in swept], overrides, return_hydra_config=True)
         hydra = master.hydra
         if not (multirun or (OmegaConf.select(hydra, "mode") is not None and hydra.mode.name == "MULTIRUN")):
@@ -60,13 +60,13 @@ def compose_one(overrides: Sequence[str]) -> Composed:
     check_words(overrides)
     if swept := [word for word in overrides if is_sweep(word)]:
         raise InputError(f"{swept[0]} lists several values: choose one")
-    with _hydra():
+    with composing():
         return _composed(_compose(overrides, overrides), overrides)
 
 
 def compose_values(overrides: Sequence[str]) -> DictConfig:
     """The configuration to look at: every value is allowed, and what a trial needs may still be missing."""
-    with _hydra():
+    with composing():
         config = _compose(overrides, overrides)
     with _errors(overrides):
         check_values(config)
@@ -130,7 +130,8 @@ def _resolved(config: DictConfig, overrides: Sequence[str]) -> Composed:
 
 
 @contextmanager
-def _hydra() -> Iterator[None]:
+def composing() -> Iterator[None]:
+    """Hydra, ready to compose from ``conf``."""
     register_schemas()
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(conf_dir()), version_base="1.3", job_name="gsbench"):
@@ -202,7 +203,7 @@ def _chain(error: BaseException | None) -> list[str]:
 def _keys_below(parent: str, overrides: Sequence[str]) -> list[str]:
     """The settings below ``parent`` with the group choices among ``overrides``, as far as these compose."""
     choices = [word for word in overrides if re.fullmatch(r"\w+=[\w-]+", word) and word.split("=")[0] in GROUPS]
-    with _hydra():
+    with composing():
         try:
             config = compose("config", overrides=choices)
         except Exception:  # noqa: BLE001 - the choices may be what is wrong

@@ -207,7 +207,8 @@ class LaunchConfig:
     name: Literal["serial", "local", "slurm"] = MISSING
     parallel: PositiveInt = 1  # trials at once
     timeout_min: PositiveInt | None = None  # minutes until a trial is stopped with a checkpoint and queued again
-    max_requeues: NonNegativeInt = 20  # Slurm only, as are the next: how often a trial may run out of time
+    wait: bool = True  # Slurm only, as are the next: until all trials have ended; false: submit them and leave
+    max_requeues: NonNegativeInt = 20  # how often a trial may run out of time
     signal_seconds: PositiveInt = 120  # so long before the end a trial is told to save its checkpoint
     cpus_per_trial: PositiveInt | None = None
     gpus_per_trial: NonNegativeInt = 0
@@ -220,6 +221,8 @@ class LaunchConfig:
 
     def __post_init__(self) -> None:
         check_settings(self, "launch")
+        if self.name != "slurm" and not self.wait:
+            raise InputError(f"launch.wait=false leaves the trials to Slurm, so it needs launch=slurm, not {self.name}")
         if self.name == "slurm" and self.timeout_min is not None and self.signal_seconds >= 60 * self.timeout_min:
             raise InputError(
                 f"launch.signal_seconds must be below launch.timeout_min ({self.timeout_min} minutes), "

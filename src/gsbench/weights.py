@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import shutil
 import urllib.request
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsbench.errors import InputError
-from gsbench.files import atomic
+from gsbench.files import CHUNK, atomic
+from gsbench.progress import progress
+from gsbench.words import readable_bytes
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -184,8 +185,17 @@ def _download(spec: WeightsFile, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / spec.names[0]
     with atomic(target) as temporary:
-        with temporary.open("wb") as file, urllib.request.urlopen(spec.url, timeout=DOWNLOAD_TIMEOUT_SECONDS) as source:
-            shutil.copyfileobj(source, file)
+        with (
+            temporary.open("wb") as file,
+            urllib.request.urlopen(spec.url, timeout=DOWNLOAD_TIMEOUT_SECONDS) as source,
+            progress("weights") as report,
+        ):
+            size = int(source.headers.get("Content-Length") or 0) or None
+            while piece := source.read(CHUNK):
+                file.write(piece)
+                report(target.name, file.tell(), size, f"{readable_bytes(file.tell())} of {readable_bytes(size)}")
+            if size is not None and file.tell() < size:
+                raise OSError(f"the connection ended after {file.tell()} of {size} bytes")
         fault = _checksum_fault(temporary, spec)
         if fault is not None:
             raise MissingWeights(f"the download of {spec.names[0]} from {spec.url} is damaged: try again ({fault})")

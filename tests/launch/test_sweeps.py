@@ -25,10 +25,10 @@ from gsbench.launch.plan import (
     add_to_plan,
     describe_plan,
     forget,
-    progress_of_experiment,
     read_plan,
     same_trial_elsewhere,
 )
+from gsbench.launch.states import states_of_experiment
 from gsbench.pipeline.locks import BusyError, hold, is_held
 from gsbench.pipeline.stages import TRAIN
 from gsbench.pipeline.step import Step
@@ -312,15 +312,15 @@ def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs: Path) -> 
     folders[2].mkdir(parents=True)
     (folders[2] / "config.yaml").touch()
     with hold(folders[2] / ".lock", "a trial"):
-        states = [(trial.state, trial.note) for trial in progress_of_experiment(runs / "x")]
+        states = [(trial.state, trial.note) for trial in states_of_experiment(runs / "x")]
     assert states[0] == ("done", "")
     assert states[1] == ("failed", "no luck")
     assert states[2][0] == "running"
     assert f"process {os.getpid()}" in states[2][1]
     assert states[3] == ("missing", "never started")
-    assert progress_of_experiment(runs / "x")[2].state == "partial"
+    assert states_of_experiment(runs / "x")[2].state == "partial"
     forget(runs / "x", [folders[3]])
-    assert len(progress_of_experiment(runs / "x")) == 3
+    assert len(states_of_experiment(runs / "x")) == 3
 
 
 def test_damaged_plan_is_named(runs: Path) -> None:

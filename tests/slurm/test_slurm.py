@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -23,6 +24,7 @@ pytestmark = [pytest.mark.slurm, pytest.mark.end_to_end]
 SLOW = """
 import os, time
 from dataclasses import dataclass
+from pathlib import Path
 from gsbench.densify import ADC
 
 @dataclass
@@ -30,6 +32,13 @@ class Slow(ADC):
     def after_step(self, step, gaussians, rng):
         time.sleep(float(os.environ.get("PAUSE", "0")))
         super().after_step(step, gaussians, rng)
+
+@dataclass
+class Broken(ADC):
+    def refine(self, step, gaussians, rng):
+        if Path(__file__).with_name("broken").exists():
+            raise RuntimeError("it is broken")
+        return super().refine(step, gaussians, rng)
 """
 PAUSE = 0.2  # seconds an iteration: with 300 of them a trial does not fit into Slurm's shortest time limit, a minute
 SWEEP = ["--config-dir", "conf", "-m", *SMALL, "name=cluster", "densify=slow", "allow_targets=[slow]", "tracking=none"]
@@ -62,9 +71,9 @@ def slurm() -> None:
 def place(tmp_path: Path) -> Path:
     (tmp_path / "slow.py").write_text(SLOW)
     (tmp_path / "conf" / "densify").mkdir(parents=True)
-    (tmp_path / "conf" / "densify" / "slow.yaml").write_text(
-        "defaults: [adc, _self_]\n_target_: slow.Slow\nname: slow\n"
-    )
+    for name, target in (("slow", "slow.Slow"), ("broken", "slow.Broken")):
+        text = f"defaults: [adc, _self_]\n_target_: {target}\nname: {name}\n"
+        (tmp_path / "conf" / "densify" / f"{name}.yaml").write_text(text)
     return tmp_path
 
 
@@ -122,6 +131,75 @@ def test_sweep_runs_out_of_time_is_requeued_and_ends_as_undisturbed(place: Path,
     assert "Requeued job" in logs
     assert logs.count("stopping at iteration") >= 2, logs
     assert logs.count("going on from iteration") >= 2, logs
+
+
+def gsbench(
+    place: Path, environment: dict[str, str], *words: str, pause: float = 0
+) -> subprocess.CompletedProcess[str]:
+    """The program, to its end, with its own sayings on stdout and log lines on stderr."""
+    variables = environment | {"GSBENCH_RUNS": str(place / "runs"), "PAUSE": str(pause)}
+    command = [sys.executable, "-m", "gsbench.cli", *words]
+    return subprocess.run(command, cwd=place, env=variables, capture_output=True, text=True, timeout=240, check=False)
+
+
+def states(place: Path, environment: dict[str, str]) -> dict[str, str]:
+    """What ``gsbench status`` says of each arm."""
+    listing = json.loads(gsbench(place, environment, "status", "cluster", "--json").stdout)
+    return {Path(trial["folder"]).parent.name.removeprefix("random-"): trial["state"] for trial in listing}
+
+
+def wait_for_states(place: Path, environment: dict[str, str], **wanted: str) -> None:
+    deadline = time.monotonic() + 240
+    while (found := states(place, environment)) != wanted:
+        assert time.monotonic() < deadline, (found, job_logs(place / "runs"))
+        time.sleep(1)
+
+
+def test_submitted_and_left_status_and_retry_do_the_rest(place: Path, environment: dict[str, str]) -> None:
+    (place / "broken").touch()
+    sweep = [*SWEEP, "densify=slow,broken", *CLUSTER, "launch.timeout_min=10", "launch.parallel=1", "launch.wait=false"]
+
+    first = gsbench(place, environment, *sweep, pause=PAUSE)
+    assert first.returncode == 0, first.stderr
+    assert re.fullmatch(r"Slurm job \d+: 2 trials; see gsbench status cluster\n", first.stdout)
+    array = first.stdout.split()[2].rstrip(":")
+    assert {job.split("_")[0] for job in queue()} == {array}
+    wait_for_states(place, environment, slow="running", broken="queued")
+    listing = gsbench(place, environment, "status", "cluster")
+    assert listing.returncode == 0
+    assert f"Slurm job {array}_1, pending (" in listing.stdout
+    assert "nothing to retry" in gsbench(place, environment, "retry", "cluster").stdout
+    assert "2 trials: 1 running, 1 queued" in gsbench(place, environment, *sweep, "--dry-run").stdout
+
+    second = gsbench(place, environment, *sweep, pause=PAUSE)
+    assert (second.returncode, second.stdout) == (0, first.stdout), second.stderr
+    assert len(list(place.glob("runs/.jobs/cluster/*_submission.sh"))) == 1, "the trials were submitted a second time"
+
+    wait_for_states(place, environment, slow="done", broken="failed")
+    listing = gsbench(place, environment, "status", "cluster")
+    assert listing.returncode == 1
+    assert "it is broken" in listing.stdout
+    (place / "broken").unlink()
+    again = gsbench(place, environment, "retry", "cluster")
+    assert again.returncode == 0, again.stderr
+    assert re.fullmatch(r"Slurm job \d+: 1 trial; see gsbench status cluster\n", again.stdout)
+    assert again.stdout.split()[2].rstrip(":") != array
+    wait_for_states(place, environment, slow="done", broken="done")
+    assert not list(place.glob("runs/cluster/*/*/*/.submitted.json"))
+
+
+def test_job_that_was_cancelled_is_missing_and_can_be_run_elsewhere(place: Path, environment: dict[str, str]) -> None:
+    later = [*CLUSTER, "launch.wait=false", "launch.sbatch={begin: now+1hour}"]
+    done = gsbench(place, environment, *SWEEP, *later)
+    assert done.returncode == 0, done.stderr
+    job = done.stdout.split()[2].rstrip(":")
+    assert states(place, environment) == {"slow": "queued"}
+    subprocess.run(["scancel", job], check=True)
+    wait_for_states(place, environment, slow="missing")
+    assert f"Slurm job {job} has ended, log: " in gsbench(place, environment, "status", "cluster").stdout
+    again = gsbench(place, environment, "retry", "cluster", "launch=serial")  # which knows no launch.wait
+    assert again.returncode == 0, again.stderr
+    assert states(place, environment) == {"slow": "done"}
 
 
 def test_failed_trial_and_killed_job_are_reported(place: Path, environment: dict[str, str]) -> None:

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 def launch(argv: list[str]) -> int:
-    """Run the trials of the command line ``argv``; 0 if all are done, 1 if some failed.
+    """Run the trials of the command line ``argv``; 0 if all are done (or left to Slurm), 1 if some failed.
 
     Raises InputError for a configuration that does not compose or hold together, and for a single trial's bad input.
     """
@@ -64,10 +64,14 @@ def run_trials(trials: Sequence[Composed]) -> int:
         if unfinished:
             if launcher == "serial":
                 outcomes += run_serial(unfinished)
-            else:
-                from gsbench.launch.jobs import run_jobs
+            elif launcher == "local":
+                from gsbench.launch.jobs import run_local
 
-                outcomes += run_jobs(unfinished)
+                outcomes += run_local(unfinished)
+            else:
+                from gsbench.launch.slurm import run_slurm
+
+                outcomes += run_slurm(unfinished)
     return summarize(outcomes, trials)
 
 
@@ -115,9 +119,12 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Composed]) -> int:
     for outcome in failed:
         print(f"gsbench: failed: {outcome.label}: {outcome.message}", file=sys.stderr)
     name = trials[0].values["name"]
-    advice = f"gsbench retry {name}" if failed else f"gsbench tables {name}"
     done = sum(outcome.status == "done" for outcome in outcomes)
-    log.info("%d of %d trials done; %s: %s", done, len(outcomes), "again" if failed else "the table", advice)
+    if any(outcome.status == "queued" for outcome in outcomes):
+        advice = f"how far the others are: gsbench status {name}"
+    else:
+        advice = f"again: gsbench retry {name}" if failed else f"the table: gsbench tables {name}"
+    log.info("%d of %d trials done; %s", done, len(outcomes), advice)
     if failed and all(outcome.status == "failed" and outcome.bad_input for outcome in outcomes):
         return 2
     return 1 if failed else 0

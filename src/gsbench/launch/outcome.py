@@ -10,12 +10,15 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.files import DiskFullError
 from gsbench.pipeline.trial_files import label_of
 
-Status = Literal["done", "failed", "not run"]
+Status = Literal["done", "failed", "queued"]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """``message`` is why a trial failed, or its metrics; ``bad_input``: the user's files or settings are the cause."""
+    """``message`` is why a trial failed, or its metrics; ``bad_input``: the user's files or settings are the cause.
+
+    One that is queued was left to Slurm, in the job that ``message`` names, and may be running by now.
+    """
 
     folder: Path
     status: Status

@@ -13,14 +13,15 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from gsbench.compose import Composed
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import read_object, write_json
-from gsbench.layout import CONFIG, FAILED, LOCK, PLAN, RESULTS, STORE, TRIAL_GLOB
-from gsbench.pipeline.locks import hold, read_holder
-from gsbench.pipeline.trial_files import State, TrialPaths, failure_of, find_finished, stage_and_step, state_of
+from gsbench.launch.queue import ask_queue, state_in_queue
+from gsbench.layout import PLAN, RESULTS, STORE, TRIAL_GLOB
+from gsbench.pipeline.locks import hold
+from gsbench.pipeline.trial_files import TrialPaths, find_finished, stage_and_step, state_of
 from gsbench.words import counted, readable_time
 
 PLAN_VERSION = 1
@@ -34,19 +35,6 @@ class Planned:
     overrides: tuple[str, ...]
     cwd: str
     time: float
-
-
-@dataclass(frozen=True)
-class TrialState:
-    """A trial's state with what people want to know of it: since when (Unix time), and a note.
-
-    A trial that is done is ``superseded`` where the code that made it is no longer the present one.
-    """
-
-    folder: Path
-    state: State | Literal["superseded"]
-    since: float | None
-    note: str
 
 
 def add_to_plan(trials: Sequence[Composed]) -> None:
@@ -102,42 +90,6 @@ def _read(home: Path) -> dict[str, Any]:
         raise InputError(
             f"{home / PLAN} is damaged ({error}): delete it, and give the sweep's command again"
         ) from error
-
-
-def progress_of_experiment(home: Path) -> list[TrialState]:
-    """The state of every trial of the experiment in ``home``, planned or found there."""
-    planned = {trial.folder: trial.time for trial in read_plan(home)}
-    found = {path for path in home.glob(TRIAL_GLOB) if path.is_dir() and (path / CONFIG).exists()}
-    return [progress_of(folder, planned.get(folder)) for folder in sorted({*planned, *found})]
-
-
-def progress_of(folder: Path, planned: float | None = None) -> TrialState:
-    """The state of the trial in ``folder``; ``planned`` is when it was asked for."""
-    state = state_of(folder)
-    if state == "done":
-        return TrialState(folder, state, _changed(folder / RESULTS), "")
-    if state == "failed":
-        return TrialState(folder, state, _changed(folder / FAILED), failure_of(folder))
-    if state == "running":
-        holder = read_holder(folder / LOCK)
-        job = f", Slurm job {holder['slurm']}" if holder.get("slurm") else ""
-        where = f"process {holder.get('pid', '?')} on {holder.get('host', '?')}{job}"
-        return TrialState(folder, state, holder.get("since"), f"{_reached(folder)} {where}".strip())
-    if state == "partial":
-        return TrialState(folder, state, _changed(folder / CONFIG), f"stopped {_reached(folder)}".strip())
-    return TrialState(folder, state, planned, "never started")
-
-
-def _reached(folder: Path) -> str:
-    stage, step = stage_and_step(folder)
-    return f"in {stage}" + (f" at iteration {step}" if stage == "train" and step else "") if stage else ""
-
-
-def _changed(path: Path) -> float | None:
-    try:
-        return path.stat().st_mtime
-    except OSError:
-        return None
 
 
 def same_trial_elsewhere(paths: TrialPaths) -> str | None:
@@ -207,14 +159,17 @@ def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
         [],
         0.0,
         0,
-        dict.fromkeys(("done", "partial", "missing", "running", "failed"), 0),
+        dict.fromkeys(("done", "partial", "missing", "running", "queued", "failed"), 0),
     )
     estimator = Estimator(TrialPaths.of(trials[0].values).runs) if trials else None
     learned = 0
     built_stages = _stage_finder(trials)
+    queue = ask_queue(TrialPaths.of(trial.values).folder for trial in trials)
     for trial in trials:
         paths = TrialPaths.of(trial.values)
         state: str = state_of(paths.folder)
+        if state not in ("done", "running"):
+            state = state_in_queue(paths.folder, queue) or state
         note = ""
         if state == "done" and find_finished(trial.values) is None:
             note = "  will be checked: something that it was made of has changed, or a metric is missing"

@@ -11,6 +11,7 @@ from gsbench.arguments import ArgumentParser, path
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.layout import STORE
+from gsbench.view import ADDRESS
 
 if TYPE_CHECKING:
     from gsbench.gaussians.model import Gaussians
@@ -23,8 +24,7 @@ FORMATS = {
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    from gsbench.view.trials import ADDRESS, find_trial, model_file
-
+    """The verb: 0 if the file, or folder, was written."""
     parser = ArgumentParser(
         prog="gsbench export",
         description="Write a trained model for other programs; `gsbench export init TRIAL --out DIR` copies the COLMAP "
@@ -38,6 +38,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
         "--out", type=path, required=True, metavar="PATH", help="the file, or for init the folder, to write"
     )
     options = parser.parse_args(argv)
+    from gsbench.view.trials import find_trial, model_file
+
     is_init = len(options.trial) == 2 and options.trial[0] == "init"
     if len(options.trial) > 1 and not is_init:
         raise InputError(f"one TRIAL is exported, not {len(options.trial)}; for an initial model: export init TRIAL")

@@ -15,7 +15,7 @@ from gsbench.datasets.remote import Patience, RangesRefusedError
 from gsbench.errors import InputError
 from gsbench.files import remove_temporaries, storage_errors
 from gsbench.pipeline.locks import hold
-from gsbench.pipeline.progress import progress
+from gsbench.progress import progress
 from gsbench.words import closest, readable_bytes
 
 MIRROR_VARIABLE = "GSBENCH_MIRROR"

@@ -14,7 +14,8 @@ from gsbench.analysis.results import experiment_home
 from gsbench.arguments import ArgumentParser
 from gsbench.compose import Composed, compose_one
 from gsbench.errors import InputError
-from gsbench.launch.plan import Planned, describe_plan, forget, progress_of_experiment, read_plan
+from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
+from gsbench.launch.states import states_of_experiment
 from gsbench.pipeline.trial_files import TrialPaths, label_of, read_config
 
 log = logging.getLogger(__name__)
@@ -35,10 +36,10 @@ def main(argv: Sequence[str], runs: Path) -> int:
     options = parser.parse_args(argv)
     home = experiment_home(runs, options.experiment)
     unfinished = [
-        trial.folder for trial in progress_of_experiment(home) if trial.state in ("failed", "partial", "missing")
+        trial.folder for trial in states_of_experiment(home) if trial.state in ("failed", "partial", "missing")
     ]
     if not unfinished:
-        print(f"nothing to retry: all trials of {options.experiment} are done or running")
+        print(f"nothing to retry: all trials of {options.experiment} are done, running or queued")
         return 0
     planned = {trial.folder: trial for trial in read_plan(home)}
     trials = [recompose(folder, planned.get(folder), runs, options.changes) for folder in unfinished]
@@ -59,6 +60,8 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
     if planned is not None:
         changed = {change.split("=")[0] for change in changes}
         own = [word for word in planned.overrides if word.split("=")[0] not in changed]
+        if any(change.startswith("launch=") and change not in planned.overrides for change in changes):
+            own = [word for word in own if not word.startswith("launch.")]  # they were meant for the other launcher
         where = planned.cwd if Path(planned.cwd).is_dir() else os.getcwd()
         if where != os.getcwd():
             os.chdir(where)  # relative paths were meant from there, and the trials are run from there

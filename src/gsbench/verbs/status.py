@@ -11,16 +11,17 @@ from pathlib import Path
 from gsbench.analysis.results import Trial, experiment_home, list_experiments, read_experiment
 from gsbench.analysis.superseded import find_superseded
 from gsbench.arguments import ArgumentParser
-from gsbench.launch.plan import TrialState, forget, progress_of_experiment, read_plan, remove
+from gsbench.launch.plan import forget, read_plan, remove
+from gsbench.launch.states import TrialState, states_of_experiment
 from gsbench.pipeline.trial_files import label_of
 from gsbench.source import source_on_disk
 from gsbench.words import counted, readable_time
 
-ORDER = ("failed", "running", "partial", "missing", "superseded", "done")
+ORDER = ("failed", "running", "queued", "partial", "missing", "superseded", "done")
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: 0 if all trials are done, 1 if some failed or are missing."""
+    """The verb: 0 if all trials are done, or will be, 1 if some failed or are missing."""
     parser = ArgumentParser(prog="gsbench status", description="The state of every trial of an experiment.")
     parser.add_argument("experiment", nargs="?", help="its name; without one, a line for each experiment")
     parser.add_argument("--all", action="store_true", help="list the finished trials too")
@@ -52,7 +53,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         print(json.dumps([_as_dict(trial) for trial in trials], indent=1))
     else:
         print("\n".join(lines_of(trials, options.all)))
-    return 0 if all(trial.state in ("done", "running", "superseded") for trial in trials) else 1
+    return 0 if all(trial.state in ("done", "running", "queued", "superseded") for trial in trials) else 1
 
 
 def progress_with_superseded(home: Path) -> list[TrialState]:
@@ -70,7 +71,7 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
         replace(trial, state="superseded", note=reasons[trial.folder])
         if trial.state == "done" and trial.folder in reasons
         else trial
-        for trial in progress_of_experiment(home)
+        for trial in states_of_experiment(home)
     ]
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 from gsbench.config import SceneConfig
 from gsbench.hashing import sha256_of
-from gsbench.pipeline.progress import progress
 from gsbench.pipeline.stages import CAPTURE
 from gsbench.pipeline.step import Step
+from gsbench.progress import progress
 from gsbench.scene.courtyard import render_courtyard
 from gsbench.scene.images import image_size
 from gsbench.scene.readers import read_colmap, read_photos

@@ -23,12 +23,12 @@ from gsbench.layout import FIGURES, LINEAGE, MAPS, PER_VIEW, POINT_CLOUD, RENDER
 from gsbench.pipeline.components import options_of
 from gsbench.pipeline.figures import draw_ellipsoids
 from gsbench.pipeline.maps import view_maps
-from gsbench.pipeline.progress import progress
 from gsbench.pipeline.stages import EVALUATE
 from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.ground_truth import png_name
 from gsbench.pipeline.steps.views import Views
 from gsbench.pipeline.trainer import snapshot_file
+from gsbench.progress import progress
 from gsbench.raster import Rasterizer
 from gsbench.scene.types import Scene
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from gsbench.init.base import MODEL_FOLDER, Initializer
 from gsbench.pipeline.components import options_of
-from gsbench.pipeline.progress import Report, progress
 from gsbench.pipeline.resources import available_threads
 from gsbench.pipeline.stages import INIT
 from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.capture import split_of
 from gsbench.pipeline.store import Store
+from gsbench.progress import Report, progress
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Capture
 

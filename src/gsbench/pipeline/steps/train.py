@@ -23,11 +23,11 @@ from gsbench.layout import LINEAGE, POINT_CLOUD
 from gsbench.machine import describe_machine
 from gsbench.memory import peak_memory_mb, reset_peak_memory
 from gsbench.pipeline.components import options_of, rasterizer_inputs
-from gsbench.pipeline.progress import progress
 from gsbench.pipeline.stages import TRAIN
 from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.views import Views
 from gsbench.pipeline.trainer import Status, Trainer
+from gsbench.progress import progress
 from gsbench.raster import Rasterizer
 
 TRAINING_FILE = "training.json"

@@ -7,10 +7,10 @@ from typing import Any
 
 from gsbench.config import SceneConfig
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.pipeline.progress import progress
 from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.capture import split_of
 from gsbench.pipeline.store import Store
+from gsbench.progress import progress
 from gsbench.scene.load import load_scene
 from gsbench.scene.types import Capture, Scene
 

@@ -17,9 +17,9 @@ SECONDS_BETWEEN_LINES = 20.0
 
 
 class Report(Protocol):
-    """Called with how far a piece of work is; ``note`` is shown as it is."""
+    """Called with how far a piece of work is, of a ``total`` that may be unknown; ``note`` is shown as it is."""
 
-    def __call__(self, phase: str, done: int, total: int, note: str = "") -> None: ...
+    def __call__(self, phase: str, done: int, total: int | None, note: str = "") -> None: ...
 
 
 @contextmanager
@@ -33,7 +33,7 @@ def progress(title: str) -> Iterator[Report]:
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(title, total=None, note="")
 
-        def report(phase: str, done: int, total: int, note: str = "") -> None:
+        def report(phase: str, done: int, total: int | None, note: str = "") -> None:
             bar.update(
                 task, description=f"{title}: {phase}", completed=done, total=total, note=note or f"{done}/{total}"
             )
@@ -44,12 +44,12 @@ def progress(title: str) -> Iterator[Report]:
 def _lines(title: str) -> Report:
     last_phase, last_done, last_time = "", -1, 0.0
 
-    def report(phase: str, done: int, total: int, note: str = "") -> None:
+    def report(phase: str, done: int, total: int | None, note: str = "") -> None:
         nonlocal last_phase, last_done, last_time
         now = time.monotonic()
         ends = done == total and done != last_done
         if phase != last_phase or ends or now - last_time >= SECONDS_BETWEEN_LINES:
             last_phase, last_done, last_time = phase, done, now
-            log.info("%s: %s %d/%d %s", title, phase, done, total, note)
+            log.info("%s: %s %d/%s %s", title, phase, done, "?" if total is None else total, note)
 
     return report

@@ -1,0 +1,138 @@
+"""Trials as tasks of a Slurm array job: submitted once, then waited for, or left to Slurm (``launch.wait=false``)."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gsbench.compose import Composed
+from gsbench.errors import InputError
+from gsbench.launch.jobs import collect, job_folder, job_of, need_submitit, prepare_tracking
+from gsbench.launch.outcome import Outcome
+from gsbench.launch.queue import (
+    ask_queue,
+    current_user,
+    forget_submission,
+    read_queue,
+    read_submission,
+    record_submission,
+)
+from gsbench.pipeline.locks import hold
+from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.words import counted
+
+if TYPE_CHECKING:
+    from submitit import Job, SlurmExecutor
+
+log = logging.getLogger(__name__)
+
+SUBMIT_LOCK = ".submit.lock"  # in the folder of the jobs' output: two commands at once submit a trial once
+SECONDS_BETWEEN_POLLS = 1.0
+SECONDS_BETWEEN_QUEUE_CHECKS = 20.0
+CHECKS_UNTIL_LOST = 2  # a job that the queue does not know so often in a row, and that left no result, is lost
+
+
+def run_slurm(trials: Sequence[Composed]) -> list[Outcome]:
+    """Run the trials in Slurm, those that an earlier command left there included.
+
+    Returns when all have ended; with ``launch.wait=false`` as soon as Slurm has them, as outcomes of status "queued".
+    """
+    values = trials[0].values
+    executor = make_executor(values["launch"], job_folder(values))
+    prepare_tracking(values)
+    with hold(Path(executor.folder) / SUBMIT_LOCK, f"submitting trials of {values['name']}"):
+        jobs = _submit(trials, executor)
+    array = sorted({job.job_id.split("_")[0] for job in jobs.values()})
+    if not values["launch"].get("wait", True):
+        print(f"Slurm job {', '.join(array)}: {counted(len(jobs), 'trial')}; see gsbench status {values['name']}")
+        return [Outcome(folder, "queued", job.job_id) for folder, job in jobs.items()]
+    log.info("%s in Slurm, job %s; logs: %s", counted(len(jobs), "trial"), ", ".join(array), executor.folder)
+    try:
+        return _wait(jobs, trials)
+    except KeyboardInterrupt:
+        log.info(
+            "the jobs stay in Slurm: the same command waits for them again, `scancel %s` ends them", " ".join(array)
+        )
+        raise
+
+
+def make_executor(launch: dict[str, Any], folder: Path) -> SlurmExecutor:
+    """The submitit executor for the settings ``launch``. Raises InputError where submitit or Slurm is missing."""
+    need_submitit("slurm")
+    import submitit
+
+    try:
+        slurm = submitit.SlurmExecutor(folder, max_num_timeout=launch["max_requeues"])
+    except RuntimeError:
+        raise InputError("launch=slurm: there is no srun here; start gsbench on a login node of the cluster") from None
+    wanted = {
+        "job_name": "gsbench",
+        "partition": launch["partition"],
+        "account": launch["account"],
+        "qos": launch["qos"],
+        "time": launch["timeout_min"],
+        "cpus_per_task": launch["cpus_per_trial"],
+        "gpus_per_node": launch["gpus_per_trial"] or None,
+        "mem": None if launch["mem_gb"] is None else f"{launch['mem_gb']}GB",
+        "signal_delay_s": launch["signal_seconds"],
+        "array_parallelism": launch["parallel"],
+        "setup": launch["setup"] or None,
+        "additional_parameters": launch["sbatch"] or None,
+    }
+    slurm.update_parameters(**{key: value for key, value in wanted.items() if value is not None})
+    return slurm
+
+
+def _submit(trials: Sequence[Composed], executor: SlurmExecutor) -> dict[Path, Job[Outcome]]:
+    """The job of each trial by the trial's folder: one that is in the queue already, else a task of a new array job."""
+    import submitit
+
+    homes = [TrialPaths.of(trial.values).folder for trial in trials]
+    queue = ask_queue(homes)
+    if queue is None:
+        raise InputError("Slurm does not say what it has (squeue failed), so nothing was submitted: try again later")
+    jobs: dict[Path, Job[Outcome]] = {}
+    fresh: dict[Path, Composed] = {}
+    for home, trial in zip(homes, trials, strict=True):
+        known = read_submission(home)
+        if known and known.job in queue:
+            jobs[home] = submitit.SlurmJob(executor.folder, known.job)
+        else:
+            fresh[home] = trial
+    if fresh:
+        try:
+            submitted = executor.submit_array([job_of(trial) for trial in fresh.values()])
+        except Exception as error:
+            raise InputError(f"Slurm refused the job: {' '.join(str(error).split())[:300]}") from error
+        for home, job in zip(fresh, submitted, strict=True):
+            record_submission(home, job.job_id, job.paths.stderr)
+            jobs[home] = job
+    return jobs
+
+
+def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Composed]) -> list[Outcome]:
+    outcomes: list[Outcome] = []
+    users = {known.user for folder in jobs if (known := read_submission(folder))} | {current_user()}
+    unseen = dict.fromkeys(jobs, 0)
+    checked = time.monotonic()
+    while jobs:
+        ended = [folder for folder, job in jobs.items() if job.paths.result_pickle.exists()]
+        if time.monotonic() - checked > SECONDS_BETWEEN_QUEUE_CHECKS:
+            checked = time.monotonic()
+            queue = read_queue(users)
+            if queue is not None:  # a scheduler that is down for a while has lost nothing
+                for folder, job in jobs.items():
+                    unseen[folder] = 0 if job.job_id in queue else unseen[folder] + 1
+            ended += [folder for folder in jobs if unseen[folder] >= CHECKS_UNTIL_LOST and folder not in ended]
+        for folder in ended:
+            outcomes.append(collect(jobs.pop(folder), folder, trials))
+            with suppress(OSError):
+                forget_submission(folder)
+            log.info("%s: %s  (%d of %d)", outcomes[-1].label, outcomes[-1].message, len(outcomes), len(trials))
+        if not ended:
+            time.sleep(SECONDS_BETWEEN_POLLS)
+    return outcomes

@@ -1,0 +1,77 @@
+"""The state of an experiment's trials: from their folders, and of those that Slurm was given also from its queue.
+
+Loads no torch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from gsbench.launch.plan import read_plan
+from gsbench.launch.queue import Queue, ask_queue, read_submission, state_in_queue
+from gsbench.layout import CONFIG, FAILED, LOCK, RESULTS, TRIAL_GLOB
+from gsbench.pipeline.locks import read_holder
+from gsbench.pipeline.trial_files import State, failure_of, stage_and_step, state_of
+
+
+@dataclass(frozen=True)
+class TrialState:
+    """A trial's state with what people want to know of it: since when (Unix time), and a note.
+
+    A trial is ``queued`` where Slurm has it and it has not begun. One that is done is ``superseded`` where the code
+    that made it is no longer the present one.
+    """
+
+    folder: Path
+    state: State | Literal["queued", "superseded"]
+    since: float | None
+    note: str
+
+
+def states_of_experiment(home: Path) -> list[TrialState]:
+    """The state of every trial of the experiment in ``home``, planned or found there."""
+    planned = {trial.folder: trial.time for trial in read_plan(home)}
+    found = {path for path in home.glob(TRIAL_GLOB) if path.is_dir() and (path / CONFIG).exists()}
+    folders = sorted({*planned, *found})
+    queue = ask_queue(folders)
+    return [_state(folder, planned.get(folder), queue) for folder in folders]
+
+
+def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialState:
+    """The state of the trial in ``folder``; ``planned`` is when it was asked for."""
+    state = state_of(folder)
+    if state == "done":
+        return TrialState(folder, state, _changed(folder / RESULTS), "")
+    if state == "running":
+        holder = read_holder(folder / LOCK)
+        within = f", Slurm job {holder['slurm']}" if holder.get("slurm") else ""
+        where = f"process {holder.get('pid', '?')} on {holder.get('host', '?')}{within}"
+        return TrialState(folder, state, holder.get("since"), f"{_reached(folder)} {where}".strip())
+    submission = read_submission(folder)
+    lost = ""
+    if submission:
+        if found := state_in_queue(folder, queue):
+            job = queue.get(submission.job) if queue is not None else None
+            words = job.words if job else "Slurm does not answer"
+            note = f"{_reached(folder)} Slurm job {submission.job}, {words}".strip()
+            return TrialState(folder, found, _changed(submission.note), note)
+        lost = f"; Slurm job {submission.job} has ended, log: {submission.log}"
+    if state == "failed":
+        return TrialState(folder, state, _changed(folder / FAILED), failure_of(folder))
+    if state == "partial":
+        return TrialState(folder, state, _changed(folder / CONFIG), f"stopped {_reached(folder)}".strip() + lost)
+    return TrialState(folder, state, planned, "never started" + lost)
+
+
+def _reached(folder: Path) -> str:
+    stage, step = stage_and_step(folder)
+    return f"in {stage}" + (f" at iteration {step}" if stage == "train" and step else "") if stage else ""
+
+
+def _changed(path: Path) -> float | None:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return None

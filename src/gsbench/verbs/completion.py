@@ -1,0 +1,191 @@
+"""``gsbench completion``: what the Tab key offers, as folders tell of experiments and trials, and Hydra of settings.
+
+A shell's script (`gsbench.verbs.shells`) asks ``gsbench completion query LINE``, which prints a line for each word that
+the last one of ``LINE`` may become. Loads no torch, and Hydra for settings only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from gsbench.analysis.results import list_experiments
+from gsbench.arguments import ArgumentParser
+from gsbench.datasets.catalog import read_catalog
+from gsbench.errors import InputError
+from gsbench.eval.facts import known_keys
+from gsbench.layout import TRIAL_GLOB
+from gsbench.verbs import VERBS
+from gsbench.verbs.shells import SCRIPTS, how_to_install
+
+QUERY = "query"
+OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
+CHOICES = r"(?<![\w-]){option}[ =]\{{([^}}]*)\}}"  # as argparse shows them: --format {{md,csv}}
+NOT_TYPED = ("experiment", "experiment=", "hydra", "hydra.", "schema/")  # Hydra offers them, and gsbench refuses them
+
+
+def main(argv: Sequence[str], runs: Path) -> int:
+    """The verb: print the script of a shell, or answer one."""
+    if argv[:1] == [QUERY]:
+        print("\n".join(complete(argv[1] if len(argv) > 1 else "", runs)))
+        return 0
+    parser = ArgumentParser(
+        prog="gsbench completion",
+        description="Print the script that lets a shell complete gsbench's verbs, settings, experiments and trials.",
+        epilog="; ".join(f"{shell}: {line}" for shell, line in how_to_install().items()),
+    )
+    parser.add_argument("shell", choices=list(SCRIPTS))
+    print(SCRIPTS[parser.parse_args(argv).shell])
+    return 0
+
+
+def complete(line: str, runs: Path) -> list[str]:
+    """What the last word of a command ``line`` may become, whole words in order; the line starts with the program."""
+    words = line.split()[1:]
+    word = words.pop() if words and not line[-1:].isspace() else ""
+    if words and words[0] in VERBS:
+        found = _of_verb(words[0], words[1:], word, runs)
+    elif word.startswith("-"):
+        from gsbench.command_words import OPTIONS
+
+        found = list(OPTIONS)
+    else:
+        found = [*([] if words else VERBS), *_settings(words, word)]
+    return sorted({candidate for candidate in found if candidate.startswith(word)})
+
+
+def _of_verb(verb: str, words: Sequence[str], word: str, runs: Path) -> Iterable[str]:
+    """Words after a verb: options as its own help lists them, and what its arguments name."""
+    if word.startswith("-"):
+        return OPTION.findall(_help_of(verb, runs))
+    if words and words[-1].startswith("--"):
+        if choices := re.search(CHOICES.format(option=words[-1]), _help_of(verb, runs)):
+            return choices.group(1).split(",")
+        if words[-1] in ("--as", "--truth"):
+            return _addresses(runs, word, whole=words[-1] == "--truth")
+        if re.search(rf"(?<![\w-]){words[-1]} [A-Z]", _help_of(verb, runs)):
+            return []  # a value of its own: a file, for which the shell has a better list
+    arguments = [argument for argument in words if not argument.startswith("-")]
+    return ARGUMENTS.get(verb, _none)(arguments, word, runs)
+
+
+def _help_of(verb: str, runs: Path) -> str:
+    with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
+        importlib.import_module(VERBS[verb][0]).main(["--help"], runs)
+    return text.getvalue()
+
+
+def _none(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
+    return []
+
+
+def _experiment(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
+    return [] if arguments else list_experiments(runs)
+
+
+def _retry(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
+    return _settings(arguments[1:], word) if arguments else list_experiments(runs)
+
+
+def _trial(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
+    return _addresses(runs, word, whole=True)
+
+
+def _export(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
+    return [*([] if arguments else ["init"]), *_addresses(runs, word, whole=True)]
+
+
+def _cell(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
+    """``EXPERIMENT:SCENE:METRIC:ARM``, a part at a time."""
+    if "=" in word:
+        return _settings(arguments, word)
+    name, *rest = word.split(":")
+    if not rest:
+        return [f"{experiment}:" for experiment in list_experiments(runs)]
+    scenes = sorted({folder.parents[1].name for folder in _trials(runs, name)})
+    if len(rest) == 1:
+        return [f"{name}:{scene}:" for scene in scenes]
+    if len(rest) == 2:
+        return [f"{name}:{rest[0]}:{metric}:" for metric in known_keys()]
+    arms = {folder.parent.name for folder in _trials(runs, name) if folder.parents[1].name == rest[0]}
+    return [f"{name}:{rest[0]}:{rest[1]}:{arm}" for arm in arms]
+
+
+def _dataset(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
+    catalog = read_catalog()
+    return catalog if not arguments else catalog[arguments[0]].scenes if arguments[0] in catalog else []
+
+
+def _shell(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
+    return [] if arguments else list(SCRIPTS)
+
+
+ARGUMENTS: dict[str, Callable[[Sequence[str], str, Path], Iterable[str]]] = {
+    "tables": _experiment,
+    "report": _experiment,
+    "status": _experiment,
+    "sync": _experiment,
+    "ui": _experiment,
+    "retry": _retry,
+    "explain": _cell,
+    "view": _trial,
+    "export": _export,
+    "fetch": _dataset,
+    "completion": _shell,
+}
+
+
+def _addresses(runs: Path, word: str, whole: bool) -> list[str]:
+    """``EXPERIMENT:SCENE:ARM:SEED`` of the trials that are there, a part at a time; if not ``whole``, experiments."""
+    depth = word.count(":")
+    found = set()
+    for name in [word.split(":")[0]] if depth else list_experiments(runs):
+        if not depth:
+            found.add(f"{name}:")
+            continue
+        for folder in _trials(runs, name) if whole else []:
+            scene, arm, seed = folder.parents[1].name, folder.parent.name, folder.name.rpartition("-seed")[2]
+            parts = [name, scene, arm, seed][: depth + 1]
+            found.add(":".join(parts) + (":" if len(parts) < 4 else ""))
+    return sorted(found)
+
+
+def _trials(runs: Path, name: str) -> list[Path]:
+    return list((runs / name).glob(TRIAL_GLOB)) if name in list_experiments(runs) else []
+
+
+def _settings(words: Sequence[str], word: str) -> list[str]:
+    """Groups, their choices and keys, as Hydra completes them after ``words``; of a list, the last value."""
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.plugins.completion_plugin import DefaultCompletionPlugin
+
+    from gsbench.command_words import parse
+    from gsbench.compose import composing
+
+    head, comma, last = word.rpartition(",")
+    key = head.partition("=")[0] + "=" if comma else ""
+    try:
+        overrides, _, _ = parse(words)
+    except InputError:
+        return []
+    first_values = [re.sub(r"^(\w+=[\w-]+),.*", r"\1", override) for override in overrides]  # Hydra: one at a time
+    with composing():
+        plugin = DefaultCompletionPlugin(GlobalHydra.instance().config_loader())
+        try:
+            found = plugin._query("config", " ".join([*first_values, key + last]))
+        except Exception:  # noqa: BLE001 - a line that is half typed may be wrong in any way
+            return []
+    if comma:
+        return [head + comma + candidate.removeprefix(key) for candidate in found]
+    if not words or "+experiment=".startswith(word):
+        found.append("+experiment=")
+    return [_closed(candidate) for candidate in found if candidate not in NOT_TYPED]
+
+
+def _closed(candidate: str) -> str:
+    """A group that has folders below it is chosen as any other."""
+    return candidate if re.search(r"[=./]", candidate) else f"{candidate}="
