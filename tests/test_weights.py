@@ -153,7 +153,7 @@ def test_without_a_network_the_answer_comes_at_once():
 def test_state_round_trip(tmp_path: Path, name: str):
     path = tmp_path / name
     if name.endswith("safetensors"):
-        pytest.importorskip("safetensors").torch.save_file(STATE, path)
+        pytest.importorskip("safetensors.torch").save_file(STATE, path)
     else:
         torch.save(STATE, path)
     state = load_state(path)
@@ -198,7 +198,7 @@ def test_truncated_and_foreign_files(tmp_path: Path, name: str, content: bytes |
     path = tmp_path / name
     if content == "half":
         if name.endswith("safetensors"):
-            pytest.importorskip("safetensors").torch.save_file(STATE, path)
+            pytest.importorskip("safetensors.torch").save_file(STATE, path)
         else:
             torch.save(STATE, path)
         content = path.read_bytes()[: path.stat().st_size // 2]
