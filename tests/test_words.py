@@ -116,6 +116,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "densify=adc densify._target_=own.Raises allow_targets=[own]": "own.Raises cannot be made (KeyError",
     "densify=adc densify._target_=own.Own allow_targets=[own] +densify.patiense=1": "did you mean patience?",
     "densify=adc densify._target_=own.Own allow_targets=[own] +densify.patience=x": "must be a whole number, got 'x'",
+    "densify=pixelgs raster=gsplat": "raster=gsplat does not say; take raster=reference or raster=cpu or raster=triton",
     "init._target_=5": "the import path of a class",
     # verbs and questions
     "tables": "required: experiment",

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.densify import ADC, MCMC, Volumetric
+from gsbench.densify import ADC, MCMC, PixelGS, Volumetric
 from gsbench.densify.budgeted import Budgeted
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
@@ -26,6 +26,7 @@ ARMS: dict[str, tuple[type[Budgeted], dict[str, object]]] = {
     "volumetric": (Volumetric, {"volume_threshold": 0.003}),
     "volumetric, not the round": (Volumetric, {"volume_threshold": 0.003, "split_isotropic": False}),
     "volumetric, its tail": (Volumetric, {"threshold_mode": "quantile", "volume_quantile": 0.9}),
+    "pixelgs": (PixelGS, {}),
     "mcmc": (MCMC, {}),
 }
 

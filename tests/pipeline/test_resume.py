@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.densify import ADC, MCMC, Densifier, Volumetric
+from gsbench.densify import ADC, MCMC, Densifier, PixelGS, Volumetric
 from gsbench.gaussians.model import Gaussians
 from gsbench.pipeline.stopping import Stopped, stop_on_signals
 from gsbench.pipeline.trainer import Status, Trainer
@@ -23,6 +23,9 @@ MAKERS: dict[str, Callable[[], Densifier]] = {
     "adc": lambda: ADC(start=20, stop=110, interval=20, opacity_reset_interval=60),
     "volumetric": lambda: Volumetric(start=20, stop=110, interval=20, opacity_reset_interval=60, volume_threshold=0.01),
     "capped": lambda: ADC(start=20, stop=110, interval=20, opacity_reset_interval=60, max_gaussians=120, cap="hard"),
+    "pixelgs": lambda: PixelGS(
+        start=20, stop=110, interval=20, opacity_reset_interval=60, max_gaussians=150, cap="hard"
+    ),
     "mcmc": lambda: MCMC(start=20, stop=110, interval=20),
 }
 

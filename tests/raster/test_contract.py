@@ -12,7 +12,15 @@ from hypothesis import HealthCheck, given, settings
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster import EXECUTORS, create_rasterizer
 from gsbench.raster.base import Rasterizer
-from gsbench.raster.contract import CASES, GRADIENT_TOLERANCE, VALUE_TOLERANCE, Case, render_with_gradients
+from gsbench.raster.contract import (
+    CASES,
+    FOOTPRINT_TOLERANCE,
+    GRADIENT_TOLERANCE,
+    VALUE_TOLERANCE,
+    Case,
+    footprint_errors,
+    render_with_gradients,
+)
 from gsbench.raster.executors import Executor, find
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.camera import Camera
@@ -58,6 +66,8 @@ def test_values_and_gradients_match_the_reference(rasterizer: Rasterizer, device
         assert error < GRADIENT_TOLERANCE, f"{name}: relative error {error:.2e}"
         if not (name == "sh_rest" and case.sh_degree == 0):
             assert reference.abs().max() > 0, name
+    assert find(rasterizer.name).has_footprint
+    assert max(footprint_errors(output, expected).values()) < FOOTPRINT_TOLERANCE  # asked after the backward pass
 
 
 def test_unused_coefficients_get_a_zero_gradient(rasterizer: Rasterizer, device: str) -> None:
@@ -90,6 +100,7 @@ def test_nothing_to_see_is_the_background(rasterizer: Rasterizer, device: str) -
         assert torch.equal(output.image, background.expand(17, 20, 3))
         assert output.alpha.abs().max() == 0
         assert not output.visible.any()
+        assert not output.footprint(torch.ones(17, 20, device=device)).values.any()
         output.image.sum().backward()
         for name, tensor in leaves.tensors().items():
             assert tensor.grad is None or tensor.grad.abs().sum() == 0, name

@@ -14,8 +14,14 @@ from gsbench.scene.camera import Camera
 from tests.gaussians.helpers import front_camera, random_gaussians
 
 
-def brute_force(gaussians: Gaussians, camera: Camera, background: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every pixel by itself, in plain Python from the published formulas; colours of degree 0 only."""
+def brute_force(
+    gaussians: Gaussians, camera: Camera, background: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Every pixel by itself, in plain Python from the published formulas; colours of degree 0 only.
+
+    Image, opacity, and [N, 3] of each Gaussian over the pixels it is blended into: their number, the sum of
+    column + 100 row, and that of their distances to its mean.
+    """
     items = []
     for i in range(len(gaussians)):
         mean = gaussians.means[i].numpy()
@@ -50,15 +56,16 @@ def brute_force(gaussians: Gaussians, camera: Camera, background: np.ndarray) ->
         )
         rgb = np.maximum(0, gaussians.sh_dc[i].numpy() * 0.28209479177387814 + 0.5)
         opacity = 1 / (1 + math.exp(-float(gaussians.opacity_logits[i])))
-        items.append((view[2], pixel, np.linalg.inv(covariance), math.ceil(3 * math.sqrt(largest)), opacity, rgb))
+        items.append((view[2], pixel, np.linalg.inv(covariance), math.ceil(3 * math.sqrt(largest)), opacity, rgb, i))
     items.sort(key=lambda item: item[0])
     image = np.zeros((camera.height, camera.width, 3))
     alpha_image = np.zeros((camera.height, camera.width))
+    covered = np.zeros((len(gaussians), 3))
     for row in range(camera.height):
         for column in range(camera.width):
             transmittance, color = 1.0, np.zeros(3)
             tile_x, tile_y = column // 16 * 16, row // 16 * 16
-            for _, pixel, inverse, radius, opacity, rgb in items:
+            for _, pixel, inverse, radius, opacity, rgb, i in items:
                 reaches = (
                     math.floor((pixel[0] - radius) / 16) * 16 <= tile_x < math.floor((pixel[0] + radius + 15) / 16) * 16
                     and math.floor((pixel[1] - radius) / 16) * 16
@@ -75,9 +82,10 @@ def brute_force(gaussians: Gaussians, camera: Camera, background: np.ndarray) ->
                     break
                 color += rgb * alpha * transmittance
                 transmittance *= 1 - alpha
+                covered[i] += 1, column + 100 * row, math.hypot(*offset)
             image[row, column] = color + transmittance * background
             alpha_image[row, column] = 1 - transmittance
-    return image, alpha_image
+    return image, alpha_image, covered
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (5.0, -4.0)])
@@ -86,10 +94,17 @@ def test_matches_brute_force(shift: tuple[float, float]) -> None:
     gaussians.opacity_logits[:8] = 6.0  # opaque ones reach both the clamp of alpha and the early stop
     camera, background = front_camera(37, 21, shift), torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
     out = ReferenceRasterizer().render(gaussians, camera, 0, background)
-    image, alpha = brute_force(gaussians, camera, background.numpy())
+    image, alpha, covered = brute_force(gaussians, camera, background.numpy())
     np.testing.assert_allclose(out.image.detach().numpy(), image, atol=1e-10)
     np.testing.assert_allclose(out.alpha.detach().numpy(), alpha, atol=1e-10)
     assert alpha.max() > 0.999
+    footprint = out.footprint(torch.arange(37) + 100 * torch.arange(21).unsqueeze(1))
+    assert footprint.pixels.tolist() == covered[:, 0].tolist()
+    assert footprint.values.tolist() == covered[:, 1].tolist()
+    np.testing.assert_allclose(footprint.distances, covered[:, 2], rtol=1e-12)
+    depths = gaussians.means.numpy() @ camera.rotation[2] + camera.translation[2]
+    np.testing.assert_allclose(footprint.depths, depths)
+    assert (covered[:, 0] > 0).sum() > 30
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])

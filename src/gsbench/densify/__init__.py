@@ -6,6 +6,7 @@ from gsbench.densify.budgeted import Budgeted
 from gsbench.densify.lineage import Lineage
 from gsbench.densify.long_axis import LongAxis
 from gsbench.densify.mcmc import MCMC
+from gsbench.densify.pixel_gs import PixelGS
 from gsbench.densify.volumetric import Volumetric
 from gsbench.events import Cause, RefineEvent
 
@@ -19,6 +20,7 @@ __all__ = [
     "Lineage",
     "LongAxis",
     "NoDensifier",
+    "PixelGS",
     "RefineEvent",
     "Refinement",
     "Rule",

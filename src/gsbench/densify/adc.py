@@ -64,15 +64,19 @@ class ADC(Budgeted):
     def observe(self, step: int, render: RenderOutput) -> None:
         if step >= self.stop:
             return
+        visible, statistics = render.visible, self.statistics
+        statistics["gradient_sum"] += torch.where(visible, self.screen_gradient(render), 0.0)
+        statistics["visible_count"] += visible
+        statistics["max_radii"] = torch.maximum(statistics["max_radii"], render.radii)
+
+    def screen_gradient(self, render: RenderOutput) -> Tensor:
+        """Length of the gradient of each projected mean, [N] NDC."""
         gradient = render.screen_gradient_abs if self.gradient == "absolute" else render.screen_points.grad
         if gradient is None:
             raise RuntimeError(
                 "observe needs the screen gradient: call it after backward, with absolute_gradient if used"
             )
-        visible, statistics = render.visible, self.statistics
-        statistics["gradient_sum"] += torch.where(visible, gradient.norm(dim=-1), 0.0)
-        statistics["visible_count"] += visible
-        statistics["max_radii"] = torch.maximum(statistics["max_radii"], render.radii)
+        return gradient.norm(dim=-1)
 
     def rules(self, refinement: Refinement) -> list[Rule]:
         """A round in the order of the baseline, and its opacity reset."""

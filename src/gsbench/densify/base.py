@@ -66,6 +66,7 @@ class Densifier:
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {}
     needs_absolute_gradient: bool = False
+    needs_footprint: bool = False  # ``RenderOutput.footprint``, which not every rasterizer gives
 
     context: DensifyContext
     lineage: Lineage

@@ -47,13 +47,17 @@ def check_components(trials: Sequence[Composed], here: bool) -> None:
 
     With ``here``, the trials will run on this machine, whose devices are known. Raises InputError naming the key.
     """
-    from gsbench.pipeline.components import build, select_device
+    from gsbench.pipeline.components import build, check_footprint, select_device
     from gsbench.raster.executors import AUTO, resolve
 
     for values in _distinct(trials, (*COMPONENTS, "raster", "device", "allow_targets")):
         own_raster = values["raster"]["_target_"] is not None
-        for group in (*COMPONENTS, *(["raster"] if own_raster else [])):
-            build(group, values[group], values["allow_targets"])
+        groups = (*COMPONENTS, *(["raster"] if own_raster else []))
+        made = {group: build(group, values[group], values["allow_targets"]) for group in groups}
+        if own_raster or values["raster"]["name"] != AUTO:
+            own = made.get("raster")
+            raster = getattr(own, "name", values["raster"]["name"])
+            check_footprint(made["densify"], values["densify"]["name"], raster, own)
         if here:
             device = select_device(values["device"])
             if not own_raster and values["raster"]["name"] != AUTO:

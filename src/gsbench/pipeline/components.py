@@ -85,6 +85,19 @@ def build_rasterizer(
     return rasterizer
 
 
+def check_footprint(densifier: Any, arm: str, raster: str, own: Any = None) -> None:
+    """Raise InputError where densify=``arm`` asks which pixels a Gaussian covers and raster=``raster`` does not say.
+
+    ``own`` is the rasterizer if it is a user's.
+    """
+    given = {executor.name: executor.has_footprint for executor in EXECUTORS}
+    if getattr(densifier, "needs_footprint", False) and not given.get(raster, getattr(own, "has_footprint", False)):
+        able = " or ".join(f"raster={name}" for name, footprint in given.items() if footprint)
+        raise InputError(
+            f"densify={arm} asks which pixels a Gaussian covers, and raster={raster} does not say; take {able}"
+        )
+
+
 def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str, Metric]:
     """The user's own metrics that the settings ``eval`` name. Raises InputError for one that cannot be used."""
     metrics: dict[str, Metric] = {}

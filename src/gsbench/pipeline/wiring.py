@@ -20,7 +20,14 @@ from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.metric import Metric
 from gsbench.init import Sfm
 from gsbench.init.base import Initializer
-from gsbench.pipeline.components import build, build_metrics, build_rasterizer, make_evaluator, select_device
+from gsbench.pipeline.components import (
+    build,
+    build_metrics,
+    build_rasterizer,
+    check_footprint,
+    make_evaluator,
+    select_device,
+)
 from gsbench.pipeline.resources import available_threads
 from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.capture import capture_step, read_capture
@@ -56,11 +63,14 @@ class Parts:
         """The parts of the trial with the resolved configuration ``values``. Raises InputError naming a wrong key."""
         device = select_device(values["device"])
         threads = available_threads(values["launch"]["parallel"]) if values["threads"] == "auto" else values["threads"]
+        densifier = build("densify", values["densify"], values["allow_targets"])
+        rasterizer = build_rasterizer(values["raster"], values["allow_targets"], device, threads)
+        check_footprint(densifier, values["densify"]["name"], rasterizer.name, rasterizer)
         return cls(
             scene=SceneConfig(**values["scene"]),
             initializer=build("init", values["init"], values["allow_targets"]),
-            densifier=build("densify", values["densify"], values["allow_targets"]),
-            rasterizer=build_rasterizer(values["raster"], values["allow_targets"], device, threads),
+            densifier=densifier,
+            rasterizer=rasterizer,
             train=TrainConfig(**values["train"]),
             eval=EvalConfig(**values["eval"]),
             metrics=build_metrics(values["eval"], values["allow_targets"]),

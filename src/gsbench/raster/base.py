@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gsbench.gaussians.model import Gaussians
+    from gsbench.raster.footprint import Footprint
     from gsbench.scene.camera import Camera
 
 
@@ -30,6 +31,12 @@ class RasterConstants:
 CONSTANTS = RasterConstants()
 
 
+class FootprintOf(Protocol):
+    """The question after a footprint, for one view that was rendered."""
+
+    def __call__(self, values: Tensor | None = None) -> Footprint: ...
+
+
 @dataclass
 class RenderOutput:
     """One rendered view.
@@ -39,6 +46,10 @@ class RenderOutput:
     loss with respect to the projected means in NDC units, as 3DGS's densification reads it (pixel gradient times W/2,
     H/2). ``screen_gradient_abs`` is [N, 2], filled by ``backward`` with the same sum over pixels of absolute values
     (AbsGS, arXiv 2404.10484), or None if it was not asked for.
+
+    ``footprint()`` says which pixels each Gaussian was blended into; ``footprint(values)`` sums ``values`` [H, W] over
+    them too. It takes its time when it is called, which may be after ``backward``. None where the rasterizer cannot
+    say.
     """
 
     image: Tensor
@@ -46,6 +57,7 @@ class RenderOutput:
     radii: Tensor
     screen_points: Tensor
     screen_gradient_abs: Tensor | None = None
+    footprint: FootprintOf | None = None
 
     @property
     def visible(self) -> Tensor:
@@ -54,7 +66,11 @@ class RenderOutput:
 
 
 class Rasterizer(Protocol):
-    """An executor of the contract; every one passes ``tests/raster/test_contract.py``."""
+    """An executor of the contract; every one passes ``tests/raster/test_contract.py``.
+
+    One of a user's that gives ``RenderOutput.footprint``, which is optional, has a class attribute ``has_footprint =
+    True``.
+    """
 
     name: str
 

@@ -20,6 +20,7 @@ from gsbench.scene.camera import Camera
 
 VALUE_TOLERANCE = 1e-4  # of image and alpha
 GRADIENT_TOLERANCE = 1e-3  # of the largest entry of each gradient
+FOOTPRINT_TOLERANCE = 1e-3  # of each sum: a pixel at the edge of being skipped may fall on the other side
 
 
 @dataclass(frozen=True)
@@ -105,8 +106,8 @@ def render_with_gradients(
 def departures(rasterizer: Rasterizer, device: str = "cpu", cases: tuple[Case, ...] = CASES) -> list[str]:
     """What ``rasterizer``, in float32 on ``device``, does otherwise than the contract, in one line each; [] if nothing.
 
-    Compares image, alpha, radii and all gradients of ``cases`` with the reference, and looks at a scene without
-    Gaussians. Takes seconds.
+    Compares image, alpha, radii, all gradients and, where there is one, the footprint of ``cases`` with the reference,
+    and looks at a scene without Gaussians. Takes seconds.
     """
     return [line for case in cases for line in _compare(rasterizer, case, device)] + _without_gaussians(
         rasterizer, device
@@ -138,7 +139,25 @@ def _compare(rasterizer: Rasterizer, case: Case, device: str) -> list[str]:
         off = _largest(gradients[name] - reference) / max(_largest(reference), 1e-30)
         if not off < GRADIENT_TOLERANCE:
             found.append(f"{case}: the gradient of {name} is off by {off:.2e} of its largest entry")
+    if output.footprint is not None:
+        for name, off in footprint_errors(output, expected).items():
+            if not off < FOOTPRINT_TOLERANCE:
+                found.append(f"{case}: the {name} of the footprint are off by {off:.2e} of their sum")
     return found
+
+
+def footprint_errors(output: RenderOutput, expected: RenderOutput) -> dict[str, float]:
+    """How far each part of the footprint of ``output`` is from that of ``expected``, relative to the sum of all."""
+    height, width = expected.alpha.shape
+    values = torch.rand(height, width, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
+    assert output.footprint is not None
+    assert expected.footprint is not None
+    footprint, reference = output.footprint(values.to(output.alpha)), expected.footprint(values)
+    errors = {}
+    for name, right in vars(reference).items():
+        error = (getattr(footprint, name).cpu().double() - right).abs().sum()
+        errors[name] = float(error / right.abs().sum().double().clamp_min(1e-30))
+    return errors
 
 
 def _without_gaussians(rasterizer: Rasterizer, device: str) -> list[str]:

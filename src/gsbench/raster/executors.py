@@ -29,6 +29,7 @@ class Executor:
     package: str | None = None  # what it imports beyond gsbench's own requirements
     install: str = ""  # how to get that package
     takes_threads: bool = False  # its class has an argument ``threads``
+    has_footprint: bool = True  # its renders say which pixels each Gaussian covers
 
     @property
     def is_installed(self) -> bool:
@@ -78,6 +79,7 @@ EXECUTORS = (
         text="gsplat's CUDA kernels, to measure against; compiled with a CUDA toolkit (nvcc) at first use",
         package="gsplat",
         install=install_command("gsplat"),
+        has_footprint=False,
     ),
 )
 # What ``auto`` takes: the first that is installed. Other types of devices have the reference alone.

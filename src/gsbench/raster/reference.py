@@ -7,6 +7,7 @@ Faster executors are tested against this one in float64. Formulas: EWA splatting
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from torch.utils.checkpoint import checkpoint
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.spherical_harmonics import colors
 from gsbench.raster.base import CONSTANTS, RasterConstants, RenderOutput
+from gsbench.raster.footprint import Footprint, view_depths
 from gsbench.raster.validate import check_inputs
 from gsbench.scene.camera import Camera
 
@@ -68,12 +70,8 @@ class ReferenceRasterizer:
         alpha = torch.zeros(camera.height, camera.width, dtype=image.dtype, device=image.device)
         tiles_x = -(-camera.width // self.constants.tile)
         for tile, members in bin_gaussians(projected.depths, tile_min, tile_max, tiles_x):
-            x0, y0 = tile % tiles_x * self.constants.tile, tile // tiles_x * self.constants.tile
-            x1, y1 = min(x0 + self.constants.tile, camera.width), min(y0 + self.constants.tile, camera.height)
-            pixels = torch.cartesian_prod(
-                torch.arange(y0, y1, dtype=image.dtype, device=image.device),
-                torch.arange(x0, x1, dtype=image.dtype, device=image.device),
-            ).flip(-1)  # [P, 2] x, y
+            x0, y0, x1, y1 = self._bounds(tile, tiles_x, camera)
+            pixels = pixel_centres(x0, y0, x1, y1, image)
             spread = means[members].expand(len(pixels), -1, -1)  # [P, K, 2]
             if gradient_abs is not None and spread.requires_grad:
                 spread.register_hook(_absolute_sum_into(gradient_abs, projected.index[members], half_size))
@@ -91,13 +89,46 @@ class ReferenceRasterizer:
             )
             image[y0:y1, x0:x1] = tile_image.reshape(y1 - y0, x1 - x0, 3)
             alpha[y0:y1, x0:x1] = tile_alpha.reshape(y1 - y0, x1 - x0)
-        return RenderOutput(image, alpha, radii, screen_points, gradient_abs)
+        footprint = partial(self._footprint, gaussians.map(torch.Tensor.detach), camera)
+        return RenderOutput(image, alpha, radii, screen_points, gradient_abs, footprint)
+
+    @torch.no_grad()
+    def _footprint(self, gaussians: Gaussians, camera: Camera, values: Tensor | None = None) -> Footprint:
+        covered = torch.zeros(len(gaussians), dtype=torch.int32, device=gaussians.means.device)
+        sums, distances = torch.zeros(2, len(gaussians), dtype=gaussians.means.dtype, device=gaussians.means.device)
+        projected = project(gaussians, camera, self.constants)
+        tile_min, tile_max = tile_rectangles(projected, camera, self.constants.tile)
+        tiles_x = -(-camera.width // self.constants.tile)
+        for tile, members in bin_gaussians(projected.depths, tile_min, tile_max, tiles_x):
+            x0, y0, x1, y1 = self._bounds(tile, tiles_x, camera)
+            pixels, index = pixel_centres(x0, y0, x1, y1, sums), projected.index[members]
+            means = projected.means[members].expand(len(pixels), -1, -1)  # [P, K, 2]
+            conics, opacities = projected.conics[members], gaussians.opacities[index]
+            blended = blending_weights(pixels, means, conics, opacities, self.constants) > 0  # [P, K]
+            covered.index_add_(0, index, blended.sum(0, dtype=torch.int32))
+            distances.index_add_(0, index, ((means - pixels.unsqueeze(1)).norm(dim=-1) * blended).sum(0))
+            if values is not None:
+                sums.index_add_(0, index, (values[y0:y1, x0:x1].reshape(-1, 1).to(sums) * blended).sum(0))
+        return Footprint(covered, view_depths(gaussians, camera), sums, distances)
+
+    def _bounds(self, tile: int, tiles_x: int, camera: Camera) -> tuple[int, int, int, int]:
+        """First and past-the-last pixel of a tile: x, y, x, y."""
+        x, y = tile % tiles_x * self.constants.tile, tile // tiles_x * self.constants.tile
+        return x, y, min(x + self.constants.tile, camera.width), min(y + self.constants.tile, camera.height)
 
     @staticmethod
     def _colors(gaussians: Gaussians, index: Tensor, camera: Camera, sh_degree: int) -> Tensor:
         center = gaussians.means.new_tensor(camera.center)
         directions = torch.nn.functional.normalize(gaussians.means[index] - center, dim=-1)  # [M, 3]
         return colors(gaussians.sh_dc[index], gaussians.sh_rest[index], directions, sh_degree)
+
+
+def pixel_centres(x0: int, y0: int, x1: int, y1: int, like: Tensor) -> Tensor:
+    """The pixels of a rectangle, row by row, [P, 2] (x, y) with the dtype and on the device of ``like``."""
+    return torch.cartesian_prod(
+        torch.arange(y0, y1, dtype=like.dtype, device=like.device),
+        torch.arange(x0, x1, dtype=like.dtype, device=like.device),
+    ).flip(-1)
 
 
 def project(gaussians: Gaussians, camera: Camera, constants: RasterConstants = CONSTANTS) -> Projection:
@@ -107,8 +138,7 @@ def project(gaussians: Gaussians, camera: Camera, constants: RasterConstants = C
     gradients of the others.
     """
     with torch.no_grad():
-        rotation = gaussians.means.new_tensor(camera.rotation)
-        depths = gaussians.means @ rotation[2] + camera.translation[2]  # [N]
+        depths = view_depths(gaussians, camera)  # [N]
         index = (depths > constants.near).nonzero().squeeze(-1)  # [M]
         means, (xx, xy, yy), _ = _to_image(gaussians.select(index), camera, constants)
         determinant = xx * yy - xy * xy  # [M]
@@ -189,6 +219,15 @@ def composite(
     ``pixels`` [P, 2], ``means`` [P, K, 2], ``conics`` [K, 3], ``opacities`` [K], ``rgb`` [K, 3]; returns [P, 3] and the
     opacity [P]. A pixel stops before the Gaussian that would bring its transmittance below ``transmittance_min``.
     """
+    weight = blending_weights(pixels, means, conics, opacities, constants)  # [P, K]
+    opacity = weight.sum(1)  # [P]
+    return weight @ rgb + (1 - opacity).unsqueeze(-1) * background, opacity
+
+
+def blending_weights(
+    pixels: Tensor, means: Tensor, conics: Tensor, opacities: Tensor, constants: RasterConstants = CONSTANTS
+) -> Tensor:
+    """Alpha times transmittance, [P, K], for the arguments of ``composite``; 0 where a Gaussian is not blended."""
     dx, dy = (means - pixels.unsqueeze(1)).unbind(-1)  # [P, K]
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
     raw = opacities * power.clamp_max(0).exp()  # [P, K]
@@ -196,9 +235,7 @@ def composite(
     alpha = torch.where((power <= 0) & (raw >= constants.alpha_min), saturated, 0.0)
     after = torch.cumprod(1 - alpha, dim=1)  # [P, K] transmittance behind each Gaussian
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
-    weight = torch.where(after >= constants.transmittance_min, alpha * before, 0.0)  # [P, K]
-    opacity = weight.sum(1)  # [P]
-    return weight @ rgb + (1 - opacity).unsqueeze(-1) * background, opacity
+    return torch.where(after >= constants.transmittance_min, alpha * before, 0.0)
 
 
 def _absolute_sum_into(buffer: Tensor, index: Tensor, half_size: Tensor):  # type: ignore[no-untyped-def]

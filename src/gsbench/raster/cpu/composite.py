@@ -176,7 +176,7 @@ def composite_tiles(
             store(blue, place, fma(behind, background[2], load(blue, place)))
         for y in range(top, min(top + at.TILE, height)):
             for x in range(left, min(left + at.TILE, width)):
-                local = _place_in_tile(x - left, y - top)
+                local = place_in_tile(x - left, y - top)
                 pixel = y * width + x
                 image[3 * pixel] = red[local]
                 image[3 * pixel + 1] = green[local]
@@ -185,7 +185,7 @@ def composite_tiles(
 
 
 @inlined
-def _place_in_tile(x: int, y: int) -> int:
+def place_in_tile(x: int, y: int) -> int:
     """Where pixel (x, y) of a tile stands in the order by block and lane."""
     return (((y >> 2) * 4 + (x >> 2)) << 4) + (y & 3) * 4 + (x & 3)
 
@@ -231,7 +231,7 @@ def decomposite_tiles(
             red[place] = green[place] = blue[place] = behind[place] = ZERO
         for y in range(top, min(top + at.TILE, height)):
             for x in range(left, min(left + at.TILE, width)):
-                local = _place_in_tile(x - left, y - top)
+                local = place_in_tile(x - left, y - top)
                 pixel = y * width + x
                 red[local] = g_image[3 * pixel]
                 green[local] = g_image[3 * pixel + 1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,11 @@ from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.backprojection import backproject_shard
 from gsbench.raster.cpu.binning import balance_tiles, count_shard, fill_shard, start_tiles
 from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_tiles, decomposite_tiles
+from gsbench.raster.cpu.footprint import cover_tiles
 from gsbench.raster.cpu.jit import announce_compilation
 from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, project_shard
 from gsbench.raster.cpu.workspace import Arena, ArenaPool, ShardRunner, TensorPool
+from gsbench.raster.footprint import Footprint, view_depths
 from gsbench.raster.validate import check_settings, raise_for_values
 from gsbench.scene.camera import Camera
 
@@ -66,10 +69,12 @@ class CpuRasterizer:
             )
         screen_points = torch.zeros(len(gaussians), 2, requires_grad=True)
         absolute = torch.zeros(len(gaussians), 2) if absolute_gradient else None
+        kept = _Kept()
         image, alpha, radii = _Render.apply(
-            self, camera, sh_degree, absolute, background, screen_points, *gaussians.tensors().values()
+            self, kept, camera, sh_degree, absolute, background, screen_points, *gaussians.tensors().values()
         )
-        return RenderOutput(image, alpha, radii, screen_points, absolute)
+        footprint = partial(_footprint, self, kept, gaussians.map(torch.Tensor.detach), camera)
+        return RenderOutput(image, alpha, radii, screen_points, absolute, footprint)
 
 
 @dataclass
@@ -250,8 +255,49 @@ def _arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:
     return means, log_scales, quaternions, logits, sh_dc, sh_rest.reshape(len(means), 45)
 
 
+def _footprint(
+    rasterizer: CpuRasterizer, kept: _Kept, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
+) -> Footprint:
+    """See ``raster.base.RenderOutput``."""
+    frame, count = kept.frame, len(gaussians)
+    covered = np.zeros((TILE_SHARDS, count), np.int32)
+    sums, distances = np.zeros((2, TILE_SHARDS, count), np.float32)
+    asked = np.empty(0, np.float32) if values is None else values.detach().float().contiguous().numpy().reshape(-1)
+
+    def cover(shard: int) -> None:
+        cover_tiles(
+            at.kernel_memory(),
+            int(frame.bounds[shard]),
+            int(frame.bounds[shard + 1]),
+            frame.starts,
+            frame.entries,
+            frame.masks,
+            frame.processed,
+            frame.records,
+            frame.records.view(np.int32),
+            frame.view.width,
+            frame.view.height,
+            frame.last,
+            asked,
+            covered[shard],
+            sums[shard],
+            distances[shard],
+        )
+
+    rasterizer._runner.run(TILE_SHARDS, cover)
+    totals = (torch.from_numpy(shards.sum(0, dtype=shards.dtype)) for shards in (covered, sums, distances))
+    return Footprint(next(totals), view_depths(gaussians, camera), *totals)
+
+
 class _Holder:
-    """Lives as long as a graph; its arena goes back to the pool with it."""
+    """Lives as long as a graph, or a question after its footprint; its arena goes back to the pool with it."""
+
+
+class _Kept:
+    """What a render keeps for the backward pass and for its footprint, and the hold on the memory of it."""
+
+    frame: _Frame
+    holder: _Holder
 
 
 class _Render(torch.autograd.Function):
@@ -261,6 +307,7 @@ class _Render(torch.autograd.Function):
     def forward(
         ctx: Any,
         rasterizer: CpuRasterizer,
+        kept: _Kept,
         camera: Camera,
         degree: int,
         absolute: Tensor | None,
@@ -269,15 +316,15 @@ class _Render(torch.autograd.Function):
         *tensors: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         gaussians = Gaussians(*(tensor.contiguous() for tensor in tensors))
-        ctx.holder = _Holder()
-        arena = rasterizer._frames.lease(ctx.holder)
+        kept.holder = _Holder()
+        arena = rasterizer._frames.lease(kept.holder)
         image = rasterizer._tensors.empty((camera.height, camera.width, 3))
         alpha = rasterizer._tensors.empty((camera.height, camera.width))
         radii = torch.empty(len(gaussians), dtype=torch.int32)
         background_array = background.detach().contiguous().numpy()
-        ctx.frame = _forward(rasterizer, arena, gaussians, camera, degree, background_array, image, alpha, radii)
-        ctx.rasterizer, ctx.absolute = rasterizer, absolute
-        ctx.save_for_backward(alpha if ctx.needs_input_grad[4] else None, *gaussians.tensors().values())
+        kept.frame = _forward(rasterizer, arena, gaussians, camera, degree, background_array, image, alpha, radii)
+        ctx.rasterizer, ctx.kept, ctx.absolute = rasterizer, kept, absolute
+        ctx.save_for_backward(alpha if ctx.needs_input_grad[5] else None, *gaussians.tensors().values())
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
         return image, alpha, radii
@@ -286,7 +333,7 @@ class _Render(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
         alpha, *tensors = ctx.saved_tensors
-        frame: _Frame = ctx.frame
+        frame: _Frame = ctx.kept.frame
         if g_image is None:
             g_image = torch.zeros(frame.view.height, frame.view.width, 3)
         g_image_array = g_image.contiguous().numpy().reshape(-1)
@@ -301,4 +348,4 @@ class _Render(torch.autograd.Function):
             arena.drop("rows")  # it must be all zero, and an interrupt may have left sums in it
             raise
         g_background = None if alpha is None else (g_image * (1 - alpha).unsqueeze(-1)).sum((0, 1))
-        return None, None, None, None, g_background, g_screen, *gradients
+        return None, None, None, None, None, g_background, g_screen, *gradients

@@ -40,7 +40,7 @@ TO_PRECISION = tl.constexpr(2 * math.log(2.0))  # -curve to entry of the inverse
 
 
 @triton.jit
-def _pixels(block, blocks_x, width, height):
+def block_pixels(block, blocks_x, width, height):
     """Of the pixels of a block: which are in the image, their numbers in it (both [STEPS, LANES]), and the column of
     each lane's first and the row of all (both [LANES], px)."""
     lane, step = tl.arange(0, LANES), tl.arange(0, STEPS)
@@ -52,7 +52,7 @@ def _pixels(block, blocks_x, width, height):
 
 
 @triton.jit
-def _places():
+def block_places():
     """Where the pixels of a block stand in its memory, [STEPS, LANES]: those of a lane side by side.
 
     Triton then lays out all [STEPS, LANES] so that sums over steps stay within a lane.
@@ -61,7 +61,7 @@ def _places():
 
 
 @triton.jit
-def _record(records, entry):
+def load_record(records, entry):
     place = records + entry.to(tl.int64) * RECORD
     return (
         tl.load(place + MEAN_X),
@@ -77,8 +77,8 @@ def _record(records, entry):
 
 
 @triton.jit
-def _log2_alpha(record, x, y):
-    """log2(alpha) [STEPS, LANES] before it is clamped, t [STEPS, LANES] and dy [LANES], at ``_pixels``' x and y.
+def log2_alpha(record, x, y):
+    """log2(alpha) [STEPS, LANES] before it is clamped, t [STEPS, LANES] and dy [LANES], at ``block_pixels``' x and y.
 
     Every rounding is spelled out: the forward and the backward kernel have to agree on each pixel that is skipped.
     """
@@ -115,7 +115,7 @@ def composite(
     ``past`` [blocks], their maximum.
     """
     block = tl.load(order + tl.program_id(0)).to(tl.int32)
-    inside, pixel, x, y = _pixels(block, blocks_x, width, height)
+    inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
     begin, end = tl.load(starts + block), tl.load(starts + block + 1)
     # A pixel that has stopped, or lies outside, has its transmittance with a minus sign: it stays as it is.
     light = tl.where(inside, 1.0, -1.0)
@@ -123,17 +123,17 @@ def composite(
     seen = tl.where(inside, begin, 0)
 
     # Records are loaded one entry ahead, entries two; past the end of the list stands what cannot be seen.
-    ahead = _record(records, tl.load(entries + begin, mask=begin < end, other=closing))
+    ahead = load_record(records, tl.load(entries + begin, mask=begin < end, other=closing))
     entry = tl.load(entries + begin + 1, mask=begin + 1 < end, other=closing)
     alive = True
     position = begin
     while (position < end) & alive:
         for _ in tl.static_range(UNROLL):
             record = ahead
-            ahead = _record(records, entry)
+            ahead = load_record(records, entry)
             entry = tl.load(entries + position + 2, mask=position + 2 < end, other=closing)
             position += 1
-            power, _, _ = _log2_alpha(record, x, y)
+            power, _, _ = log2_alpha(record, x, y)
             opacity = tl.where(power >= LOG2_ALPHA_MIN, tl.minimum(tl.exp2(power), ALPHA_MAX), 0.0)
             weight = light * opacity
             after = light - weight
@@ -147,7 +147,7 @@ def composite(
         alive = tl.max(tl.max((light > 0).to(tl.int32), 0), 0) > 0
 
     light = tl.abs(light)
-    state = block * BLOCK_PIXELS + _places()
+    state = block * BLOCK_PIXELS + block_places()
     tl.store(transmittance + state, light)
     tl.store(last + state, seen)
     tl.store(past + block, tl.minimum(tl.max(tl.max(seen, 0), 0), end))
@@ -242,7 +242,7 @@ def decomposite(
     cancels. ``slots`` [pairs] has the row of each entry. ``g_alpha`` is read if ``HAS_ALPHA``.
     """
     block = tl.load(order + tl.program_id(0)).to(tl.int32)
-    inside, pixel, x, y = _pixels(block, blocks_x, width, height)
+    inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
     begin, end, stop = tl.load(starts + block), tl.load(starts + block + 1), tl.load(past + block)
     lane = tl.arange(0, LANES)
     number, stores = _number_of_sum(lane, ABSOLUTE)
@@ -259,7 +259,7 @@ def decomposite(
         tl.load(g_image + 3 * pixel + 1, mask=inside, other=0.0),
         tl.load(g_image + 3 * pixel + 2, mask=inside, other=0.0),
     )
-    state = block * BLOCK_PIXELS + _places()
+    state = block * BLOCK_PIXELS + block_places()
     light = tl.load(transmittance + state)
     seen = tl.load(last + state)
     behind = g[0] * tl.load(background) + g[1] * tl.load(background + 1) + g[2] * tl.load(background + 2)
@@ -267,17 +267,17 @@ def decomposite(
         behind -= tl.load(g_alpha + pixel, mask=inside, other=0.0)
     behind *= light
 
-    ahead = _record(records, tl.load(entries + stop - 1, mask=begin < stop, other=closing))
+    ahead = load_record(records, tl.load(entries + stop - 1, mask=begin < stop, other=closing))
     entry = tl.load(entries + stop - 2, mask=begin + 1 < stop, other=closing)
     position = stop
     while position > begin:
         for _ in tl.static_range(UNROLL_BACK):
             position -= 1
             record = ahead
-            ahead = _record(records, entry)
+            ahead = load_record(records, entry)
             entry = tl.load(entries + position - 2, mask=position - 2 >= begin, other=closing)
             slot = tl.load(slots + position, mask=position >= begin, other=0)
-            power, t, dy = _log2_alpha(record, x, y)
+            power, t, dy = log2_alpha(record, x, y)
             raw = tl.where((power >= LOG2_ALPHA_MIN) & (position < seen), tl.exp2(power), 0.0)
             opacity = tl.minimum(raw, ALPHA_MAX)
             root = tl.rsqrt(1.0 - opacity)

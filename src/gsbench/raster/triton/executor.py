@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -11,9 +12,11 @@ from torch.autograd.function import once_differentiable
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, RenderOutput
+from gsbench.raster.footprint import Footprint, view_depths
 from gsbench.raster.triton.backprojection import backproject, sum_units
 from gsbench.raster.triton.binning import find_units, summarise, write_pairs
 from gsbench.raster.triton.composite import composite, decomposite
+from gsbench.raster.triton.footprint import cover, sum_cover
 from gsbench.raster.triton.launch import launch
 from gsbench.raster.triton.layout import BLOCK_PIXELS, RECORD, ROW, TILE, Grid, View, make_grid, make_view
 from gsbench.raster.triton.projection import project
@@ -58,10 +61,12 @@ class TritonRasterizer:
             load_driver()
         screen_points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         absolute = torch.zeros_like(screen_points) if absolute_gradient else None
+        kept = _Kept()
         image, alpha, radii = _Render.apply(
-            self, camera, sh_degree, absolute, background, screen_points, *gaussians.tensors().values()
+            self, kept, camera, sh_degree, absolute, background, screen_points, *gaussians.tensors().values()
         )
-        return RenderOutput(image, alpha, radii, screen_points, absolute)
+        footprint = partial(_footprint, self, kept, gaussians.map(Tensor.detach), camera)
+        return RenderOutput(image, alpha, radii, screen_points, absolute, footprint)
 
 
 @dataclass
@@ -264,8 +269,56 @@ def _backward(
     return gradients, g_screen
 
 
+def _footprint(
+    rasterizer: TritonRasterizer, kept: _Kept, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
+) -> Footprint:
+    """See ``raster.base.RenderOutput``."""
+    frame, count, device = kept.frame, len(gaussians), gaussians.means.device
+    covered = torch.zeros(count, dtype=torch.int32, device=device)
+    sums, distances = torch.zeros(2, count, device=device)
+    asked = sums if values is None else values.detach().float().contiguous()
+    holder = _Holder()
+    with torch.cuda.device_of(covered):
+        scratch = rasterizer._scratch.lease(holder, device)
+        rows = scratch.take("rows", frame.pairs * ROW.value, torch.float32).zero_()  # ``cover`` fills three of 16
+        cover[(frame.grid.blocks,)](
+            frame.starts,
+            frame.entries,
+            frame.slots,
+            frame.records,
+            frame.grid.width,
+            frame.grid.height,
+            frame.grid.blocks_x,
+            frame.last,
+            asked,
+            rows,
+            HAS_VALUES=values is not None,
+            num_warps=1,
+        )
+        launch(sum_units, frame.units, 32)(frame.pair_ends, frame.unit_widths, frame.units, rows)
+        launch(sum_cover, count, 128)(
+            count,
+            frame.row_counts,
+            frame.first_units,
+            frame.pair_ends,
+            frame.unit_widths,
+            rows,
+            covered,
+            sums,
+            distances,
+        )
+    return Footprint(covered, view_depths(gaussians, camera), sums, distances)
+
+
 class _Holder:
-    """Lives as long as a graph; its workspace goes back to the pool with it."""
+    """Lives as long as a graph, or a question after its footprint; its workspace goes back to the pool with it."""
+
+
+class _Kept:
+    """What a render keeps for the backward pass and for its footprint, and the hold on the memory of it."""
+
+    frame: _Frame
+    holder: _Holder
 
 
 class _Render(torch.autograd.Function):
@@ -275,6 +328,7 @@ class _Render(torch.autograd.Function):
     def forward(
         ctx: Any,
         rasterizer: TritonRasterizer,
+        kept: _Kept,
         camera: Camera,
         degree: int,
         absolute: Tensor | None,
@@ -284,17 +338,17 @@ class _Render(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         gaussians = Gaussians(*(tensor.contiguous() for tensor in tensors))
         background, device = background.contiguous(), background.device
-        ctx.holder, scratch_holder = _Holder(), _Holder()
+        kept.holder, scratch_holder = _Holder(), _Holder()
         image = torch.empty(camera.height, camera.width, 3, dtype=torch.float32, device=device)
         alpha = torch.empty(camera.height, camera.width, dtype=torch.float32, device=device)
         radii = torch.empty(len(gaussians), dtype=torch.int32, device=device)
         with torch.cuda.device_of(background):
-            memory = rasterizer._frames.lease(ctx.holder, device)
+            memory = rasterizer._frames.lease(kept.holder, device)
             scratch = rasterizer._scratch.lease(scratch_holder, device)
-            ctx.frame = _forward(memory, scratch, gaussians, camera, degree, background, image, alpha, radii)
-        ctx.rasterizer, ctx.absolute = rasterizer, absolute
-        kept = alpha if ctx.needs_input_grad[4] else None
-        ctx.save_for_backward(kept, background, *gaussians.tensors().values())
+            kept.frame = _forward(memory, scratch, gaussians, camera, degree, background, image, alpha, radii)
+        ctx.rasterizer, ctx.kept, ctx.absolute = rasterizer, kept, absolute
+        opacity = alpha if ctx.needs_input_grad[5] else None
+        ctx.save_for_backward(opacity, background, *gaussians.tensors().values())
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
         return image, alpha, radii
@@ -303,7 +357,7 @@ class _Render(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
         alpha, background, *tensors = ctx.saved_tensors
-        grid: Grid = ctx.frame.grid
+        grid: Grid = ctx.kept.frame.grid
         if g_image is None:
             g_image = background.new_zeros(grid.height, grid.width, 3)
         g_image = g_image.contiguous()
@@ -312,7 +366,7 @@ class _Render(torch.autograd.Function):
         with torch.cuda.device_of(background):
             scratch = ctx.rasterizer._scratch.lease(holder, background.device)
             gradients, g_screen = _backward(
-                scratch, ctx.frame, Gaussians(*tensors), background, g_image, g_alpha, ctx.absolute
+                scratch, ctx.kept.frame, Gaussians(*tensors), background, g_image, g_alpha, ctx.absolute
             )
         g_background = None if alpha is None else (g_image * (1 - alpha).unsqueeze(-1)).sum((0, 1))
-        return None, None, None, None, g_background, g_screen, *gradients
+        return None, None, None, None, None, g_background, g_screen, *gradients
