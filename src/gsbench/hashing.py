@@ -8,7 +8,7 @@ from typing import Any
 
 from gsbench.source import source_of
 
-WITHOUT_EFFECT = ("threads", "weights", "download")  # options of a group that cannot change its result
+WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")  # options that cannot change a result
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
 # Settings that are younger than the first results, with the default at which a result is what it was before them. There
 # they are left out of hashes and keys, so that nothing is computed anew for a setting that changes nothing.

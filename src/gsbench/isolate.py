@@ -2,7 +2,8 @@
 
 The child is a fresh interpreter (never a fork, so no threads or locks are inherited) that imports only what the
 function needs: the parent's ``__main__`` is not imported again, so it works alike from a console script, a notebook,
-pytest and Hydra. The child ends when the parent does, even when the parent is killed.
+pytest and Hydra. The child, and every program that it started, ends when the parent does, even when the parent is
+killed; no such program outlives the function.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import tempfile
 import threading
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, ParamSpec, TypeVar
 
@@ -98,8 +100,16 @@ def _run_child(call: Path, result: Path, output: BinaryIO) -> int:
             except subprocess.TimeoutExpired:
                 child.kill()
                 child.wait()
+        _end_group(child.pid)
         if child.stdin is not None:
             child.stdin.close()
+
+
+def _end_group(leader: int) -> None:
+    """End what the child started and left behind: its session is the process group ``leader``."""
+    if hasattr(os, "killpg"):
+        with suppress(ProcessLookupError, PermissionError):  # nobody is left (macOS: only the dead are)
+            os.killpg(leader, signal.SIGKILL)
 
 
 def _child() -> None:
@@ -121,6 +131,7 @@ def _child() -> None:
 def _exit_with_parent() -> None:
     while os.read(0, 1):
         pass
+    _end_group(os.getpid())  # this process too, which leads the group
     os._exit(1)
 
 

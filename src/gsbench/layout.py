@@ -28,6 +28,7 @@ CURVES = "metrics.jsonl"  # of the training
 EVENTS = "events.jsonl"  # what every refinement did
 HISTOGRAMS = "volume_histograms.jsonl"
 POINT_CLOUD = "point_cloud.ply"
+TRAINER_LOG = "trainer.log"  # the output of another program that trained
 LINEAGE = "lineage.npz"  # for each Gaussian its parent, and the rule that made it
 RENDERS, GROUND_TRUTH, MAPS = "renders", "ground_truth", "maps"  # a file for each test view
 FIGURES = "figures"  # pictures for the report

@@ -98,8 +98,10 @@ def _trial_lines(trial: Trial, shown: Quantity) -> list[str]:
     value = shown.read(trial)
     data = trial.data
     text = "n/a" if value is None else f"{value:.6g}"
-    if trial.from_renders:
+    if trial.from_renders and not trial.program:
         counts = ", ".join(f"{key} {value}" for key, value in data.get("renders", {}).items())
+    elif trial.from_renders:
+        counts = "its own renders"
     else:
         counts = f"{data['num_gaussians']:,} Gaussians from {data.get('num_init_points') or 0:,} points"
     lines = [
@@ -108,6 +110,8 @@ def _trial_lines(trial: Trial, shown: Quantity) -> list[str]:
         f"    {data.get('test_views', '?')} test views, raster {data['raster']}, {counts}",
     ]
     lines += [f"    {key:<9} {value}" for key, value in data.get("hashes", {}).items()]
+    if trial.program:
+        lines.append(f"    program   {data['trained_by']['version']}: {' '.join(data['trained_by']['command'])}")
     if machine := machine_of(trial):
         lines.append(f"    machine   {machine}")
     if trial.code:

@@ -100,6 +100,7 @@ class Trial:
             known["raster"] = str(self.data["raster"])
         if not self.made_elsewhere:
             known["iterations"] = str(self.data["iterations"])
+        if not self.made_elsewhere and not self.program:
             known["budget"] = canonical(self.data.get("budget"))
         return known
 
@@ -111,12 +112,19 @@ class Trial:
     @property
     def made_elsewhere(self) -> bool:
         """Whether another program made the model or the renders, in a time and with a budget that nobody knows."""
-        return self.data.get("evaluated_from") in (FROM_MODEL, FROM_RENDERS)
+        return self.data.get("evaluated_from") in (FROM_MODEL, FROM_RENDERS) and not self.program
+
+    @property
+    def program(self) -> str:
+        """The program that gsbench let train in its place, as it is called; "" where it trained itself, or nobody
+        did."""
+        found = self.data.get("trained_by")
+        return str(found["program"]) if isinstance(found, dict) else ""
 
     @property
     def budget_acted(self) -> bool:
         """Whether the trial's budget may have changed it: a cap that refused or steers, or a limit of time."""
-        if self.made_elsewhere:
+        if self.made_elsewhere or self.program:
             return False
         budget, events = self.data.get("budget"), self.data.get("events")
         if not isinstance(budget, dict) or not isinstance(events, dict):

@@ -232,14 +232,26 @@ def _reading_notes(
     return notes
 
 
+_BY_PROGRAM = (
+    ("Trained here by another program, its model rendered by gsbench", FROM_MODEL),
+    ("Trained here by another program, its own renders measured as they are", FROM_RENDERS),
+)
+
+
 def _origin_notes(trials: Sequence[Trial]) -> list[str]:
     """Which arms gsbench did not train, and what of them it saw."""
     notes = []
+    for what, origin in _BY_PROGRAM:
+        own = [trial for trial in trials if trial.program and trial.data.get("evaluated_from") == origin]
+        if own:
+            versions = {(f"{trial.init}-{trial.densify}", str(trial.data["trained_by"]["version"])) for trial in own}
+            arms = ", ".join(f"{arm} (version {version})" for arm, version in sorted(versions))
+            notes.append(f"{what} (its time is that of the whole program, its budget its own): {arms}.")
     for what, origin in (
         ("A model that another program trained, rendered here", FROM_MODEL),
         ("Renders of another program, measured as they are", FROM_RENDERS),
     ):
-        own = [trial for trial in trials if trial.data.get("evaluated_from") == origin]
+        own = [trial for trial in trials if trial.made_elsewhere and trial.data["evaluated_from"] == origin]
         if own:
             arms = ", ".join(sorted({f"{trial.init}-{trial.densify}" for trial in own}))
             notes.append(f"{what} (its conditions are not known): {arms}.")

@@ -3,6 +3,7 @@
 from gsbench.densify.adc import ADC
 from gsbench.densify.base import Densifier, DensifyContext, NoDensifier, Refinement, Rule
 from gsbench.densify.budgeted import Budgeted
+from gsbench.densify.external import External
 from gsbench.densify.lineage import Lineage
 from gsbench.densify.long_axis import LongAxis
 from gsbench.densify.mcmc import MCMC
@@ -17,6 +18,7 @@ __all__ = [
     "Cause",
     "Densifier",
     "DensifyContext",
+    "External",
     "Lineage",
     "LongAxis",
     "NoDensifier",

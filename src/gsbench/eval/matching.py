@@ -27,13 +27,13 @@ class Matching:
     left_out: tuple[str, ...]
 
 
-def match_pictures(photographs: Sequence[str], pictures: Sequence[str]) -> Matching:
+def match_pictures(photographs: Sequence[str], pictures: Sequence[str], by_order: str = "--by-order") -> Matching:
     """Match names (relative paths) by the first rule under which every photograph has exactly one picture.
 
     The rules, from strict to loose: the same name; apart from the extension; with folders written as part of the name;
     apart from case; apart from a beginning and an end that all names of a folder share; apart from leading zeros; and
     the last four without the folders. Raises `InputError` where a photograph has several pictures under the strictest
-    rule that finds any for all, or where no rule finds one for each.
+    rule that finds any for all, or where no rule finds one for each; ``by_order`` is how one asks for `match_by_order`.
     """
     for rule, keys in _RULES.items():
         of_photographs, of_pictures = keys(photographs), keys(pictures)
@@ -52,7 +52,7 @@ def match_pictures(photographs: Sequence[str], pictures: Sequence[str]) -> Match
                 )
         pairs = {photograph: candidates[0] for photograph, candidates in found.items()}
         return Matching(pairs, rule, tuple(sorted(set(pictures) - set(pairs.values()))))
-    raise InputError(_no_match(photographs, pictures))
+    raise InputError(_no_match(photographs, pictures, by_order))
 
 
 def match_by_order(photographs: Sequence[str], pictures: Sequence[str]) -> Matching:
@@ -68,13 +68,13 @@ def match_by_order(photographs: Sequence[str], pictures: Sequence[str]) -> Match
     return Matching({photograph: pairs[photograph] for photograph in photographs}, BY_ORDER, ())
 
 
-def _no_match(photographs: Sequence[str], pictures: Sequence[str]) -> str:
+def _no_match(photographs: Sequence[str], pictures: Sequence[str], by_order: str) -> str:
     missing = list(photographs)
     for keys in _RULES.values():  # the rule that came closest
         found, wanted = set(keys(pictures).values()), keys(photographs)
         missing = min(missing, [name for name in photographs if wanted[name] not in found], key=len)
     called = some_of(sorted(pictures)) or "there are none"
-    hint = "; --by-order takes them as they are sorted" if len(pictures) == len(photographs) else ""
+    hint = f"; {by_order} takes them as they are sorted" if len(pictures) == len(photographs) else ""
     return (
         f"{len(missing)} of {counted(len(photographs), 'photograph')} have no picture of their name "
         f"({some_of(missing)}); the pictures are {called}: rename them{hint}"

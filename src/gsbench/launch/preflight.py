@@ -47,6 +47,7 @@ def check_components(trials: Sequence[Composed], here: bool) -> None:
 
     With ``here``, the trials will run on this machine, whose devices are known. Raises InputError naming the key.
     """
+    from gsbench.densify import External
     from gsbench.pipeline.components import build, check_footprint, select_device
     from gsbench.raster.executors import AUTO, resolve
 
@@ -54,7 +55,10 @@ def check_components(trials: Sequence[Composed], here: bool) -> None:
         own_raster = values["raster"]["_target_"] is not None
         groups = (*COMPONENTS, *(["raster"] if own_raster else []))
         made = {group: build(group, values[group], values["allow_targets"]) for group in groups}
-        if own_raster or values["raster"]["name"] != AUTO:
+        program = made["densify"] if isinstance(made["densify"], External) else None
+        if here and program is not None:
+            program.executable()
+        if program is None and (own_raster or values["raster"]["name"] != AUTO):
             own = made.get("raster")
             raster = getattr(own, "name", values["raster"]["name"])
             check_footprint(made["densify"], values["densify"]["name"], raster, own)

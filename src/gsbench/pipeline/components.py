@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from gsbench.config import ALLOWED_TARGETS, EvalConfig, check_target, require_values
+from gsbench.densify import External
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import facts_of
@@ -131,7 +132,8 @@ def locate(target: str, group: str) -> type:
         found = getattr(importlib.import_module(module), name)
     except Exception as error:  # importing a user's file runs it: it may raise anything
         raise InputError(f"{group}._target_={target} cannot be imported ({type(error).__name__}: {error})") from error
-    lacking = [method for method in METHODS[group.partition(".")[0]] if not callable(getattr(found, method, None))]
+    methods = () if found is External else METHODS[group.partition(".")[0]]
+    lacking = [method for method in methods if not callable(getattr(found, method, None))]
     if not isinstance(found, type) or lacking:
         raise InputError(f"{group}._target_={target} is not a class for {group}: it has no {', '.join(lacking)}()")
     if has_changed_since_import(target):  # the first call also notes the file as it is now, while it is what runs

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench import __version__
-from gsbench.analysis.results import FROM_MODEL, MADE_ELSEWHERE
+from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS, MADE_ELSEWHERE
 from gsbench.events import sum_events
 from gsbench.hashing import config_hash, sha256_of
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
@@ -81,7 +81,25 @@ def results_of(
         "machine": training.get("machine"),  # None of a training before it was recorded
         "versions": versions(),
     }
+    if "trained_by" in training:
+        return _by_program(results, training)
     return results if training["iterations"] else _without_training(results)
+
+
+def _by_program(results: dict[str, Any], training: Mapping[str, Any]) -> dict[str, Any]:
+    """The results of a training by another program, which may have left renders alone."""
+    origin = training["evaluated_from"]
+    unknown = {}
+    if origin == FROM_RENDERS:
+        unknown["gaussians"] = f"{MADE_ELSEWHERE}, of which only the renders are known"
+    if training["peak_memory_mb"] is None:
+        unknown["peak_memory_mb"] = "another program's memory of a GPU is not measured"
+    return results | {
+        "evaluated_from": origin,
+        "trained_by": training["trained_by"],
+        "raster": "unknown" if origin == FROM_RENDERS else results["raster"],
+        "unavailable": results["unavailable"] | unknown,
+    }
 
 
 def _without_training(results: dict[str, Any]) -> dict[str, Any]:

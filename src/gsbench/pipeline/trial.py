@@ -33,7 +33,9 @@ from gsbench.tracking import Mirror
 
 log = logging.getLogger(__name__)
 
-PUBLISHED_TRAINING = (layout.POINT_CLOUD, layout.LINEAGE, layout.CURVES, layout.EVENTS, layout.HISTOGRAMS)
+PUBLISHED_TRAINING = (
+    layout.POINT_CLOUD, layout.LINEAGE, layout.CURVES, layout.EVENTS, layout.HISTOGRAMS, layout.TRAINER_LOG
+)  # fmt: skip
 
 
 def run_trial(values: dict[str, Any], config_yaml: str, wait: bool = True) -> dict[str, Any]:
@@ -108,7 +110,8 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
             write_json(paths.folder / RESULTS, results)
         (paths.folder / BUILDING).unlink(missing_ok=True)
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results["metrics"].items())
-    log.info("%s: %s  %d Gaussians%s", paths.label, metrics, results["num_gaussians"], "  (was done)" if again else "")
+    size = "" if results["num_gaussians"] is None else f"  {results['num_gaussians']} Gaussians"
+    log.info("%s: %s%s%s", paths.label, metrics, size, "  (was done)" if again else "")
     return results
 
 

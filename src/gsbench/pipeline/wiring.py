@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from gsbench.config import EvalConfig, SceneConfig, TrainConfig
-from gsbench.densify import Densifier
+from gsbench.densify import Densifier, External
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.metric import Metric
 from gsbench.init import Sfm
@@ -31,7 +31,8 @@ from gsbench.pipeline.components import (
 from gsbench.pipeline.resources import available_threads
 from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.capture import capture_step, read_capture
-from gsbench.pipeline.steps.evaluate import evaluate_step
+from gsbench.pipeline.steps.evaluate import evaluate_step, measure_step
+from gsbench.pipeline.steps.external import external_step
 from gsbench.pipeline.steps.ground_truth import ground_truth_step
 from gsbench.pipeline.steps.init import init_step
 from gsbench.pipeline.steps.train import train_step
@@ -49,7 +50,7 @@ class Parts:
 
     scene: SceneConfig
     initializer: Initializer
-    densifier: Densifier
+    densifier: Densifier | External
     rasterizer: Rasterizer
     train: TrainConfig
     eval: EvalConfig
@@ -118,15 +119,36 @@ class Trial:
         init = init_step(store, self.capture, parts.initializer, reference)
         yield init
         self.views = Views(store, self.capture, init, parts.scene)
-        earlier = parts.measured_earlier
-        trained = train_step(
-            self.views, parts.densifier, parts.rasterizer, parts.train, parts.seed, parts.device, earlier
-        )
+        trained = self._train_step()
         yield trained
         yield ground_truth_step(self.views)
-        background, maps = parts.train.background, parts.eval.maps
-        yield evaluate_step(
-            self.views, trained, parts.rasterizer, self.evaluator, background, maps, parts.device, earlier
+        yield self._evaluate_step(trained)
+
+    def _train_step(self) -> Step:
+        parts = self.parts
+        if isinstance(parts.densifier, External):
+            return external_step(
+                self.views, parts.densifier, parts.train.iterations, parts.seed, parts.device, parts.threads
+            )
+        return train_step(
+            self.views, parts.densifier, parts.rasterizer, parts.train, parts.seed, parts.device, parts.measured_earlier
+        )
+
+    def _evaluate_step(self, trained: Step) -> Step:
+        parts = self.parts
+        program = parts.densifier if isinstance(parts.densifier, External) else None
+        if program is not None and not program.leaves_model:
+            return measure_step(self.views, trained, self.evaluator)
+        return evaluate_step(
+            self.views,
+            trained,
+            parts.rasterizer,
+            self.evaluator,
+            parts.train.background,
+            parts.eval.maps,
+            parts.device,
+            parts.measured_earlier,
+            made_by_program=program is not None,
         )
 
 

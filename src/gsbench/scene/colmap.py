@@ -168,8 +168,17 @@ def points_of(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], NDAr
     return xyz, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
 
 
-def write_model(folder: Path, cameras: Mapping[str, Camera], text: bool = False) -> None:
-    """Write PINHOLE cameras with their poses as a COLMAP model without points; equal intrinsics share one camera."""
+def write_model(
+    folder: Path,
+    cameras: Mapping[str, Camera],
+    text: bool = False,
+    cloud: tuple[NDArray[np.float64], NDArray[np.uint8]] | None = None,
+) -> None:
+    """Write PINHOLE cameras with their poses as a COLMAP model; equal intrinsics share one camera.
+
+    ``cloud``, positions [P, 3] and colours [P, 3], becomes its points, which no image observes; without it there are
+    none.
+    """
     model = pycolmap.Reconstruction()
     ids: dict[tuple[float, ...], int] = {}
     for image_id, (name, camera) in enumerate(sorted(cameras.items()), start=1):
@@ -187,6 +196,8 @@ def write_model(folder: Path, cameras: Mapping[str, Camera], text: bool = False)
             )
         image = pycolmap.Image(name=name, camera_id=ids[intrinsics], image_id=image_id)
         model.add_image_with_trivial_frame(image, rigid_pose(camera))
+    for point, color in zip(*cloud, strict=True) if cloud is not None else ():
+        model.add_point3D(point, pycolmap.Track(), color)
     folder.mkdir(parents=True, exist_ok=True)
     (model.write_text if text else model.write_binary)(folder)
 

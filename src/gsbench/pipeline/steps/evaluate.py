@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from gsbench.gaussians.ply import read_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.layout import FIGURES, LINEAGE, MAPS, PER_VIEW, POINT_CLOUD, RENDERS
-from gsbench.pipeline.components import options_of
+from gsbench.pipeline.components import options_of, rasterizer_inputs
 from gsbench.pipeline.figures import draw_ellipsoids
 from gsbench.pipeline.maps import view_maps
 from gsbench.pipeline.stages import EVALUATE
@@ -30,6 +31,7 @@ from gsbench.pipeline.steps.views import Views
 from gsbench.pipeline.trainer import snapshot_file
 from gsbench.progress import progress
 from gsbench.raster import Rasterizer
+from gsbench.scene.images import read_image
 from gsbench.scene.types import Scene
 
 METRICS_FILE = "metrics.json"
@@ -45,10 +47,12 @@ def evaluate_step(
     maps: bool,
     device: torch.device,
     earlier: Sequence[int] = (),
+    made_by_program: bool = False,
 ) -> Step:
     """Render and measure the model of ``trained``, and its snapshots of the iterations ``earlier``.
 
-    ``maps`` also keeps what the report needs to say where an arm helps.
+    ``maps`` also keeps what the report needs to say where an arm helps. The key of a training by another program
+    (``made_by_program``) knows nothing of the rendering, so it is in this step's.
     """
     inputs: dict[str, Any] = {
         "train": trained.key,
@@ -58,8 +62,9 @@ def evaluate_step(
     }
     if earlier:
         inputs["earlier"] = list(earlier)
-    if evaluator.extra:
-        inputs["extra"] = {name: options_of("eval", metric) for name, metric in evaluator.extra.items()}
+    if made_by_program:
+        inputs |= {"raster": rasterizer_inputs(rasterizer), "background": list(background)}
+    inputs |= _own_metrics(evaluator)
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
@@ -94,6 +99,36 @@ def evaluate_step(
         write_json(folder / METRICS_FILE, summary_of(evaluator, per_view) | ({"at": at} if at else {}))
 
     return Step(EVALUATE, inputs, build)
+
+
+def measure_step(views: Views, trained: Step, evaluator: Evaluator) -> Step:
+    """Measure the renders that another program left in ``trained``, as they are."""
+    inputs: dict[str, Any] = {
+        "renders": trained.key,
+        "protocol": evaluator.protocol.id,
+        "unavailable": sorted(evaluator.unavailable),
+    } | _own_metrics(evaluator)
+
+    def build(folder: Path) -> None:
+        training, scene = views.store.path(trained), views.scene
+        shutil.copytree(training / RENDERS, folder / RENDERS)
+        per_view = {}
+        with progress("evaluate") as report:
+            for done, view in enumerate(scene.test, 1):
+                per_view[view.name] = evaluator.evaluate_view(
+                    read_image(folder / RENDERS / png_name(view.name)), view.image
+                )
+                report("views", done, len(scene.test))
+        write_per_view(folder / PER_VIEW, per_view)
+        write_json(folder / METRICS_FILE, summary_of(evaluator, per_view))
+
+    return Step(EVALUATE, inputs, build)
+
+
+def _own_metrics(evaluator: Evaluator) -> dict[str, Any]:
+    """The user's own metrics as they enter a key; nothing where there are none."""
+    own = {name: options_of("eval", metric) for name, metric in evaluator.extra.items()}
+    return {"extra": own} if own else {}
 
 
 def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:

@@ -1,0 +1,158 @@
+"""Training by another program: a command that gets the training views and leaves a model, or renders."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS
+from gsbench.densify import External, Lineage
+from gsbench.densify.external import DATA, OUTPUT, TEST_CAMERAS
+from gsbench.errors import InputError, TrainingError
+from gsbench.files import write_json
+from gsbench.init import read_cloud
+from gsbench.init.base import MODEL_FOLDER
+from gsbench.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG
+from gsbench.machine import describe_machine
+from gsbench.pipeline.components import options_of
+from gsbench.pipeline.external.inputs import write_test_cameras, write_training_views
+from gsbench.pipeline.external.outputs import take_model, take_renders
+from gsbench.pipeline.external.program import run_program
+from gsbench.pipeline.stages import EXTERNAL
+from gsbench.pipeline.step import Step
+from gsbench.pipeline.steps.train import TRAINING_FILE
+from gsbench.pipeline.steps.views import Views
+from gsbench.placeholders import fill, words_of
+from gsbench.words import readable_time
+
+CONTRACT = 1  # raise when programs are given, or asked for, something else
+WORK = "work"  # in the folder of the build: what the program is given, and where it writes
+SECONDS_TO_TELL_VERSION = 120.0
+MAX_SAID = 200  # characters of a program that tells its version
+OWN_VARIABLES = "GSBENCH_"  # gsbench's settings, such as where photographs lie, are not handed on
+
+log = logging.getLogger(__name__)
+
+
+def external_step(
+    views: Views, trainer: External, iterations: int, seed: int, device: torch.device, threads: int
+) -> Step:
+    """Let ``trainer`` train on the training views, from the cloud of the initialiser."""
+    inputs: dict[str, Any] = {
+        "contract": CONTRACT,
+        "scene": views.inputs,
+        "init": views.init.key,
+        "densify": options_of("densify", trainer),
+        "iterations": iterations,
+        "seed": seed,
+    }
+
+    def build(folder: Path) -> None:
+        scene, cloud = views.scene, read_cloud(views.store.path(views.init) / MODEL_FOLDER)
+        executable, work, log_file = trainer.executable(), folder / WORK, folder / TRAINER_LOG
+        places = {name: work / name for name in (DATA, TEST_CAMERAS, OUTPUT)}
+        values = {name: str(place.resolve()) for name, place in places.items()} | trainer.options
+        values |= {"iterations": iterations, "seed": seed, "device": str(device), "threads": threads}
+        command = [executable, *(fill(word, values, "densify.command") for word in trainer.words[1:])]
+        environment = environment_of(trainer, values)
+        said = check_version(trainer, values, environment)
+        places[OUTPUT].mkdir(parents=True)
+        write_training_views(places[DATA], scene.train, cloud)
+        if trainer.needs_test_cameras:
+            write_test_cameras(places[TEST_CAMERAS], scene.test)
+        log.info("train: %s runs; its output: %s", trainer.program, log_file)
+        limit = None if trainer.time_limit_minutes is None else 60 * trainer.time_limit_minutes
+        try:
+            ended = run_program(command, log_file, places[OUTPUT], environment, limit)
+        finally:
+            shutil.rmtree(places[DATA])
+        log.info("train: %s ended after %s", trainer.program, readable_time(ended.seconds))
+        pattern = fill(trainer.result, values, "densify.result")
+        with what_it_left(trainer, log_file):
+            summary = take_result(trainer, pattern, views, places[OUTPUT], folder)
+        shutil.rmtree(work)
+        (folder / EVENTS).write_text("")
+        summary |= {
+            "iterations": iterations,
+            "num_init_points": len(cloud),
+            "scene_extent": scene.extent,
+            "seconds": ended.seconds,
+            # of a GPU's memory only the program itself could tell what it needed
+            "peak_memory_mb": ended.peak_memory_mb if device.type == "cpu" else None,
+            "machine": describe_machine(device),
+            "trained_by": {
+                "program": trainer.program,
+                "version": trainer.version,
+                "said": said,
+                "command": command,
+            },
+        }
+        write_json(folder / TRAINING_FILE, summary)
+
+    return Step(EXTERNAL, inputs, build)
+
+
+def take_result(trainer: External, pattern: str, views: Views, output: Path, folder: Path) -> dict[str, Any]:
+    """Keep in ``folder`` what the program left in ``output``; what is to be said of it."""
+    if not trainer.leaves_model:
+        take_renders(output, pattern, trainer.by_order, views.scene.test, folder / RENDERS)
+        return {"evaluated_from": FROM_RENDERS, "num_gaussians": None, "causes": {}}
+    gaussians = take_model(output, pattern, folder / POINT_CLOUD)
+    lineage = Lineage(len(gaussians))  # of its Gaussians, nobody knows where they came from
+    state: dict[str, Any] = {name: tensor.numpy() for name, tensor in lineage.state_dict().items()}
+    np.savez_compressed(folder / LINEAGE, **state)
+    return {"evaluated_from": FROM_MODEL, "num_gaussians": len(gaussians), "causes": lineage.causes_of_living()}
+
+
+@contextmanager
+def what_it_left(trainer: External, log_file: Path) -> Iterator[None]:
+    """Name the program, and where its log lies, in what is wrong with its result."""
+    try:
+        yield
+    except TrainingError as error:
+        raise TrainingError(f"{Path(trainer.program).name} ended well, but {error}; log: {log_file}") from error
+
+
+def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str, str]:
+    """The program's environment: that of gsbench without gsbench's own variables, and what the settings add."""
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(OWN_VARIABLES)}
+    return inherited | {
+        name: fill(text, values, f"densify.environment.{name}") for name, text in trainer.environment.items()
+    }
+
+
+def check_version(trainer: External, values: Mapping[str, object], environment: Mapping[str, str]) -> str | None:
+    """What ``densify.version_command`` prints, in one line; raises `InputError` unless it contains the version."""
+    if trainer.version_command is None:
+        return None
+    key = "densify.version_command"
+    command = [fill(word, values, key) for word in words_of(trainer.version_command, key)]
+    try:
+        done = subprocess.run(
+            command,
+            env=dict(environment),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=SECONDS_TO_TELL_VERSION,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise InputError(f"{key} cannot be run ({error})") from error
+    said = " ".join((done.stdout + done.stderr).split())
+    if trainer.version not in said:
+        raise InputError(
+            f"densify.version is {trainer.version!r}, but `{' '.join(command)}` says {said[:MAX_SAID]!r}: results are "
+            "kept by the version, so set densify.version to what it is"
+        )
+    return said

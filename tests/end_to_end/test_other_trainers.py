@@ -1,0 +1,320 @@
+"""Another program as an arm: it trains on what it is given, and what it leaves stands in the tables."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from PIL import Image
+
+from gsbench.cli import run
+from gsbench.datasets.catalog import read_catalog
+from gsbench.scene.courtyard import render_courtyard
+from tests.datasets.server import serve
+from tests.end_to_end.conftest import Run
+from tests.processes import heed_interrupts
+
+pytestmark = pytest.mark.end_to_end
+
+TRAINER = Path(__file__).with_name("trainer.py")
+CLOUD = f"""
+defaults: [external, _self_]
+name: cloud
+command: ["{{python}}", {TRAINER}, --data, "{{data}}", --output, "{{output}}", --iterations, "{{iterations}}",
+  --seed, "{{seed}}", --mode, "{{mode}}"]
+version: 1.2.3
+version_command: ["{{python}}", {TRAINER}, --version]
+result: point_cloud/iteration_{{iterations}}/*.ply
+options: {{python: {sys.executable}, mode: good}}
+environment: {{PAINTER: "{{mode}}"}}
+"""
+PAINTER = f"""
+defaults: [cloud, _self_]
+name: painter
+command: ["{{python}}", {TRAINER}, --data, "{{data}}", --output, "{{output}}", --iterations, "{{iterations}}",
+  --seed, "{{seed}}", --mode, "{{mode}}", --cameras, "{{test_cameras}}"]
+result: renders/*.png
+"""
+QUICK = ["init=random", "init.count=2000", "train.iterations=40", "train.densify_start=500", "tracking=none",
+         "eval.lpips=[squeeze]", "eval.download=false", f"allow_targets=['{sys.executable}']"]  # fmt: skip
+COURTYARD = ["scene.views=12", "scene.width=96", "scene.height=72", *QUICK]
+
+
+@pytest.fixture(scope="module")
+def trainers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of configurations with the two trainers: a user's own YAML files."""
+    folder = tmp_path_factory.mktemp("conf")
+    (folder / "densify").mkdir()
+    (folder / "densify" / "cloud.yaml").write_text(CLOUD)
+    (folder / "densify" / "painter.yaml").write_text(PAINTER)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str], trainers: Path) -> Path:
+    """A folder with a fetched scene, and a sweep over it of one arm of ours and two of other programs."""
+    home = tmp_path_factory.mktemp("home")
+    courtyard = home / "courtyard"
+    render_courtyard(courtyard, views=12, width=96, height=72, seed=0)
+    (archives := home / "archives").mkdir()
+    dataset = read_catalog()["mipnerf360"]
+    archive = next(archive for archive in dataset.archives if "garden" in archive.scenes)
+    with zipfile.ZipFile(archives / archive.name, "w") as content:
+        for file in sorted(path for path in courtyard.rglob("*") if path.is_file()):
+            name = file.relative_to(courtyard).as_posix().replace("images/", "images_4/")
+            content.write(file, f"{archive.scenes['garden']}/{name}")
+    with serve(archives) as server:
+        program(environment, home, "fetch", "mipnerf360", "garden", "--mirror", server.url)
+    sweep = ["densify=adc,cloud,painter", "seed=0,1", "name=three", "scene=garden"]
+    program(environment, home, "--config-dir", str(trainers), "-m", *QUICK, *sweep)
+    return home
+
+
+def program(environment: dict[str, str], home: Path, *words: str) -> str:
+    done = subprocess.run([sys.executable, "-m", "gsbench.cli", *words], cwd=home, capture_output=True, text=True,
+                          env=environment | {"GSBENCH_RUNS": str(home / "runs")}, timeout=500, check=False)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def trial(home: Path, arm: str, seed: int = 0) -> Path:
+    return next((home / "runs").glob(f"three/garden/random-{arm}/*-seed{seed}"))
+
+
+def results(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "results.json").read_text())
+
+
+def pixels(path: Path) -> str:
+    return hashlib.sha256(np.asarray(Image.open(path)).tobytes()).hexdigest()
+
+
+def test_two_programs_and_a_folder_of_renders_in_one_table(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
+    for seed in (0, 1):
+        folder = tmp_path / f"renders{seed}"
+        folder.mkdir()
+        for file in (trial(home, "adc", seed) / "renders").glob("*.png"):
+            truth = Image.open(trial(home, "adc") / "ground_truth" / file.name)
+            Image.blend(Image.open(file), truth, 0.5).save(folder / file.name)
+        words = ["--truth", "three:garden:adc", "--as", "three:folder", "--seed", str(seed)]
+        assert run(["evaluate", str(folder), *words]) == 0
+    capsys.readouterr()
+    assert run(["tables", "three"]) == 0
+    table = capsys.readouterr().out
+    rows = {arm: next(line for line in table.splitlines() if f"| {arm} |" in line)
+            for arm in ("adc", "cloud", "painter", "folder")}  # fmt: skip
+    assert "2.0" in rows["cloud"]  # thousand Gaussians: one a point
+    assert [row.count("n/a") for row in rows.values()] == [1, 1, 2, 3]  # LPIPS; Gaussians of renders; their time
+    assert "its model rendered by gsbench (its time is that of the whole program, its budget its own): " \
+        "random-cloud (version 1.2.3)." in table  # fmt: skip
+    assert "its own renders measured as they are (its time" in table
+    assert "Renders of another program, measured as they are (its conditions are not known): random-folder." in table
+    assert run(["report", "three"]) == 0
+    report = (home / "runs" / "three" / "report.html").read_text()
+    for arm in ("cloud", "painter", "folder"):
+        assert re.search(rf"random-{arm} against random-adc, on this scene: (better|worse)", report), arm
+    for words in (["status", "three"], ["explain", "three:garden:psnr:cloud"], ["explain", "three:garden:psnr:painter"],
+                  ["explain", "--stale", str(trial(home, "cloud"))], ["sync", "three"]):  # fmt: skip
+        assert run(words) == 0, words
+    said = capsys.readouterr().out
+    assert "6 done" in said or "8 done" in said
+    assert f"program   1.2.3: {sys.executable} {TRAINER}" in said
+
+
+def test_what_is_recorded(home: Path) -> None:
+    model, renders = results(trial(home, "cloud")), results(trial(home, "painter"))
+    assert (model["evaluated_from"], renders["evaluated_from"]) == ("model", "renders")
+    assert model["trained_by"]["said"] == "painter 1.2.3"
+    assert model["num_gaussians"] == model["num_init_points"] == 2000
+    assert model["iterations"] == 40
+    assert model["seconds"]["train"] > 0.1
+    assert 20 < model["peak_memory_mb"] < 4000  # an interpreter with numpy
+    assert (trial(home, "cloud") / "point_cloud.ply").is_file()
+    assert (trial(home, "painter") / "trainer.log").is_file()
+    assert model["hashes"]["train"] != results(trial(home, "cloud", 1))["hashes"]["train"]
+    assert not list((home / "runs" / "store").rglob("work"))
+
+
+@pytest.mark.parametrize("arm", ["cloud", "painter"])
+def test_no_test_photograph_reaches_it(home: Path, arm: str) -> None:
+    """The trainer walked everything beside and below its input, links followed, and told what it found."""
+    log = (trial(home, arm) / "trainer.log").read_text()
+    seen = dict(line.split()[1:] for line in log.splitlines() if line.startswith("saw "))
+    held_out = {file.name: pixels(file) for file in (trial(home, arm) / "ground_truth").glob("*.png")}
+    photographs = {file.name: pixels(file) for file in (home / "data" / "garden" / "images_4").iterdir()}
+    training = photographs.keys() - held_out.keys()
+    assert len(held_out) == 2
+    assert len(training) == 10
+    assert {photographs[name] for name in held_out} == set(held_out.values())
+    assert {Path(name).name: found for name, found in seen.items() if name.endswith(".png")} == {
+        name: photographs[name] for name in training
+    }
+    assert not set(seen.values()) & set(held_out.values())
+    models = {str(Path(name).parent) for name in seen if "sparse" in name}
+    assert models == ({"data/sparse/0"} if arm == "cloud" else {"data/sparse/0", "test_cameras/sparse/0"})
+    assert ("test_cameras/transforms.json" in seen) == (arm == "painter")
+    assert "observations 0" in log
+    assert "environment [] good" in log
+
+
+def test_done_is_done_and_another_version_is_another_result(
+    home: Path, trainers: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
+    monkeypatch.chdir(home)
+    words = ["--config-dir", str(trainers), *QUICK, "scene=garden", "densify=cloud", "name=three"]
+    before = {path: path.stat().st_mtime_ns for path in (home / "runs" / "store").glob("*/*/manifest.json")}
+    assert run(words) == 0
+    assert run([*words, "name=again", "densify.time_limit_minutes=7"]) == 0  # the limit makes no other result
+    assert {path: path.stat().st_mtime_ns for path in (home / "runs" / "store").glob("*/*/manifest.json")} == before
+    capsys.readouterr()
+    assert run([*words, "densify.version=9", "--dry-run"]) == 0
+    planned = capsys.readouterr().out
+    assert "missing" in planned
+    assert "the store has its init" in planned
+    assert run([*words, "densify.version=9"]) == 2
+    assert "says 'painter 1.2.3'" in capsys.readouterr().err
+
+
+BAD = {
+    "exit": "ended early (exit code 1); its last words: Error: the painter has no paint; log: ",
+    "nothing": "left no point_cloud/iteration_40/*.ply (densify.result); it wrote notes.txt; log: ",
+    "torn": "it is cut short: its header promises",
+    "nan": "f_dc_1 is not a finite number everywhere",
+    "two": "2 files fit densify.result (point_cloud/iteration_40/point_cloud.ply, point_cloud/iteration_40/second.ply)",
+}
+BAD_RENDERS = {
+    "fewer": "1 of 2 photographs have no picture of their name (0008.png)",
+    "smaller": "is 48x36 px and the view 96x72: sizes are never changed here",
+}
+
+
+@pytest.mark.parametrize(("arm", "expected"), [("cloud", BAD), ("painter", BAD_RENDERS)])
+def test_bad_programs_end_in_a_line_each_and_lose_nothing_else(
+    trainers: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arm: str,
+    expected: dict[str, str],
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
+    words = ["--config-dir", str(trainers), "-m", *COURTYARD, f"densify={arm}", "name=bad"]
+    assert run([*words, f"densify.options.mode={','.join([*expected, 'good'])}"]) == 1
+    error = capsys.readouterr().err
+    lines = [line for line in error.splitlines() if line.startswith("gsbench: failed: ")]
+    assert len(lines) == len(expected)
+    for mode, line in zip(expected, lines, strict=True):
+        assert expected[mode] in line, (mode, line)
+    assert len(list(tmp_path.glob("bad/*/*/*/results.json"))) == 1
+    for failed in tmp_path.glob("bad/*/*/*/failed.json"):
+        log = re.search(r"log: (\S+)$", json.loads(failed.read_text())["message"])
+        assert log is not None
+        assert "observations 0" in Path(log[1]).read_text()
+
+
+def test_one_that_hangs_is_ended(
+    trainers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With its child, though both are deaf to SIGTERM."""
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
+    words = ["--config-dir", str(trainers), *COURTYARD, "densify=cloud", "densify.options.mode=hang"]
+    assert run([*words, "densify.time_limit_minutes=0.25"]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "python still ran after 15 s (densify.time_limit_minutes); its last words: " in said
+    log = Path(said.rpartition("log: ")[2]).read_text()
+    pids = [int(word) for line in log.splitlines() if line.startswith("pids ") for word in line.split()[1:]]
+    assert len(pids) == 2
+    assert not any(map(is_running, pids))
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+@pytest.fixture
+def hanging(
+    environment: dict[str, str], trainers: Path, tmp_path: Path
+) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
+    """gsbench with a trainer that hangs, deaf to SIGTERM, and the trainer's and its child's process ids."""
+    words = ["--config-dir", str(trainers), *COURTYARD, "densify=cloud", "densify.options.mode=hang"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "gsbench.cli", *words],
+        cwd=tmp_path, env=environment | {"GSBENCH_RUNS": str(tmp_path / "runs")},
+        stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts,
+    )  # fmt: skip
+    pids: list[int] = []
+    deadline = time.monotonic() + 120
+    while not pids and process.poll() is None and time.monotonic() < deadline:
+        for log in (tmp_path / "runs" / "store" / "train").glob(".*/trainer.log"):
+            pids = [int(word) for line in log.read_text().splitlines() if line.startswith("pids ")
+                    for word in line.split()[1:]]  # fmt: skip
+        time.sleep(0.05)
+    yield process, pids
+    process.kill()
+    process.communicate()
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_it_ends_with_gsbench(hanging: tuple[subprocess.Popen[str], list[int]], signum: int) -> None:
+    process, pids = hanging
+    assert len(pids) == 2
+    assert all(map(is_running, pids))
+    os.kill(process.pid, signum)
+    process.wait(60)
+    deadline = time.monotonic() + 30
+    while any(map(is_running, pids)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(map(is_running, pids))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["allow_targets=[]"], "if you trust it, add allow_targets=["),
+        (["densify.options.python=no-such-program", "allow_targets=[no-such-program]"], "no program 'no-such-program'"),
+        (["densify.command='{python} {date}'"], "nothing is known as {date}; did you mean data?"),
+        (["densify.command='{python} x'"], "has no {data}"),
+        (["densify.version=???"], "densify.version is not set"),
+        (["densify.options.mode=???"], "densify.options.mode is not set"),
+        (["+densify.options.seed=1"], "densify.options.seed: an option is one value with a name of its own"),
+        (["eval.at=[10]"], "seen at its end only"),
+        (["train.max_seconds=10"], "cannot be stopped early"),
+        (["train.iterations=0"], "add densify=none"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else None,
+)
+def test_bad_requests_are_one_line(
+    gsbench: Run,
+    trainers: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    said: str,
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
+    assert run(["--config-dir", str(trainers), *COURTYARD, "densify=cloud", *words]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("gsbench: ") == 1
+    assert not list(tmp_path.glob("store/train/*"))

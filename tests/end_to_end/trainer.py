@@ -1,0 +1,145 @@
+"""A trainer of another program, as small as one can be: it knows nothing of gsbench.
+
+It reads its COLMAP folder with pycolmap, makes a Gaussian of every point, in the colours that the training images have
+there, and writes a 3DGS PLY; or paints the points as seen by the test cameras. MODE says how it fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from PIL import Image
+from scipy.spatial import cKDTree
+
+SH_DC = 0.28209479177387814  # of the constant harmonic, 1 / (2 sqrt(pi))
+COLUMNS = [
+    *"xyz",
+    "f_dc_0",
+    "f_dc_1",
+    "f_dc_2",
+    "opacity",
+    "scale_0",
+    "scale_1",
+    "scale_2",
+    *(f"rot_{i}" for i in range(4)),
+]
+
+
+def project(image: pycolmap.Image, camera: pycolmap.Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [P, 2] and depths [P] of world points."""
+    matrix = image.cam_from_world().matrix()
+    local = points @ matrix[:, :3].T + matrix[:, 3]
+    fx, fy, cx, cy = camera.params
+    depth = local[:, 2]
+    safe = np.where(depth > 0.01, depth, 1.0)
+    return np.stack([fx * local[:, 0] / safe + cx, fy * local[:, 1] / safe + cy], axis=1), depth
+
+
+def colors_of(data: Path, model: pycolmap.Reconstruction, points: np.ndarray) -> np.ndarray:
+    """The median colour of every point [P, 3] in [0, 1] over the training images that look at it."""
+    seen = []
+    for image in model.images.values():
+        picture = np.asarray(Image.open(data / "images" / image.name)) / 255.0
+        camera = model.cameras[image.camera_id]
+        assert picture.shape[:2] == (camera.height, camera.width)
+        pixels, depth = project(image, camera, points)
+        column, row = np.floor(pixels).astype(int).T
+        inside = (depth > 0.01) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+        values = np.full((len(points), 3), np.nan)
+        values[inside] = picture[row[inside], column[inside]]
+        seen.append(values)
+    return np.nan_to_num(np.nanmedian(np.stack([*seen, np.full((len(points), 3), 0.5)]), axis=0), nan=0.5)
+
+
+def write_model(path: Path, points: np.ndarray, colors: np.ndarray, mode: str) -> None:
+    """A 3DGS PLY of harmonics of degree 0, by hand."""
+    spacing = cKDTree(points).query(points, k=4)[0][:, 1:].mean(axis=1).clip(1e-4)
+    table = np.zeros((len(points), len(COLUMNS)), "<f4")
+    table[:, :3], table[:, 3:6], table[:, 6] = points, (colors - 0.5) / SH_DC, 2.0
+    table[:, 7:10], table[:, 10] = np.log(spacing)[:, None], 1.0
+    if mode == "nan":
+        table[1, 4] = np.nan
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [f"property float {name}" for name in COLUMNS] + ["end_header", ""]
+    body = table.tobytes()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes("\n".join(header).encode() + (body[: len(body) // 2] if mode == "torn" else body))
+
+
+def paint(cameras: Path, output: Path, points: np.ndarray, colors: np.ndarray, mode: str) -> None:
+    """The points, far ones first, as squares of 3 px."""
+    for frame in json.loads((cameras / "transforms.json").read_text())["frames"]:
+        pose = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))  # world to OpenCV camera
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        picture = np.zeros((frame["h"], frame["w"], 3), np.uint8)
+        for index in np.argsort(-local[:, 2]):
+            if local[index, 2] > 0.1:
+                x = int(frame["fl_x"] * local[index, 0] / local[index, 2] + frame["cx"])
+                y = int(frame["fl_y"] * local[index, 1] / local[index, 2] + frame["cy"])
+                picture[max(0, y - 1) : max(0, y + 2), max(0, x - 1) : max(0, x + 2)] = colors[index] * 255
+        output.mkdir(parents=True, exist_ok=True)
+        size = (frame["w"] // 2, frame["h"] // 2) if mode == "smaller" else (frame["w"], frame["h"])
+        Image.fromarray(picture).resize(size).save(output / frame["file_path"])
+        if mode == "fewer":
+            return
+
+
+def confess(folder: Path) -> None:
+    """Print every file below ``folder`` that can be seen, and the pixels of those that are pictures, as hashes."""
+    for place, _, files in os.walk(folder, followlinks=True):
+        for name in files:
+            path = Path(place, name)
+            pixels = (
+                hashlib.sha256(np.asarray(Image.open(path)).tobytes()).hexdigest() if name.endswith(".png") else "-"
+            )
+            print("saw", path.relative_to(folder).as_posix(), pixels)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--version", action="version", version="painter 1.2.3")
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--cameras", type=Path)
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--mode", default="good")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--iterations", type=int, required=True)
+    options = parser.parse_args()
+    confess(options.data.parent)
+    print("environment", sorted(name for name in os.environ if name.startswith("GSBENCH")), os.environ.get("PAINTER"))
+    model = pycolmap.Reconstruction(options.data / "sparse" / "0")
+    print("observations", sum(len(point.track.elements) for point in model.points3D.values()))
+    if options.mode == "exit":
+        sys.exit("Error: the painter has no paint")
+    if options.mode == "hang":  # with a child, and deaf to SIGTERM
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+        print("pids", os.getpid(), child.pid, flush=True)
+        time.sleep(600)
+    if options.mode == "nothing":
+        (options.output / "notes.txt").write_text("I was here")
+        return
+    points = np.array([point.xyz for _, point in sorted(model.points3D.items())])
+    points = points + np.random.default_rng(options.seed).normal(0, 1e-3, points.shape)
+    colors = colors_of(options.data, model, points)
+    if options.cameras is None:
+        place = options.output / "point_cloud" / f"iteration_{options.iterations}" / "point_cloud.ply"
+        write_model(place, points, colors, options.mode)
+        if options.mode == "two":
+            write_model(place.with_name("second.ply"), points, colors, "good")
+    else:
+        paint(options.cameras, options.output / "renders", points, colors, options.mode)
+
+
+if __name__ == "__main__":
+    main()
