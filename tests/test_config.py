@@ -30,18 +30,34 @@ def composed(*overrides: str) -> dict[str, Any]:
     return plain(config)
 
 
+# What the user of another program must say: its version, where it lies, and that it may run.
+PROGRAMS = {
+    "external": ["densify.command=[mine,'{data}']", "densify.result=x.ply", "allow_targets=[mine]"],
+    "3dgs": ["densify.options.code=/code", "allow_targets=[python]"],
+    "gsplat": ["densify.options.code=/code", "allow_targets=[python]"],
+    "opensplat": ["allow_targets=[opensplat]"],
+    "brush": ["allow_targets=[brush]"],
+    "nerfstudio": ["allow_targets=[bash]"],
+}
+
+
+def needs(option: str) -> list[str]:
+    return [*PROGRAMS[option], "densify.version='1'"] if option in PROGRAMS else []
+
+
 @pytest.mark.parametrize(("group", "option"), [(group, option) for group in GROUPS for option in options(group)])
 def test_every_option_composes(group: str, option: str) -> None:
     extra = ["scene.path=/data/capture"] if group == "scene" else []
     extra += ["init.path=/data/model.ply"] if option in ("ply", "points") else []
     extra += ["densify=none"] if (group, option) == ("train", "none") else []
+    extra += needs(option) if group == "densify" else []
     values = composed(f"{group}={option}", *extra)
     assert values[group]["name"] == option
 
 
 @pytest.mark.parametrize("option", options("densify"))
 def test_every_densifier_can_be_built_and_matches_its_class(option: str) -> None:
-    values = composed(f"densify={option}", "train=paper")["densify"]
+    values = composed(f"densify={option}", "train=paper", *needs(option))["densify"]
     densifier = build("densify", values, [])
     if dataclasses.is_dataclass(densifier):
         names = {field.name for field in dataclasses.fields(densifier) if field.init}

@@ -106,6 +106,7 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(
     home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
+    monkeypatch.chdir(home)
     for seed in (0, 1):
         folder = tmp_path / f"renders{seed}"
         folder.mkdir()
@@ -263,7 +264,7 @@ def hanging(
         stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts,
     )  # fmt: skip
     pids: list[int] = []
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while not pids and process.poll() is None and time.monotonic() < deadline:
         for log in (tmp_path / "runs" / "store" / "train").glob(".*/trainer.log"):
             pids = [int(word) for line in log.read_text().splitlines() if line.startswith("pids ")
