@@ -55,10 +55,9 @@ def check_components(trials: Sequence[Composed], here: bool) -> None:
         own_raster = values["raster"]["_target_"] is not None
         groups = (*COMPONENTS, *(["raster"] if own_raster else []))
         made = {group: build(group, values[group], values["allow_targets"]) for group in groups}
-        program = made["densify"] if isinstance(made["densify"], External) else None
-        if here and program is not None:
-            program.executable()
-        if program is None and (own_raster or values["raster"]["name"] != AUTO):
+        if here and isinstance(made["densify"], External):
+            made["densify"].executable()
+        if own_raster or values["raster"]["name"] != AUTO:
             own = made.get("raster")
             raster = getattr(own, "name", values["raster"]["name"])
             check_footprint(made["densify"], values["densify"]["name"], raster, own)
