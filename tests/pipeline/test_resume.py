@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.densify import ADC, MCMC, Densifier, PixelGS, Volumetric
+from gsbench.densify import ADC, MCMC, Densifier, EdgeAware, PixelGS, Taming, Volumetric
 from gsbench.gaussians.model import Gaussians
 from gsbench.pipeline.stopping import Stopped, stop_on_signals
 from gsbench.pipeline.trainer import Status, Trainer
@@ -26,6 +26,10 @@ MAKERS: dict[str, Callable[[], Densifier]] = {
     "pixelgs": lambda: PixelGS(
         start=20, stop=110, interval=20, opacity_reset_interval=60, max_gaussians=150, cap="hard"
     ),
+    "edgeaware": lambda: EdgeAware(
+        start=20, stop=110, interval=20, gradient="absolute", opacity_reset_interval=60, max_gaussians=150, cap="curve"
+    ),
+    "taming": lambda: Taming(start=20, stop=110, interval=20, opacity_reset_interval=60, max_gaussians=150),
     "mcmc": lambda: MCMC(start=20, stop=110, interval=20),
 }
 

@@ -3,11 +3,14 @@
 from gsbench.densify.adc import ADC
 from gsbench.densify.base import Densifier, DensifyContext, NoDensifier, Refinement, Rule
 from gsbench.densify.budgeted import Budgeted
+from gsbench.densify.edge_aware import EdgeAware
 from gsbench.densify.external import External
 from gsbench.densify.lineage import Lineage
 from gsbench.densify.long_axis import LongAxis
 from gsbench.densify.mcmc import MCMC
 from gsbench.densify.pixel_gs import PixelGS
+from gsbench.densify.scores import TrainingViews
+from gsbench.densify.taming import Taming
 from gsbench.densify.volumetric import Volumetric
 from gsbench.events import Cause, RefineEvent
 
@@ -18,6 +21,7 @@ __all__ = [
     "Cause",
     "Densifier",
     "DensifyContext",
+    "EdgeAware",
     "External",
     "Lineage",
     "LongAxis",
@@ -26,5 +30,7 @@ __all__ = [
     "RefineEvent",
     "Refinement",
     "Rule",
+    "Taming",
+    "TrainingViews",
     "Volumetric",
 ]

@@ -102,6 +102,13 @@ class ADC(Budgeted):
         large = log_scales.amax(-1) > math.log(self.split_size * self.context.extent)
         return mean >= threshold if self.threshold_inclusive else mean > threshold, large
 
+    def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
+        """Those of the ``candidates`` [N] that the budget admits, and how many it refuses: the largest mean gradients.
+
+        Each adds ``gain`` Gaussians.
+        """
+        return admit(candidates, self.mean_gradient(), gain, self.allowance(refinement))
+
     def grown(self, refinement: Refinement) -> Grown:
         """What growth would make of each Gaussian."""
         values = refinement.gaussians.values
@@ -121,10 +128,8 @@ class ADC(Budgeted):
     def grow_by_gradient(self, refinement: Refinement) -> None:
         """Clone the small and split the large of those whose mean gradient reaches the threshold."""
         gaussians, event = refinement.gaussians, refinement.event
-        mean = self.mean_gradient()
         over, large = self.candidates(refinement)
-        allowed = self.allowance(refinement)
-        selected, blocked = admit(over, mean, max(1, self.split_children - 1), allowed)
+        selected, blocked = self.choose(refinement, over, max(1, self.split_children - 1))
         event.blocked_by_cap += blocked
         event.cloned += self.clone(refinement, selected & ~large, revised_opacity=self.revised_opacity)
         new = selected.new_zeros(len(gaussians) - len(selected))

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsbench.densify.lineage import Lineage
 from gsbench.densify.operations import revised_logits, split
+from gsbench.densify.scores import TrainingViews
 from gsbench.errors import InputError
 from gsbench.events import Cause, RefineEvent
 from gsbench.gaussians.model import Gaussians
@@ -29,6 +30,14 @@ class DensifyContext:
     extent: float  # world units: 3DGS's cameras_extent
     white_background: bool = False
     device: torch.device = CPU  # of the Gaussians
+    views: TrainingViews | None = None
+
+    @property
+    def training_views(self) -> TrainingViews:
+        """``views``, which a trainer gives."""
+        if self.views is None:
+            raise RuntimeError("this densifier looks at training views: give them as DensifyContext.views")
+        return self.views
 
 
 @dataclass

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from gsbench.densify.adc import ADC, Grown
 from gsbench.densify.base import Refinement
-from gsbench.densify.budget import admit
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.settings import OpenFraction
@@ -46,7 +45,7 @@ class LongAxis(ADC):
     def grow_by_gradient(self, refinement: Refinement) -> None:
         """Split whose mean gradient reaches the threshold."""
         over, _ = self.candidates(refinement)
-        selected, blocked = admit(over, self.mean_gradient(), 1, self.allowance(refinement))
+        selected, blocked = self.choose(refinement, over, 1)
         parents = selected.nonzero().squeeze(-1)  # [S]
         half = refinement.gaussians.values.detach().select(parents)
         longest = half.log_scales.argmax(-1)  # [S]

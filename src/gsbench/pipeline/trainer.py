@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from gsbench.pipeline.losses import LossLog
 from gsbench.pipeline.room import explain_full, free_bytes, room_for_images
 from gsbench.pipeline.stopping import deferred, requested
 from gsbench.pipeline.targets import Targets
+from gsbench.pipeline.training_views import SceneViews
 from gsbench.raster import Rasterizer
 from gsbench.scene.types import Scene
 
@@ -92,7 +94,6 @@ class Trainer:
         self.device = initial.means.device
         initial = densifier.prepare(initial)
         self.background = torch.tensor(list(options.background), dtype=torch.float32, device=self.device)  # [3]
-        self.context = DensifyContext(scene.extent, bool((self.background == 1).all()), self.device)
         self.gaussians = TrainableGaussians(initial, learning_rates(options), scene.extent)
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
         self.rngs = {name: generator(seed, stream) for stream, name in enumerate(STREAMS)}
@@ -104,6 +105,10 @@ class Trainer:
         pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
         room = room_for_images(free_bytes(self.device), len(initial), cap, pixels)
         self.targets = Targets(scene.train, self.device, room)
+        views = SceneViews(
+            scene.train, self.targets, rasterizer, self.background, self.loss, partial(sh_degree_at, options)
+        )
+        self.context = DensifyContext(scene.extent, bool((self.background == 1).all()), self.device, views)
         densifier.begin(initial, self.context)
 
     def run(self, folder: Path, on_status: Callable[[Status], None] = lambda status: None) -> Gaussians:
@@ -214,7 +219,7 @@ class Trainer:
 
     @property
     def sh_degree(self) -> int:
-        return min(MAX_SH_DEGREE, self.step // self.options.sh_interval)
+        return sh_degree_at(self.options, self.step)
 
     def _optimize(self, visible: torch.Tensor) -> None:
         self.gaussians.optimizer_step(self.sh_degree, visible if self.options.visible_adam else None)
@@ -260,6 +265,11 @@ def _last_state(folder: Path) -> str:
 def snapshot_file(step: int) -> str:
     """The file, below a training's folder, of the model as 3DGS saves it at iteration ``step``: before it refines."""
     return f"snapshots/iteration_{step}.ply"
+
+
+def sh_degree_at(options: TrainConfig, step: int) -> int:
+    """The degree of harmonics that iteration ``step`` renders with."""
+    return min(MAX_SH_DEGREE, step // options.sh_interval)
 
 
 def learning_rates(options: TrainConfig) -> LearningRates:

@@ -1,0 +1,112 @@
+"""Taming 3DGS: a budget that is spent on Gaussians drawn by a score of many terms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from pydantic import NonNegativeFloat, PositiveInt
+from torch import Tensor
+
+from gsbench.densify.adc import ADC
+from gsbench.densify.base import Refinement, Rule
+from gsbench.densify.scores import blended_sums, by_median, draw, draw_views, edge_map, to_unit_range
+from gsbench.gaussians.model import Gaussians
+
+LEAST_SCORE = 1e-6  # keeps the inverse finite by which the faint are drawn for pruning (the authors' code)
+
+
+@dataclass
+class Taming(ADC):
+    """ADC whose candidates are drawn by score, up to a budget, after Mallick et al. (arXiv 2406.15643).
+
+    In each round, the score of a Gaussian is a sum over ``score_views`` training views, drawn anew, that see it: the
+    loss of the view times a weighted sum of what is listed below, each over its median. A pixel's value is
+    ``weight_error`` times its L1 error plus ``weight_edge`` times its edge strength, both from 0 to 1. The budget of
+    the round, up to the count that ``cap=curve`` allows (their eq. 2), is shared between clones and splits as
+    candidates are, and drawn without replacement in proportion to the score. Of those to prune, half as many as there
+    are are drawn from all in inverse proportion to the score, and only they go; in the first ``prune_rounds`` rounds.
+    """
+
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"score": torch.float32}  # within a round; 0 for the new
+    needs_footprint = True
+
+    max_gaussians: PositiveInt = 1_000_000
+    cap: Literal["curve", "hard"] = "curve"
+    score_views: PositiveInt = 10
+    prune_rounds: PositiveInt = 27
+    weight_gradient: NonNegativeFloat = 25.0  # mean gradient since the last round
+    weight_opacity: NonNegativeFloat = 100.0
+    weight_depth: NonNegativeFloat = 5.0  # view z
+    weight_radius: NonNegativeFloat = 10.0  # px
+    weight_scale: NonNegativeFloat = 25.0  # product of the three
+    weight_distance: NonNegativeFloat = 50.0  # sum over its pixels of the distance to its mean
+    weight_values: NonNegativeFloat = 10.0  # sum over its pixels of their values
+    weight_pixels: NonNegativeFloat = 0.1  # their number
+    weight_blending: NonNegativeFloat = 50.0  # sum over them of alpha T
+    weight_error: NonNegativeFloat = 50.0  # of a pixel's value
+    weight_edge: NonNegativeFloat = 50.0
+
+    def rules(self, refinement: Refinement) -> list[Rule]:
+        """Those of ADC, and before they grow the scores."""
+        rules = super().rules(refinement)
+        if self.grow_by_gradient in rules:
+            rules.insert(rules.index(self.grow_by_gradient), self.score)
+        return rules
+
+    def score(self, refinement: Refinement) -> None:
+        """The rule that gives everyone a score, which follows what the round does."""
+        values, rng = refinement.gaussians.values, refinement.rng
+        views, total = self.context.training_views, torch.zeros_like(values.opacity_logits)
+        for index in draw_views(views, self.score_views, rng):
+            total += self.score_in(index, values, refinement.step)
+        self.statistics["score"] = (total + LEAST_SCORE).float()
+
+    def score_in(self, index: int, gaussians: Gaussians, step: int) -> Tensor:
+        """What one view adds to the score, [N]."""
+        views = self.context.training_views
+        photograph = views.image(index)
+        image = views.render(index, gaussians, step).image
+        error = (image - photograph.to(image) / 255).abs().mean(-1)  # [H, W]
+        pixels = self.weight_error * to_unit_range(error) + self.weight_edge * edge_map(photograph).to(error)
+        sums, render = blended_sums(views, index, gaussians, step, torch.ones_like(image))
+        if render.footprint is None:
+            raise RuntimeError("the score needs RenderOutput.footprint, which this rasterizer does not give")
+        footprint, visible = render.footprint(pixels), render.visible
+        terms = (
+            (self.weight_gradient, self.mean_gradient()),
+            (self.weight_opacity, gaussians.opacities.detach()),
+            (self.weight_depth, torch.where(visible, footprint.depths, 0.0)),
+            (self.weight_radius, render.radii.to(error)),
+            (self.weight_scale, gaussians.scales.detach().prod(-1)),
+            (self.weight_distance, footprint.distances),
+            (self.weight_values, footprint.values),
+            (self.weight_pixels, footprint.pixels.to(error)),
+            (self.weight_blending, sums[:, 0]),
+        )
+        total = torch.stack([weight * by_median(term) for weight, term in terms]).sum(0)  # [N]
+        return torch.where(visible, views.loss(index, image) * total, 0.0)
+
+    def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
+        _, large = self.candidates(refinement)
+        count, allowed = int(candidates.sum()), self.allowance(refinement)
+        assert allowed is not None  # no cap of this class is without a limit
+        places = min(allowed // gain, count)
+        drawn = torch.zeros_like(candidates)
+        for kind in (candidates & ~large, candidates & large):
+            share = places * int(kind.sum()) // max(count, 1)
+            drawn |= draw(kind, self.statistics["score"], share, refinement.rng)
+        return drawn, count - int(drawn.sum())
+
+    def prune(self, refinement: Refinement) -> None:
+        """Remove some of the faint and, after the first opacity reset, of the huge: more likely those of low score."""
+        if refinement.step // self.interval - self.start // self.interval > self.prune_rounds:
+            return
+        values, score = refinement.gaussians.values, self.statistics["score"]
+        faint, huge = self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
+        budget = int((faint | huge).sum()) // 2
+        drawn = draw(score > 0, 1 / score, budget, refinement.rng)
+        refinement.event.pruned_opacity += int((faint & drawn).sum())
+        refinement.event.pruned_size += int((huge & ~faint & drawn).sum())
+        self.edit(refinement, keep=~((faint | huge) & drawn))

@@ -1,0 +1,292 @@
+"""Edge maps, sums over pixels, draws, and the two densifiers that use them, against restatements in numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image, ImageFilter
+
+from gsbench.densify import DensifyContext, EdgeAware, Refinement, Taming
+from gsbench.densify.adc import ADC
+from gsbench.densify.scores import blended_sums, by_median, draw, edge_map
+from gsbench.errors import InputError
+from gsbench.events import RefineEvent
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.pipeline.ssim import torch_photometric_loss
+from gsbench.raster.base import RenderOutput
+from gsbench.raster.reference import ReferenceRasterizer, bin_gaussians, blending_weights, project, tile_rectangles
+from gsbench.scene.camera import Camera
+from tests.densify import restatement
+from tests.densify.test_long_axis import halves
+from tests.densify.test_rounds import EXTENT, assert_same, to_rows
+from tests.gaussians.helpers import front_camera, random_gaussians
+
+COUNT = 60
+WIDTH, HEIGHT = 37, 21
+BLACK = torch.zeros(3, dtype=torch.float64)
+
+
+class Room:
+    """Three views of made-up photographs; float64."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        self.cameras = [front_camera(WIDTH, HEIGHT, (5.0 * k, -3.0 * k)) for k in range(3)]
+        self.images = [torch.from_numpy(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)) for _ in range(3)]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def image(self, index: int) -> torch.Tensor:
+        return self.images[index]
+
+    def render(self, index: int, gaussians: Gaussians, step: int) -> RenderOutput:
+        return ReferenceRasterizer().render(gaussians, self.cameras[index], 0, BLACK)
+
+    def loss(self, index: int, image: torch.Tensor) -> torch.Tensor:
+        return torch_photometric_loss(image, self.images[index])[0]
+
+
+def alphas(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """alpha T of every Gaussian in every pixel, [N, H, W], taken apart from all sums."""
+    found = np.zeros((len(gaussians), HEIGHT, WIDTH))
+    projected = project(gaussians, camera)
+    for tile, members in bin_gaussians(projected.depths, *tile_rectangles(projected, camera, 16), 3):
+        for y in range(tile // 3 * 16, min(tile // 3 * 16 + 16, HEIGHT)):
+            for x in range(tile % 3 * 16, min(tile % 3 * 16 + 16, WIDTH)):
+                index = projected.index[members]
+                pixel = torch.tensor([[x, y]], dtype=torch.float64)
+                weights = blending_weights(
+                    pixel, projected.means[members][None], projected.conics[members], gaussians.opacities[index]
+                )
+                found[index.numpy(), y, x] = weights[0].numpy()
+    return found
+
+
+def find_edges(image: torch.Tensor) -> np.ndarray:
+    """By Pillow, with the outermost pixels taken away."""
+    edges = np.array(Image.fromarray(image.numpy()).convert("L").filter(ImageFilter.FIND_EDGES), np.float64)
+    edges[[0, -1]], edges[:, [0, -1]] = 0, 0
+    return (edges - edges.min()) / (edges.max() - edges.min())
+
+
+def over_median(values: np.ndarray) -> np.ndarray:
+    positive = np.sort(values[values > 0])
+    return np.where(values > 0, values / positive[(len(positive) - 1) // 2], 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_edges_are_those_that_pillow_finds(seed: int) -> None:
+    image = torch.from_numpy(np.random.default_rng(seed).integers(0, 256, (13, 17, 3), np.uint8))
+    image[3:9, 4:12] = torch.tensor([200, 30, 90], dtype=torch.uint8)
+    np.testing.assert_allclose(edge_map(image), find_edges(image), atol=1e-6)
+    assert not edge_map(torch.full((5, 5, 3), 90, dtype=torch.uint8)).any()
+    assert edge_map(image[:2]).shape == (2, 17)
+
+
+def test_blended_sums_are_sums_of_alpha_and_transmittance() -> None:
+    gaussians, room = random_gaussians(COUNT, 3, log_scale=(-3.5, -0.5)), Room()
+    gaussians.sh_dc[:] = -9.0  # all black: their own colours have no gradient
+    weights = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    with torch.no_grad():  # as in a refinement
+        sums, _ = blended_sums(room, 1, gaussians, 1, weights)
+    expected = np.einsum("nyx,yxc->nc", alphas(gaussians, room.cameras[1]), weights.numpy())
+    np.testing.assert_allclose(sums, expected, atol=1e-12)
+    assert (expected[:, 0] > 0).sum() > 30
+
+
+def test_by_median_leaves_out_what_is_not_positive() -> None:
+    values = torch.tensor([0.0, -3.0, float("nan"), 4.0, 2.0, 8.0, 6.0])
+    assert by_median(values).tolist() == [0, 0, 0, 1, 0.5, 2, 1.5]
+    assert not by_median(torch.zeros(3)).any()
+
+
+def test_draws_are_in_proportion_and_without_replacement() -> None:
+    """Of four, two are drawn: the chance of each pair is known (first one, then one of the rest, by score)."""
+    scores = torch.tensor([9.0, 1.0, 2.0, 0.0, 3.0])
+    candidates = torch.tensor([False, True, True, True, True])
+    rng, counts = torch.Generator().manual_seed(0), np.zeros(5)
+    rounds = 4000
+    for _ in range(rounds):
+        drawn = draw(candidates, scores, 2, rng)
+        assert drawn.sum() == 2
+        counts += drawn.numpy()
+    weight = {1: 1 / 6, 2: 2 / 6, 4: 3 / 6}
+    expected = {i: w + sum(v * w / (1 - v) for j, v in weight.items() if j != i) for i, w in weight.items()}
+    assert counts[0] == counts[3] == 0
+    for i, chance in expected.items():
+        assert abs(counts[i] / rounds - chance) < 5 * np.sqrt(chance * (1 - chance) / rounds)
+    assert draw(candidates, scores, 4, rng).tolist() == candidates.tolist()  # the one without a score comes last
+    assert draw(candidates, scores, 9, rng).tolist() == candidates.tolist()
+    assert not draw(candidates, scores, 0, rng).any()
+
+
+def started(densifier: ADC, seed: int) -> tuple[TrainableGaussians, np.ndarray]:
+    """Gaussians with moments and mean gradients, in a room with views."""
+    gaussians = random_gaussians(COUNT, seed, log_scale=(-5.0, 0.3))
+    trainable = TrainableGaussians(gaussians, LearningRates(), EXTENT)
+    for tensor in trainable.values.tensors().values():
+        tensor.grad = torch.full_like(tensor, 1e-3)
+    trainable.optimizer_step()
+    densifier.begin(trainable.values.detach(), DensifyContext(EXTENT, views=Room()))
+    gradient = np.random.default_rng(seed).uniform(0, 6e-4, COUNT)
+    densifier.statistics["gradient_sum"] = torch.from_numpy(gradient)
+    densifier.statistics["visible_count"][:] = 1
+    return trainable, gradient
+
+
+def at(step: int, trainable: TrainableGaussians, rng: torch.Generator) -> Refinement:
+    return Refinement(step, trainable, rng, RefineEvent(step, len(trainable)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_edge_aware_score_of_each_gaussian(seed: int) -> None:
+    densifier, room = EdgeAware(score_views=2), Room()
+    trainable, _ = started(densifier, seed)
+    with torch.no_grad():
+        scores = densifier.edge_scores(trainable.values, 700, torch.Generator().manual_seed(seed))
+    drawn = torch.randperm(3, generator=torch.Generator().manual_seed(seed))[:2].tolist()
+    expected = np.zeros(COUNT)
+    for view in drawn:
+        weights = alphas(trainable.values.detach(), room.cameras[view])
+        expected += over_median((weights * find_edges(room.images[view])).sum((1, 2))) / 2
+    np.testing.assert_allclose(scores, expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("step", [600, 3100])
+@pytest.mark.parametrize("seed", range(2))
+def test_edge_aware_round(seed: int, step: int) -> None:
+    """Who is drawn becomes two halves along the longest axis; nobody else changes."""
+    densifier = EdgeAware(gradient_threshold=3e-4, max_gaussians=COUNT + 9, cap="hard")
+    trainable, gradient = started(densifier, seed)
+    rows, expected = to_rows(trainable), {}
+    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
+    over = gradient >= 3e-4
+    assert event.split_gradient == 9
+    assert event.blocked_by_cap == over.sum() - 9
+    rng = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        twin, _ = started(densifier, seed)
+        scores = densifier.edge_scores(twin.values, step, rng)
+    drawn = draw(torch.from_numpy(over), scores, 9, rng).numpy()
+    assert not (drawn & ~over).any()
+    rows = restatement.prune(halves(rows, np.where(drawn, 1.0, 0.0)), step, EXTENT, expected)
+    assert_same(trainable, rows)
+    assert expected == {name: getattr(event, name) for name in expected}
+    assert event.balances()
+
+
+def test_the_growth_control_is_a_root() -> None:
+    densifier = EdgeAware(max_gaussians=10_000, start=500, stop=15_000)
+    trainable, _ = started(densifier, 0)
+    rng = torch.Generator()
+    allowed = [densifier.allowance(at(step, trainable, rng)) for step in (600, 7500, 14_500, 14_900)]
+    assert allowed == [round(10_000 * np.sqrt(x)) - COUNT for x in (100 / 14_000, 0.5, 1, 1)]
+    densifier.max_gaussians = COUNT
+    assert densifier.allowance(at(7500, trainable, rng)) == 0
+    event = densifier.refine(7500, trainable, rng)
+    assert event.split_gradient == 0
+    assert event.blocked_by_cap > 0
+
+
+def taming_scores(trainable: TrainableGaussians, gradient: np.ndarray) -> np.ndarray:
+    """The score over all three views, term by term."""
+    room, values = Room(), trainable.values.detach()
+    scales, opacities = np.exp(values.log_scales.numpy()), 1 / (1 + np.exp(-values.opacity_logits.numpy()))
+    total = np.zeros(COUNT)
+    for view, camera in enumerate(room.cameras):
+        weights = alphas(values, camera)
+        render = ReferenceRasterizer().render(values, camera, 0, BLACK)
+        photograph = room.images[view].numpy() / 255
+        error = np.abs(render.image.detach().numpy() - photograph).mean(-1)
+        pixels = 50 * (error - error.min()) / (error.max() - error.min()) + 50 * find_edges(room.images[view])
+        local = values.means.numpy() @ camera.rotation.T + camera.translation
+        x = camera.fx * local[:, 0] / local[:, 2] + camera.cx - 0.5
+        y = camera.fy * local[:, 1] / local[:, 2] + camera.cy - 0.5
+        columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+        distance = np.hypot(columns - x[:, None, None], rows - y[:, None, None])
+        hit, radii = weights > 0, render.radii.numpy()
+        score = (
+            25 * over_median(gradient)
+            + 100 * over_median(opacities)
+            + 5 * over_median(np.where(radii > 0, local[:, 2], 0))
+            + 10 * over_median(radii)
+            + 25 * over_median(scales.prod(-1))
+            + 50 * over_median((hit * distance).sum((1, 2)))
+            + 10 * over_median((hit * pixels).sum((1, 2)))
+            + 0.1 * over_median(hit.sum((1, 2)))
+            + 50 * over_median(weights.sum((1, 2)))
+        )
+        loss = float(torch_photometric_loss(render.image.detach(), room.images[view])[0])
+        total += np.where(radii > 0, loss * score, 0)
+    return total + 1e-6
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_taming_round(seed: int) -> None:
+    """Scores, shares and draws; the other rules against the restatement of ADC."""
+    densifier = Taming(max_gaussians=COUNT + 12, cap="hard")
+    trainable, gradient = started(densifier, seed)
+    rows, expected = to_rows(trainable), {}
+    scores = taming_scores(trainable, gradient)
+    large = np.array([np.exp(row["log_scales"]).max() > 0.01 * EXTENT for row in rows])
+    over = gradient >= 2e-4
+    event = densifier.refine(600, trainable, torch.Generator().manual_seed(seed))
+    small_share, large_share = 12 * (over & ~large).sum() // over.sum(), 12 * (over & large).sum() // over.sum()
+    assert (event.cloned, event.split_gradient) == (small_share, large_share)
+    assert event.blocked_by_cap == over.sum() - small_share - large_share
+
+    rng = torch.Generator().manual_seed(seed)
+    torch.randperm(3, generator=rng)  # the views: all three
+    given = torch.from_numpy(scores)
+    cloned = draw(torch.from_numpy(over & ~large), given, small_share, rng).numpy()
+    split = draw(torch.from_numpy(over & large), given, large_share, rng).numpy()
+    noise = iter(torch.randn(2 * large_share, 3, generator=rng, dtype=torch.float64).numpy())
+    grown = restatement.adc_growth(rows, np.where(cloned | split, 1.0, 0.0), EXTENT, noise, expected)
+    faint = np.array([1 / (1 + np.exp(-row["opacity_logits"])) < 0.005 for row in grown])
+    assert not faint.any()  # nothing to prune yet
+    assert_same(trainable, grown)
+    assert event.balances()
+
+
+def test_taming_prunes_half_as_many_draws_as_there_are_to_prune() -> None:
+    densifier = Taming(max_gaussians=COUNT, cap="hard")
+    trainable, _ = started(densifier, 1)
+    trainable.values.opacity_logits.data[:40] = -9.0
+    event = densifier.refine(600, trainable, torch.Generator().manual_seed(0))
+    assert 0 < event.pruned_opacity <= 20
+    trainable, _ = started(densifier, 1)
+    trainable.values.opacity_logits.data[:40] = -9.0
+    late = densifier.refine(600 + 2700, trainable, torch.Generator().manual_seed(0))
+    assert late.pruned_opacity == late.pruned_size == 0  # after 27 rounds no more
+    assert densifier.statistics["score"].shape == (COUNT,)
+    assert not densifier.statistics["score"].any()
+
+
+def test_taming_follows_its_curve_and_ends_at_the_budget() -> None:
+    densifier = Taming(max_gaussians=150, gradient_threshold=1e-9, stop=1500, prune_opacity=0.0)
+    trainable, _ = started(densifier, 2)
+    counts, rng = [], torch.Generator().manual_seed(0)
+    for step in range(600, 1500, 100):
+        densifier.statistics["gradient_sum"] = torch.rand(len(trainable), generator=rng, dtype=torch.float64) + 0.1
+        densifier.statistics["visible_count"][:] = 1
+        counts.append(densifier.refine(step, trainable, rng).after)
+    progress = np.arange(1, 10) / 10
+    np.testing.assert_allclose(counts, COUNT + 90 * (2 * progress - progress**2), atol=2)
+
+
+@pytest.mark.parametrize("cap", ["soft", "freeze", "governor"])
+@pytest.mark.parametrize("kind", [EdgeAware, Taming])
+def test_caps_without_a_limit_are_refused(kind: type[ADC], cap: str) -> None:
+    with pytest.raises(InputError, match=r"densify\.cap must be"):
+        kind(cap=cap)  # type: ignore[arg-type]
+
+
+def test_without_views_it_says_what_is_missing() -> None:
+    densifier = Taming(max_gaussians=COUNT)
+    trainable, _ = started(densifier, 0)
+    densifier.context = DensifyContext(EXTENT)
+    with pytest.raises(RuntimeError, match=r"DensifyContext\.views"):
+        densifier.refine(600, trainable, torch.Generator())
