@@ -20,6 +20,7 @@ from gsbench.compose import compose_one, compose_trials
 from gsbench.errors import GsbenchError, InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
+from gsbench.gaussians.spherical_harmonics import colors
 from gsbench.launch.plan import add_to_plan
 from gsbench.pipeline.stages import EVALUATE, INIT, TRAIN
 from gsbench.pipeline.stale import explain_steps
@@ -217,6 +218,43 @@ def test_splat_is_what_gsplat_writes(gaussians: Gaussians) -> None:
     sizes = [struct.unpack_from("<3f", ours, 32 * i + 12) for i in range(len(gaussians))]
     weights = [x * y * z * ours[32 * i + 27] for i, (x, y, z) in enumerate(sizes)]
     assert weights[0] >= weights[len(weights) // 2] >= weights[-1]
+
+
+def test_spz_is_read_by_another_library(gaussians: Gaussians, tmp_path: Path) -> None:
+    """To half a step of each quantity; the file's axes are those of OpenGL."""
+    gsply = pytest.importorskip("gsply", reason="needs gsply (extra dev)")
+    far = gaussians.map(lambda tensor: tensor.clone())
+    far.means[0] = torch.tensor([3000.0, -1.0, 0.5])  # beyond the reference's 12 bits behind the point
+    write_ply(far, tmp_path / "a.ply")
+    export.export_model(tmp_path / "a.ply", "spz", tmp_path / "a.spz")
+    export.export_model(tmp_path / "a.ply", "spz", tmp_path / "b.spz")
+    assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
+    read = gsply.read_spz(tmp_path / "a.spz")
+    assert len(read.means) == len(far)
+    axes = np.array([1.0, -1.0, -1.0])
+    np.testing.assert_allclose(read.means * axes, far.means, atol=0.5 / 2**11)
+    np.testing.assert_allclose(read.scales, far.log_scales, atol=1 / 32 + 1e-5)
+    turned = torch.nn.functional.normalize(torch.tensor(read.quats * np.array([1.0, 1.0, -1.0, -1.0])).double(), dim=1)
+    cosines = (turned * torch.nn.functional.normalize(far.quaternions.double(), dim=1)).sum(dim=1).abs()
+    assert cosines.min() > np.cos(np.radians(0.25))
+    opacities = torch.sigmoid(torch.tensor(read.opacities).double())
+    torch.testing.assert_close(opacities, torch.sigmoid(far.opacity_logits.double()), atol=0.6 / 255, rtol=0)
+    np.testing.assert_allclose(read.sh0, far.sh_dc, atol=0.5 / (255 * 0.15) + 1e-6)
+    # A direction d in our axes is d * axes in the file's: the colours seen from there are the same.
+    seen = torch.nn.functional.normalize(torch.randn(len(far), 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    ours = colors(far.sh_dc, far.sh_rest, seen, 3)
+    theirs = colors(torch.tensor(read.sh0), torch.tensor(read.shN), seen * torch.tensor(axes).float(), 3)
+    assert (ours - theirs).abs().mean() < 0.05
+    mirrored = colors(torch.tensor(read.sh0), torch.tensor(read.shN), seen, 3)
+    assert (ours - mirrored).abs().mean() > 0.2  # the test would see wrong axes
+
+
+def test_sog_names_the_program_that_writes_it(
+    runs: Path, gaussians: Gaussians, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = finished_trial(runs, gaussians)
+    assert cli.run(["export", str(folder), "--out", "model.sog"]) == 2
+    assert "`splat-transform model.ply model.sog`" in capsys.readouterr().err
 
 
 def test_compressed_ply_is_small_and_readable(gaussians: Gaussians, tmp_path: Path) -> None:

@@ -19,8 +19,14 @@ if TYPE_CHECKING:
 FORMATS = {
     "ply": "the 3DGS point cloud, as every viewer and trainer reads it (248 bytes a Gaussian)",
     "splat": "antimatter15's .splat for browsers: 32 bytes a Gaussian, colour without view dependence",
+    "spz": "Niantic's .spz: about a tenth of the .ply, harmonics included",
     "compressed": "PlayCanvas's compressed .ply for SuperSplat: about 16 bytes a Gaussian and harmonics; needs gsplat",
 }
+# The command of the program that writes it, from its manual: developer.playcanvas.com/user-manual/splat-transform
+SOG = (
+    "gsbench writes no .sog: export {ply}, then `npm install -g @playcanvas/splat-transform` and `splat-transform "
+    "{ply} {sog}`"
+)
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -65,9 +71,10 @@ def export_model(ply: Path, form: str, out: Path) -> None:
         _write(out, lambda temporary: shutil.copyfile(ply, temporary))
         return
     from gsbench.gaussians.ply import read_ply
+    from gsbench.gaussians.spz import spz_bytes
 
-    gaussians = read_ply(ply)
-    content = splat_bytes(gaussians) if form == "splat" else compressed_bytes(gaussians)
+    writers = {"splat": splat_bytes, "spz": spz_bytes, "compressed": compressed_bytes}
+    content = writers[form](read_ply(ply))
     _write(out, lambda temporary: temporary.write_bytes(content))
 
 
@@ -130,6 +137,8 @@ def _format_of(out: Path) -> str:
     name = out.name.lower()
     if name.endswith(".compressed.ply"):
         return "compressed"
+    if name.endswith(".sog"):
+        raise InputError(SOG.format(ply=out.with_suffix(".ply"), sog=out))
     form = out.suffix.lower().lstrip(".")
     if form not in FORMATS:
         raise InputError(f"what is {out.name} to hold? give --to {', '.join(FORMATS)}")
