@@ -16,11 +16,12 @@ import pytest
 import torch
 
 from gsbench import cli
-from gsbench.compose import compose_one, compose_trials
+from gsbench.compose import compose_one
 from gsbench.errors import GsbenchError, InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.gaussians.spherical_harmonics import colors
+from gsbench.launch.hydra_app import compose_trials
 from gsbench.launch.plan import add_to_plan
 from gsbench.pipeline.stages import EVALUATE, INIT, TRAIN
 from gsbench.pipeline.stale import explain_steps

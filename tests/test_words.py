@@ -15,10 +15,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gsbench import cli
-from gsbench.compose import compose_trials, compose_values
+from gsbench.compose import compose_values
 from gsbench.config import GROUP_SCHEMAS, check_values, plain
 from gsbench.errors import InputError
 from gsbench.hashing import config_hash
+from gsbench.launch.hydra_app import compose_trials
 from gsbench.settings import option_fields
 
 REFUSED = {  # command line: a part of the line that refuses it
@@ -32,14 +33,22 @@ REFUSED = {  # command line: a part of the line that refuses it
     "SEED=1": "did you mean seed?",
     "seed.x=1": "seed.x is not a setting",
     "densify=none densify.start=4": "densify.start is not a setting",
-    "hydra.run.dir=x": "runs=FOLDER",
-    "hydra.sweep.dir=x": "runs=FOLDER",
     "hydra.job.chdir=true": "where the command was given",
-    "hydra.verbose=true": "log.txt",
-    "+hydra.callbacks.x._target_=os.system": "no callback is called",
+    "+experiment=moves --config-dir conf": "where the command was given",
+    "+hydra.callbacks.x._target_=os.system": "allow_targets=[os]",
+    "+hydra.callbacks.x.size=3": "hydra.callbacks.x names no _target_",
+    "+hydra.callbacks.x._target_=own.Nothing allow_targets=[own]": "own.Nothing",
+    "+experiment=calls --config-dir conf": "allow_targets=[os]",
     "hydra/job_logging=default": "does not read hydra/job_logging",
-    "hydra/launcher=joblib": "launch=serial, local or slurm",
-    "hydra.sweeper.params.seed=1": "-m seed=0,1,2",
+    "hydra/launcher=nosuch": "launch=serial, local or slurm",
+    "hydra/launcher=basic": "add -m",
+    "-m hydra/launcher=basic launch=local seed=0,1": "two launchers",
+    "-m hydra/launcher=basic train.iterations=2.5": "a whole number of at least 0, got 2.5",
+    "hydra/sweeper=nosuch": "choose: basic, gsbench",
+    "-m hydra.verbose=true,false": "Sweeping over Hydra's configuration",
+    "hydra.sweeper.parms=1": "did you mean params?",
+    "hydra.nosuch=1": "hydra.nosuch is not a setting",
+    "+hydra.sweeper.params.seed=1": "add -m",
     "hydra.searchpath=[file:///nosuch]": "no such folder",
     "--config-dir . --config-dir .": "names one folder",
     "--config-dir nosuch": "no such folder",
@@ -157,6 +166,12 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(sys, "path", list(sys.path))
     (tmp_path / "own.py").write_text(OWN)
     (tmp_path / "broken.py").write_text("def (:\n")
+    experiments = tmp_path / "conf" / "experiment"
+    experiments.mkdir(parents=True)
+    (experiments / "moves.yaml").write_text("# @package _global_\nhydra:\n  job:\n    chdir: true\n")
+    (experiments / "calls.yaml").write_text(
+        "# @package _global_\nhydra:\n  callbacks:\n    x:\n      _target_: os.system\n"
+    )
     for module in ("own", "broken"):
         monkeypatch.delitem(sys.modules, module, raising=False)
     return tmp_path

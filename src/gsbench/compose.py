@@ -1,58 +1,96 @@
-"""From a command line to configurations: one for a trial, many for a sweep; Hydra's errors in one line."""
+"""Configurations as Hydra composes them, made ready for trials; Hydra's errors in one line."""
 
 from __future__ import annotations
 
-import itertools
 import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-from hydra import compose, initialize_config_dir
+from hydra import initialize_config_dir
+from hydra._internal.hydra import Hydra
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from gsbench.command_words import GROUPS, check_sweep, check_words, is_sweep, options
+from gsbench.command_words import GROUPS, check_words, is_sweep, options
 from gsbench.config import Config, check, check_values, conf_dir, plain, register_schemas
 from gsbench.errors import InputError
+from gsbench.hydra_job import CONFIG_NAME, HydraJob, number_job, words_of
 from gsbench.settings import checked
 from gsbench.words import closest
 
 MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood
+PLUGIN_HINTS = {  # where a word may name a plug-in of Hydra's that is not installed
+    "hydra/launcher": "; other launchers are packages of their own, which launch=serial, local or slurm do not need",
+    "hydra/sweeper": "; other sweepers are packages of their own",
+}
 SEED = re.compile(r"seed=(\d+)")
 
 
 @dataclass(frozen=True)
 class Composed:
-    """The configuration of one trial: resolved values, the same as YAML, and the overrides that give it."""
+    """The configuration of one trial: resolved values, the same as YAML, and the overrides that give it.
+
+    ``job`` is what Hydra knows of the trial where it runs as a job of Hydra's.
+    """
 
     values: dict[str, Any]
     yaml: str
     overrides: tuple[str, ...]
+    job: HydraJob | None = field(default=None, compare=False, repr=False)
 
 
-def compose_trials(overrides: Sequence[str], multirun: bool = False) -> list[Composed]:
-    """The trials that ``overrides`` describe: one, or with ``multirun`` (or in an experiment that is a sweep) a grid.
+@contextmanager
+def composing() -> Iterator[Hydra]:
+    """Hydra with gsbench's configuration, as ``hydra.main`` would make it."""
+    register_schemas()
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(conf_dir()), version_base="1.3", job_name="gsbench"):
+            hydra = GlobalHydra.instance().hydra
+            assert hydra is not None
+            yield hydra
+    finally:
+        HydraConfig.instance().cfg = None
 
-    Raises InputError, one line, for what does not compose or does not hold together.
-    """
-    check_words(overrides)
-    swept = [word for word in overrides if is_sweep(word)]
-    with composing():
-        master = _compose([word for word in overrides if word not in swept], overrides, return_hydra_config=True)
-        hydra = master.hydra
-        if not (multirun or (OmegaConf.select(hydra, "mode") is not None and hydra.mode.name == "MULTIRUN")):
-            if swept:
-                raise InputError(f"{swept[0]} lists several values: add -m to run one trial for each")
-            with open_dict(master):
-                del master["hydra"]
-            return [_composed(master, overrides)]
-        parameters = [f"{key}={value}" for key, value in (hydra.sweeper.params or {}).items()]
-        return list(_sweep([*parameters, *overrides], overrides))
+
+def compose_master(hydra: Hydra, words: Sequence[str], mode: RunMode = RunMode.RUN) -> DictConfig:
+    """What Hydra makes of ``words``, with its own settings in the node ``hydra``. Raises InputError, one line."""
+    with explained(words), warnings.catch_warnings():
+        warnings.filterwarnings("error", message=r".* is not available\.", module="hydra")  # a folder to search in
+        return hydra.compose_config(CONFIG_NAME, list(words), run_mode=mode)
+
+
+def compose_jobs(
+    context: HydraContext, master: DictConfig, jobs: Sequence[Sequence[str]], first: int = 0
+) -> list[Composed]:
+    """The trials of a sweep from the words of each; those that differ in the seed alone share a composition."""
+    shared: dict[tuple[str, ...], DictConfig] = {}
+    trials = []
+    for_hydra, _ = words_of(master.hydra.overrides)
+    for number, words in enumerate(jobs, first):
+        given = (*for_hydra, *words)
+        seeds = [match for word in words if (match := SEED.fullmatch(word))]
+        rest = tuple(word for word in words if not SEED.fullmatch(word))
+        job = HydraJob(master, tuple(words), number, context.config_loader, context.callbacks)
+        if rest in shared:
+            config = shared[rest]
+            for match in seeds:
+                config.seed = checked(Config, {"seed": int(match.group(1))}, "")["seed"]
+            trials.append(_resolved(config, given, job))
+            continue
+        with explained(given):
+            config = context.config_loader.load_sweep_config(master, list(words))
+        number_job(config, number)
+        asks = settle(config, given)
+        trials.append(_resolved(config, given, job))
+        if not asks:
+            shared[rest] = config
+    return trials
 
 
 def compose_one(overrides: Sequence[str]) -> Composed:
@@ -60,86 +98,59 @@ def compose_one(overrides: Sequence[str]) -> Composed:
     check_words(overrides)
     if swept := [word for word in overrides if is_sweep(word)]:
         raise InputError(f"{swept[0]} lists several values: choose one")
-    with composing():
-        return _composed(_compose(overrides, overrides), overrides)
+    with composing() as hydra:
+        return ready_trial(compose_master(hydra, overrides), overrides)
 
 
 def compose_values(overrides: Sequence[str]) -> DictConfig:
     """The configuration to look at: every value is allowed, and what a trial needs may still be missing."""
-    with composing():
-        config = _compose(overrides, overrides)
-    with _errors(overrides):
-        check_values(config)
+    with composing() as hydra:
+        config = compose_master(hydra, overrides)
+        with explained(overrides):
+            _take_hydra_away(config)
+            check_values(config)
     return config
 
 
-def _sweep(words: Sequence[str], given: Sequence[str]) -> Iterator[Composed]:
-    """Every point of the grid; trials that differ in the seed alone share a composition."""
-    grid: dict[str, list[str]] = {}
-    for override in _parse_grid(words, given):
-        key = override.get_key_element()
-        if override.is_sweep_override():
-            check_sweep(override)
-            try:
-                grid[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
-            except ValueError as error:  # such as a range of steps of 0
-                raise InputError(f"{override.input_line}: {error}") from error
-            if not grid[key]:
-                raise InputError(f"{override.input_line} lists no value")
-        else:
-            grid[key] = [_text(override)]
-    known: dict[tuple[str, ...], DictConfig] = {}
-    for point in itertools.product(*grid.values()):
-        seeds = [match for word in point if (match := SEED.fullmatch(word))]
-        rest = tuple(word for word in point if not SEED.fullmatch(word))
-        if rest not in known:
-            known[rest] = _compose(point, given)
-            yield _composed(known[rest], point)
-            continue
-        config = known[rest]
-        for match in seeds:
-            config.seed = checked(Config, {"seed": int(match.group(1))}, "")["seed"]
-        yield _resolved(config, point)
+def ready_trial(config: DictConfig, overrides: Sequence[str], job: HydraJob | None = None) -> Composed:
+    """The trial of a composed configuration, checked, whose node ``hydra`` is taken away."""
+    settle(config, overrides)
+    return _resolved(config, overrides, job)
 
 
-def _parse_grid(words: Sequence[str], given: Sequence[str]) -> list[Override]:
-    with _errors(given):
-        return list(OverridesParser.create(GlobalHydra.instance().config_loader()).parse_overrides(list(words)))
+def settle(config: DictConfig, overrides: Sequence[str]) -> bool:
+    """Take the node ``hydra`` away from ``config`` and check what is left; whether a value asks Hydra (``${hydra:…}``).
 
-
-def _compose(words: Sequence[str], given: Sequence[str], return_hydra_config: bool = False) -> DictConfig:
-    """What Hydra makes of ``words``; its errors are explained in terms of what was ``given``."""
-    with _errors(given), warnings.catch_warnings():
-        warnings.filterwarnings("error", message=r".* is not available\.", module="hydra")  # a folder to search in
-        return compose("config", overrides=list(words), return_hydra_config=return_hydra_config)
-
-
-def _text(override: Override) -> str:
-    key = override.get_key_element()
-    return key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"
-
-
-def _composed(config: DictConfig, overrides: Sequence[str]) -> Composed:
-    with _errors(overrides):  # such as an interpolation that leads nowhere
+    Such a value differs from trial to trial, or may.
+    """
+    with explained(overrides):  # such as an interpolation that leads nowhere
+        asks = _take_hydra_away(config)
         check(config)
-        return _resolved(config, overrides)
+    return asks
 
 
-def _resolved(config: DictConfig, overrides: Sequence[str]) -> Composed:
-    return Composed(plain(config), OmegaConf.to_yaml(config, resolve=True), tuple(overrides))
+def _take_hydra_away(config: DictConfig) -> bool:
+    raw = OmegaConf.to_container(config, resolve=False)
+    assert isinstance(raw, dict)
+    if "hydra" not in raw:  # Hydra has taken it already, and knows it: it runs the job
+        return True
+    del raw["hydra"]
+    asks = "${hydra" in repr(raw)
+    if asks:
+        HydraConfig.instance().set_config(config)
+    with open_dict(config):
+        del config["hydra"]
+    return asks
+
+
+def _resolved(config: DictConfig, overrides: Sequence[str], job: HydraJob | None) -> Composed:
+    with explained(overrides):
+        return Composed(plain(config), OmegaConf.to_yaml(config, resolve=True), tuple(overrides), job)
 
 
 @contextmanager
-def composing() -> Iterator[None]:
-    """Hydra, ready to compose from ``conf``."""
-    register_schemas()
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(conf_dir()), version_base="1.3", job_name="gsbench"):
-        yield
-
-
-@contextmanager
-def _errors(overrides: Sequence[str]) -> Iterator[None]:
+def explained(overrides: Sequence[str]) -> Iterator[None]:
+    """Raise what the block raises as InputError, one line in terms of the words that were given."""
     try:
         yield
     except InputError:
@@ -180,7 +191,8 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
         wanted, name = missing.group(1), missing.group(2)
         choices = sorted({*options(name), *re.findall(r"[\w.-]+", missing.group(3))})
         word = wanted.rpartition("/")[2]
-        return f"{name}={word} does not exist{closest(word, choices)} (choose: {', '.join(choices)})"
+        near = closest(word, choices) or PLUGIN_HINTS.get(name, "")
+        return f"{name}={word} does not exist{near} (choose: {', '.join(choices)})"
     absent = re.search(r"[Mm]issing mandatory value: ([\w.]+)", text)
     if absent:
         return f"{absent.group(1)} is not set: give it a value"
@@ -203,13 +215,13 @@ def _chain(error: BaseException | None) -> list[str]:
 def _keys_below(parent: str, overrides: Sequence[str]) -> list[str]:
     """The settings below ``parent`` with the group choices among ``overrides``, as far as these compose."""
     choices = [word for word in overrides if re.fullmatch(r"\w+=[\w-]+", word) and word.split("=")[0] in GROUPS]
-    with composing():
+    with composing() as hydra:
         try:
-            config = compose("config", overrides=choices)
+            config = hydra.compose_config(CONFIG_NAME, choices, RunMode.RUN)
         except Exception:  # noqa: BLE001 - the choices may be what is wrong
-            config = compose("config")
+            config = hydra.compose_config(CONFIG_NAME, [], RunMode.RUN)
     node = OmegaConf.select(config, parent) if parent else config
-    return [str(key) for key in node] if isinstance(node, DictConfig) else []
+    return [str(key) for key in node if key != "hydra"] if isinstance(node, DictConfig) else []
 
 
 def options_text() -> str:

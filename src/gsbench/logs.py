@@ -3,22 +3,44 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 LOGGER = logging.getLogger("gsbench")
 
 
+class _People(logging.StreamHandler):
+    """Shows lines from INFO on, and all of the loggers that are ``watched``."""
+
+    watched: tuple[str, ...] = ()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        family = f"{record.name}."
+        return record.levelno >= logging.INFO or any(family.startswith(f"{name}.") for name in self.watched)
+
+
 def set_up_logging() -> None:
     """Show what gsbench logs, from INFO on, on stderr."""
     if not LOGGER.handlers:
-        handler = logging.StreamHandler()
+        handler = _People()
         handler.setFormatter(logging.Formatter("%(message)s"))
-        handler.setLevel(logging.INFO)
         LOGGER.addHandler(handler)
         LOGGER.setLevel(logging.DEBUG)
         LOGGER.propagate = False
+
+
+def show_details(loggers: bool | str | Sequence[str]) -> None:
+    """Show on stderr also what these loggers log for debugging; ``True`` (as ``hydra.verbose``) means gsbench's own."""
+    if isinstance(loggers, bool):
+        loggers = [LOGGER.name] * loggers
+    names = [loggers] if isinstance(loggers, str) else list(loggers)
+    for people in (handler for handler in LOGGER.handlers if isinstance(handler, _People)):
+        people.watched = tuple(names)
+        for logger in map(logging.getLogger, names):
+            logger.setLevel(logging.DEBUG)
+            if not f"{logger.name}.".startswith(f"{LOGGER.name}.") and people not in logger.handlers:
+                logger.addHandler(people)
 
 
 @contextmanager

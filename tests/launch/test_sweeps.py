@@ -12,13 +12,14 @@ from typing import Any
 import pytest
 
 from gsbench.command_words import GROUPS, options, parse
-from gsbench.compose import Composed, compose_one, compose_trials
+from gsbench.compose import Composed, compose_one
 from gsbench.config import check_target
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError, explain_storage
 from gsbench.hashing import config_hash
 from gsbench.launch import serial
 from gsbench.launch.command import launch, run_trials
+from gsbench.launch.hydra_app import compose_trials
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.plan import (
     Estimator,

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsbench.compose import Composed
 from gsbench.errors import InputError
+from gsbench.hydra_job import HydraJob
 from gsbench.install import install_command
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.queue import forget_submission
@@ -46,6 +47,7 @@ class TrialJob:
     yaml: str
     path: list[str]  # sys.path of the submitting process
     visible_gpus: str | None  # its CUDA_VISIBLE_DEVICES
+    job: HydraJob | None = None
 
     def __call__(self) -> Outcome:
         sys.path[:] = [*self.path, *(entry for entry in sys.path if entry not in self.path)]
@@ -62,7 +64,7 @@ class TrialJob:
                 assign_threads(self.values["threads"], launch["parallel"])
                 from gsbench.launch.serial import run_one
 
-                outcome = run_one(Composed(self.values, self.yaml, ()), wait=True)
+                outcome = run_one(Composed(self.values, self.yaml, (), self.job), wait=True)
                 if launch["name"] == "slurm":
                     with suppress(OSError):
                         forget_submission(outcome.folder)
@@ -147,9 +149,9 @@ def collect(job: Job[Outcome], folder: Path, trials: Sequence[Composed]) -> Outc
 
 def job_of(trial: Composed) -> TrialJob:
     """The trial as a job of the environment that this process has."""
-    return TrialJob(
-        trial.values, trial.yaml, [entry for entry in sys.path if entry], os.environ.get("CUDA_VISIBLE_DEVICES")
-    )
+    job = None if trial.job is None else trial.job.for_another_process()
+    path = [entry for entry in sys.path if entry]
+    return TrialJob(trial.values, trial.yaml, path, os.environ.get("CUDA_VISIBLE_DEVICES"), job)
 
 
 def prepare_tracking(values: dict[str, Any]) -> None:

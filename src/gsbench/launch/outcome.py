@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +11,7 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.files import DiskFullError
 from gsbench.pipeline.trial_files import label_of
 
+OBJECTIVE = "psnr"  # what a trial returns to Hydra's sweepers
 Status = Literal["done", "failed", "queued"]
 
 
@@ -25,6 +27,7 @@ class Outcome:
     message: str = ""
     bad_input: bool = False
     fatal: bool = False  # no other trial can succeed either
+    metrics: Mapping[str, float] | None = None  # of a trial that is done
 
     @property
     def label(self) -> str:
@@ -34,7 +37,7 @@ class Outcome:
 def outcome_of_results(folder: Path, results: dict[str, Any]) -> Outcome:
     """The outcome of a trial that is complete."""
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results["metrics"].items())
-    return Outcome(folder, "done", metrics)
+    return Outcome(folder, "done", metrics, metrics=results["metrics"])
 
 
 def outcome_of_error(folder: Path, error: Exception) -> Outcome:
@@ -43,3 +46,8 @@ def outcome_of_error(folder: Path, error: Exception) -> Outcome:
         return Outcome(folder, "failed", str(error), isinstance(error, InputError), isinstance(error, DiskFullError))
     text = f"{type(error).__name__}: {error}".splitlines()[0]
     return Outcome(folder, "failed", f"{text}; the traceback is in {folder / 'log.txt'}")
+
+
+def objective(metrics: Mapping[str, float]) -> float | None:
+    """What a trial with these metrics returns to Hydra's sweepers and callbacks."""
+    return metrics.get(OBJECTIVE)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 from gsbench.compose import Composed
-from gsbench.launch.outcome import Outcome, outcome_of_error, outcome_of_results
-from gsbench.pipeline.locks import BusyError
-from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.launch.outcome import Outcome, objective, outcome_of_error, outcome_of_results
+from gsbench.layout import LOCK
+from gsbench.pipeline.locks import BusyError, describe_holder, is_held
+from gsbench.pipeline.trial_files import TrialPaths, label_of
 
 log = logging.getLogger(__name__)
 
@@ -34,10 +37,19 @@ def run_one(trial: Composed, wait: bool) -> Outcome:
     """Run one trial; only BusyError, and what ends the program, is raised."""
     folder = TrialPaths.of(trial.values).folder
     try:
-        from gsbench.pipeline.trial import run_trial  # here, because a sweep that is done needs no torch
-
-        return outcome_of_results(folder, run_trial(trial.values, trial.yaml, wait))
+        if trial.job is None:
+            return outcome_of_results(folder, _run(trial, wait))
+        if not wait and is_held(folder / LOCK):  # before Hydra's callbacks hear of a start
+            raise BusyError(f"{label_of(folder)}: {describe_holder(folder / LOCK)} is at it")
+        results = trial.job.run(partial(_run, trial, wait), lambda results: objective(results["metrics"]))
+        return outcome_of_results(folder, results)
     except BusyError:
         raise
     except Exception as error:  # noqa: BLE001 - a failed trial does not stop the others
         return outcome_of_error(folder, error)
+
+
+def _run(trial: Composed, wait: bool) -> dict[str, Any]:
+    from gsbench.pipeline.trial import run_trial  # here, because a sweep that is done needs no torch
+
+    return run_trial(trial.values, trial.yaml, wait)

@@ -34,7 +34,7 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
     )
     parser.add_argument("trial", nargs="+", help="a trial's folder, or the settings of one (scene=... densify=...)")
     words = parser.parse_args(argv).trial
-    from gsbench.compose import compose_trials
+    from gsbench.launch.hydra_app import compose_trials
     from gsbench.pipeline.entered import is_entered
     from gsbench.pipeline.stale import explain_steps
     from gsbench.pipeline.store import Store

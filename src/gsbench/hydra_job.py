@@ -1,0 +1,102 @@
+"""A trial as a job of Hydra: what ``${hydra:…}``, ``hydra.job.env_set``, Hydra's folders and callbacks belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from hydra.core.utils import run_job, setup_globals
+from hydra.types import HydraContext, RunMode
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+
+from gsbench.logs import show_details
+
+if TYPE_CHECKING:
+    from hydra._internal.callbacks import Callbacks
+    from hydra.core.config_loader import ConfigLoader
+
+CONFIG_NAME = "config"  # conf/config.yaml
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class HydraJob:
+    """One job of a run or sweep whose configuration, with the node ``hydra``, is ``master``.
+
+    ``words`` are the job's own and ``number`` its place in the sweep; a single run has none. The configuration is
+    composed when the job begins, unless it is ``ready``.
+    """
+
+    master: DictConfig
+    words: tuple[str, ...] = ()
+    number: int | None = None
+    loader: ConfigLoader | None = None
+    callbacks: Callbacks | None = None  # None: made anew from the configuration
+    ready: bool = False
+
+    def composed(self) -> DictConfig:
+        """The job's configuration with the node ``hydra``."""
+        if self.ready:
+            return self.master
+        if self.number is None:
+            return start(self.master, RunMode.RUN)
+        assert self.loader is not None
+        config = self.loader.load_sweep_config(self.master, list(self.words))
+        number_job(config, self.number)
+        return start(config, RunMode.MULTIRUN)
+
+    def for_another_process(self) -> HydraJob:
+        """The same job without what belongs to this process; the classes of a user's callbacks are imported there."""
+        return replace(self, master=self.composed(), loader=None, callbacks=None, ready=True)
+
+    def run(self, work: Callable[[], Result], value_of: Callable[[Result], object]) -> Result:
+        """Do ``work`` as Hydra runs a job; ``value_of`` its result is what callbacks are told. Raises what it raises.
+
+        Hydra would hand an error back in place of a result, and write a line of its own on looking at it.
+        """
+        from hydra._internal.callbacks import Callbacks
+
+        setup_globals()  # the resolvers, in a process where nothing was composed
+        config = self.composed()
+        show_details(config.hydra.verbose)
+        ended: list[Result] = []
+        errors: list[Exception] = []
+
+        def task(_: DictConfig) -> object:
+            try:
+                ended.append(work())
+            except Exception as error:
+                errors.append(error)
+                raise
+            return value_of(ended[0])
+
+        callbacks = self.callbacks if self.callbacks is not None else Callbacks(config)
+        folder, subfolder = (
+            ("hydra.run.dir", None) if self.number is None else ("hydra.sweep.dir", "hydra.sweep.subdir")
+        )
+        context = HydraContext(self.loader, callbacks)  # type: ignore[arg-type] # a job asks it for callbacks alone
+        run_job(task, config, folder, subfolder, hydra_context=context, configure_logging=False)
+        if errors:
+            raise errors[0]
+        return ended[0]
+
+
+def number_job(config: DictConfig, number: int) -> None:
+    """Give a job its place in the sweep."""
+    with read_write(config.hydra), open_dict(config.hydra):
+        config.hydra.job.num = number
+        config.hydra.job.id = str(number)
+
+
+def start(config: DictConfig, mode: RunMode) -> DictConfig:
+    """``config`` with the mode it runs in, which Hydra takes from a command line as well as from a file."""
+    with read_write(config.hydra), open_dict(config.hydra):
+        config.hydra.mode = mode
+    return config
+
+
+def words_of(overrides: Any) -> tuple[list[str], list[str]]:
+    """The words for Hydra and those for gsbench of a node ``hydra.overrides``, as they were given."""
+    given: Any = OmegaConf.to_container(overrides, resolve=False)
+    return given["hydra"], given["task"]

@@ -1,0 +1,100 @@
+"""A batch of trials: skip what is done, check the rest before any work, run it; how each ended."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from gsbench.compose import Composed
+from gsbench.errors import InputError
+from gsbench.files import checked_runs_folder, make_runs_folder, storage_errors
+from gsbench.launch.outcome import Outcome, outcome_of_results
+from gsbench.launch.plan import add_to_plan
+from gsbench.launch.preflight import check_components, missing_folders, missing_weights
+from gsbench.launch.serial import run_serial
+from gsbench.layout import STORE
+from gsbench.pipeline.stages import STAGES
+from gsbench.pipeline.stopping import stop_on_signals
+from gsbench.pipeline.store import Store
+from gsbench.pipeline.trial_files import TrialPaths, find_finished
+from gsbench.tracking import prepare
+
+log = logging.getLogger(__name__)
+
+
+def run_batch(trials: Sequence[Composed]) -> list[Outcome]:
+    """Run what is not done among ``trials`` by the launcher that they name; how each ended."""
+    runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
+    with storage_errors(runs), stop_on_signals():
+        if launcher != "slurm" and (missing := missing_weights(trials)):  # also where all is done and none is needed
+            raise InputError("; ".join(missing))
+        outcomes, unfinished = _skip_finished(trials)
+        _begin(trials, unfinished)
+        if unfinished:
+            if launcher == "serial":
+                outcomes += run_serial(unfinished)
+            elif launcher == "local":
+                from gsbench.launch.jobs import run_local
+
+                outcomes += run_local(unfinished)
+            else:
+                from gsbench.launch.slurm import run_slurm
+
+                outcomes += run_slurm(unfinished)
+    return outcomes
+
+
+def begin_for_another_launcher(trials: Sequence[Composed]) -> None:
+    """All that precedes the first trial where a launcher of somebody else's will run them, several at once perhaps."""
+    values = trials[0].values
+    runs = checked_runs_folder(values["runs"])
+    with storage_errors(runs):
+        _begin(trials, [trial for trial in trials if find_finished(trial.values, _unavailable_metrics) is None])
+        prepare(values["tracking"], TrialPaths.of(values).runs, values["name"])
+
+
+def _begin(trials: Sequence[Composed], unfinished: Sequence[Composed]) -> None:
+    """Refuse what can be known to fail, then make the runs folder, tidy the store and write the plan."""
+    runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
+    # A node of a cluster may have folders and devices that this machine lacks.
+    if launcher != "slurm" and (missing := missing_folders(unfinished)):
+        raise InputError("; ".join(missing))
+    check_components(unfinished, here=launcher != "slurm")
+    make_runs_folder(runs)
+    Store(runs / STORE).sweep(STAGES)
+    add_to_plan(trials)
+
+
+def _skip_finished(trials: Sequence[Composed]) -> tuple[list[Outcome], list[Composed]]:
+    outcomes: list[Outcome] = []
+    unfinished: list[Composed] = []
+    seen: set[Path] = set()
+    for trial in trials:
+        folder = TrialPaths.of(trial.values).folder
+        if folder in seen:  # a sweep may list a value twice
+            continue
+        seen.add(folder)
+        results = find_finished(trial.values, _unavailable_metrics)
+        if results is None:
+            unfinished.append(trial)
+        else:
+            outcomes.append(outcome_of_results(folder, results))
+            log.info("%s: was done  %s", outcomes[-1].label, outcomes[-1].message)
+    return outcomes, unfinished
+
+
+def _unavailable_metrics(options: dict[str, Any]) -> frozenset[str]:
+    return _unavailable(json.dumps(options, sort_keys=True))
+
+
+@cache
+def _unavailable(options: str) -> frozenset[str]:
+    """The metrics that cannot be computed here and now; weights are looked for, and fetched, once for a sweep."""
+    from gsbench.config import EvalConfig
+    from gsbench.pipeline.components import make_evaluator
+
+    return frozenset(make_evaluator(EvalConfig(**json.loads(options))).awaited)
