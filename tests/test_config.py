@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from gsbench.config import TrainConfig, check, check_target, conf_dir, plain, register_schemas
 from gsbench.errors import InputError
 from gsbench.hashing import config_hash
-from gsbench.pipeline.components import build
+from gsbench.pipeline.components import build, build_metrics
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch")
 
@@ -122,6 +122,37 @@ def test_rules_name_the_key(overrides: list[str], key: str) -> None:
         composed(*overrides)
 
 
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["eval.primary=lpips_vg"], r"is no metric; did you mean lpips_vgg\? \(known are psnr, ssim, .*flip"),
+        (["eval.primary=sharpness"], "is no metric .*eval.extra"),
+        (["eval.primary=lpips_alex", "eval.lpips=[vgg]"], r"lpips_alex is not measured: add alex to eval\.lpips"),
+        (["eval.primary=flip", "eval.flip=false"], r"eval\.flip=false"),
+    ],
+)
+def test_a_declared_metric_exists_and_is_measured(words: list[str], error: str) -> None:
+    with pytest.raises(InputError, match=error):
+        composed(*words)
+
+
+def test_a_metric_of_ones_own_can_be_declared_if_it_says_what_is_better(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    text = "class Known:\n    direction = 1\n    def measure(self, image, truth): return 1.0\n"
+    text += "class Unknown(Known):\n    direction = 0\n"
+    (tmp_path / "declared_metrics.py").write_text(text)
+    for name in ("Known", "Unknown"):
+        own = [f"eval.extra.mine._target_=declared_metrics.{name}", "allow_targets=[declared_metrics]"]
+        values = composed(*own, "eval.primary=mine")["eval"]
+        if name == "Known":
+            assert set(build_metrics(values, ["declared_metrics"])) == {"mine"}
+        else:
+            with pytest.raises(InputError, match=r"eval\.primary=mine: declared_metrics\.Unknown does not say"):
+                build_metrics(values, ["declared_metrics"])
+
+
 def test_wrong_type_in_a_component_names_the_key() -> None:
     with pytest.raises(InputError, match=r"densify\.max_gaussians"):
         build("densify", composed("densify.max_gaussians=1.5")["densify"], [])
@@ -140,6 +171,7 @@ def test_only_trusted_code_is_imported() -> None:
 def test_hash_ignores_what_cannot_change_a_result() -> None:
     base = config_hash(composed())
     assert config_hash(composed("name=other", "seed=5", "threads=1", "tracking=none", "device=cpu")) == base
+    assert config_hash(composed("eval.primary=psnr")) == base  # how a result will be read does not change it
     assert config_hash(composed("densify.volume_threshold=0.04")) != base
     assert config_hash(composed("scene.max_size=200")) != base
 

@@ -13,7 +13,7 @@ from hydra.errors import HydraException
 
 from gsbench.config import COMPONENTS, conf_dir
 from gsbench.errors import InputError
-from gsbench.hashing import NOT_HASHED, WITHOUT_EFFECT
+from gsbench.hashing import DECLARED, NOT_HASHED, WITHOUT_EFFECT
 from gsbench.words import closest
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")
@@ -114,7 +114,8 @@ def check_sweep(override: Override) -> None:
     if not override.is_discrete_sweep():
         raise InputError(f"{override.input_line}: a sweep is a list of values, such as {key}=1,2,3")
     first, _, last = key.partition(".")
-    if (first in NOT_HASHED and first not in NAMED_APART) or last in WITHOUT_EFFECT:
+    without_effect = last in (*WITHOUT_EFFECT, *DECLARED.get(first, ()))
+    if (first in NOT_HASHED and first not in NAMED_APART) or without_effect:
         raise InputError(f"{override.input_line}: {key} makes no other trial, so choose one value of it")
 
 

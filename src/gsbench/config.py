@@ -21,7 +21,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.eval.facts import known_keys, lpips_variants
+from gsbench.eval.facts import LPIPS, find, known_keys, lpips_variants
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.layout import IN_RUNS
 from gsbench.placeholders import program_of
@@ -165,6 +165,7 @@ class EvalConfig:
     flip: bool = True
     extra: dict[str, Any] = field(default_factory=dict)  # metrics of your own: {name: {_target_: mine.MyMetric}}
     at: Annotated[list[PositiveInt], Predicate(are_different), doc(AT_RULE)] = field(default_factory=list)
+    primary: str | None = None  # the metric of the verdict, declared before results are seen; null: none was
     maps: bool = False  # keep maps of depth, volume and distance to the initial cloud: where an arm helps
     weights: PathName | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
     download: bool = True  # fetch missing weights, checked by checksum
@@ -179,6 +180,22 @@ class EvalConfig:
                 )
             if not isinstance(options, Mapping) or "_target_" not in options:
                 raise InputError(f"eval.extra.{name} must name a class, as eval.extra.{name}._target_=mine.MyMetric")
+        if self.primary is not None and self.primary not in self.extra:
+            self._check_primary(self.primary)
+
+    def _check_primary(self, key: str) -> None:
+        """Raise InputError unless one of gsbench's own metrics, which these settings ask for, has this key."""
+        facts = find(key)
+        if facts is None:
+            known = [*known_keys(), *self.extra]
+            raise InputError(
+                f"eval.primary={key} is no metric{closest(key, known)} (known are {', '.join(known)}; a metric of your "
+                "own by the name that it has under eval.extra)"
+            )
+        if facts.setting == "eval.flip" and not self.flip:
+            raise InputError("eval.primary=flip is not measured with eval.flip=false")
+        if facts.setting == "eval.lpips" and key.removeprefix(LPIPS) not in self.lpips:
+            raise InputError(f"eval.primary={key} is not measured: add {key.removeprefix(LPIPS)} to eval.lpips")
 
 
 @dataclass

@@ -9,6 +9,7 @@ from typing import Any
 from gsbench.source import source_of
 
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")  # options that cannot change a result
+DECLARED = {"eval": ("primary",)}  # settings of a group that say how results will be read, whatever they are
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
 # Settings that are younger than the first results, with the default at which a result is what it was before them. There
 # they are left out of hashes and keys, so that nothing is computed anew for a setting that changes nothing.
@@ -24,7 +25,8 @@ def config_hash(values: dict[str, Any]) -> str:
     kept = {key: value for key, value in values.items() if key not in NOT_HASHED}
     for key, group in kept.items():
         if isinstance(group, dict):
-            kept[key] = without_later(key, {name: value for name, value in group.items() if name not in WITHOUT_EFFECT})
+            dropped = (*WITHOUT_EFFECT, *DECLARED.get(key, ()))
+            kept[key] = without_later(key, {name: value for name, value in group.items() if name not in dropped})
     return sha256_of(_with_sources(kept))
 
 

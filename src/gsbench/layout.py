@@ -12,6 +12,7 @@ IN_RUNS = (STORE, ARTIFACTS, DATABASE)
 
 # in an experiment's folder
 PLAN = "plan.json"  # the trials that were asked for
+DECLARED = "declared.jsonl"  # the metrics that verdicts were declared to be about, and when
 TRIAL_GLOB = "*/*/*-seed*"  # the trials that are there
 
 # in a trial's folder

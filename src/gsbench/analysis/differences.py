@@ -12,7 +12,10 @@ from gsbench.source import OWN, SHOWN
 Versions = dict[str, list[Trial]]  # version -> the trials that it made
 
 # Settings in which trials of one cell may differ: they name the trial or say where it runs, not what is computed.
-IGNORED_SETTINGS = ("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path")
+IGNORED_SETTINGS = (
+    *("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path"),
+    "eval.primary",
+)
 CODE = "code of "  # how the keys of ``Trial.code`` start that are a user's own classes
 CLASSES = ("init._target_", "densify._target_")
 

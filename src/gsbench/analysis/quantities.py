@@ -83,6 +83,11 @@ def quantity(name: str, trials: Iterable[Trial]) -> Quantity:
     raise InputError(f"unknown metric {name!r}; choose among {', '.join([*metric_keys(trials, known_keys()), *COSTS])}")
 
 
+def metric_quantity(key: str, trials: Iterable[Trial]) -> Quantity:
+    """The metric ``key`` at the end of trials; of a user's own that no trial has, nothing but the key is known."""
+    return _metric(key, "", list(trials))
+
+
 def metric_keys(trials: Iterable[Trial], wanted: Container[str] = ()) -> list[str]:
     """The metrics that some trial has or that are ``wanted``, in the order of tables; a user's own come last."""
     present = {key for trial in trials for key in trial.metrics}

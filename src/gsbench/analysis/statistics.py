@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +19,14 @@ from scipy import special
 from gsbench.analysis.pairing import Paired
 
 ALPHA = 0.05
-MIN_SCENES = 6  # the exact test over n units cannot give p below 2^(1 - n): six are the fewest that reach 5 %
-MIN_PAIRS = 6
+MIN_SCENES = 6  # scenes of which a statement about scenes like these is made
 MAX_ENUMERATED = 16  # units whose 2^n sign patterns are all tried
 RANDOM_FLIPS = 100_000
 BOOTSTRAP_SAMPLES = 4000
 POWER = 0.8
 MAX_SEEDS = 1000
 
+TOO_FEW = " (too few for an exact test)"
 NOT_REPEATED = "none, since no trial was repeated with another seed"
 SCENES_LIKE_THESE, THESE_SCENES, THIS_SCENE = "scenes like these", "these scenes", "this scene"
 
@@ -64,8 +64,9 @@ class SceneComparison:
 class Comparison:
     """Second arm minus first in one metric, averaged over scenes.
 
-    ``scope`` is what the verdict speaks of ("scenes like these", "these scenes" or "this scene"), ``test`` the test
-    behind ``p``. ``effect_size`` is the mean difference in deviations of the units tested (Cohen's d for pairs), None
+    ``p`` is of this comparison alone, ``p_family`` adjusted for the ``family`` of comparisons that it was one of, by
+    Holm. ``scope`` is what the verdict speaks of ("scenes like these", "these scenes" or "this scene"), ``test`` what
+    gave ``p``. ``effect_size`` is the mean difference in deviations of the units tested (Cohen's d for pairs), None
     with fewer than two. ``interval`` is the bootstrap interval. ``verdict`` is better, worse or "no evidence".
     """
 
@@ -81,19 +82,23 @@ class Comparison:
     scenes: tuple[SceneComparison, ...]
     seed_deviation: float | None
     left_out: tuple[str, ...]
+    p_family: float | None
+    family: int = 1
 
 
-def compare(paired: Paired, direction: int, samples: int = BOOTSTRAP_SAMPLES, seed: int = 0) -> Comparison:
+def compare(
+    paired: Paired, direction: int, samples: int = BOOTSTRAP_SAMPLES, seed: int = 0, family: int = 1
+) -> Comparison:
     """Compare two arms; ``direction`` is +1 where more of the metric is better, -1 where less is.
 
-    The verdict is better or worse only where the test's p is below 5 % and the bootstrap interval excludes zero.
+    The verdict is better or worse only where the test's p is below 5 % and the bootstrap interval excludes zero. The
+    test is chosen for one of ``family`` comparisons; `compare_family` adjusts for their number.
     """
     per_trial = [matrix.mean(axis=1) for matrix in paired.differences]  # [K] for each scene
     per_scene = np.array([values.mean() for values in per_trial])  # [S]
     mean = float(per_scene.mean())
-    p, test, scope, units = _overall_test(per_trial, per_scene)
+    p, test, scope, units = _overall_test(per_trial, per_scene, family)
     interval = bootstrap_interval(paired.differences, scope == SCENES_LIKE_THESE, samples, np.random.default_rng(seed))
-    decided = p is not None and p < ALPHA and interval is not None and interval.excludes_zero()
     return Comparison(
         metric=paired.metric,
         mean=mean,
@@ -103,25 +108,66 @@ def compare(paired: Paired, direction: int, samples: int = BOOTSTRAP_SAMPLES, se
         test=test,
         scope=scope,
         effect_size=_standardised(units),
-        verdict="no evidence" if not decided else "better" if mean * direction > 0 else "worse",
+        verdict=_verdict(p, interval, mean * direction),
         scenes=_scene_comparisons(paired, per_trial, direction),
         seed_deviation=pooled_deviation(per_trial),
         left_out=paired.left_out,
+        p_family=p,
     )
 
 
-def _overall_test(per_trial: Sequence[Array], per_scene: Array) -> tuple[float | None, str, str, Array]:
-    """(p, test, scope, units tested): over scenes where there are enough, else over trials."""
+def compare_family(
+    members: Sequence[tuple[Paired, int]], samples: int = BOOTSTRAP_SAMPLES, seed: int = 0
+) -> list[Comparison]:
+    """Compare each of ``members`` (pairs of arms in one metric, direction) as one of a family of questions.
+
+    The chance that any verdict of the family is false is held at 5 %, by Holm's method.
+    """
+    size = len(members)
+    found = [compare(paired, direction, samples, seed, size) for paired, direction in members]
+    return [
+        replace(one, p_family=p, family=size, verdict=_verdict(p, one.interval, one.mean * direction))
+        for one, p, (_, direction) in zip(found, holm([one.p for one in found]), members, strict=True)
+    ]
+
+
+def _verdict(p: float | None, interval: Interval | None, gain: float) -> str:
+    decided = p is not None and p < ALPHA and interval is not None and interval.excludes_zero()
+    return "no evidence" if not decided else "better" if gain > 0 else "worse"
+
+
+def units_needed(family: int = 1) -> int:
+    """The fewest units with which the exact test can reach 5 % as one of ``family`` tests that Holm adjusts.
+
+    Over n units it cannot give p below 2^(1 - n).
+    """
+    return 1 + math.ceil(math.log2(family / ALPHA))
+
+
+def _overall_test(per_trial: Sequence[Array], per_scene: Array, family: int) -> tuple[float | None, str, str, Array]:
+    """(p, test, scope, units tested): over scenes where there are enough, else over trials.
+
+    Where the units are too few for the exact test to reach 5 %, Student's t is taken; that hangs on numbers of trials,
+    scenes and comparisons alone, never on a result.
+    """
+    needed = units_needed(family)
     if len(per_scene) >= MIN_SCENES:
-        test = f"exact sign flips of {len(per_scene)} scenes"
-        return sign_flip_p(per_scene, np.ones(len(per_scene))), test, SCENES_LIKE_THESE, per_scene
+        count = len(per_scene)
+        if count >= needed:
+            return (
+                sign_flip_p(per_scene, np.ones(count)),
+                f"exact sign flips of {count} scenes",
+                SCENES_LIKE_THESE,
+                per_scene,
+            )
+        return stratified_t_p([per_scene]), f"Student's t over {count} scenes{TOO_FEW}", SCENES_LIKE_THESE, per_scene
     scope = THESE_SCENES if len(per_scene) > 1 else THIS_SCENE
     pairs = np.concatenate(list(per_trial))  # [sum of K]
     weights = np.concatenate([np.full(len(values), 1 / len(values)) for values in per_trial])
-    if len(pairs) >= MIN_PAIRS:
+    if len(pairs) >= needed:
         return sign_flip_p(pairs, weights), f"exact sign flips of {len(pairs)} pairs of trials", scope, pairs
     p = stratified_t_p(per_trial)
-    test = f"Student's t over {len(pairs)} pairs of trials (too few for an exact test)"
+    test = f"Student's t over {len(pairs)} pairs of trials{TOO_FEW}"
     return p, test if p is not None else NOT_REPEATED, scope, pairs
 
 
@@ -259,7 +305,7 @@ def _scene_comparisons(paired: Paired, per_trial: Sequence[Array], direction: in
 
 
 def _scene_p(values: Array) -> float | None:
-    return sign_flip_p(values, np.ones(len(values))) if len(values) >= MIN_PAIRS else stratified_t_p([values])
+    return sign_flip_p(values, np.ones(len(values))) if len(values) >= units_needed() else stratified_t_p([values])
 
 
 def _t_interval(values: Array) -> Interval | None:

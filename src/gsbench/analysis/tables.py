@@ -19,10 +19,12 @@ from gsbench.analysis.cells import (
     field_value,
     make_cell,
     swept_settings,
+    with_variants,
 )
+from gsbench.analysis.declaration import standing
 from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.origins import cloud_notes, machine_notes
-from gsbench.analysis.pairing import BASELINE
+from gsbench.analysis.pairing import BASELINE, ViewCache, choose_pairs
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS, Experiment, Trial
 from gsbench.words import counted
@@ -122,7 +124,13 @@ def build_table(
     keys = tuple((quantity.key, "+".join(arm)) for quantity in quantities for arm in arm_keys)
     heads = tuple(Column(q.heading, arm) if columns else Column("", q.heading) for q in quantities for arm in arms)
     notes += _reading_notes(grid, quantities, expected, "scene" in fields) + _origin_notes(trials)
-    notes += _cost_notes(trials) + machine_notes(trials) + cloud_notes(trials) + _left_out(experiment)
+    notes += (
+        _declared_notes(experiment)
+        + _cost_notes(trials)
+        + machine_notes(trials)
+        + cloud_notes(trials)
+        + _left_out(experiment)
+    )
     return Table(title or f"Experiment {experiment.name}", tuple(rows), heads, tuple(shown), tuple(notes), keys)
 
 
@@ -256,6 +264,21 @@ def _origin_notes(trials: Sequence[Trial]) -> list[str]:
             arms = ", ".join(sorted({f"{trial.init}-{trial.densify}" for trial in own}))
             notes.append(f"{what} (its conditions are not known): {arms}.")
     return notes
+
+
+def _declared_notes(experiment: Experiment) -> list[str]:
+    """The verdict on the declared metric, of the whole experiment; nothing where none was declared.
+
+    Which trials a table shows has no say in it, so that nobody can choose a verdict by choosing trials.
+    """
+    declared = standing(experiment.folder, experiment.trials)
+    if declared is None:
+        return []
+    from gsbench.analysis.verdicts import declared_lines, judge  # here, for a quick start of what needs no test
+
+    trials = with_variants(experiment.trials)
+    pairs = choose_pairs(sorted({trial.arm for trial in trials}))
+    return declared_lines(declared, judge(trials, pairs, ViewCache(), declared))
 
 
 def _cost_notes(trials: Sequence[Trial]) -> list[str]:

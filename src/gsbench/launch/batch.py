@@ -12,6 +12,7 @@ from typing import Any
 from gsbench.compose import Composed
 from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder, storage_errors
+from gsbench.launch.declare import declare, declared_metrics
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
 from gsbench.launch.preflight import check_components, missing_folders, missing_weights
@@ -58,7 +59,8 @@ def begin_for_another_launcher(trials: Sequence[Composed]) -> None:
 
 
 def _begin(trials: Sequence[Composed], unfinished: Sequence[Composed]) -> None:
-    """Refuse what can be known to fail, then make the runs folder, tidy the store and write the plan."""
+    """Refuse what can be known to fail, then make the runs folder, tidy the store, write plan and declaration."""
+    declared_metrics(trials)  # refuses two for one verdict
     runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
     # A node of a cluster may have folders and devices that this machine lacks.
     if launcher != "slurm" and (missing := missing_folders(unfinished)):
@@ -67,6 +69,7 @@ def _begin(trials: Sequence[Composed], unfinished: Sequence[Composed]) -> None:
     make_runs_folder(runs)
     Store(runs / STORE).sweep(STAGES)
     add_to_plan(trials)
+    declare(trials)
 
 
 def _skip_finished(trials: Sequence[Composed]) -> tuple[list[Outcome], list[Composed]]:

@@ -104,7 +104,11 @@ def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str,
     metrics: dict[str, Metric] = {}
     for name, options in values.get("extra", {}).items():
         metrics[name] = build(f"eval.extra.{name}", options, allow_targets)
-        facts_of(name, metrics[name])
+        if facts_of(name, metrics[name]).direction == 0 and values.get("primary") == name:
+            raise InputError(
+                f"eval.primary={name}: {options['_target_']} does not say whether more or less is better (direction), "
+                "so no verdict can be about it"
+            )
     return metrics
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench import __version__
+from gsbench.analysis.declaration import read_declarations
 from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS, MADE_ELSEWHERE
 from gsbench.events import sum_events
 from gsbench.hashing import config_hash, sha256_of
@@ -19,6 +20,7 @@ from gsbench.pipeline.stages import EVALUATE, INIT, STAGES, TRAIN
 from gsbench.pipeline.steps.evaluate import METRICS_FILE
 from gsbench.pipeline.steps.train import TRAINING_FILE
 from gsbench.pipeline.store import MANIFEST, Entry
+from gsbench.pipeline.trial_files import TrialPaths
 from gsbench.scene.types import Scene
 from gsbench.source import sources_of
 
@@ -52,6 +54,8 @@ def results_of(
         "iterations": training["iterations"],
         "metrics": metrics["metrics"],
         "unavailable": metrics["unavailable"],
+        "measured": _read(evaluated.path / MANIFEST)["created"],  # of what came from the store: when it came there
+        **_declared(values),
         **{key: metrics[name] for name, key in EVALUATED.items() if name in metrics},
         "num_init_points": training["num_init_points"],
         "num_gaussians": training["num_gaussians"],
@@ -100,6 +104,14 @@ def _by_program(results: dict[str, Any], training: Mapping[str, Any]) -> dict[st
         "raster": "unknown" if origin == FROM_RENDERS else results["raster"],
         "unavailable": results["unavailable"] | unknown,
     }
+
+
+def _declared(values: dict[str, Any]) -> dict[str, Any]:
+    """The metric that the verdict was declared to be about when the trial was run, and since when; else nothing."""
+    home = TrialPaths.of(values).runs / values["name"]
+    metric = values["eval"].get("primary")
+    said = [declaration for declaration in read_declarations(home) if declaration.metric == metric]
+    return {"declared": said[-1].to_record()} if said else {}
 
 
 def _without_training(results: dict[str, Any]) -> dict[str, Any]:

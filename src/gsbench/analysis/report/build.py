@@ -8,6 +8,7 @@ from importlib.resources import files
 from jinja2 import Environment, StrictUndefined
 
 from gsbench.analysis.cells import by_key, with_variants
+from gsbench.analysis.declaration import standing
 from gsbench.analysis.errors_by_region import read_image
 from gsbench.analysis.origins import cloud_lines
 from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs
@@ -26,6 +27,7 @@ from gsbench.analysis.report.tradeoff_charts import tradeoff_charts, tradeoff_ga
 from gsbench.analysis.results import Experiment, Trial
 from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import build_table
+from gsbench.analysis.verdicts import families, judge
 from gsbench.layout import FIGURES
 
 
@@ -34,7 +36,10 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
     trials = with_variants(experiment.trials)
     arms = sorted({trial.arm for trial in trials})
     views = ViewCache()
-    versus = [compare_arms(trials, first, second, views) for first, second in choose_pairs(arms, baseline)]
+    declared = standing(experiment.folder, trials)
+    judged = judge(trials, choose_pairs(arms, baseline), views, declared)
+    versus = [compare_arms(trials, *pair, views, own) for pair, own in judged.items()]
+    quantity = next((one.declared for one in judged.values() if one.declared is not None), None)
     is_paper = experiment.name in PAPER_TABLES
     tables = paper_tables(experiment, experiment.name) if is_paper else [build_table(experiment)]
     volumes, volume_notes = volume_charts(trials, arms)
@@ -50,6 +55,8 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         seeds=experiment.seeds,
         trials=trials,
         versus=versus,
+        declared=declared.sentences(quantity.name) if declared and quantity else [],
+        families=families(list(judged.values())),
         tables=[to_html(table) for table in tables],
         contradictions=inconsistencies(load_paper()) if is_paper else [],
         sweeps=sweep_charts(trials),

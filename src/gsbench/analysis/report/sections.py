@@ -12,15 +12,15 @@ from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import short_version
 from gsbench.analysis.errors_by_region import MAP_PROPERTIES, RegionErrors, errors_by_region
 from gsbench.analysis.origins import machine_of, unlike_clouds
-from gsbench.analysis.pairing import ViewCache, arm_name, pair_arms, pair_trials
-from gsbench.analysis.quantities import Quantity, choose_quantities
+from gsbench.analysis.pairing import ViewCache, arm_name, pair_trials
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart, short_number
 from gsbench.analysis.report.crops import Crop, choose_crops
 from gsbench.analysis.report.volumes import share_above, volume_histogram
 from gsbench.analysis.results import Arm, Trial, read_json_lines
-from gsbench.analysis.statistics import ALPHA, Comparison, compare, seeds_needed
+from gsbench.analysis.statistics import ALPHA
 from gsbench.analysis.tables import change_words, cost_change
 from gsbench.analysis.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve
+from gsbench.analysis.verdicts import Judged, Verdict, judge
 from gsbench.errors import InputError
 from gsbench.events import Cause, RefineEvent
 
@@ -35,19 +35,6 @@ CURVES = (  # key of metrics.jsonl, title, y axis
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """One metric's comparison with what it takes to read it."""
-
-    quantity: Quantity
-    comparison: Comparison
-    seeds: int | None  # that would resolve the worthwhile difference; None: unknown or beyond reach
-
-    @property
-    def symbol(self) -> str:
-        return {"better": "▲", "worse": "▼"}.get(self.comparison.verdict, "●")
-
-
-@dataclass(frozen=True)
 class Versus:
     """Everything about one pair of arms."""
 
@@ -55,6 +42,7 @@ class Versus:
     second: Arm
     verdicts: tuple[Verdict, ...]
     headline: str
+    secondary: str  # what else was found, where a metric was declared
     by_scene: tuple[str, ...]
     costs: tuple[str, ...]
     forests: tuple[str, ...]
@@ -67,23 +55,27 @@ class Versus:
     def title(self) -> str:
         return f"{arm_name(self.second)} against {arm_name(self.first)}"
 
+    @property
+    def tests(self) -> list[str]:
+        """``declared: exact sign flips of 9 pairs of trials, on these scenes`` and the like; without the role where all
+        verdicts come from one test."""
+        by_role = {v.role: f"{v.comparison.test}, on {v.comparison.scope}" for v in reversed(self.verdicts)}
+        if len(set(by_role.values())) == 1:
+            return [*by_role.values()][:1]
+        return [f"{role}: {test}" for role, test in reversed(by_role.items())]
 
-def compare_arms(trials: Sequence[Trial], first: Arm, second: Arm, views: ViewCache) -> Versus:
-    """Verdicts, costs, forest plots, regions and crops of two arms; what cannot be had is said in the notes."""
-    notes: list[str] = []
-    verdicts = []
+
+def compare_arms(
+    trials: Sequence[Trial], first: Arm, second: Arm, views: ViewCache, judged: Judged | None = None
+) -> Versus:
+    """Verdicts, costs, forest plots, regions and crops of two arms; what cannot be had is said in the notes.
+
+    ``judged`` are the pair's verdicts as one of several; without it, the pair is judged by itself.
+    """
     own = [trial for trial in trials if trial.arm in (first, second)]
-    for quantity in choose_quantities(own):
-        if quantity.cost or quantity.direction == 0:
-            continue
-        try:
-            comparison = compare(pair_arms(own, first, second, quantity.key, views), quantity.direction)
-        except InputError as error:
-            reasons = [t.unavailable[quantity.key] for t in own if quantity.key in t.unavailable]
-            notes.append(f"{quantity.name}: {reasons[0] if reasons else error}")
-            continue
-        verdicts.append(_verdict(quantity, comparison))
-        notes += [f"{quantity.name}: {line}" for line in comparison.left_out]
+    if judged is None:
+        judged = judge(own, [(first, second)], views)[first, second]
+    verdicts, notes = judged.verdicts, list(judged.notes)
     pairs = pair_trials(own, first, second)
     gained, lost, faults = choose_crops(pairs, CROPS)
     regions = []
@@ -96,9 +88,10 @@ def compare_arms(trials: Sequence[Trial], first: Arm, second: Arm, views: ViewCa
     return Versus(
         first,
         second,
-        tuple(verdicts),
-        _headline(verdicts, first, second),
-        tuple(_by_scene(verdicts)),
+        verdicts,
+        _headline(judged, first, second),
+        _secondary(judged),
+        tuple(_by_scene([verdict for verdict in verdicts if verdict.role in ("", "declared")])),
         tuple(_costs(own, first, second)),
         tuple(_forest(verdict) for verdict in verdicts),
         tuple(regions),
@@ -226,26 +219,37 @@ def provenance(trials: Sequence[Trial]) -> list[dict[str, str]]:
     ]
 
 
-def _verdict(quantity: Quantity, comparison: Comparison) -> Verdict:
-    seeds = None
-    if comparison.seed_deviation is not None and quantity.worthwhile is not None:
-        seeds = seeds_needed(comparison.seed_deviation, len(comparison.scenes), quantity.worthwhile)
-    return Verdict(quantity, comparison, seeds)
-
-
-def _headline(verdicts: Sequence[Verdict], first: Arm, second: Arm) -> str:
+def _headline(judged: Judged, first: Arm, second: Arm) -> str:
+    verdicts, against = judged.verdicts, f"{arm_name(second)} against {arm_name(first)}"
     if not verdicts:
         return f"{arm_name(second)} and {arm_name(first)} cannot be compared: no metric has paired trials."
     scope = verdicts[0].comparison.scope
     if all(scene.mean == 0 for verdict in verdicts for scene in verdict.comparison.scenes):
         return (
-            f"{arm_name(second)} against {arm_name(first)}, on {scope}: equal in every metric, to the last bit. What "
+            f"{against}, on {scope}: equal in every metric, to the last bit. What "
             "they differ in never acted: look at the events, and at train.densify_start and densify_stop."
         )
     if all(verdict.comparison.p is None for verdict in verdicts):
+        return f"{against}: no verdict, one trial of each on {scope}; run more seeds."
+    if judged.declared is None:
+        return f"{against}, on {scope}: {_in_words(verdicts)}."
+    if judged.missing:
         return (
-            f"{arm_name(second)} against {arm_name(first)}: no verdict, one trial of each on {scope}; run more seeds."
+            f"{against}: no verdict, since {judged.declared.name}, which was declared, has no value ({judged.missing})."
         )
+    if verdicts[0].role != "declared":
+        return f"{against}, on {scope}, all metrics adjusted for their number: {_in_words(verdicts)}."
+    return f"{against}, on {scope}: {_in_words(verdicts[:1])}, which was declared beforehand."
+
+
+def _secondary(judged: Judged) -> str:
+    others = [verdict for verdict in judged.verdicts if verdict.role == "secondary"]
+    decidable = any(verdict.comparison.p is not None for verdict in others)
+    return f"Secondary, adjusted for their number: {_in_words(others)}." if decidable else ""
+
+
+def _in_words(verdicts: Sequence[Verdict]) -> str:
+    """``better in PSNR; no evidence of a difference in SSIM, FLIP``"""
     words = []
     for word, opening in (
         ("better", "better in"),
@@ -255,7 +259,7 @@ def _headline(verdicts: Sequence[Verdict], first: Arm, second: Arm) -> str:
         names = [v.quantity.name for v in verdicts if v.comparison.verdict == word]
         if names:
             words.append(f"{opening} {', '.join(names)}")
-    return f"{arm_name(second)} against {arm_name(first)}, on {scope}: {'; '.join(words)}."
+    return "; ".join(words)
 
 
 def _by_scene(verdicts: Sequence[Verdict]) -> list[str]:

@@ -1,0 +1,189 @@
+"""The verdicts of an experiment: each pair of arms in each metric, by itself or as families that were fixed beforehand.
+
+Where nothing was declared (``eval.primary``), every metric of every pair is tested by itself at 5 %. Where a metric was
+declared, two questions are kept apart, each with its own 5 % for the chance that any of its answers is false:
+
+- the declared metric, one test for each pair of arms: of a single pair it is tested as it is, of several adjusted by
+  Holm (1979), as Demšar (2006, section 3.2.2) adjusts comparisons of many methods with one control;
+- all other metrics of all pairs, called secondary and adjusted by Holm for their whole number.
+
+There is no gate between the two, though one would hold both under a single 5 % (Dmitrienko and Tamhane 2007): where the
+declared metric shows nothing, a secondary one that got worse must still be seen. A metric that was declared when
+results were there has no place of its own: then all metrics of all pairs are one family.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from gsbench.analysis.declaration import Standing
+from gsbench.analysis.pairing import Paired, ViewCache, arm_name, pair_arms
+from gsbench.analysis.quantities import Quantity, choose_quantities, metric_quantity
+from gsbench.analysis.results import Arm, Trial
+from gsbench.analysis.statistics import Comparison, compare, compare_family, seeds_needed
+from gsbench.errors import InputError
+
+Role = Literal["", "declared", "secondary", "one of all"]
+Pair = tuple[Arm, Arm]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One metric's comparison with what it takes to read it; ``role`` is empty where nothing was declared."""
+
+    quantity: Quantity
+    comparison: Comparison
+    seeds: int | None  # that would resolve the worthwhile difference; None: unknown or beyond reach
+    role: Role = ""
+
+    @property
+    def symbol(self) -> str:
+        return {"better": "▲", "worse": "▼"}.get(self.comparison.verdict, "●")
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The verdicts of one pair of arms, the declared metric first; ``notes`` say what could not be had.
+
+    ``missing`` says, of a declared metric that has no verdict here, why.
+    """
+
+    verdicts: tuple[Verdict, ...]
+    notes: tuple[str, ...]
+    declared: Quantity | None = None
+    missing: str = ""
+
+
+@dataclass(frozen=True)
+class _Question:
+    pair: Pair
+    quantity: Quantity
+    paired: Paired
+
+
+def judge(
+    trials: Sequence[Trial], pairs: Sequence[Pair], views: ViewCache, declared: Standing | None = None
+) -> dict[Pair, Judged]:
+    """Compare each pair of arms in every metric that has a direction, in the families that ``declared`` makes."""
+    primary = None if declared is None else declared_quantity(trials, declared)
+    questions: list[_Question] = []
+    faults: dict[Pair, dict[str, str]] = {pair: {} for pair in pairs}
+    quantities = {}
+    for pair in pairs:
+        own = [trial for trial in trials if trial.arm in pair]
+        shown = [one for one in choose_quantities(own) if not one.cost and one.direction != 0]
+        if primary is not None:
+            shown = [primary, *(one for one in shown if one.key != primary.key)]
+        quantities[pair] = shown
+        for one in shown:
+            try:
+                if one.direction == 0:
+                    raise InputError("whether more of it is better is not known")
+                questions.append(_Question(pair, one, pair_arms(own, *pair, one.key, views)))
+            except InputError as error:
+                reasons = [trial.unavailable[one.key] for trial in own if one.key in trial.unavailable]
+                faults[pair][one.key] = reasons[0] if reasons else str(error)
+    verdicts = _answer(questions, declared)
+    judged = {}
+    for pair in pairs:
+        own_verdicts = tuple(verdict for question, verdict in verdicts if question.pair == pair)
+        compared = {verdict.quantity.key: verdict for verdict in own_verdicts}
+        notes = []
+        for one in quantities[pair]:
+            if one.key in compared:
+                notes += [f"{one.name}: {line}" for line in compared[one.key].comparison.left_out]
+            else:
+                notes.append(f"{one.name}: {faults[pair][one.key]}")
+        missing = faults[pair].get(primary.key, "") if primary is not None else ""
+        judged[pair] = Judged(own_verdicts, tuple(notes), primary, missing)
+    return judged
+
+
+def declared_quantity(trials: Sequence[Trial], declared: Standing) -> Quantity:
+    """The declared metric; also one of the user's own that no trial could compute."""
+    return metric_quantity(declared.metric, trials)
+
+
+def declared_lines(declared: Standing, judged: dict[Pair, Judged]) -> list[str]:
+    """What was declared, and the verdict on it for each pair of arms, for the notes below a table."""
+    quantity = next(iter(judged.values())).declared if judged else None
+    lines = declared.sentences(declared.metric if quantity is None else quantity.name)
+    for (first, second), one in judged.items():
+        against = f"{arm_name(second)} against {arm_name(first)}"
+        found = [verdict for verdict in one.verdicts if verdict.quantity.key == declared.metric]
+        lines += [f"Verdict, {against}: {_in_words(verdict)}." for verdict in found]
+        if not found:
+            lines.append(f"Verdict, {against}: none, since {declared.metric} has no value: {one.missing}.")
+    return lines
+
+
+def families(judged: Sequence[Judged]) -> list[str]:
+    """How many tests each family had, and how it was adjusted; nothing where nothing was declared."""
+    sizes: dict[Role, int] = {}
+    for one in judged:
+        sizes |= {verdict.role: verdict.comparison.family for verdict in one.verdicts if verdict.role}
+    lines = []
+    if "declared" in sizes:
+        how = "tested as it is" if sizes["declared"] == 1 else f"adjusted by Holm for {sizes['declared']} pairs of arms"
+        lines.append(f"The declared metric is {how}.")
+    if "secondary" in sizes:
+        lines.append(
+            f"Secondary: all other metrics of all pairs of arms, {sizes['secondary']} tests adjusted by Holm among "
+            "themselves; they do not make the verdict."
+        )
+    if "one of all" in sizes:
+        lines.append(
+            "No metric was declared beforehand: all metrics of all pairs of arms are one family, "
+            f"{sizes['one of all']} tests adjusted by Holm."
+        )
+    return lines
+
+
+def _answer(questions: Sequence[_Question], declared: Standing | None) -> list[tuple[_Question, Verdict]]:
+    """Every question's verdict, in the order of ``questions``."""
+    if declared is None:
+        return [(one, _verdict(one.quantity, compare(one.paired, one.quantity.direction), "")) for one in questions]
+    answers: dict[int, Verdict] = {}
+    roles: list[Role] = [_role(one, declared) for one in questions]
+    for role in set(roles):
+        places = [place for place, found in enumerate(roles) if found == role]
+        members = [(questions[place].paired, questions[place].quantity.direction) for place in places]
+        for place, comparison in zip(places, compare_family(members), strict=True):
+            answers[place] = _verdict(questions[place].quantity, comparison, role)
+    return [(one, answers[place]) for place, one in enumerate(questions)]
+
+
+def _role(question: _Question, declared: Standing) -> Role:
+    if not declared.beforehand:
+        return "one of all"
+    return "declared" if question.quantity.key == declared.metric else "secondary"
+
+
+def _verdict(quantity: Quantity, comparison: Comparison, role: Role) -> Verdict:
+    seeds = None
+    if comparison.seed_deviation is not None and quantity.worthwhile is not None:
+        seeds = seeds_needed(comparison.seed_deviation, len(comparison.scenes), quantity.worthwhile)
+    return Verdict(quantity, comparison, seeds, role)
+
+
+def _in_words(verdict: Verdict) -> str:
+    """``better in LPIPS VGG raw on these scenes: −0.0123 (95 % interval −0.0200 to −0.0046), p 0.012``"""
+    one, decimals = verdict.comparison, verdict.quantity.decimals + 1
+
+    def signed(value: float) -> str:
+        return f"{value:+.{decimals}f}".replace("-", "−")
+
+    word = "no evidence of a difference in" if one.verdict == "no evidence" else f"{one.verdict} in"
+    text = f"{word} {verdict.quantity.name} on {one.scope}: {signed(one.mean)}"
+    if one.interval is not None:
+        text += f" (95 % interval {signed(one.interval.low)} to {signed(one.interval.high)})"
+    if one.p is None or one.p_family is None:
+        return f"{text}, no test: {one.test}"
+    adjusted = f", adjusted for {one.family} tests {_p_text(one.p_family)}" if one.family > 1 else ""
+    return f"{text}, p {_p_text(one.p)}{adjusted}"
+
+
+def _p_text(p: float) -> str:
+    return "below 0.001" if p < 0.001 else f"{p:.3f}"

@@ -1,0 +1,61 @@
+"""Writing down which metric a command declares its verdict to be about, before its trials run. Loads no torch."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsbench.analysis.declaration import Declaration, read_declarations
+from gsbench.compose import Composed
+from gsbench.errors import InputError
+from gsbench.files import write_text
+from gsbench.layout import DECLARED
+from gsbench.pipeline.locks import hold
+from gsbench.pipeline.trial_files import TrialPaths
+
+log = logging.getLogger(__name__)
+
+
+def declared_metrics(trials: Sequence[Composed]) -> dict[Path, str | None]:
+    """The metric that each experiment's trials declare (``eval.primary``), by its folder; None where none does.
+
+    Raises InputError where trials of one experiment declare different ones.
+    """
+    found: dict[Path, str | None] = {}
+    for trial in trials:
+        home = TrialPaths.of(trial.values).runs / trial.values["name"]
+        metric, known = trial.values["eval"].get("primary"), found.get(home)
+        if metric and known and metric != known:
+            raise InputError(
+                f"trials of {home.name} declare eval.primary={known} and eval.primary={metric}: a verdict is about one "
+                "metric, so give one of them, or run two experiments (name=…)"
+            )
+        found[home] = known or metric
+    return found
+
+
+def declare(trials: Sequence[Composed]) -> None:
+    """Add what the trials declare to their experiments' records, where it is not what stands there already.
+
+    A declaration is not taken back by a command without one.
+    """
+    for home, metric in declared_metrics(trials).items():
+        home.mkdir(parents=True, exist_ok=True)
+        with hold(home / f".{DECLARED}.lock", "the declarations"):
+            known = read_declarations(home)
+            if known and metric is None:
+                log.info("%s: %s stays declared, since %s", home.name, known[-1].metric, known[-1].when)
+            if metric is None or (known and known[-1].metric == metric):
+                continue
+            entries = [*known, Declaration(int(time.time()), metric)]
+            write_text(home / DECLARED, "".join(json.dumps(entry.to_record()) + "\n" for entry in entries))
+        if known:
+            log.warning(
+                "%s: the verdict is from now on about %s, and the report will say that %s was declared before",
+                home.name,
+                metric,
+                known[-1].metric,
+            )

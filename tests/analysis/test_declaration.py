@@ -1,0 +1,215 @@
+"""A verdict whose metric was fixed before: what is adjusted for what, and what is said of late declarations."""
+
+from __future__ import annotations
+
+import calendar
+import json
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsbench.analysis.declaration import STAMP, read_declarations, standing
+from gsbench.analysis.pairing import Paired, ViewCache, choose_pairs
+from gsbench.analysis.report.build import build_report
+from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.analysis.statistics import (
+    SCENES_LIKE_THESE,
+    bootstrap_interval,
+    compare,
+    compare_family,
+    stratified_t_p,
+    units_needed,
+)
+from gsbench.analysis.tables import build_table
+from gsbench.analysis.verdicts import Judged, judge
+from tests.analysis.false_verdicts import measure
+from tests.analysis.synthetic import Plan, write_runs
+
+EARLY, LATE = "2020-01-01T00:00:00Z", "2037-01-01T00:00:00Z"
+CLEAR = {"lpips_vgg_raw": -0.05}
+
+
+def declare(runs: Path, *records: tuple[str, str], experiment: str = "exp") -> None:
+    lines = [json.dumps({"metric": metric, "time": moment}) + "\n" for metric, moment in records]
+    (runs / experiment / "declared.jsonl").write_text("".join(lines))
+
+
+def declared_experiment(runs: Path, *records: tuple[str, str], **plan: object) -> Experiment:
+    write_runs(runs, Plan(**plan))  # type: ignore[arg-type]
+    declare(runs, *records)
+    return load_experiment(runs, "exp")
+
+
+def judged(experiment: Experiment) -> list[Judged]:
+    trials = experiment.trials
+    pairs = choose_pairs(sorted({trial.arm for trial in trials}))
+    return list(judge(trials, pairs, ViewCache(), standing(experiment.folder, trials)).values())
+
+
+# --- families
+
+
+def test_of_one_pair_the_declared_metric_is_tested_as_it_is_and_the_others_by_holm(tmp_path: Path) -> None:
+    (one,) = judged(declared_experiment(tmp_path, ("flip", EARLY), effect=CLEAR))
+    assert [verdict.quantity.key for verdict in one.verdicts] == ["flip", "psnr", "ssim", "lpips_vgg_raw"]
+    assert [verdict.role for verdict in one.verdicts] == ["declared", *["secondary"] * 3]
+    first, *others = (verdict.comparison for verdict in one.verdicts)
+    assert first.family == 1
+    assert first.p_family == first.p
+    # Holm by hand: times 3, 2, 1 from the smallest, never below the one before.
+    ordered = sorted(others, key=lambda comparison: comparison.p)
+    expected, running = [], 0.0
+    for factor, comparison in zip((3, 2, 1), ordered, strict=True):
+        running = max(running, min(1.0, factor * comparison.p))
+        expected.append(running)
+    assert [comparison.p_family for comparison in ordered] == pytest.approx(expected)
+    assert ordered[0].verdict == "better"  # a clear effect is found among the secondary, too
+
+
+def test_with_several_arms_the_declared_metric_is_adjusted_for_their_number(tmp_path: Path) -> None:
+    arms = ("adc", "volumetric", "absgrad", "mcmc")
+    found = judged(declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR, densifiers=arms))
+    firsts = [one.verdicts[0].comparison for one in found]
+    assert [comparison.family for comparison in firsts] == [3, 3, 3]
+    least = min(firsts, key=lambda comparison: comparison.p)
+    assert least.p_family == pytest.approx(3 * least.p)
+    assert least.verdict == "better"
+    assert all(verdict.comparison.family == 9 for one in found for verdict in one.verdicts[1:])
+
+
+def test_a_verdict_that_only_a_single_test_would_give_is_none_in_a_family() -> None:
+    rng = np.random.default_rng(3)
+    noise = [Paired("m", ("s",), (rng.normal(0, 0.1, (3, 5)),), 25.0, ()) for _ in range(9)]
+    weak = Paired("m", ("s",), (np.array([[0.9], [1.0], [1.3]]) + rng.normal(0, 0.01, (3, 5)),), 25.0, ())
+    alone = compare(weak, 1)
+    assert alone.verdict == "better"
+    first = compare_family([(weak, 1), *((one, 1) for one in noise)])[0]
+    assert first.p == alone.p
+    assert first.p_family == pytest.approx(10 * alone.p)
+    assert first.verdict == "no evidence"
+
+
+def test_the_exact_test_is_taken_where_it_can_reach_the_level_of_the_family() -> None:
+    # Over n units its smallest p is 2^(1 - n): 1/32 < 5 % for six; twice that, 1/16, is not, and 1/32 for seven is.
+    assert [units_needed(family) for family in (1, 2, 3, 5, 12)] == [6, 7, 7, 8, 9]
+    rng = np.random.default_rng(0)
+    scenes = tuple(rng.normal(1.0, 0.1, (2, 4)) for _ in range(6))
+    paired = Paired("m", tuple("abcdef"), scenes, 25.0, ())
+    alone, of_four = compare(paired, 1), compare(paired, 1, family=4)
+    assert (alone.scope, of_four.scope) == (SCENES_LIKE_THESE, SCENES_LIKE_THESE)
+    assert alone.p == 2 / 64
+    means = np.array([matrix.mean() for matrix in scenes])
+    assert "Student's t over 6 scenes" in of_four.test
+    assert of_four.p == pytest.approx(stratified_t_p([means]))
+    assert of_four.interval == bootstrap_interval(scenes, True, 4000, np.random.default_rng(0))
+    assert [one.verdict for one in compare_family([(paired, 1)] * 4)] == ["better"] * 4
+
+
+# --- what readers are told
+
+
+def test_the_report_says_what_was_declared_and_what_is_secondary(tmp_path: Path) -> None:
+    page = build_report(declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR, views=3, random_seed=1))
+    assert "LPIPS VGG raw was declared beforehand (eval.primary, 2020-01-01 00:00 UTC), before any of the 12" in page
+    assert "on these scenes: better in LPIPS VGG raw, which was declared beforehand." in page
+    assert "Secondary, adjusted for their number: no evidence of a difference in PSNR (dB), SSIM, FLIP." in page
+    assert "p, adjusted" in page
+    assert "by itself at 5 %" not in page
+
+
+def test_where_nothing_was_declared_that_is_said_and_nothing_is_adjusted(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan(effect=CLEAR, views=3))
+    experiment = load_experiment(tmp_path, "exp")
+    page = build_report(experiment)
+    assert "No metric was declared beforehand (eval.primary), so each metric is tested by itself at 5 %" in page
+    assert "p, adjusted" not in page
+    (one,) = judged(experiment)
+    assert all(v.role == "" and v.comparison.p_family == v.comparison.p for v in one.verdicts)
+    assert not any("declared" in note for note in build_table(experiment).notes)
+
+
+def test_tables_carry_the_verdict_on_the_declared_metric_whichever_trials_they_show(tmp_path: Path) -> None:
+    experiment = declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR)
+    whole = [note for note in build_table(experiment).notes if note.startswith("Verdict")]
+    assert len(whole) == 1
+    assert whole[0].startswith(
+        "Verdict, sfm-volumetric against sfm-adc: better in LPIPS VGG raw on these scenes: −0.05"
+    )
+    part = build_table(experiment, [trial for trial in experiment.trials if trial.scene == "garden"])
+    assert [note for note in part.notes if note.startswith("Verdict")] == whole
+
+
+def test_a_declared_metric_without_weights_is_undecided_and_no_other_takes_its_place(tmp_path: Path) -> None:
+    experiment = declared_experiment(tmp_path, ("lpips_alex", EARLY), effect=CLEAR)
+    (one,) = judged(experiment)
+    assert "lpips_alex" not in [verdict.quantity.key for verdict in one.verdicts]
+    assert {verdict.role for verdict in one.verdicts} == {"secondary"}
+    reason = "LPIPS Alex, which was declared, has no value (weights file alexnet.pth not found)"
+    assert f"no verdict, since {reason}" in build_report(experiment)
+    (note,) = (note for note in build_table(experiment).notes if note.startswith("Verdict"))
+    assert "none, since lpips_alex has no value: weights file alexnet.pth not found" in note
+
+
+# --- when it was declared
+
+
+def test_a_declaration_after_results_is_said_and_gives_no_place_of_its_own(tmp_path: Path) -> None:
+    experiment = declared_experiment(tmp_path, ("lpips_vgg_raw", LATE), effect=CLEAR, views=3)
+    (one,) = judged(experiment)
+    assert {(verdict.role, verdict.comparison.family) for verdict in one.verdicts} == {("one of all", 4)}
+    page = build_report(experiment)
+    assert "LPIPS VGG raw was declared when results were there" in page
+    assert "12 of the 12 trials had been measured" in page
+    assert "all metrics adjusted for their number: better in LPIPS VGG raw" in page
+    assert "which was declared beforehand" not in page
+
+
+def test_a_declaration_that_took_the_place_of_another_is_said(tmp_path: Path) -> None:
+    experiment = declared_experiment(tmp_path, ("psnr", EARLY), ("flip", LATE))
+    found = standing(experiment.folder, experiment.trials)
+    assert found is not None
+    assert found.metric == "flip"
+    assert any("Before it, psnr was declared (2020-01-01 00:00 UTC)." in line for line in found.sentences("FLIP"))
+
+
+def test_what_was_measured_before_counts_also_where_results_were_written_later(tmp_path: Path) -> None:
+    """The store gives an experiment of another name the same numbers within seconds: ``measured`` is when they came."""
+    paths = write_runs(tmp_path, Plan())
+    declare(tmp_path, ("psnr", "2030-06-01T00:00:00Z"))
+    after = calendar.timegm(time.strptime("2030-06-02T00:00:00Z", STAMP))
+    for place, path in enumerate(paths):
+        data = json.loads((path / "results.json").read_text())
+        if place < 2:
+            data["measured"] = "2030-05-31T00:00:00Z"
+        (path / "results.json").write_text(json.dumps(data))
+        os.utime(path / "results.json", (after, after))
+    experiment = load_experiment(tmp_path, "exp")
+    found = standing(experiment.folder, experiment.trials)
+    assert found is not None
+    assert {trial.path for trial in found.seen} == set(paths[:2])
+    assert not found.beforehand
+
+
+def test_trials_remember_a_declaration_whose_record_is_gone(tmp_path: Path) -> None:
+    path = write_runs(tmp_path, Plan())[0]
+    data = json.loads((path / "results.json").read_text())
+    (path / "results.json").write_text(json.dumps(data | {"declared": {"metric": "psnr", "time": EARLY}}))
+    experiment = load_experiment(tmp_path, "exp")
+    assert [one.metric for one in read_declarations(experiment.folder, experiment.trials)] == ["psnr"]
+    assert read_declarations(tmp_path / "nothing") == []
+
+
+# --- simulated sweeps without any difference
+
+SIMULATIONS = 100
+LIMIT = 0.05 + 3 * (0.05 * 0.95 / SIMULATIONS) ** 0.5  # three standard errors above the stated rate
+
+
+@pytest.mark.parametrize(("arms", "scenes", "correlation"), [(2, 3, 0.7), (3, 1, 0.0)])
+def test_false_verdicts_are_held_for_each_family(arms: int, scenes: int, correlation: float) -> None:
+    rates = measure(arms, scenes, correlation, SIMULATIONS)
+    assert max(rates.declared, rates.secondary, rates.late) < LIMIT
+    assert rates.none > rates.declared  # what a declaration is for

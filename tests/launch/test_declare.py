@@ -1,0 +1,82 @@
+"""Declaring the metric of a verdict: recorded before trials run, visible when changed, and nothing is computed anew."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from pathlib import Path
+
+import pytest
+
+from gsbench.analysis.declaration import measured, read_declarations, standing
+from gsbench.analysis.results import load_experiment
+from gsbench.cli import run
+from gsbench.compose import Composed, compose_one
+from gsbench.errors import InputError
+from gsbench.launch.declare import declare, declared_metrics
+from tests.end_to_end.conftest import SMALL
+
+# later words win: a trial of seconds
+TINY = [*SMALL, "train.iterations=3", "scene.views=9", "eval.lpips=[]", "tracking=none", "densify=none"]
+
+
+def composed(runs: Path, *words: str) -> Composed:
+    return compose_one(["name=exp", f"runs={runs}", *words])
+
+
+def test_a_declaration_is_kept_with_its_time_and_changes_are_added(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    undeclared, psnr, ssim = (
+        composed(tmp_path, *words) for words in ([], ["eval.primary=psnr"], ["eval.primary=ssim"])
+    )
+    declare([undeclared])
+    assert read_declarations(tmp_path / "exp") == []
+    for trials in ([psnr, psnr], [psnr], [undeclared]):  # said again, or not said: it stands
+        declare(trials)
+        assert [one.metric for one in read_declarations(tmp_path / "exp")] == ["psnr"]
+    with caplog.at_level(logging.WARNING):
+        declare([ssim])
+    assert {one.metric for one in read_declarations(tmp_path / "exp")} == {"psnr", "ssim"}
+    assert "about ssim, and the report will say that psnr was declared before" in caplog.text
+
+
+def test_one_command_cannot_declare_two(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trials = [composed(tmp_path, f"eval.primary={metric}") for metric in ("psnr", "ssim")]
+    with pytest.raises(InputError, match=r"trials of exp declare eval\.primary=psnr and eval\.primary=ssim"):
+        declared_metrics(trials)
+    assert run(["-m", *TINY, "eval.primary=psnr,ssim", f"runs={tmp_path}"]) == 2
+    assert "eval.primary makes no other trial" in capsys.readouterr().err
+
+
+@pytest.mark.end_to_end
+def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path: Path) -> None:
+    words = [*TINY, f"runs={tmp_path}", "name=exp"]
+    assert run([*words, "eval.primary=psnr"]) == 0
+    (file,) = tmp_path.glob("exp/*/*/*/results.json")
+    before = file.read_bytes()
+    results = json.loads(before)
+    (declared,) = read_declarations(tmp_path / "exp")
+    assert results["declared"] == declared.to_record() == {"metric": "psnr", "time": declared.to_record()["time"]}
+    experiment = load_experiment(tmp_path, "exp")
+    found = standing(experiment.folder, experiment.trials)
+    assert found is not None
+    assert found.beforehand
+    assert measured(experiment.trials[0]) >= declared.time
+
+    store = {path: path.stat().st_mtime_ns for path in tmp_path.glob("store/*/*")}
+    assert run([*words, "eval.primary=ssim"]) == 0
+    assert file.read_bytes() == before
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("store/*/*")} == store
+    found = standing(experiment.folder, load_experiment(tmp_path, "exp").trials)
+    assert found is not None
+    assert (found.metric, len(found.seen), [one.metric for one in found.earlier]) == ("ssim", 1, ["psnr"])
+
+    time.sleep(1.1)  # moments are kept in whole seconds
+    # another name gets the same numbers from the store: they were there before, and are known to have been
+    assert run([*words, "name=again", "eval.primary=ssim"]) == 0
+    again = load_experiment(tmp_path, "again")
+    found = standing(again.folder, again.trials)
+    assert found is not None
+    assert not found.beforehand
