@@ -18,7 +18,10 @@ from gsbench.launch.declare import declare, declared_metrics
 from tests.end_to_end.conftest import SMALL
 
 # later words win: a trial of seconds
-TINY = [*SMALL, "train.iterations=3", "scene.views=9", "eval.lpips=[]", "tracking=none", "densify=none"]
+TINY = [
+    *(*SMALL, "train.iterations=2", "scene.views=9", "scene.width=48", "scene.height=36", "init.count=200"),
+    *("raster=reference", "eval.lpips=[]", "eval.flip=false", "tracking=none", "densify=none"),
+]
 
 
 def composed(runs: Path, *words: str) -> Composed:

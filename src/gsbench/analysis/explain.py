@@ -9,7 +9,7 @@ from gsbench.analysis.differences import differing_settings, short_version
 from gsbench.analysis.origins import machine_of
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.paper import load_paper
-from gsbench.analysis.paper_tables import PAPER_TABLES, agreement
+from gsbench.analysis.paper_tables import agreement, layout_of, paper_init
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import Experiment, Trial, load_experiment
 from gsbench.analysis.tables import format_cell
@@ -66,12 +66,13 @@ def _find(experiment: Experiment, scene: str, arm: str) -> list[Trial]:
 
 
 def _paper_lines(name: str, scene: str, trial: Trial, shown: Quantity, cell: Cell) -> list[str]:
-    if name not in PAPER_TABLES or cell.mean is None:
+    layout = layout_of(name)
+    if layout is None or cell.mean is None:
         return []
-    table = load_paper().table(name)
+    table = load_paper().table(layout)
     keys = {"gaussians": "gaussians_millions", "train_time": "train_minutes"}
     in_paper_units = quantity(keys.get(shown.key, shown.key), cell.trials)
-    printed = table.get((scene, trial.init, trial.densify, in_paper_units.key))
+    printed = table.get((scene, paper_init(trial.init), trial.densify, in_paper_units.key))
     if printed is None:
         return []
     same_units = make_cell(cell.trials, in_paper_units, [scene], cell.expected)

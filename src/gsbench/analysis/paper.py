@@ -11,6 +11,8 @@ from typing import Any
 
 import yaml
 
+from gsbench.analysis.choices import Said, read_setup
+
 TABLE1_QUANTITIES = ("ssim", "psnr", "lpips_vgg_raw", "gaussians_millions", "train_minutes")
 TABLE1_ARMS = (("dim", "adc"), ("dim", "volumetric"))
 TABLE2_ARMS = (("sfm", "adc"), ("dim", "adc"), ("sfm", "volumetric"), ("dim", "volumetric"))
@@ -50,6 +52,7 @@ class Paper:
     table2: Mapping[Key, Printed]
     datasets: Mapping[str, str]  # scene -> data set, as in Table 1
     claims: Mapping[str, Any]
+    setup: Mapping[str, Said]
 
     def table(self, name: str) -> Mapping[Key, Printed]:
         return {"table1": self.table1, "table2": self.table2}[name]
@@ -75,7 +78,7 @@ def load_paper() -> Paper:
         for scene, texts in content["table2"]["scenes"].items()
         for (init, densify), text in zip(TABLE2_ARMS, texts, strict=True)
     }
-    return Paper(table1, table2, datasets, content["claims"])
+    return Paper(table1, table2, datasets, content["claims"], read_setup(content["setup"]))
 
 
 def inconsistencies(paper: Paper) -> list[str]:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from enum import Enum
 
 from gsbench.analysis.cells import Cell
+from gsbench.analysis.choices import choice_lines
 from gsbench.analysis.paper import (
     ARM_NAMES,
     INIT_NAMES,
@@ -23,6 +24,8 @@ from gsbench.analysis.tables import Column, Entry, Row, Table, build_table
 from gsbench.errors import InputError
 
 PAPER_TABLES = ("table1", "table2")
+OWN = "_own"  # ends the name of the same table with poses and gauge of each initialiser's own
+STAND_FOR = {"dim_paper": "dim"}  # initialisers that are one of the paper's arms under another name
 CONFIDENCE = 0.95
 
 
@@ -55,9 +58,20 @@ def paper_tables(
         metrics=metrics or (TABLE1_QUANTITIES if name == "table1" else ("lpips_vgg_raw",)),
         title=f"{name.replace('table', 'Table ')}, measured (experiment {experiment.name})",
         order=([(scene,) for scene in scenes], [arm[-len(columns) :] for arm in arms]),
-        names=ARM_NAMES | INIT_NAMES,
+        names=ARM_NAMES | INIT_NAMES | {init: INIT_NAMES[known] for init, known in STAND_FOR.items()},
     )
     return [measured, _differences(name, measured, arms, trials, notes)]
+
+
+def layout_of(name: str) -> str | None:
+    """The paper's table that the experiment ``name`` repeats, by its name: ``table1`` for ``table1_own``, too."""
+    table = name.removesuffix(OWN)
+    return table if table in PAPER_TABLES else None
+
+
+def paper_init(init: str) -> str:
+    """What the paper's tables call the initialiser ``init``."""
+    return STAND_FOR.get(init, init)
 
 
 def agreement(cell: Cell, printed: Printed) -> Agreement:
@@ -106,11 +120,18 @@ def t_half_width(std: float, count: int) -> float:
 def _arms(name: str, trials: Sequence[Trial]) -> tuple[list[tuple[str, str]], list[str]]:
     """The (init, densify) arms of a table; where DIM was not run and one other initialiser was, that one stands in."""
     inits = {trial.init for trial in trials}
-    if name == "table1" and "dim" not in inits and len(inits) == 1:
+    arms = [(_run_as(init, inits), densify) for init, densify in (TABLE1_ARMS if name == "table1" else TABLE2_ARMS)]
+    if name == "table1" and arms[0][0] not in inits and len(inits) == 1:
         other = inits.pop()
         note = f"Initial clouds from {other} stand in for the paper's DIM: the columns do not repeat its experiment."
         return [(other, densify) for _, densify in TABLE1_ARMS], [note]
-    return list(TABLE1_ARMS if name == "table1" else TABLE2_ARMS), []
+    return arms, []
+
+
+def _run_as(init: str, inits: set[str]) -> str:
+    """The initialiser that stands for the paper's ``init``: itself, unless only another of that kind was run."""
+    others = [other for other in sorted(inits) if init not in inits and paper_init(other) == init]
+    return others[0] if others else init
 
 
 def _differences(
@@ -143,7 +164,7 @@ def _differences(
         ("scene", "arm"),
         heads,
         tuple(rows),
-        (legend(tally), *notes),
+        (legend(tally), *notes, *choice_lines(trials, paper.setup)),
         tuple((key, heading) for key in compared for heading in ("paper", "delta")),
     )
 

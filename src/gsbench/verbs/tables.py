@@ -10,7 +10,7 @@ from pathlib import Path
 from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.frame import to_frame
 from gsbench.analysis.paper import inconsistencies, load_paper
-from gsbench.analysis.paper_tables import PAPER_TABLES, paper_tables
+from gsbench.analysis.paper_tables import PAPER_TABLES, layout_of, paper_tables
 from gsbench.analysis.published import published_names, published_table
 from gsbench.analysis.results import Experiment, Trial, load_experiment
 from gsbench.analysis.table_formats import FORMATS
@@ -48,7 +48,7 @@ def _trials(trials: Sequence[Trial], options: argparse.Namespace) -> dict[str, s
 
 def _tables(experiment: Experiment, trials: Sequence[Trial], options: argparse.Namespace) -> dict[str, str]:
     """The tables as text, each with what its file's name ends in."""
-    layout = options.layout or (experiment.name if _is_plain(options) and experiment.name in PAPER_TABLES else "plain")
+    layout = options.layout or (_is_plain(options) and layout_of(experiment.name)) or "plain"
     metrics = options.metrics
     if layout == "plain":
         rows, columns = options.rows, options.columns or ()
@@ -73,7 +73,7 @@ def _parser() -> ArgumentParser:
         "numbers contradict.",
     )
     parser.add_argument(
-        "experiment", help="its name; table1 and table2 come in the paper's layout, with its values beside"
+        "experiment", help="its name; table1, table2 and their _own come in the paper's layout, with its values beside"
     )
     parser.add_argument(
         "--format", choices=[*FORMATS, TRIALS], default="md", help=f"{TRIALS}: CSV with one row a trial instead"

@@ -11,6 +11,7 @@ from importlib.resources import files
 import yaml
 
 from gsbench.analysis.cells import by_key, check_averageable, make_cell
+from gsbench.analysis.choices import Said, choice_lines, read_setup
 from gsbench.analysis.paper import Printed
 from gsbench.analysis.paper_tables import Agreement, compare_with_printed, legend
 from gsbench.analysis.quantities import quantity
@@ -31,6 +32,7 @@ class Published:
     densify: str  # the densifier of ours that is the paper's method
     quantities: tuple[str, ...]
     printed: Mapping[tuple[str, str], Printed]
+    setup: Mapping[str, Said]
 
 
 def published_names() -> list[str]:
@@ -53,7 +55,8 @@ def load_published(name: str) -> Published:
         for key, text in zip(quantities, texts, strict=True)
     }
     title, source, conventions = (" ".join(content[key].split()) for key in ("title", "source", "conventions"))
-    return Published(name, title, source, conventions, content["densify"], quantities, printed)
+    setup = read_setup(content["setup"])
+    return Published(name, title, source, conventions, content["densify"], quantities, printed, setup)
 
 
 def published_table(trials: Sequence[Trial], name: str) -> Table:
@@ -79,6 +82,7 @@ def published_table(trials: Sequence[Trial], name: str) -> Table:
     heads = tuple(Column(one.name, heading) for one in shown for heading in (name, "Δ"))
     method = f"The printed numbers are of densify={paper.densify}; other arms stand beside them for orientation."
     notes = [f"{paper.title}.", f"Read from {paper.source}.", f"Conventions: {paper.conventions}.", method]
+    notes += choice_lines(own, paper.setup)
     keys = tuple((one.key, heading) for one in shown for heading in (name, "delta"))
     return Table(
         f"Difference from {name}", ("scene", "init", "densify"), heads, tuple(rows), (legend(tally), *notes), keys

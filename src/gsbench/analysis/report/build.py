@@ -13,7 +13,7 @@ from gsbench.analysis.errors_by_region import read_image
 from gsbench.analysis.origins import cloud_lines
 from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs
 from gsbench.analysis.paper import inconsistencies, load_paper
-from gsbench.analysis.paper_tables import PAPER_TABLES, paper_tables
+from gsbench.analysis.paper_tables import layout_of, paper_tables
 from gsbench.analysis.report.crops import data_uri
 from gsbench.analysis.report.sections import (
     compare_arms,
@@ -40,8 +40,8 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
     judged = judge(trials, choose_pairs(arms, baseline), views, declared)
     versus = [compare_arms(trials, *pair, views, own) for pair, own in judged.items()]
     quantity = next((one.declared for one in judged.values() if one.declared is not None), None)
-    is_paper = experiment.name in PAPER_TABLES
-    tables = paper_tables(experiment, experiment.name) if is_paper else [build_table(experiment)]
+    layout = layout_of(experiment.name)
+    tables = [build_table(experiment)] if layout is None else paper_tables(experiment, layout)
     volumes, volume_notes = volume_charts(trials, arms)
     rows = provenance(trials)
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
@@ -58,7 +58,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         declared=declared.sentences(quantity.name) if declared and quantity else [],
         families=families(list(judged.values())),
         tables=[to_html(table) for table in tables],
-        contradictions=inconsistencies(load_paper()) if is_paper else [],
+        contradictions=[] if layout is None else inconsistencies(load_paper()),
         sweeps=sweep_charts(trials),
         tradeoffs=tradeoff_charts(trials),
         gaps=tradeoff_gaps(trials, baseline),

@@ -1,0 +1,154 @@
+"""Our choices where a paper is silent or chose otherwise: one line each, below a table of differences from it.
+
+What we chose is read from the trials' recorded configurations; what the paper says stands with its numbers, as
+``setup`` of its YAML. A choice of which that says nothing is not shown, nor one in which both agree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from gsbench.analysis.results import Trial
+from gsbench.eval.facts import LPIPS, find
+from gsbench.eval.protocol import PAPER, PROTOCOLS
+
+NOT_RECORDED = "not recorded"
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a paper says of one choice, in words that follow "the paper"; ``value`` is set where it states all of it."""
+
+    words: str
+    value: str | None = None
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A choice: ``read`` gives a trial's as text, None where it has none; it may raise KeyError for what is unknown."""
+
+    key: str  # in ``setup`` of a paper's YAML
+    label: str
+    read: Callable[[Trial], str | None]
+    detail: Callable[[Sequence[Trial]], str] = lambda trials: ""  # of all trials, after their choices
+
+
+def read_setup(content: Mapping[str, Any]) -> dict[str, Said]:
+    """``setup`` of a paper's YAML: for each topic words, or words with a value. Raises ValueError for another topic."""
+    known = [topic.key for topic in TOPICS]
+    if unknown := content.keys() - set(known):
+        raise ValueError(f"setup: unknown {', '.join(sorted(unknown))}; known are {', '.join(known)}")
+    return {
+        key: Said(said) if isinstance(said, str) else Said(said["words"], str(said["value"]))
+        for key, said in content.items()
+    }
+
+
+def choice_lines(trials: Sequence[Trial], setup: Mapping[str, Said]) -> list[str]:
+    """A line for each topic of ``setup`` in which our trials and the paper do not state the same."""
+    own = [trial for trial in trials if not trial.made_elsewhere]
+    lines = []
+    for topic in TOPICS:
+        chosen: dict[str, list[Trial]] = {}
+        for trial in own:
+            if (text := _read(topic, trial)) is not None:
+                chosen.setdefault(text, []).append(trial)
+        said = setup.get(topic.key)
+        if said is not None and chosen and set(chosen) != {said.value}:
+            lines.append(f"{topic.label}: {_of_whom(chosen)}{topic.detail(own)}; the paper {said.words}.")
+    return lines
+
+
+def _read(topic: Topic, trial: Trial) -> str | None:
+    try:
+        return topic.read(trial)
+    except KeyError:
+        return NOT_RECORDED
+
+
+def _of_whom(chosen: Mapping[str, Sequence[Trial]]) -> str:
+    """``2,048 an image for dim, 8,192 an image for sfm``: of several choices, each with those whose it is."""
+    if len(chosen) == 1:
+        return next(iter(chosen))
+    for name in ("init", "densify", "scene"):
+        owners = {text: sorted({getattr(trial, name) for trial in trials}) for text, trials in chosen.items()}
+        if len({owner for group in owners.values() for owner in group}) == sum(map(len, owners.values())):
+            return ", ".join(f"{text} for {' '.join(group)}" for text, group in owners.items())
+    return ", ".join(f"{text} in {len(trials)} trials" for text, trials in chosen.items())
+
+
+def _poses(trial: Trial) -> str:
+    trial.config["init.name"]  # raises where nothing was recorded
+    if trial.config.get("init.poses") == "own":
+        return "estimated by each initialiser (init.poses=own)"
+    return "the same for all arms of a scene (init.poses=shared)" if "init.poses" in trial.config else "as they came"
+
+
+def _gauge(trial: Trial) -> str:
+    own = trial.config["init.name"] and trial.config.get("init.poses") == "own"
+    if not own:
+        return "that of the given cameras"
+    return (
+        "moved into that of the reference"
+        if trial.config.get("init.align")
+        else "as the mapper left it (init.align=false)"
+    )
+
+
+def _keypoints(trial: Trial) -> str | None:
+    trial.config["init.name"]
+    for key in ("max_keypoints", "max_num_features"):
+        if (count := trial.config.get(f"init.{key}")) is not None:
+            return f"{count:,} an image"
+    return None
+
+
+def _networks(trial: Trial) -> str | None:
+    trial.config["init.name"]
+    parts = [trial.config.get(f"init.{key}") for key in ("extractor", "matcher")]
+    return " and ".join(map(str, parts)) if all(parts) else None
+
+
+def _cap(trial: Trial) -> str:
+    count, cap = trial.config.get("densify.max_gaussians"), trial.config["densify.cap"]
+    return "none" if count is None else f"{count:,} (densify.cap={cap})"
+
+
+def _images(trial: Trial) -> str:
+    config = trial.config
+    text = f"the files of {config['scene.images']}" if config.get("scene.images") else "the photographs"
+    if config["scene.downscale"] != 1:
+        text += f" divided by {config['scene.downscale']}"
+    if config.get("scene.max_size") is not None:
+        text += f" at most {config['scene.max_size']} px long"
+    return f"{text} ({config['scene.resample']} where shrunk)"
+
+
+def _sizes(trials: Sequence[Trial]) -> str:
+    """`` at 400×300 px``, or the smallest and the largest."""
+    sizes = sorted({tuple(size) for trial in trials if (size := trial.data.get("resolution"))}, key=math.prod)
+    shown = [f"{width}×{height}" for width, height in dict.fromkeys([*sizes[:1], *sizes[-1:]])]
+    return f", {' to '.join(shown)} px" if shown else ""
+
+
+def _lpips(trial: Trial) -> str:
+    protocol = PROTOCOLS.get(str(trial.data["protocol"]).rsplit("-", 1)[0], PAPER)
+    facts = find(f"{LPIPS}{protocol.lpips}")
+    assert facts is not None
+    return f"net {facts.options['net']}, fed [{'0' if facts.options['raw'] else '−1'}, 1]"
+
+
+TOPICS = (
+    Topic("poses", "Poses", _poses),
+    Topic("gauge", "Gauge (the unit of V_th)", _gauge),
+    Topic("keypoints", "Keypoints", _keypoints),
+    Topic("networks", "Matching networks", _networks),
+    Topic("cap", "Cap of Gaussians", _cap),
+    Topic("opacity", "Learning rate of opacity", lambda trial: str(trial.config["train.opacity"])),
+    Topic("iterations", "Iterations", lambda trial: str(trial.data["iterations"])),
+    Topic("images", "Images", _images, _sizes),
+    Topic("lpips", "LPIPS weights", _lpips),
+)
