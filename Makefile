@@ -11,8 +11,12 @@ GENERIC_TESTS := tests/test_machine.py tests/raster/test_cpu.py tests/raster/tes
 	tests/pipeline/test_loss.py tests/pipeline/test_trainer.py tests/pipeline/test_resume.py tests/eval/test_metrics.py \
 	tests/init/test_alignment.py tests/init/test_sfm.py
 
+# The next version of Hydra, as far as it is released, laid over .venv for the tests of what Hydra does.
+NEXT_HYDRA := 'hydra-core>=1.4.0rc1,<1.5' 'omegaconf>=2.4.1rc1,<2.5'
+NEXT_HYDRA_TESTS := tests/launch tests/test_cli.py tests/test_config.py tests/verbs/test_completion.py
+
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-generic lint
+.PHONY: help install demo test test-generic test-next-hydra lint
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -29,6 +33,10 @@ test: $(VENV)/.stamp-dev ## run the tests
 
 test-generic: $(VENV)/.stamp-dev ## run core tests as on the plainest processor of this architecture
 	$(GENERIC) $(BIN)/python -m pytest $(GENERIC_TESTS)
+
+test-next-hydra: $(VENV)/.stamp-dev ## run the tests of configurations and sweeps on the next version of Hydra
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --pre --no-deps --upgrade --target $(VENV)/next-hydra $(NEXT_HYDRA)
+	PYTHONPATH=$(abspath $(VENV)/next-hydra) $(BIN)/python -m pytest $(NEXT_HYDRA_TESTS)
 
 lint: $(VENV)/.stamp-dev ## check style and types
 	$(BIN)/ruff check .

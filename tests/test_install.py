@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shutil
+import subprocess
 import tomllib
 from pathlib import Path
 
@@ -41,3 +43,15 @@ def test_no_text_sends_anyone_to_the_project_that_has_our_name() -> None:
     places = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "notebooks").glob("*.py")]
     places += [*(ROOT / "src").rglob("*.py"), *(ROOT / "conf").rglob("*.yaml")]
     assert [str(path) for path in places if foreign.search(path.read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+def test_the_image_is_built_by_commands_that_there_are() -> None:
+    """Docker builds what the README's two commands build: every ``make`` of the Dockerfile is a target."""
+    targets = re.findall(r"RUN make (\S+)", (ROOT / "Dockerfile").read_text())
+    assert {"demo", "test"} < set(targets)
+    for target in targets:
+        done = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+    ignored = (ROOT / ".dockerignore").read_text().split()
+    assert set((ROOT / ".gitignore").read_text().split()) < set(ignored)  # nothing of this machine gets in
