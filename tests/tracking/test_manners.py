@@ -182,6 +182,7 @@ def test_the_comparison_shows_final_metrics_first(runs: Path) -> None:
     url = address_of("http://127.0.0.1:5000", default_uri(runs), runs, "tracked")
     assert f"/experiments/{run.info.experiment_id}/runs?viewStateShareKey=gsbench&" in url
     view = json.loads(client.get_experiment(run.info.experiment_id).tags["mlflow.sharedViewState.gsbench"])
+    assert view["runsHiddenMode"] == "SHOW_ALL"  # not the ten youngest alone
     (section,) = view["compareRunSections"]
     assert {chart["metricSectionId"] for chart in view["compareRunCharts"]} == {section["uuid"]}
     bars = [chart["metricKey"] for chart in view["compareRunCharts"] if chart["type"] == "BAR"]

@@ -41,6 +41,7 @@ def _view() -> dict[str, Any]:
         "compareRunCharts": charts,
         "isAccordionReordered": True,  # else sections are sorted by name
         "hideEmptyCharts": True,
+        "runsHiddenMode": "SHOW_ALL",  # else charts show the ten youngest runs, and the baseline is mostly the oldest
         "selectedColumns": [f"params.`{name}`" for name in COLUMNS] + [f"metrics.`{name}`" for name in BARS],
     }
 
