@@ -167,6 +167,8 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
     if unknown:
         key = override.group(1) if override else unknown.group(1)
         bad = unknown.group(1)
+        if bad == "grids":
+            return "hydra.sweeper.grids: gsbench's own sweeper alone joins grids, so leave out hydra/sweeper"
         parent = key[: key.rindex(bad)].rstrip(".") if bad in key else key.rpartition(".")[0]
         where = re.search(r"In '([^']+)'", text)
         file = ""

@@ -29,7 +29,7 @@ class GsbenchLauncher(Launcher):
 
 
 class GsbenchSweeper(Sweeper):
-    """The grid of all listed values, handed to the launcher as a whole."""
+    """The grid of all listed values, or several joined, handed to the launcher as a whole."""
 
     def __init__(self, params: dict[str, Any]) -> None:
         self.params = params
@@ -45,11 +45,10 @@ class GsbenchSweeper(Sweeper):
     def sweep(self, arguments: list[str]) -> Sequence[JobReturn]:
         from gsbench.launch.task import sweep
 
-        words = [*(f"{key}={value}" for key, value in self.params.items()), *arguments]
-        return sweep(self.task, self.context, self.config, self.launcher, words)
+        return sweep(self.task, self.context, self.config, self.launcher, self.params, arguments)
 
 
 LAUNCHER = {"_target_": "hydra_plugins.gsbench.GsbenchLauncher"}
-SWEEPER = {"_target_": "hydra_plugins.gsbench.GsbenchSweeper", "params": {}}
+SWEEPER = {"_target_": "hydra_plugins.gsbench.GsbenchSweeper", "params": {}, "grids": []}
 ConfigStore.instance().store(group="hydra/launcher", name="gsbench", node=LAUNCHER, provider="gsbench")
 ConfigStore.instance().store(group="hydra/sweeper", name="gsbench", node=SWEEPER, provider="gsbench")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import xml.etree.ElementTree as ElementTree
 from html.parser import HTMLParser
@@ -289,6 +290,29 @@ def test_a_sweep_of_one_setting_is_drawn_by_its_values_relative_to_each_scene(tm
     # each scene's mean is one above its lowest value; values stand in order of size, whatever their names
     assert "courtyard 1 at 0.03, −1 at 0.3, 0 at 1M; garden 1 at 0.03, −1 at 0.3, 0 at 1M" in words.group(1)
     assert "densify.volume_threshold" in words.group(1)
+
+
+def test_the_baseline_stands_beside_the_values_of_a_setting_that_it_has_not(tmp_path: Path) -> None:
+    for arm, psnr, settings in (
+        ("adc", 1.0, {"densify___target_": "gsbench.densify.ADC"}),
+        ("volumetric-0.1", 0.0, {"densify___target_": "gsbench.densify.Volumetric", "densify__volume_threshold": 0.1}),
+        (
+            "volumetric-0.01",
+            2.0,
+            {"densify___target_": "gsbench.densify.Volumetric", "densify__volume_threshold": 0.01},
+        ),
+    ):
+        views = {"psnr": np.array([20.0 + psnr])}
+        data = trial_data(Plan(), "courtyard", "sfm", arm, 0, views)
+        folder = write_trial(tmp_path, data, views, arm.encode().hex()[-8:].rjust(8, "0"), **settings)
+        if arm == "adc":
+            config = json.loads((folder / "config.yaml").read_text())
+            del config["densify"]["volume_threshold"]
+            (folder / "config.yaml").write_text(json.dumps(config))
+    (psnr_chart,) = [chart for chart in sweep_charts(load_experiment(tmp_path, "exp").trials) if "PSNR" in chart]
+    words = re.search(r'aria-label="([^"]*)"', psnr_chart)
+    assert words is not None
+    assert "courtyard 1 at 0.01, −1 at 0.1, 0 at adc" in words.group(1)
 
 
 def test_no_chart_by_setting_where_nothing_or_more_than_one_was_varied(tmp_path: Path, runs: Path) -> None:

@@ -20,6 +20,7 @@ from gsbench.compose import Composed, compose_master, composing, explained, read
 from gsbench.config import check_target
 from gsbench.errors import InputError
 from gsbench.hydra_job import CONFIG_NAME, HydraJob, start, words_of
+from gsbench.launch.grids import take_grids
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.task import OWN, Enough, Task
 from gsbench.logs import show_details
@@ -73,6 +74,7 @@ def _run(context: HydraContext, config: DictConfig, words: Sequence[str], task: 
 def _multirun(context: HydraContext, config: DictConfig, words: Sequence[str], task: Task) -> None:
     """As `hydra.multirun`."""
     context.callbacks.on_multirun_start(config=config, config_name=CONFIG_NAME)
+    task.grids = take_grids(config)
     with explained(words):  # a sweeper or launcher that cannot be made
         sweeper = Plugins.instance().instantiate_sweeper(hydra_context=context, task_function=task, config=config)
     sweeper.sweep(arguments=words_of(config.hydra.overrides)[1])
@@ -92,8 +94,8 @@ def _check(master: DictConfig, multirun: bool, look_only: bool) -> None:
         if choices[group] != "none":
             reason = f"gsbench does not read {group}: log.txt in a trial's folder holds everything"
             raise InputError(f"{group}={choices[group]}: {reason}")
-    if not multirun and hydra.mode is None and hydra.sweeper.get("params"):
-        raise InputError("hydra.sweeper.params lists values: add -m to run a trial for each, or hydra.mode=RUN for one")
+    if not multirun and hydra.mode is None and (hydra.sweeper.get("params") or hydra.sweeper.get("grids")):
+        raise InputError("hydra.sweeper lists values: add -m to run a trial for each, or hydra.mode=RUN for one")
     if not multirun and launcher != OWN:
         raise InputError(f"hydra/launcher={launcher} launches sweeps: add -m, or leave it out")
     if launcher != OWN and master.launch.name != "serial":

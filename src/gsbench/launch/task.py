@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
@@ -22,6 +22,7 @@ from gsbench.compose import Composed, compose_jobs, explained, ready_trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.hydra_job import words_of
 from gsbench.launch.batch import begin_for_another_launcher
+from gsbench.launch.grids import words_of_grids
 from gsbench.launch.outcome import Outcome, objective, outcome_of_error
 from gsbench.logs import set_up_logging
 from gsbench.pipeline.trial_files import TrialPaths
@@ -37,11 +38,13 @@ class Enough(Exception):  # noqa: N818 - it is no error
 class Task:
     """The function that Hydra runs. ``handle`` runs trials, or only looks at them and raises `Enough`.
 
-    ``trials`` and ``outcomes`` are what has come together, over all batches of a sweep.
+    ``grids`` are what gsbench's sweeper joins (`gsbench.launch.grids`); ``trials`` and ``outcomes`` are what has come
+    together, over all batches of a sweep.
     """
 
     handle: Callable[[Sequence[Composed]], list[Outcome]]
     look_only: bool = False
+    grids: list[dict[str, str]] = field(default_factory=list)
     trials: list[Composed] = field(default_factory=list)
     outcomes: list[Outcome] = field(default_factory=list)
 
@@ -75,14 +78,25 @@ def launch_jobs(
 
 
 def sweep(
-    task: Task, context: HydraContext, master: DictConfig, launcher: Launcher, words: Sequence[str]
+    task: Task,
+    context: HydraContext,
+    master: DictConfig,
+    launcher: Launcher,
+    params: Mapping[str, Any],
+    words: Sequence[str],
 ) -> Sequence[JobReturn]:
-    """What gsbench's sweeper does with the words of a sweep: all points of the grid at once, by any launcher.
+    """What gsbench's sweeper does with the words of a sweep: all points of its grids at once, by any launcher.
 
-    Another launcher than gsbench's gets them after a look at all, so that what is refused is refused before any work.
+    ``params`` are the settings and values of ``hydra.sweeper.params``. Another launcher than gsbench's gets them after
+    a look at all, so that what is refused is refused before any work.
     """
+    parser = OverridesParser.create(context.config_loader)
     with explained(words):
-        jobs = grid(OverridesParser.create(context.config_loader).parse_overrides(list(words)))
+        jobs = [
+            point
+            for of_grid in words_of_grids(params, task.grids, words)
+            for point in grid(parser.parse_overrides(of_grid))
+        ]
     name = master.hydra.runtime.choices["hydra/launcher"]
     if name == OWN:
         return launcher.launch(jobs, initial_job_idx=0)

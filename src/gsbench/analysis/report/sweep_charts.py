@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import differing_settings
+from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.report.charts import Series, line_chart, short_number
 from gsbench.analysis.results import Trial, canonical
@@ -19,13 +20,16 @@ def sweep_charts(trials: Sequence[Trial]) -> list[str]:
     """For each initialiser and class of densifier of which one setting was varied, a chart for each quantity.
 
     A line is a scene, relative to its own mean over the values, so that scenes of unlike levels share an axis and each
-    scene's best value can be seen: a threshold in scene units need not suit all scenes.
+    scene's best value can be seen: a threshold in scene units need not suit all scenes. The baseline, which has no such
+    setting, stands beside the values.
     """
     charts = []
-    for family, group in by_key(trials, lambda trial: tuple(trial.config.get(key) for key in FAMILY)).items():
-        setting = _varied(group)
+    for family, swept in by_key(trials, lambda trial: tuple(trial.config.get(key) for key in FAMILY)).items():
+        setting = _varied(swept)
         if setting is None:
             continue
+        baseline = _baseline(trials, swept, setting)
+        group = [*swept, *baseline]
         values = {canonical(trial.config.get(setting)): trial.config.get(setting) for trial in group}
         places = {key: place for place, key in enumerate(sorted(values, key=lambda key: _order(values[key])))}
         arm = ", ".join(str(part).rpartition(".")[2] for part in family if part is not None)
@@ -35,10 +39,20 @@ def sweep_charts(trials: Sequence[Trial]) -> list[str]:
                 Series(scene, _deviations(own, setting, places, quantity))
                 for scene, own in sorted(by_key(group, lambda trial: trial.scene).items())
             ]
-            names = [_name(values[key]) for key in places]
+            names = [BASELINE if baseline and values[key] is None else _name(values[key]) for key in places]
             label = f"{quantity.heading}, minus the scene's mean"
             charts.append(line_chart(f"{quantity.name} by {title}", series, setting, label, x_names=names))
     return [chart for chart in charts if chart]
+
+
+def _baseline(trials: Sequence[Trial], swept: Sequence[Trial], setting: str) -> list[Trial]:
+    """The trials of the baseline beside those ``swept``, where it is one arm and has no such setting."""
+    if any(trial.config.get(setting) is None for trial in swept):
+        return []
+    found = [trial for trial in trials if (trial.init, trial.densify) == (swept[0].init, BASELINE)]
+    scenes = by_key(found, lambda trial: trial.scene).values()
+    one_arm = not any(differing_settings(own) for own in scenes)
+    return found if one_arm and not any(setting in trial.config for trial in found) else []
 
 
 def _varied(group: Sequence[Trial]) -> str | None:
