@@ -15,7 +15,7 @@ from gsbench import __version__
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder
 from gsbench.logs import set_up_logging
-from gsbench.verbs import VERBS
+from gsbench.verb_table import VERBS
 from gsbench.words import closest
 
 DONE, TRIAL_FAILED, BAD_INPUT = 0, 1, 2

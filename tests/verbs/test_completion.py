@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.verbs import VERBS
+from gsbench.shells import SCRIPTS
+from gsbench.verb_table import VERBS
 from gsbench.verbs.completion import complete
-from gsbench.verbs.shells import SCRIPTS
 from tests.conftest import ROOT
 
 SECONDS = 120  # within which what never comes is told from a slow machine

@@ -1,6 +1,6 @@
 """``gsbench completion``: what the Tab key offers, as folders tell of experiments and trials, and Hydra of settings.
 
-A shell's script (`gsbench.verbs.shells`) asks ``gsbench completion query LINE``, which prints a line for each word that
+A shell's script (`gsbench.shells`) asks ``gsbench completion query LINE``, which prints a line for each word that
 the last one of ``LINE`` may become. Loads no torch, and Hydra for settings only.
 """
 
@@ -19,8 +19,8 @@ from gsbench.datasets.catalog import read_catalog
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys
 from gsbench.layout import TRIAL_GLOB
-from gsbench.verbs import VERBS
-from gsbench.verbs.shells import SCRIPTS, how_to_install
+from gsbench.shells import SCRIPTS, how_to_install
+from gsbench.verb_table import VERBS
 
 QUERY = "query"
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")

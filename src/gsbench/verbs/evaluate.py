@@ -12,7 +12,7 @@ from gsbench.eval.protocol import PROTOCOLS
 def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: 0 if every photograph was measured."""
     options = _parser().parse_intermixed_args(argv)
-    from gsbench.verbs.measure_renders import measure_renders
+    from gsbench.pipeline.measure_renders import measure_renders
 
     measure_renders(options, runs)
     return 0

@@ -1,0 +1,26 @@
+"""The verbs of the command line: for each the module with its ``main(argv, runs)``, and what it is for."""
+
+from __future__ import annotations
+
+VERBS = {
+    "fetch": (
+        "gsbench.verbs.fetch",
+        "bring public scenes here: Mip-NeRF 360, Tanks and Temples, Deep Blending",
+    ),
+    "evaluate": (
+        "gsbench.verbs.evaluate",
+        "measure renders of any program; --as enters them beside an experiment's arms",
+    ),
+    "tables": ("gsbench.verbs.tables", "Markdown, CSV, LaTeX or HTML tables of an experiment"),
+    "report": ("gsbench.verbs.report", "one HTML file with the evidence of an experiment"),
+    "explain": ("gsbench.verbs.explain", "how a table's number came about; with --stale, why a stage is computed anew"),
+    "status": ("gsbench.verbs.status", "what an experiment has done, runs, failed and misses"),
+    "retry": ("gsbench.verbs.retry", "run what failed, was stopped or is missing of an experiment"),
+    "bench": ("gsbench.verbs.bench", "time rasterizers and the training step"),
+    "sync": ("gsbench.verbs.sync", "mirror to MLflow what it missed"),
+    "ui": ("gsbench.verbs.ui", "open the MLflow dashboard on this machine"),
+    "export": ("gsbench.verbs.export", "copy a trained model or an initial cloud to where another program reads it"),
+    "view": ("gsbench.verbs.view", "look at trained models in the browser: one, or two side by side"),
+    "completion": ("gsbench.verbs.completion", "complete verbs, settings, experiments and trials on the Tab key"),
+    "doctor": ("gsbench.verbs.doctor", "check this machine and say what is missing"),
+}
