@@ -18,11 +18,13 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+import torch
 from PIL import Image
 
 from gsbench.cli import run
 from gsbench.datasets.catalog import read_catalog
 from gsbench.scene.courtyard import render_courtyard
+from gsbench.view.trials import find_trial, load_viewed
 from tests.datasets.server import serve
 from tests.end_to_end.conftest import Run
 from tests.processes import heed_interrupts
@@ -78,7 +80,7 @@ def home(tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str], 
             content.write(file, f"{archive.scenes['garden']}/{name}")
     with serve(archives) as server:
         program(environment, home, "fetch", "mipnerf360", "garden", "--mirror", server.url)
-    sweep = ["densify=adc,cloud,painter", "seed=0,1", "name=three", "scene=garden"]
+    sweep = ["densify=adc,cloud,painter", "seed=0,1", "name=three", "scene=garden", "eval.maps=true"]
     program(environment, home, "--config-dir", str(trainers), "-m", *QUICK, *sweep)
     return home
 
@@ -131,11 +133,25 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(
     for arm in ("cloud", "painter", "folder"):
         assert re.search(rf"random-{arm} against random-adc, on this scene: (better|worse)", report), arm
     for words in (["status", "three"], ["explain", "three:garden:psnr:cloud"], ["explain", "three:garden:psnr:painter"],
-                  ["explain", "--stale", str(trial(home, "cloud"))], ["sync", "three"]):  # fmt: skip
+                  ["explain", "--stale", str(trial(home, "cloud"))],
+                  ["explain", "--stale", str(trial(home, "painter"))], ["sync", "three"]):  # fmt: skip
         assert run(words) == 0, words
     said = capsys.readouterr().out
     assert "6 done" in said or "8 done" in said
     assert f"program   1.2.3: {sys.executable} {TRAINER}" in said
+
+
+def test_its_model_is_one_as_any_other(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
+    viewed = load_viewed(find_trial("three:garden:cloud:0", home / "runs"), torch.device("cpu"))
+    assert len(viewed.gaussians) == 2000
+    assert len(viewed.views) == 2
+    assert (trial(home, "cloud") / "figures" / "ellipsoids.png").is_file()
+    assert run(["export", "three:garden:cloud:0", "--out", str(tmp_path / "x.splat")]) == 0
+    assert run(["export", "three:garden:painter:0", "--out", str(tmp_path / "y.splat")]) == 2
+    assert "it has no model" in capsys.readouterr().err
 
 
 def test_what_is_recorded(home: Path) -> None:
@@ -179,7 +195,7 @@ def test_done_is_done_and_another_version_is_another_result(
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
     monkeypatch.chdir(home)
-    words = ["--config-dir", str(trainers), *QUICK, "scene=garden", "densify=cloud", "name=three"]
+    words = ["--config-dir", str(trainers), *QUICK, "scene=garden", "densify=cloud", "name=three", "eval.maps=true"]
     before = {path: path.stat().st_mtime_ns for path in (home / "runs" / "store").glob("*/*/manifest.json")}
     assert run(words) == 0
     assert run([*words, "name=again", "densify.time_limit_minutes=7"]) == 0  # the limit makes no other result
