@@ -62,6 +62,7 @@ def external_step(
         places = {name: work / name for name in (DATA, TEST_CAMERAS, OUTPUT)}
         values = {name: str(place.resolve()) for name, place in places.items()} | trainer.options
         values |= {"iterations": iterations, "seed": seed, "device": str(device), "threads": threads}
+        placeless = {name: f"{{{name}}}" for name in places}  # the folders of a build mean nothing after it
         command = [executable, *(fill(word, values, "densify.command") for word in trainer.words[1:])]
         environment = environment_of(trainer, values)
         said = check_version(trainer, values, environment)
@@ -74,7 +75,8 @@ def external_step(
         try:
             ended = run_program(command, log_file, places[OUTPUT], environment, limit)
         finally:
-            shutil.rmtree(places[DATA])
+            for place in (DATA, TEST_CAMERAS):
+                shutil.rmtree(places[place], ignore_errors=True)
         log.info("train: %s ended after %s", trainer.program, readable_time(ended.seconds))
         pattern = fill(trainer.result, values, "densify.result")
         with what_it_left(trainer, log_file):
@@ -93,7 +95,7 @@ def external_step(
                 "program": trainer.program,
                 "version": trainer.version,
                 "said": said,
-                "command": command,
+                "command": [fill(word, values | placeless, "densify.command") for word in trainer.words],
             },
         }
         write_json(folder / TRAINING_FILE, summary)
