@@ -110,9 +110,18 @@ def is_sweep(word: str) -> bool:
 
 def check_sweep(override: Override) -> None:
     """Raise InputError for a list of values whose trials would all be one and the same trial, or cannot be listed."""
-    key = override.get_key_element().lstrip("+~")
     if not override.is_discrete_sweep():
-        raise InputError(f"{override.input_line}: a sweep is a list of values, such as {key}=1,2,3")
+        key = override.get_key_element().lstrip("+~")
+        raise InputError(
+            f"{override.input_line}: a sweep is a list of values, such as {key}=1,2,3; "
+            "intervals are for hydra/sweeper=optuna"
+        )
+    check_makes_trials(override)
+
+
+def check_makes_trials(override: Override) -> None:
+    """Raise InputError for a setting whose values would all give one and the same trial."""
+    key = override.get_key_element().lstrip("+~")
     first, _, last = key.partition(".")
     without_effect = last in (*WITHOUT_EFFECT, *DECLARED.get(first, ()))
     if (first in NOT_HASHED and first not in NAMED_APART) or without_effect:

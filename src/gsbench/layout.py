@@ -13,6 +13,7 @@ IN_RUNS = (STORE, ARTIFACTS, DATABASE)
 # in an experiment's folder
 PLAN = "plan.json"  # the trials that were asked for
 DECLARED = "declared.jsonl"  # the metrics that verdicts were declared to be about, and when
+SEARCH, SEARCH_JOURNAL = "search.json", "search.journal"  # what a search found, and Optuna's own record of it
 TRIAL_GLOB = "*/*/*-seed*"  # the trials that are there
 
 # in a trial's folder

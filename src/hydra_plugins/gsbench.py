@@ -1,4 +1,4 @@
-"""By these names Hydra finds gsbench's launcher and sweeper; what they do stands in ``gsbench.launch``.
+"""By these names Hydra finds gsbench's launcher and sweepers; what they do stands in ``gsbench.launch``.
 
 Hydra imports this file at every start, of any Hydra app in the same environment, so it imports Hydra alone.
 """
@@ -42,13 +42,34 @@ class GsbenchSweeper(Sweeper):
             hydra_context=hydra_context, task_function=task_function, config=config
         )
 
-    def sweep(self, arguments: list[str]) -> Sequence[JobReturn]:
+    def sweep(self, arguments: list[str]) -> Any:
         from gsbench.launch.task import sweep
 
         return sweep(self.task, self.context, self.config, self.launcher, self.params, arguments)
 
 
+class OptunaSweeper(GsbenchSweeper):
+    """The points that Optuna proposes, learning from those before."""
+
+    def __init__(self, params: dict[str, Any], **settings: Any) -> None:
+        super().__init__(params)
+        self.settings = settings
+
+    def sweep(self, arguments: list[str]) -> None:
+        from gsbench.launch.search import search
+
+        words = [*(f"{key}={value}" for key, value in self.params.items()), *arguments]
+        search(self.task, self.context, self.config, self.launcher, self.settings, words)
+
+
 LAUNCHER = {"_target_": "hydra_plugins.gsbench.GsbenchLauncher"}
 SWEEPER = {"_target_": "hydra_plugins.gsbench.GsbenchSweeper", "params": {}, "grids": []}
+SEARCH = {"metric": "psnr", "trials": 20, "seed": 0, "at_once": 1, "params": {}}  # gsbench.launch.search
 ConfigStore.instance().store(group="hydra/launcher", name="gsbench", node=LAUNCHER, provider="gsbench")
 ConfigStore.instance().store(group="hydra/sweeper", name="gsbench", node=SWEEPER, provider="gsbench")
+ConfigStore.instance().store(
+    group="hydra/sweeper",
+    name="optuna",
+    node={"_target_": "hydra_plugins.gsbench.OptunaSweeper", **SEARCH},
+    provider="gsbench",
+)

@@ -85,10 +85,9 @@ def sweep(
     params: Mapping[str, Any],
     words: Sequence[str],
 ) -> Sequence[JobReturn]:
-    """What gsbench's sweeper does with the words of a sweep: all points of its grids at once, by any launcher.
+    """What gsbench's sweeper does with the words of a sweep: all points of its grids at once.
 
-    ``params`` are the settings and values of ``hydra.sweeper.params``. Another launcher than gsbench's gets them after
-    a look at all, so that what is refused is refused before any work.
+    ``params`` are the settings and values of ``hydra.sweeper.params``.
     """
     parser = OverridesParser.create(context.config_loader)
     with explained(words):
@@ -97,22 +96,28 @@ def sweep(
             for of_grid in words_of_grids(params, task.grids, words)
             for point in grid(parser.parse_overrides(of_grid))
         ]
+    return launch_trials(task, master, launcher, compose_jobs(context, master, jobs))
+
+
+def launch_trials(
+    task: Task, master: DictConfig, launcher: Launcher, trials: Sequence[Composed]
+) -> Sequence[JobReturn]:
+    """Run trials that a sweeper of gsbench's has composed, by any launcher.
+
+    Another launcher than gsbench's gets them after a look at all, so that what is refused is refused before any work.
+    """
     name = master.hydra.runtime.choices["hydra/launcher"]
-    if name == OWN:
-        return launcher.launch(jobs, initial_job_idx=0)
-    trials = compose_jobs(context, master, jobs)
-    if task.look_only:
+    if name == OWN or task.look_only:
         return task.launch(trials)
     begin_for_another_launcher(trials)
+    jobs = [trial.job for trial in trials if trial.job is not None]
     try:
-        returned = launcher.launch(jobs, initial_job_idx=0)
+        returned = launcher.launch([list(job.words) for job in jobs], initial_job_idx=jobs[0].number or 0)
     except GsbenchError:
         raise
     except Exception as error:
         message = " ".join(str(error).split()) or type(error).__name__
-        raise GsbenchError(
-            f"hydra/launcher={name} failed: {message}; `gsbench status` tells how far it came"
-        ) from error
+        raise GsbenchError(f"hydra/launcher={name}: {message} (gsbench status tells how far it came)") from error
     task.trials += trials
     task.outcomes += [_outcome(trial, ended) for trial, ended in zip(trials, returned, strict=True)]
     return returned

@@ -15,6 +15,7 @@ from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs
 from gsbench.analysis.paper import inconsistencies, load_paper
 from gsbench.analysis.paper_tables import layout_of, paper_tables
 from gsbench.analysis.report.crops import data_uri
+from gsbench.analysis.report.search_charts import search_part
 from gsbench.analysis.report.sections import (
     compare_arms,
     event_charts,
@@ -59,6 +60,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         families=families(list(judged.values())),
         tables=[to_html(table) for table in tables],
         contradictions=[] if layout is None else inconsistencies(load_paper()),
+        search=search_part(experiment.folder),
         sweeps=sweep_charts(trials),
         tradeoffs=tradeoff_charts(trials),
         gaps=tradeoff_gaps(trials, baseline),

@@ -43,10 +43,12 @@ def line_chart(
     log_y: bool = False,
     marker: tuple[float, str] | None = None,
     x_names: Sequence[str] = (),
+    dots: bool = False,
 ) -> str:
     """Lines over common axes; ``marker`` is a labelled vertical line. What a log axis cannot show is dropped.
 
-    With ``x_names``, x is the place in that list: values side by side at equal distances.
+    With ``x_names``, x is the place in that list: values side by side at equal distances. With ``dots``, points are
+    marked however many there are.
     """
     shown = [
         Series(s.name, [p for p in s.points if (p[0] > 0 or not log_x) and (p[1] > 0 or not log_y)]) for s in series
@@ -69,7 +71,7 @@ def line_chart(
         parts.append(
             f'<polyline fill="none" stroke="{color}" stroke-width="2" stroke-dasharray="{dash}" points="{path}"/>'
         )
-        if len(one.points) <= TICKS or x_names:
+        if len(one.points) <= TICKS or x_names or dots:
             parts += [
                 f'<circle cx="{x_axis.place(x):.1f}" cy="{y_axis.place(y):.1f}" r="3.5" fill="{color}"/>'
                 for x, y in one.points

@@ -1,0 +1,76 @@
+"""The report's part on a search: how its best came about, and the metric over each setting that was searched."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsbench.analysis.report.charts import Series, line_chart, short_number
+from gsbench.eval.facts import find
+from gsbench.files import read_object
+from gsbench.layout import SEARCH
+from gsbench.words import counted
+
+
+@dataclass(frozen=True)
+class SearchPart:
+    """A line in words, and charts as SVG."""
+
+    line: str
+    charts: Sequence[str]
+
+
+def search_part(home: Path) -> SearchPart | None:
+    """What the search in an experiment's folder found; None where there was none, or its file cannot be read."""
+    record = read_object(home / SEARCH)
+    try:
+        return _part(record) if record else None
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return None
+
+
+def _part(record: Mapping[str, Any]) -> SearchPart:
+    facts = find(record["metric"])
+    name = facts.name if facts else record["metric"]
+    decimals = (facts.decimals if facts else 3) + 1
+    sign = float(record["direction"])
+    points = record["points"]
+    done = [point for point in points if point["value"] is not None]
+    failed = sum(point["state"] == "failed" for point in points)
+    count = f"{len(points)} of {counted(record['wanted'], 'point')}, each {counted(record['seeds'], 'seed')}"
+    count += f"; {failed} failed" if failed else ""
+    if not done:
+        return SearchPart(f"{count}; none has a result yet.", [])
+    best = max(done, key=lambda point: sign * point["value"])
+    where = ", ".join(f"{key} = {_shown(value)}" for key, value in best["settings"].items())
+    line = f"Best {name}: {best['value']:.{decimals}f} at {where} (point {best['number'] + 1}). {count}."
+    so_far: list[tuple[float, float]] = []
+    for point in done:
+        known = so_far[-1][1] if so_far else point["value"]
+        so_far.append((point["number"] + 1.0, max(known, point["value"], key=lambda value: sign * value)))
+    each = [(point["number"] + 1.0, point["value"]) for point in done]
+    history = [Series("each point", each), Series("best so far", so_far)]
+    charts = [line_chart("The search", history, "point", name, dots=True)]
+    charts += [_by_setting(key, done, name, key in record["log"], best) for key in best["settings"]]
+    return SearchPart(line, [chart for chart in charts if chart])
+
+
+def _by_setting(
+    key: str, done: Sequence[Mapping[str, Any]], name: str, log_scale: bool, best: Mapping[str, Any]
+) -> str:
+    """The metric over one searched setting: numbers to scale, words side by side."""
+    values = [point["settings"][key] for point in done]
+    title = f"{name} by {key.rpartition('.')[2]}"
+    if all(isinstance(value, int | float) for value in values):
+        line = [(float(value), point["value"]) for value, point in zip(values, done, strict=True)]
+        marker = (float(best["settings"][key]), "best")
+        return line_chart(title, [Series("each point", sorted(line))], key, name, log_scale, marker=marker, dots=True)
+    names = sorted({str(value) for value in values})
+    places = [(float(names.index(str(value))), point["value"]) for value, point in zip(values, done, strict=True)]
+    return line_chart(title, [Series("each point", sorted(places))], key, name, x_names=names)
+
+
+def _shown(value: Any) -> str:
+    return short_number(value) if isinstance(value, float) else str(value)
