@@ -19,7 +19,8 @@ list; any other word is meant for all.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict, read_write
@@ -30,16 +31,27 @@ from gsbench.errors import InputError
 PLACE = "hydra.sweeper.grids"
 
 
-def take_grids(master: DictConfig) -> list[dict[str, str]]:
-    """Take the grids out of a composed configuration; ``${…}`` in them is for each trial to resolve.
+@contextmanager
+def grids_aside(master: DictConfig) -> Iterator[list[dict[str, str]]]:
+    """The grids of a composed configuration, which lacks them while the block runs.
 
-    Raises InputError for what is no list of settings with values.
+    Hydra resolves ``${…}`` in what it makes a sweeper of; in a grid that is for each trial to do. Raises InputError for
+    what is no list of settings with values.
     """
     sweeper = master.hydra.sweeper
     if "grids" not in sweeper:
-        return []
+        yield []
+        return
     with read_write(master.hydra), open_dict(sweeper):
         grids = sweeper.pop("grids")
+    try:
+        yield _checked(grids)
+    finally:
+        with read_write(master.hydra), open_dict(sweeper):
+            sweeper.grids = grids
+
+
+def _checked(grids: Any) -> list[dict[str, str]]:
     found = OmegaConf.to_container(grids, resolve=False) if isinstance(grids, ListConfig) else grids
     if not isinstance(found, list) or not all(isinstance(grid, dict) and grid for grid in found):
         raise InputError(f"{PLACE} must be a list, each a mapping of settings to values, got {found!r}")

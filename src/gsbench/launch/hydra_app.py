@@ -20,7 +20,7 @@ from gsbench.compose import Composed, compose_master, composing, explained, read
 from gsbench.config import check_target
 from gsbench.errors import InputError
 from gsbench.hydra_job import CONFIG_NAME, HydraJob, start, words_of
-from gsbench.launch.grids import take_grids
+from gsbench.launch.grids import grids_aside
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.task import OWN, Enough, Task
 from gsbench.logs import show_details
@@ -74,8 +74,7 @@ def _run(context: HydraContext, config: DictConfig, words: Sequence[str], task: 
 def _multirun(context: HydraContext, config: DictConfig, words: Sequence[str], task: Task) -> None:
     """As `hydra.multirun`."""
     context.callbacks.on_multirun_start(config=config, config_name=CONFIG_NAME)
-    task.grids = take_grids(config)
-    with explained(words):  # a sweeper or launcher that cannot be made
+    with grids_aside(config) as task.grids, explained(words):  # a sweeper or launcher that cannot be made
         sweeper = Plugins.instance().instantiate_sweeper(hydra_context=context, task_function=task, config=config)
     sweeper.sweep(arguments=words_of(config.hydra.overrides)[1])
     context.callbacks.on_multirun_end(config=config, config_name=CONFIG_NAME)
