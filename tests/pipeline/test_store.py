@@ -207,7 +207,7 @@ def test_killed_at_random_moments_the_work_is_finished_and_right(store: Store) -
 
 def test_rivals_do_the_work_once_and_say_what_they_wait_for(store: Store) -> None:
     processes = [toy(store, 1, "--slow") for _ in range(4)]
-    results = [process.communicate(timeout=60) for process in processes]
+    results = [process.communicate(timeout=300) for process in processes]
     assert [process.returncode for process in processes] == [0, 0, 0, 0]
     assert sorted(out.strip() for out, _ in results) == ["built", "found", "found", "found"]
     waiting = [err for out, err in results if out.strip() == "found"]
@@ -224,7 +224,7 @@ def test_killed_rival_frees_its_lock(store: Store) -> None:
     time.sleep(0.3)
     first.send_signal(signal.SIGKILL)
     first.wait()
-    out, _ = second.communicate(timeout=60)
+    out, _ = second.communicate(timeout=300)
     assert out.strip() == "built"
     assert (store.folder(TOY, key) / "lines.txt").read_text() == expected_text(0)
 

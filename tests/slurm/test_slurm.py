@@ -59,7 +59,7 @@ def slurm() -> None:
     pytest.importorskip("submitit", reason="needs the extra slurm")
     try:
         states = subprocess.run(
-            ["sinfo", "-h", "-o", "%T"], capture_output=True, text=True, timeout=20, check=True
+            ["sinfo", "-h", "-o", "%T"], capture_output=True, text=True, timeout=120, check=True
         ).stdout
     except (subprocess.SubprocessError, OSError) as error:
         pytest.skip(f"Slurm does not answer: {error}")
@@ -113,7 +113,7 @@ def test_sweep_runs_out_of_time_is_requeued_and_ends_as_undisturbed(place: Path,
     time.sleep(3)
     subprocess.run(["scontrol", "requeue", queued[0]], check=True)  # as a preemption does: SIGTERM, then the queue
     first.send_signal(signal.SIGINT)
-    output, _ = first.communicate(timeout=30)
+    output, _ = first.communicate(timeout=120)
     assert first.returncode == 130
     assert "the jobs stay in Slurm" in output
 

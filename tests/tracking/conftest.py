@@ -40,9 +40,9 @@ def postgresql(tmp_path: Path) -> Iterator[str]:
         for folder in (tmp_path, *tmp_path.parents[:2]):
             folder.chmod(folder.stat().st_mode | 0o011)
     port = free_port()
-    run = lambda *words: subprocess.run([*prefix, *words], check=True, capture_output=True, timeout=60)  # noqa: E731
+    run = lambda *words: subprocess.run([*prefix, *words], check=True, capture_output=True, timeout=300)  # noqa: E731
     run(str(home / "initdb"), "-D", str(data), "-U", "gsbench", "--auth=trust", "--no-sync")
     settings = f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories={data} -c fsync=off"
     run(str(home / "pg_ctl"), "-D", str(data), "-l", str(data / "log"), "-w", "-o", settings, "start")
     yield f"postgresql+psycopg2://gsbench@127.0.0.1:{port}/postgres"
-    subprocess.run([*prefix, str(home / "pg_ctl"), "-D", str(data), "-m", "immediate", "stop"], check=False, timeout=60)
+    subprocess.run([*prefix, str(home / "pg_ctl"), "-D", str(data), "-m", "immediate", "stop"], check=False, timeout=300)
