@@ -11,6 +11,7 @@ import pytest
 from tests.end_to_end.conftest import Run
 
 pytestmark = pytest.mark.end_to_end
+SECONDS = 900  # a trial of three iterations on a machine that has much else to do
 
 TINY = [
     *("scene=courtyard", "scene.views=6", "scene.width=64", "scene.height=48", "init=random", "init.count=300"),
@@ -73,11 +74,11 @@ def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path, launc
     (tmp_path / "conf" / "experiment" / "own.yaml").write_text(EXPERIMENT)
     (tmp_path / "notes.py").write_text(CALLBACK)
     words = ["--config-dir", "conf", "+experiment=own", *TINY, f"launch={launch}"]
-    listed = gsbench(*words, "--dry-run", GSBENCH_RUNS="runs")
+    listed = gsbench(*words, "--dry-run", GSBENCH_RUNS="runs", timeout=SECONDS)
     assert "2 trials: 2 missing" in listed.stdout, listed.stderr
     assert not (tmp_path / "notes.txt").exists()  # where nothing runs, no callback is called
 
-    done = gsbench(*words, GSBENCH_RUNS="runs")
+    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
     assert done.returncode == 0, done.stderr
     results = results_below(tmp_path / "runs" / "gsbench-none")
     assert [result["seed"] for result in results] == [0, 1]
@@ -88,7 +89,7 @@ def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path, launc
     for i in (0, 1):
         assert f"seed: {i}" in (tmp_path / "of_hydra" / str(i) / "hydra" / "config.yaml").read_text()
 
-    again = gsbench(*words, GSBENCH_RUNS="runs")
+    again = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
     assert again.returncode == 0
     assert (tmp_path / "notes.txt").read_text().splitlines()[len(notes) :] == ["sweep begins", "sweep ends"]
 
@@ -99,13 +100,13 @@ def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, launc
     if launcher != "basic" and find_spec(package) is None:
         pytest.skip(f"needs {package} (extra dev)")
     words = ["-m", *TINY, f"hydra/launcher={launcher}", "name=x", "seed=0,1"]
-    done = gsbench(*words, GSBENCH_RUNS="runs")
+    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
     assert done.returncode == 0, done.stderr
     results = sorted((tmp_path / "runs" / "x").rglob("results.json"))
     assert len(results) == 2
-    assert "2 trials: 2 done" in gsbench("status", "x", GSBENCH_RUNS="runs").stdout
+    assert "2 trials: 2 done" in gsbench("status", "x", GSBENCH_RUNS="runs", timeout=SECONDS).stdout
     written = [path.stat().st_mtime_ns for path in results]
-    assert gsbench(*words, GSBENCH_RUNS="runs").returncode == 0
+    assert gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS).returncode == 0
     assert [path.stat().st_mtime_ns for path in results] == written  # nothing is done twice
 
 
@@ -125,14 +126,16 @@ def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(gsbench:
         "densify._target_=own.Own",
         "allow_targets=[own]",
     ]
-    done = gsbench(*words, GSBENCH_RUNS="runs")
+    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     failed = [line for line in done.stderr.splitlines() if line.startswith("gsbench: failed")]
     assert len(failed) == 2
-    assert "2 trials: 2 failed" in gsbench("status", "x", GSBENCH_RUNS="runs").stdout
+    assert "2 trials: 2 failed" in gsbench("status", "x", GSBENCH_RUNS="runs", timeout=SECONDS).stdout
 
 
 def test_hydras_own_sweeper_with_our_launcher(gsbench: Run) -> None:
-    listed = gsbench("-m", *TINY, "hydra/sweeper=basic", "seed=0,1,2", "--dry-run", GSBENCH_RUNS="runs")
+    listed = gsbench(
+        "-m", *TINY, "hydra/sweeper=basic", "seed=0,1,2", "--dry-run", GSBENCH_RUNS="runs", timeout=SECONDS
+    )
     assert "3 trials: 3 missing" in listed.stdout, listed.stderr
