@@ -45,4 +45,5 @@ def postgresql(tmp_path: Path) -> Iterator[str]:
     settings = f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories={data} -c fsync=off"
     run(str(home / "pg_ctl"), "-D", str(data), "-l", str(data / "log"), "-w", "-o", settings, "start")
     yield f"postgresql+psycopg2://gsbench@127.0.0.1:{port}/postgres"
-    subprocess.run([*prefix, str(home / "pg_ctl"), "-D", str(data), "-m", "immediate", "stop"], check=False, timeout=300)
+    stop = [*prefix, str(home / "pg_ctl"), "-D", str(data), "-m", "immediate", "stop"]
+    subprocess.run(stop, check=False, timeout=300)
