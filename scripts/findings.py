@@ -1,0 +1,213 @@
+"""The tables and curves of docs/findings.md, made from the result files that are kept in docs/findings/.
+
+    python scripts/findings.py collect RUNS   copy what the page needs out of a runs folder
+    python scripts/findings.py                write the tables into the page and draw the curves
+
+The page's own test makes the tables anew and compares.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from PIL import Image
+
+from gsbench.analysis.frame import to_frame
+from gsbench.analysis.pairing import Paired
+from gsbench.analysis.results import Experiment, list_experiments, read_experiment, read_views
+from gsbench.analysis.statistics import Comparison, compare, holm
+from gsbench.eval.facts import MetricFacts, find
+
+PAGE = Path(__file__).parents[1] / "docs" / "findings.md"
+DATA = PAGE.with_suffix("")
+EXPERIMENTS = ("bonsai_growth", "fair_governor", "fair_hard", "initialisers")
+BASELINES = ("adc", "sfm")  # what the others are held against: among densifiers, among initialisers
+METRICS = {"lpips_squeeze": ("LPIPS (squeeze)", 3), "psnr": ("PSNR, dB", 2), "ssim": ("SSIM", 3), "flip": ("FLIP", 3)}
+WHICH = ["scene", "init", "densify", "seed", "iterations", "width", "height"]
+CAUSES = ["cloned", "split_gradient", "split_volume", "isotropic_resplit", "blocked_by_cap", "pruned_opacity"]
+SECTION = re.compile(r"(<!-- (\w+) of (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def collect(runs: Path) -> None:
+    """Write one row a trial, and the count after every round, into the files beside the page."""
+    DATA.mkdir(exist_ok=True)
+    kept = [*WHICH, "num_init_points", "num_gaussians", "seconds_train", *METRICS, *(f"event_{c}" for c in CAUSES)]
+    for name in EXPERIMENTS:
+        if name in list_experiments(runs):
+            experiment = read_experiment(runs / name)
+            to_frame(experiment).reindex(columns=kept).to_csv(DATA / f"{name}.csv", index=False, float_format="%.6g")
+            _rounds(experiment).to_csv(DATA / f"{name}_rounds.csv", index=False, float_format="%.5g")
+            if name == "bonsai_growth":
+                _picture(experiment).save(DATA / f"{name}.png")
+
+
+def _rounds(experiment: Experiment) -> pd.DataFrame:
+    """The count after every round of the first seed, and what the governor did to the thresholds."""
+    rows = []
+    for trial in experiment.trials:
+        if trial.seed == min(t.seed for t in experiment.trials):
+            for line in (trial.path / "events.jsonl").read_text().splitlines():
+                event = json.loads(line)
+                row = {"scene": trial.scene, "densify": trial.densify, "step": event["step"], "count": event["after"]}
+                rows.append(row | {"strictness": event.get("strictness"), "cull": event.get("cull")})
+    return pd.DataFrame(rows).dropna(axis=1, how="all")
+
+
+def _picture(experiment: Experiment, zoom: int = 2) -> Image.Image:
+    """A held-out view as photograph, by adc, and by the best and the worst seed of volumetric.
+
+    It is the view in whose PSNR the seeds of volumetric differ the most.
+    """
+    trials = [trial for trial in experiment.trials if trial.densify == "volumetric"]
+    trials.sort(key=lambda trial: -trial.metrics["psnr"])
+    best, worst = read_views(trials[0]), read_views(trials[-1])
+    name = max(best, key=lambda view: abs(best[view]["psnr"] - worst[view]["psnr"]))
+    base = next(t for t in experiment.trials if t.densify == "adc" and t.seed == trials[-1].seed)
+    folders = [base.path / "ground_truth", *(trial.path / "renders" for trial in (base, trials[0], trials[-1]))]
+    pictures = [Image.open(folder / f"{Path(name).stem}.png") for folder in folders]
+    width, height = pictures[0].width * zoom, pictures[0].height * zoom
+    joined = Image.new("RGB", (len(pictures) * (width + 4) - 4, height), "white")
+    for index, picture in enumerate(pictures):
+        joined.paste(picture.resize((width, height), Image.Resampling.NEAREST), (index * (width + 4), 0))
+    return joined
+
+
+def arms_table(frame: pd.DataFrame) -> list[str]:
+    """An arm a row: mean over scenes of the mean over seeds, and the deviation of that mean's trials over seeds."""
+    columns = {"num_gaussians": ("Gaussians", 0), **METRICS, "seconds_train": ("training, s", 0)}
+    lines = [_row(["arm", *(title for title, _ in columns.values())]), _row(["---"] + ["--:"] * len(columns))]
+    for arm in _arms(frame):
+        own = frame[frame.arm == arm]
+        by_seed = own.groupby("seed")[list(columns)].mean()
+        cells = [f"{by_seed[k].mean():,.{d}f} ± {by_seed[k].std():,.{d}f}" for k, (_, d) in columns.items()]
+        lines.append(_row([arm, *cells]))
+    return lines
+
+
+def scenes_table(frame: pd.DataFrame) -> list[str]:
+    """LPIPS by arm and scene: mean over seeds and its trials' deviation."""
+    scenes = list(dict.fromkeys(frame.scene))
+    lines = [_row(["arm", *scenes]), _row(["---"] + ["--:"] * len(scenes))]
+    for arm in _arms(frame):
+        values = [frame[(frame.arm == arm) & (frame.scene == scene)].lpips_squeeze for scene in scenes]
+        lines.append(_row([arm, *(f"{v.mean():.3f} ± {v.std():.3f}" if len(v) else "" for v in values)]))
+    return lines
+
+
+def differences_table(frame: pd.DataFrame) -> list[str]:
+    """Each arm minus the baseline in each metric: mean, 95 % interval, p adjusted over the arms (Holm), verdict."""
+    lines = [
+        _row([f"minus {_baseline(frame)}", *(title for title, _ in METRICS.values())]),
+        _row(["---"] * (1 + len(METRICS))),
+    ]
+    others = _arms(frame)[1:]
+    found = {metric: [compare_arms(frame, arm, metric) for arm in others] for metric in METRICS}
+    adjusted = {metric: holm([c.p for c in comparisons]) for metric, comparisons in found.items()}
+    for index, arm in enumerate(others):
+        cells = []
+        for metric, (_, digits) in METRICS.items():
+            c, p = found[metric][index], adjusted[metric][index]
+            interval = f" [{c.interval.low:+.{digits}f}, {c.interval.high:+.{digits}f}]" if c.interval else ""
+            decided = c.verdict != "no evidence" and p is not None and p < 0.05
+            chance = "" if p is None else f", p {p:.3f}" if p >= 0.001 else ", p < .001"
+            cells.append(f"{c.mean:+.{digits}f}{interval}{chance}{f': **{c.verdict}**' if decided else ''}")
+        lines.append(_row([arm, *cells]))
+    return lines
+
+
+def events_table(frame: pd.DataFrame) -> list[str]:
+    """What the refinements did, by cause, in thousands of Gaussians, as the mean of the trials."""
+    causes = [c for c in frame.columns if c.startswith("event_")]
+    lines = [_row(["arm", *(c.removeprefix("event_").replace("_", " ") for c in causes)])]
+    lines.append(_row(["---"] + ["--:"] * len(causes)))
+    for arm in _arms(frame):
+        means = frame[frame.arm == arm][causes].mean()
+        lines.append(_row([arm, *(f"{value / 1000:,.1f}" for value in means)]))
+    return lines
+
+
+def compare_arms(frame: pd.DataFrame, arm: str, metric: str) -> Comparison:
+    """The program's own comparison, with a trial's mean over its views in the place of the views."""
+    one, other = (
+        frame[frame.arm == name].set_index(["scene", "seed"])[metric].sort_index() for name in (_baseline(frame), arm)
+    )
+    both = one.index.intersection(other.index)
+    difference = (other[both] - one[both]).dropna()
+    scenes = tuple(dict.fromkeys(difference.index.get_level_values("scene")))
+    matrices = tuple(np.asarray(difference[scene], float)[:, None] for scene in scenes)
+    paired = Paired(metric, scenes, matrices, float(one[both].groupby("scene").mean().mean()), ())
+    return compare(paired, _facts(metric).direction)
+
+
+def read(name: str) -> pd.DataFrame:
+    """The trials of an experiment, with the column ``arm``: the densifier, or the initialiser where those differ."""
+    frame = pd.read_csv(DATA / f"{name}.csv")
+    return frame.assign(arm=frame.init if frame.densify.nunique() == 1 else frame.densify)
+
+
+def _baseline(frame: pd.DataFrame) -> str:
+    return next(arm for arm in BASELINES if arm in set(frame.arm))
+
+
+def _arms(frame: pd.DataFrame) -> list[str]:
+    """The baseline first, then the others as they stand in the file."""
+    return sorted(dict.fromkeys(frame.arm), key=lambda arm: arm != _baseline(frame))
+
+
+def _facts(metric: str) -> MetricFacts:
+    facts = find(metric)
+    assert facts is not None
+    return facts
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+TABLES = {"arms": arms_table, "scenes": scenes_table, "differences": differences_table, "events": events_table}
+
+
+def with_tables(page: str) -> str:
+    """The page with every table made anew."""
+    return SECTION.sub(lambda m: m[1] + "\n".join(TABLES[m[2]](read(m[3]))) + "\n" + m[4], page)
+
+
+def draw() -> None:
+    """Counts over the iterations, an arm a line, a scene a panel; below, how far a governor moved thresholds."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    for file in sorted(DATA.glob("*_rounds.csv")):
+        rounds = pd.read_csv(file).assign(thousands=lambda frame: frame["count"] / 1000)
+        drawn = {"thousands": "Gaussians (thousands)"}
+        if "strictness" in rounds:
+            drawn["strictness"] = "thresholds, times their own"
+        scenes = list(dict.fromkeys(rounds.scene))
+        size = (1 + 3.2 * len(scenes), 3 * len(drawn))
+        figure, axes = plt.subplots(len(drawn), len(scenes), figsize=size, squeeze=False, sharex="col")
+        for (column, label), row in zip(drawn.items(), axes, strict=True):
+            for axis, scene in zip(row, scenes, strict=True):
+                for arm, own in rounds[rounds.scene == scene].groupby("densify", sort=False):
+                    axis.plot(own.step, own[column], label=arm)
+                axis.set(title=scene, xlabel="iteration", yscale="log" if column == "strictness" else "linear")
+            row[0].set_ylabel(label)
+        axes[0][0].legend(fontsize=7)
+        figure.tight_layout()
+        figure.savefig(file.with_suffix(".png"), dpi=80)
+        plt.close(figure)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["collect"]:
+        collect(Path(sys.argv[2]))
+    else:
+        PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+        draw()

@@ -1,0 +1,36 @@
+"""docs/findings.md says what its result files say."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+
+from tests.conftest import ROOT
+
+MAX_BYTES = 300_000
+spec = importlib.util.spec_from_file_location("findings", ROOT / "scripts" / "findings.py")
+assert spec is not None
+assert spec.loader is not None
+findings = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(findings)
+
+
+def test_the_tables_of_the_page_are_those_of_the_result_files() -> None:
+    page = findings.PAGE.read_text(encoding="utf-8")
+    assert len(findings.SECTION.findall(page)) >= 4
+    assert findings.with_tables(page) == page
+    assert "nan" not in page
+
+
+def test_every_file_that_the_page_names_is_there_and_small() -> None:
+    page = findings.PAGE.read_text(encoding="utf-8")
+    for name in re.findall(r"\((findings/[^)]+)\)", page):
+        assert (findings.PAGE.parent / name).is_file(), name
+    assert all(path.stat().st_size < MAX_BYTES for path in findings.DATA.iterdir())
+
+
+def test_the_experiments_of_the_page_are_configurations() -> None:
+    page = findings.PAGE.read_text(encoding="utf-8")
+    named = set(re.findall(r"\+experiment=(\w+)", page))
+    assert named >= {"bonsai_growth", "fair_governor", "fair_hard"}
+    assert all((ROOT / "conf" / "experiment" / f"{name}.yaml").is_file() for name in named)
