@@ -1,6 +1,8 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
+# Two files of tests at a time, each in a process of its own: half the time, and no test that needs another to have run.
+PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 # Each library that chooses its instructions by the processor, told to choose the plainest. Compiled kernels keep a cache
@@ -29,14 +31,14 @@ demo: $(VENV)/.stamp-run ## baseline against volumetric densification on the cou
 	$(BIN)/gsbench report demo
 
 test: $(VENV)/.stamp-dev ## run the tests
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 test-generic: $(VENV)/.stamp-dev ## run core tests as on the plainest processor of this architecture
-	$(GENERIC) $(BIN)/python -m pytest $(GENERIC_TESTS)
+	$(GENERIC) $(PYTEST) $(GENERIC_TESTS)
 
 test-next-hydra: $(VENV)/.stamp-dev ## run the tests of configurations and sweeps on the next version of Hydra
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --pre --no-deps --upgrade --target $(VENV)/next-hydra $(NEXT_HYDRA)
-	PYTHONPATH=$(abspath $(VENV)/next-hydra) $(BIN)/python -m pytest $(NEXT_HYDRA_TESTS)
+	PYTHONPATH=$(abspath $(VENV)/next-hydra) $(PYTEST) $(NEXT_HYDRA_TESTS)
 
 lint: $(VENV)/.stamp-dev ## check style and types
 	$(BIN)/ruff check .
