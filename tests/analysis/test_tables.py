@@ -65,6 +65,14 @@ def test_bold_is_by_scene_not_by_table(make_experiment: Make) -> None:
     assert bold == {(s, "sfm", "volumetric") for s in ("courtyard", "garden", "mean of 2 scenes")}
 
 
+def test_no_mean_is_shown_where_no_scene_has_every_arm(tmp_path: Path) -> None:
+    paths = write_runs(tmp_path, Plan())
+    for path in [*paths[0:3], *paths[9:]]:  # courtyard has volumetric alone, garden adc
+        shutil.rmtree(path)
+    table = build_table(load_experiment(tmp_path, "exp"), rows=["scene"], columns=["densify"], metrics=["psnr"])
+    assert [row[0] for row in texts(table)] == ["courtyard", "garden"]
+
+
 def test_missing_and_incomplete_cells_are_marked_with_their_count(tmp_path: Path) -> None:
     paths = write_runs(tmp_path, Plan())
     (paths[0] / "results.json").unlink()  # courtyard, adc, seed 0

@@ -180,7 +180,7 @@ def _mean_rows(
     expected: int,
     comparable: bool,
 ) -> list[Row]:
-    """Means over the scenes that every arm has, one row for each combination of the other row fields."""
+    """Means over the scenes that every arm has, one row for each combination of the other row fields; none without."""
     place = list(rows).index("scene")
     others = list(dict.fromkeys(key[:place] + key[place + 1 :] for key in row_keys))
 
@@ -202,6 +202,8 @@ def _mean_rows(
             cells[other, arm, quantity.key] = make_cell(trials, quantity, shared, expected)
     # Scenes missing for one quantity only would make one label wrong: such a quantity says its own count.
     usual = max(counts.values())
+    if usual == 0:
+        return []
     bold: set[object] = set()
     for quantity in quantities if comparable else ():
         bold |= best_cells({key: cell for key, cell in cells.items() if key[2] == quantity.key}, quantity)
