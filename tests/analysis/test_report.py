@@ -342,3 +342,15 @@ def test_scenes_that_disagree_are_named_under_a_verdict_that_their_mean_leaves_o
 def test_no_scene_is_named_where_none_is_decided(tmp_path: Path) -> None:
     write_runs(tmp_path, Plan(trial_noise=0, residual_noise=0, views=3))
     assert compare_arms(load_experiment(tmp_path, "exp").trials, ADC, VOLUMETRIC, ViewCache()).by_scene == ()
+
+
+def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan())
+    assert "Verdicts, " in build_report(load_experiment(tmp_path, "exp"))
+    point = {"number": 0, "state": "done", "value": 27.5, "settings": {"densify.volume_threshold": 0.68412}}
+    record = {"metric": "psnr", "direction": 1, "wanted": 1, "seeds": 1, "log": [], "points": [point]}
+    (tmp_path / "exp" / "search.json").write_text(json.dumps(record))
+    page = build_report(load_experiment(tmp_path, "exp"))
+    assert "Verdicts, " not in page
+    assert "not held against each other" in page
+    assert "densify.volume_threshold = 0.6841 (point 1)" in page

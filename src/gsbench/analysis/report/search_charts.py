@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.report.charts import Series, line_chart, short_number
+from gsbench.analysis.report.charts import Series, line_chart
 from gsbench.eval.facts import find
 from gsbench.files import read_object
 from gsbench.layout import SEARCH
@@ -73,4 +73,5 @@ def _by_setting(
 
 
 def _shown(value: Any) -> str:
-    return short_number(value) if isinstance(value, float) else str(value)
+    """A value to be given again in a command: with four digits, the search is as good as told."""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
