@@ -37,7 +37,7 @@ def postgresql(tmp_path: Path) -> Iterator[str]:
             pytest.skip("PostgreSQL does not run as root, and there is no runuser")
         prefix = ["runuser", "-u", "nobody", "--"]
         shutil.chown(data, "nobody")
-        for folder in (tmp_path, *tmp_path.parents[:2]):
+        for folder in (tmp_path, *tmp_path.parents[:3]):  # a worker of pytest-xdist has a folder of its own
             folder.chmod(folder.stat().st_mode | 0o011)
     port = free_port()
     run = lambda *words: subprocess.run([*prefix, *words], check=True, capture_output=True, timeout=300)  # noqa: E731

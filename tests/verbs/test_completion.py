@@ -59,8 +59,8 @@ def runs(tmp_path: Path) -> Path:
         ("gsbench completion ", ["bash", "fish", "zsh"]),
         ("gsbench --v", ["--version"]),
         ("gsbench +exp", ["+experiment="]),
-        ("gsbench +experiment=table", ["+experiment=table1", "+experiment=table2"]),
-        ("gsbench -m densify=adc,vol", ["densify=adc,volumetric"]),
+        ("gsbench +experiment=table1", ["+experiment=table1", "+experiment=table1_own"]),
+        ("gsbench -m densify=adc,edge", ["densify=adc,edgeaware"]),
         ("gsbench densify=volumetric seed=1 densify.volume_th", ["densify.volume_threshold="]),
         ("gsbench -m densify=mcmc,adc densify.noi", ["densify.noise_rate="]),  # a key of the first
         ("gsbench nosuch=1 x", []),
@@ -173,6 +173,6 @@ def test_tab_completes(shell: Shell) -> None:
     assert shell.call("gsbench tab\tde\t\n") == "tables demo"
     assert shell.call("gsbench vi\tdem\tcour\tsfm-v\t1 x\n") == "view demo:courtyard:sfm-volumetric:1 x"
     assert shell.call("gsbench +experiment=thr\tseed=3\n") == "+experiment=threshold seed=3"
-    assert shell.call("gsbench -m densify=adc,volu\tseed=0,1\n") == "-m densify=adc,volumetric seed=0,1"
+    assert shell.call("gsbench -m densify=adc,edge\tseed=0,1\n") == "-m densify=adc,edgeaware seed=0,1"
     assert shell.call("gsbench train.iter\t7\n") == "train.iterations=7"
     assert shell.call("gsbench scene.path=pho\t\n").rstrip("/") == "scene.path=photos"
