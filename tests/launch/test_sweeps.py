@@ -98,6 +98,17 @@ def experiment(name: str) -> list[Composed]:
     return compose_trials([f"+experiment={name}"])
 
 
+PROGRAM = ["densify.version=1.0", "allow_targets=[mine,python,brush,opensplat,bash]"]
+WITH_CODE = [*PROGRAM, "densify.options.code=/code"]
+NEEDED = {  # what a YAML leaves to its user
+    ("train", "none"): ["densify=none"],
+    ("densify", "external"): [*PROGRAM, "densify.command=[mine]", "densify.result=mine.ply"],
+    ("densify", "3dgs"): WITH_CODE,
+    ("densify", "gsplat"): WITH_CODE,
+    **{("densify", name): PROGRAM for name in ("brush", "nerfstudio", "opensplat")},
+}
+
+
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_yaml_composes(group: str) -> None:
     assert options(group)
@@ -105,8 +116,7 @@ def test_every_yaml_composes(group: str) -> None:
         if group == "experiment":
             assert len(experiment(name)) >= 2
         else:
-            extra = ["densify=none"] if (group, name) == ("train", "none") else []
-            (trial,) = compose_trials([f"{group}={name}", "scene.path=/somewhere", *extra])
+            (trial,) = compose_trials([f"{group}={name}", "scene.path=/somewhere", *NEEDED.get((group, name), [])])
             assert trial.values[group]["name"] == name
 
 
@@ -160,7 +170,7 @@ def test_name_seed_and_machine_are_in_no_hash_and_settings_are() -> None:
         (["foo"], ["'foo' is not a setting like key=value"]),
         (["experiment=table1"], ["+experiment=NAME", "table2"]),
         (["densify._target_=mine.X", "densify.own=1"], ["densify.own", "+densify.own="]),
-        (["hydra/launcher=submitit_slurm"], ["launch=serial, local or slurm"]),
+        (["hydra/launcher=submitit_slurm"], ["launches sweeps: add -m"]),
         (["launch.parallel=0"], ["launch.parallel must be a whole number above 0, got 0"]),
         (["name=../up"], ["name must be a plain folder name"]),
         (["scene=photos"], ["scene.path is not set"]),
