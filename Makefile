@@ -15,7 +15,7 @@ GENERIC_TESTS := tests/test_machine.py tests/raster/test_cpu.py tests/raster/tes
 
 # The next version of Hydra, as far as it is released, laid over .venv for the tests of what Hydra does.
 NEXT_HYDRA := 'hydra-core>=1.4.0rc1,<1.5' 'omegaconf>=2.4.1rc1,<2.5'
-NEXT_HYDRA_TESTS := tests/launch tests/test_cli.py tests/test_config.py tests/verbs/test_completion.py
+NEXT_HYDRA_TESTS := tests/launch/test_joined_sweeps.py tests/test_config.py
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-generic test-next-hydra lint
