@@ -12,7 +12,7 @@ ARG PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu
 RUN apt-get update && apt-get install -y --no-install-recommends make && rm -rf /var/lib/apt/lists/*
 WORKDIR /opt/gsbench
 COPY . .
-RUN make .venv/.stamp-run && rm -rf /root/.cache
+RUN PIP_NO_CACHE_DIR=1 make .venv/.stamp-run
 ENV PATH=/opt/gsbench/.venv/bin:$PATH GSBENCH_RUNS=/runs
 WORKDIR /work
 ENTRYPOINT ["gsbench"]

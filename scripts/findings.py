@@ -21,7 +21,7 @@ from PIL import Image
 from gsbench.analysis.frame import to_frame
 from gsbench.analysis.pairing import Paired
 from gsbench.analysis.results import Experiment, list_experiments, read_experiment, read_views
-from gsbench.analysis.statistics import Comparison, compare, holm
+from gsbench.analysis.statistics import compare_family
 from gsbench.eval.facts import MetricFacts, find
 
 PAGE = Path(__file__).parents[1] / "docs" / "findings.md"
@@ -107,16 +107,19 @@ def differences_table(frame: pd.DataFrame) -> list[str]:
         _row(["---"] * (1 + len(METRICS))),
     ]
     others = _arms(frame)[1:]
-    found = {metric: [compare_arms(frame, arm, metric) for arm in others] for metric in METRICS}
-    adjusted = {metric: holm([c.p for c in comparisons]) for metric, comparisons in found.items()}
+    found = {
+        metric: compare_family([(pair(frame, arm, metric), _facts(metric).direction) for arm in others])
+        for metric in METRICS
+    }
     for index, arm in enumerate(others):
         cells = []
         for metric, (_, digits) in METRICS.items():
-            c, p = found[metric][index], adjusted[metric][index]
+            c = found[metric][index]
+            word = "" if c.verdict == "no evidence" else f": **{c.verdict}**"
             interval = f" [{c.interval.low:+.{digits}f}, {c.interval.high:+.{digits}f}]" if c.interval else ""
-            decided = c.verdict != "no evidence" and p is not None and p < 0.05
+            p = c.p_family
             chance = "" if p is None else f", p {p:.3f}" if p >= 0.001 else ", p < .001"
-            cells.append(f"{c.mean:+.{digits}f}{interval}{chance}{f': **{c.verdict}**' if decided else ''}")
+            cells.append(f"{c.mean:+.{digits}f}{interval}{chance}{word}")
         lines.append(_row([arm, *cells]))
     return lines
 
@@ -132,8 +135,8 @@ def events_table(frame: pd.DataFrame) -> list[str]:
     return lines
 
 
-def compare_arms(frame: pd.DataFrame, arm: str, metric: str) -> Comparison:
-    """The program's own comparison, with a trial's mean over its views in the place of the views."""
+def pair(frame: pd.DataFrame, arm: str, metric: str) -> Paired:
+    """An arm and the baseline as the program pairs them, a trial's mean standing for its views."""
     one, other = (
         frame[frame.arm == name].set_index(["scene", "seed"])[metric].sort_index() for name in (_baseline(frame), arm)
     )
@@ -141,8 +144,7 @@ def compare_arms(frame: pd.DataFrame, arm: str, metric: str) -> Comparison:
     difference = (other[both] - one[both]).dropna()
     scenes = tuple(dict.fromkeys(difference.index.get_level_values("scene")))
     matrices = tuple(np.asarray(difference[scene], float)[:, None] for scene in scenes)
-    paired = Paired(metric, scenes, matrices, float(one[both].groupby("scene").mean().mean()), ())
-    return compare(paired, _facts(metric).direction)
+    return Paired(metric, scenes, matrices, float(one[both].groupby("scene").mean().mean()), ())
 
 
 def read(name: str) -> pd.DataFrame:

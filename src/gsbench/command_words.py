@@ -36,9 +36,8 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
         elif word.split("=")[0] in ("--config-dir", "-cd"):
             folders.append(Path(word.partition("=")[2] or next(words, "")))
         elif word.startswith("-"):
-            known = OPTIONS
             raise InputError(
-                f"{word} is not an option{closest(word, known)} "
+                f"{word} is not an option{closest(word, OPTIONS)} "
                 "(there are -m, --dry-run, --config-dir FOLDER, --cfg job, --info, --help)"
             )
         else:

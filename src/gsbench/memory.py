@@ -57,8 +57,17 @@ def peak_resident_mb() -> float:
         if found:
             return int(found.group(1)) * 1024 / MIB
     if resource is not None:
-        unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss: bytes there, else kB
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MIB
+        return _max_resident_mb(resource.RUSAGE_SELF)
     import psutil
 
     return float(psutil.Process().memory_info().peak_wset) / MIB
+
+
+def peak_child_mb() -> float:
+    """The most that any one ended child of this process had resident; MiB, 0 where the platform does not say."""
+    return 0.0 if resource is None else _max_resident_mb(resource.RUSAGE_CHILDREN)
+
+
+def _max_resident_mb(who: int) -> float:
+    unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss: bytes there, else kB
+    return resource.getrusage(who).ru_maxrss * unit / MIB

@@ -25,6 +25,16 @@ def readable_time(seconds: float) -> str:
     return f"{seconds / 86400:.1f} days"
 
 
+def signed(value: float, spec: str) -> str:
+    """A number with its sign and a true minus, as ``spec`` formats it (``.2f``, ``.1%``): +0.50, −3.0%."""
+    return true_minus(f"{value:+{spec}}")
+
+
+def true_minus(number: str) -> str:
+    """A formatted number with the minus sign of print in the place of the hyphen."""
+    return number.replace("-", "−")
+
+
 def closest(word: str, choices: Iterable[str]) -> str:
     """'; did you mean X?' where one choice is near, else ''."""
     choices = list(choices)

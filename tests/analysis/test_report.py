@@ -347,7 +347,7 @@ def test_no_scene_is_named_where_none_is_decided(tmp_path: Path) -> None:
 def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> None:
     write_runs(tmp_path, Plan())
     assert "Verdicts, " in build_report(load_experiment(tmp_path, "exp"))
-    point = {"number": 0, "state": "done", "value": 27.5, "settings": {"densify.volume_threshold": 0.68412}}
+    point = {"number": 0, "state": "done", "value": 27.5, "settings": {"densify.volume_threshold": 0.6841}}
     record = {"metric": "psnr", "direction": 1, "wanted": 1, "seeds": 1, "log": [], "points": [point]}
     (tmp_path / "exp" / "search.json").write_text(json.dumps(record))
     page = build_report(load_experiment(tmp_path, "exp"))

@@ -34,13 +34,13 @@ def test_a_declaration_is_kept_with_its_time_and_changes_are_added(
     undeclared, psnr, ssim = (
         composed(tmp_path, *words) for words in ([], ["eval.primary=psnr"], ["eval.primary=ssim"])
     )
-    declare([undeclared])
+    declare(declared_metrics([undeclared]))
     assert read_declarations(tmp_path / "exp") == []
     for trials in ([psnr, psnr], [psnr], [undeclared]):  # said again, or not said: it stands
-        declare(trials)
+        declare(declared_metrics(trials))
         assert [one.metric for one in read_declarations(tmp_path / "exp")] == ["psnr"]
     with caplog.at_level(logging.WARNING):
-        declare([ssim])
+        declare(declared_metrics([ssim]))
     assert {one.metric for one in read_declarations(tmp_path / "exp")} == {"psnr", "ssim"}
     assert "about ssim, and the report will say that psnr was declared before" in caplog.text
 

@@ -22,6 +22,7 @@ from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import Experiment, Trial
 from gsbench.analysis.tables import Column, Entry, Row, Table, build_table
 from gsbench.errors import InputError
+from gsbench.words import signed
 
 PAPER_TABLES = ("table1", "table2")
 OWN = "_own"  # ends the name of the same table with poses and gauge of each initialiser's own
@@ -96,7 +97,7 @@ def compare_with_printed(
     found = agreement(cell, printed)
     tally[found] += 1
     decimals = max(shown.decimals, len(printed.text.partition(".")[2]))
-    delta = f"{cell.mean - printed.value:+.{decimals}f}".replace("-", "−")
+    delta = signed(cell.mean - printed.value, f".{decimals}f")
     return [Entry(printed.text), Entry(f"{delta} {found.value}", cell=cell)]
 
 

@@ -27,7 +27,7 @@ from gsbench.analysis.origins import cloud_notes, machine_notes
 from gsbench.analysis.pairing import BASELINE, ViewCache, choose_pairs
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS, Experiment, Trial
-from gsbench.words import counted
+from gsbench.words import counted, signed
 
 DEFAULT_ROWS = ("scene", "init", "densify")
 
@@ -318,7 +318,7 @@ def cost_change(
 
 def change_words(of_totals: float, of_scenes: float, scenes: int) -> str:
     """A relative change with its averaging rules named; over one scene there is nothing to average."""
-    totals, ratios = (f"{value:+.1%}".replace("-", "−") for value in (of_totals, of_scenes))
+    totals, ratios = (signed(value, ".1%") for value in (of_totals, of_scenes))
     if scenes == 1:
         return totals
     return f"{totals} as a ratio of totals, {ratios} as the mean of {scenes} scenes"

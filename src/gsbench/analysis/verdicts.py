@@ -24,6 +24,7 @@ from gsbench.analysis.quantities import Quantity, choose_quantities, metric_quan
 from gsbench.analysis.results import Arm, Trial
 from gsbench.analysis.statistics import Comparison, compare, compare_family, seeds_needed
 from gsbench.errors import InputError
+from gsbench.words import signed
 
 Role = Literal["", "declared", "secondary", "one of all"]
 Pair = tuple[Arm, Arm]
@@ -170,15 +171,12 @@ def _verdict(quantity: Quantity, comparison: Comparison, role: Role) -> Verdict:
 
 def _in_words(verdict: Verdict) -> str:
     """``better in LPIPS VGG raw on these scenes: −0.0123 (95 % interval −0.0200 to −0.0046), p 0.012``"""
-    one, decimals = verdict.comparison, verdict.quantity.decimals + 1
-
-    def signed(value: float) -> str:
-        return f"{value:+.{decimals}f}".replace("-", "−")
+    one, spec = verdict.comparison, f".{verdict.quantity.decimals + 1}f"
 
     word = "no evidence of a difference in" if one.verdict == "no evidence" else f"{one.verdict} in"
-    text = f"{word} {verdict.quantity.name} on {one.scope}: {signed(one.mean)}"
+    text = f"{word} {verdict.quantity.name} on {one.scope}: {signed(one.mean, spec)}"
     if one.interval is not None:
-        text += f" (95 % interval {signed(one.interval.low)} to {signed(one.interval.high)})"
+        text += f" (95 % interval {signed(one.interval.low, spec)} to {signed(one.interval.high, spec)})"
     if one.p is None or one.p_family is None:
         return f"{text}, no test: {one.test}"
     adjusted = f", adjusted for {one.family} tests {_p_text(one.p_family)}" if one.family > 1 else ""

@@ -35,9 +35,7 @@ class PixelGS(ADC):
         super().observe(step, render)
         if step >= self.stop:
             return
-        if render.footprint is None:
-            raise RuntimeError("observe needs RenderOutput.footprint, which this rasterizer does not give")
-        footprint = render.footprint()
+        footprint = render.require_footprint()
         weights = footprint.pixels * self.nearness(footprint.depths)  # [N] px
         self.statistics["weighted_gradient_sum"] += weights * self.screen_gradient(render)
         self.statistics["pixel_sum"] += footprint.pixels

@@ -71,9 +71,7 @@ class Taming(ADC):
         error = (image - photograph.to(image) / 255).abs().mean(-1)  # [H, W]
         pixels = self.weight_error * to_unit_range(error) + self.weight_edge * edge_map(photograph).to(error)
         sums, render = blended_sums(views, index, gaussians, step, torch.ones_like(image))
-        if render.footprint is None:
-            raise RuntimeError("the score needs RenderOutput.footprint, which this rasterizer does not give")
-        footprint, visible = render.footprint(pixels), render.visible
+        footprint, visible = render.require_footprint(pixels), render.visible
         terms = (
             (self.weight_gradient, self.mean_gradient()),
             (self.weight_opacity, gaussians.opacities.detach()),

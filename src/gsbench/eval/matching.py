@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 from gsbench.errors import InputError
-from gsbench.scene.names import some_of
-from gsbench.words import counted
+from gsbench.words import counted, some_of
 
 DIGITS = re.compile(r"\d+")
 SAME_NAMES = ""

@@ -22,7 +22,6 @@ from gsbench.pipeline.stages import STAGES
 from gsbench.pipeline.stopping import stop_on_signals
 from gsbench.pipeline.store import Store
 from gsbench.pipeline.trial_files import TrialPaths, find_finished
-from gsbench.tracking import prepare
 
 log = logging.getLogger(__name__)
 
@@ -51,16 +50,17 @@ def run_batch(trials: Sequence[Composed]) -> list[Outcome]:
 
 def begin_for_another_launcher(trials: Sequence[Composed]) -> None:
     """All that precedes the first trial where a launcher of somebody else's will run them, several at once perhaps."""
+    from gsbench.launch.jobs import prepare_tracking
+
     values = trials[0].values
-    runs = checked_runs_folder(values["runs"])
-    with storage_errors(runs):
+    with storage_errors(checked_runs_folder(values["runs"])):
         _begin(trials, [trial for trial in trials if find_finished(trial.values, _unavailable_metrics) is None])
-        prepare(values["tracking"], TrialPaths.of(values).runs, values["name"])
+        prepare_tracking(values)
 
 
 def _begin(trials: Sequence[Composed], unfinished: Sequence[Composed]) -> None:
     """Refuse what can be known to fail, then make the runs folder, tidy the store, write plan and declaration."""
-    declared_metrics(trials)  # refuses two for one verdict
+    metrics = declared_metrics(trials)
     runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
     # A node of a cluster may have folders and devices that this machine lacks.
     if launcher != "slurm" and (missing := missing_folders(unfinished)):
@@ -69,7 +69,7 @@ def _begin(trials: Sequence[Composed], unfinished: Sequence[Composed]) -> None:
     make_runs_folder(runs)
     Store(runs / STORE).sweep(STAGES)
     add_to_plan(trials)
-    declare(trials)
+    declare(metrics)
 
 
 def _skip_finished(trials: Sequence[Composed]) -> tuple[list[Outcome], list[Composed]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gsbench.analysis.declaration import Declaration, read_declarations
@@ -26,7 +26,7 @@ def declared_metrics(trials: Sequence[Composed]) -> dict[Path, str | None]:
     """
     found: dict[Path, str | None] = {}
     for trial in trials:
-        home = TrialPaths.of(trial.values).runs / trial.values["name"]
+        home = TrialPaths.of(trial.values).home
         metric, known = trial.values["eval"].get("primary"), found.get(home)
         if metric and known and metric != known:
             raise InputError(
@@ -37,12 +37,12 @@ def declared_metrics(trials: Sequence[Composed]) -> dict[Path, str | None]:
     return found
 
 
-def declare(trials: Sequence[Composed]) -> None:
-    """Add what the trials declare to their experiments' records, where it is not what stands there already.
+def declare(metrics: Mapping[Path, str | None]) -> None:
+    """Add to each experiment's record what its trials declare (`declared_metrics`), where it does not stand there yet.
 
     A declaration is not taken back by a command without one.
     """
-    for home, metric in declared_metrics(trials).items():
+    for home, metric in metrics.items():
         home.mkdir(parents=True, exist_ok=True)
         with hold(home / f".{DECLARED}.lock", "the declarations"):
             known = read_declarations(home)

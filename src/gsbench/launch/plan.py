@@ -42,9 +42,8 @@ def add_to_plan(trials: Sequence[Composed]) -> None:
     by_plan: dict[Path, dict[str, Any]] = {}
     for trial in trials:
         paths = TrialPaths.of(trial.values)
-        home = paths.runs / trial.values["name"]
         entry = {"overrides": list(trial.overrides), "cwd": os.getcwd(), "time": time.time()}
-        by_plan.setdefault(home, {})[paths.folder.relative_to(home).as_posix()] = entry
+        by_plan.setdefault(paths.home, {})[paths.folder.relative_to(paths.home).as_posix()] = entry
     for home, entries in by_plan.items():
         home.mkdir(parents=True, exist_ok=True)
         with hold(home / f".{PLAN}.lock", "the plan"):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsbench.compose import Composed
 from gsbench.errors import InputError
-from gsbench.launch.jobs import collect, job_folder, job_of, need_submitit, prepare_tracking
+from gsbench.launch.jobs import SECONDS_BETWEEN_POLLS, collect, job_folder, job_of, need_submitit, prepare_tracking
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.queue import (
     ask_queue,
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SUBMIT_LOCK = ".submit.lock"  # in the folder of the jobs' output: two commands at once submit a trial once
-SECONDS_BETWEEN_POLLS = 1.0
 SECONDS_BETWEEN_QUEUE_CHECKS = 20.0
 CHECKS_UNTIL_LOST = 2  # a job that the queue does not know so often in a row, and that left no result, is lost
 

@@ -24,9 +24,8 @@ from gsbench.pipeline.entered import check_place, enter, find_place
 from gsbench.pipeline.resources import available_threads
 from gsbench.pipeline.truth import Truth, find_truth, truth_of_trial
 from gsbench.progress import progress
-from gsbench.scene.names import some_of
 from gsbench.scene.readers import list_images
-from gsbench.words import counted
+from gsbench.words import counted, some_of
 
 
 def measure_renders(options: argparse.Namespace, runs: Path) -> None:

@@ -108,7 +108,7 @@ def _by_program(results: dict[str, Any], training: Mapping[str, Any]) -> dict[st
 
 def _declared(values: dict[str, Any]) -> dict[str, Any]:
     """The metric that the verdict was declared to be about when the trial was run, and since when; else nothing."""
-    home = TrialPaths.of(values).runs / values["name"]
+    home = TrialPaths.of(values).home
     metric = values["eval"].get("primary")
     said = [declaration for declaration in read_declarations(home) if declaration.metric == metric]
     return {"declared": said[-1].to_record()} if said else {}

@@ -45,6 +45,11 @@ class TrialPaths:
         return cls(runs, runs / values["name"] / values["scene"]["name"] / arm / leaf)
 
     @property
+    def home(self) -> Path:
+        """The experiment's folder."""
+        return self.folder.parents[2]
+
+    @property
     def lock(self) -> Path:
         return self.folder / LOCK
 

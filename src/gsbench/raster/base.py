@@ -64,6 +64,12 @@ class RenderOutput:
         """[N] bool: the Gaussians that reach at least one tile."""
         return self.radii > 0
 
+    def require_footprint(self, values: Tensor | None = None) -> Footprint:
+        """``footprint(values)``. Raises RuntimeError where the rasterizer cannot say."""
+        if self.footprint is None:
+            raise RuntimeError("this densifier needs RenderOutput.footprint, which the rasterizer does not give")
+        return self.footprint(values)
+
 
 class Rasterizer(Protocol):
     """An executor of the contract; every one passes ``tests/raster/test_contract.py``.

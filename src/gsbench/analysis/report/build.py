@@ -30,6 +30,7 @@ from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdicts import families, judge
 from gsbench.layout import FIGURES
+from gsbench.words import signed
 
 
 def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
@@ -94,4 +95,4 @@ def _resource(name: str) -> str:
 
 
 def _signed(value: float | None, decimals: int) -> str:
-    return "unknown" if value is None else f"{value:+.{decimals}f}".replace("-", "−")
+    return "unknown" if value is None else signed(value, f".{decimals}f")

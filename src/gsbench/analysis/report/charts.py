@@ -8,6 +8,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from gsbench.words import true_minus
+
 WIDTH, HEIGHT = 380, 250  # px at full size; text is 12 px
 LEFT, RIGHT, TOP, BOTTOM = 58, 18, 26, 44
 COLORS = ("#4477aa", "#cc3311", "#228833", "#aa3377", "#b8860b", "#0099a8")  # told apart also by colour-blind readers
@@ -185,7 +187,7 @@ class _Axis:
         if self._log or step == 0 or abs(tick) >= THOUSANDS:
             return short_number(tick)
         decimals = max(0, math.ceil(-math.log10(step) - 1e-9) + (f"{step:e}"[2] != "0"))
-        return f"{tick:.{decimals}f}".replace("-", "−")
+        return true_minus(f"{tick:.{decimals}f}")
 
     def place(self, value: float) -> float:
         part = (self._scale(value) - self._low) / (self._high - self._low)
@@ -266,9 +268,9 @@ def short_number(value: float) -> str:
     size = abs(value)
     for limit, suffix in ((1e6, "M"), (THOUSANDS, "k")):
         if size >= limit:
-            return f"{value / {'M': 1e6, 'k': 1e3}[suffix]:.3g}{suffix}".replace("-", "−")
+            return true_minus(f"{value / {'M': 1e6, 'k': 1e3}[suffix]:.3g}{suffix}")
     text = f"{value:.0e}" if 0 < size < 1e-4 else f"{value:.3g}" if size < 1000 else f"{value:.0f}"
-    return text.replace("-", "−")
+    return true_minus(text)
 
 
 _escape: Callable[[str], str] = html.escape

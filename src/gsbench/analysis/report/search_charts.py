@@ -44,7 +44,7 @@ def _part(record: Mapping[str, Any]) -> SearchPart:
     if not done:
         return SearchPart(f"{count}; none has a result yet.", [])
     best = max(done, key=lambda point: sign * point["value"])
-    where = ", ".join(f"{key} = {_shown(value)}" for key, value in best["settings"].items())
+    where = ", ".join(f"{key} = {value}" for key, value in best["settings"].items())
     line = f"Best {name}: {best['value']:.{decimals}f} at {where} (point {best['number'] + 1}). {count}."
     so_far: list[tuple[float, float]] = []
     for point in done:
@@ -70,8 +70,3 @@ def _by_setting(
     names = sorted({str(value) for value in values})
     places = [(float(names.index(str(value))), point["value"]) for value, point in zip(values, done, strict=True)]
     return line_chart(title, [Series("each point", sorted(places))], key, name, x_names=names)
-
-
-def _shown(value: Any) -> str:
-    """A value to be given again in a command: with four digits, the search is as good as told."""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -23,6 +23,7 @@ from gsbench.analysis.tradeoffs import COST_READERS, CurveGap, curve_gap, traini
 from gsbench.analysis.verdicts import Judged, Verdict, judge
 from gsbench.errors import InputError
 from gsbench.events import Cause, RefineEvent
+from gsbench.words import signed
 
 CROPS = 4  # places of each kind
 COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time"}
@@ -294,9 +295,8 @@ def _costs(trials: Sequence[Trial], first: Arm, second: Arm) -> list[str]:
 
 
 def _gap_words(gap: CurveGap, cost: str) -> str:
-    amount = f"{gap.gap:+.2f}".replace("-", "−")
     span = f"{short_number(gap.low)} to {short_number(gap.high)}"
-    return f"PSNR at equal {cost} during training {amount} dB on average ({span})"
+    return f"PSNR at equal {cost} during training {signed(gap.gap, '.2f')} dB on average ({span})"
 
 
 def _forest(verdict: Verdict) -> str:

@@ -10,6 +10,7 @@ from gsbench.analysis.report.charts import Series, line_chart, short_number
 from gsbench.analysis.results import Arm, Trial
 from gsbench.analysis.tradeoffs import Curve, curve_gap, family_curve
 from gsbench.eval.facts import METRICS
+from gsbench.words import signed
 
 COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time (s)"}
 
@@ -38,7 +39,7 @@ def tradeoff_gaps(trials: Sequence[Trial], baseline: str = BASELINE) -> list[str
                 first = curves.get((init, baseline))
                 gap = curve_gap(first, curve) if first is not None and densify != baseline else None
                 if gap is not None:
-                    amount = f"{gap.gap:+.{metric.decimals + 1}f}".replace("-", "−")
+                    amount = signed(gap.gap, f".{metric.decimals + 1}f")
                     arms = f"{init}-{densify} at the same {label} as {init}-{baseline}"
                     scale = f"from {short_number(gap.low)} to {short_number(gap.high)}, log scale"
                     lines.append(f"{metric.name} of {arms}: {amount} on average ({scale}).")

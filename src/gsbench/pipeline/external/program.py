@@ -15,7 +15,7 @@ import psutil
 
 from gsbench.errors import TrainingError
 from gsbench.isolate import CrashError, describe_exit, run_isolated, telling_lines
-from gsbench.memory import MIB
+from gsbench.memory import MIB, peak_child_mb
 from gsbench.words import readable_time
 
 SECONDS_BETWEEN_LOOKS = 0.5  # at the memory of the program and its children
@@ -69,7 +69,7 @@ def watch(command: Sequence[str], folder: Path, environment: Mapping[str, str], 
         left = float("inf") if limit is None else limit - (time.monotonic() - started)
         try:
             code = program.wait(max(0.0, min(pause, left)))
-            return Ended(code, False, time.monotonic() - started, max(peak, largest_child_mb()))
+            return Ended(code, False, time.monotonic() - started, max(peak, peak_child_mb()))
         except subprocess.TimeoutExpired:
             if left <= 0:
                 return Ended(_stop(program), True, time.monotonic() - started, peak)
@@ -98,13 +98,3 @@ def resident_mb(pid: int) -> float:
             with suppress(psutil.Error):
                 total += process.memory_info().rss
     return total / MIB
-
-
-def largest_child_mb() -> float:
-    """The most that any one ended child of this process had resident; MiB, 0 where the platform does not say."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return 0.0
-    unit = 1 if os.uname().sysname == "Darwin" else 1024  # of ru_maxrss: bytes there, else kB
-    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * unit / MIB

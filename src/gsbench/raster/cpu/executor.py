@@ -167,14 +167,14 @@ def _forward(
     image_array, alpha_array = image.numpy().reshape(-1), alpha.numpy().reshape(-1)
 
     def composite(shard: int) -> None:
-        composite_tiles(*_tile_arguments(frame, shard), image_array, alpha_array)
+        composite_tiles(*_tiles_of(frame, shard), *_blending_of(frame), image_array, alpha_array)
 
     run(TILE_SHARDS, composite)
     return frame
 
 
-def _tile_arguments(frame: _Frame, shard: int) -> tuple[Any, ...]:
-    """The arguments that the two compositing kernels share."""
+def _tiles_of(frame: _Frame, shard: int) -> tuple[Any, ...]:
+    """The arguments that all kernels share which walk through the entries of tiles."""
     return (
         at.kernel_memory(),
         int(frame.bounds[shard]),
@@ -186,10 +186,12 @@ def _tile_arguments(frame: _Frame, shard: int) -> tuple[Any, ...]:
         frame.records,
         frame.view.width,
         frame.view.height,
-        frame.background,
-        frame.transmittance,
-        frame.last,
     )
+
+
+def _blending_of(frame: _Frame) -> tuple[Any, ...]:
+    """The further arguments that the two compositing kernels share."""
+    return frame.background, frame.transmittance, frame.last
 
 
 def _backward(
@@ -207,7 +209,7 @@ def _backward(
     want_absolute = None if absolute is None else True
 
     def decomposite(shard: int) -> None:
-        decomposite_tiles(*_tile_arguments(frame, shard), g_image, g_alpha, rows[shard], want_absolute)
+        decomposite_tiles(*_tiles_of(frame, shard), *_blending_of(frame), g_image, g_alpha, rows[shard], want_absolute)
 
     rasterizer._runner.run(TILE_SHARDS, decomposite)
 
@@ -266,17 +268,8 @@ def _footprint(
 
     def cover(shard: int) -> None:
         cover_tiles(
-            at.kernel_memory(),
-            int(frame.bounds[shard]),
-            int(frame.bounds[shard + 1]),
-            frame.starts,
-            frame.entries,
-            frame.masks,
-            frame.processed,
-            frame.records,
+            *_tiles_of(frame, shard),
             frame.records.view(np.int32),
-            frame.view.width,
-            frame.view.height,
             frame.last,
             asked,
             covered[shard],
