@@ -26,7 +26,7 @@ from gsbench.eval.facts import MetricFacts, find
 
 PAGE = Path(__file__).parents[1] / "docs" / "findings.md"
 DATA = PAGE.with_suffix("")
-EXPERIMENTS = ("bonsai_growth", "fair_governor", "fair_hard", "initialisers")
+EXPERIMENTS = ("bonsai_growth", "bonsai_larger", "fair_governor", "fair_hard", "initialisers")
 BASELINES = ("adc", "sfm")  # what the others are held against: among densifiers, among initialisers
 METRICS = {"lpips_squeeze": ("LPIPS (squeeze)", 3), "psnr": ("PSNR, dB", 2), "ssim": ("SSIM", 3), "flip": ("FLIP", 3)}
 WHICH = ["scene", "init", "densify", "seed", "iterations", "width", "height"]
@@ -43,18 +43,24 @@ def collect(runs: Path) -> None:
             experiment = read_experiment(runs / name)
             to_frame(experiment).reindex(columns=kept).to_csv(DATA / f"{name}.csv", index=False, float_format="%.6g")
             _rounds(experiment).to_csv(DATA / f"{name}_rounds.csv", index=False, float_format="%.5g")
-            if name == "bonsai_growth":
+            if name.startswith("bonsai"):
                 _picture(experiment).save(DATA / f"{name}.png")
 
 
 def _rounds(experiment: Experiment) -> pd.DataFrame:
     """The count after every round of the first seed, and what the governor did to the thresholds."""
     rows = []
+    by_init = len({trial.densify for trial in experiment.trials}) == 1
     for trial in experiment.trials:
         if trial.seed == min(t.seed for t in experiment.trials):
             for line in (trial.path / "events.jsonl").read_text().splitlines():
                 event = json.loads(line)
-                row = {"scene": trial.scene, "densify": trial.densify, "step": event["step"], "count": event["after"]}
+                row = {
+                    "scene": trial.scene,
+                    "arm": trial.init if by_init else trial.densify,
+                    "step": event["step"],
+                    "count": event["after"],
+                }
                 rows.append(row | {"strictness": event.get("strictness"), "cull": event.get("cull")})
     return pd.DataFrame(rows).dropna(axis=1, how="all")
 
@@ -87,6 +93,16 @@ def arms_table(frame: pd.DataFrame) -> list[str]:
         by_seed = own.groupby("seed")[list(columns)].mean()
         cells = [f"{by_seed[k].mean():,.{d}f} ± {by_seed[k].std():,.{d}f}" for k, (_, d) in columns.items()]
         lines.append(_row([arm, *cells]))
+    return lines
+
+
+def clouds_table(frame: pd.DataFrame) -> list[str]:
+    """Points of the initial cloud by arm and scene."""
+    scenes = list(dict.fromkeys(frame.scene))
+    lines = [_row(["initial points", *scenes]), _row(["---"] + ["--:"] * len(scenes))]
+    for arm in _arms(frame):
+        counts = [frame[(frame.arm == arm) & (frame.scene == scene)].num_init_points for scene in scenes]
+        lines.append(_row([arm, *(f"{own.iloc[0]:,.0f}" if len(own) else "" for own in counts)]))
     return lines
 
 
@@ -172,7 +188,13 @@ def _row(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-TABLES = {"arms": arms_table, "scenes": scenes_table, "differences": differences_table, "events": events_table}
+TABLES = {
+    "arms": arms_table,
+    "clouds": clouds_table,
+    "scenes": scenes_table,
+    "differences": differences_table,
+    "events": events_table,
+}
 
 
 def with_tables(page: str) -> str:
@@ -197,7 +219,7 @@ def draw() -> None:
         figure, axes = plt.subplots(len(drawn), len(scenes), figsize=size, squeeze=False, sharex="col")
         for (column, label), row in zip(drawn.items(), axes, strict=True):
             for axis, scene in zip(row, scenes, strict=True):
-                for arm, own in rounds[rounds.scene == scene].groupby("densify", sort=False):
+                for arm, own in rounds[rounds.scene == scene].groupby("arm", sort=False):
                     axis.plot(own.step, own[column], label=arm)
                 axis.set(title=scene, xlabel="iteration", yscale="log" if column == "strictness" else "linear")
             row[0].set_ylabel(label)
