@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -98,21 +98,20 @@ def arms_table(frame: pd.DataFrame) -> list[str]:
 
 def clouds_table(frame: pd.DataFrame) -> list[str]:
     """Points of the initial cloud by arm and scene."""
-    scenes = list(dict.fromkeys(frame.scene))
-    lines = [_row(["initial points", *scenes]), _row(["---"] + ["--:"] * len(scenes))]
-    for arm in _arms(frame):
-        counts = [frame[(frame.arm == arm) & (frame.scene == scene)].num_init_points for scene in scenes]
-        lines.append(_row([arm, *(f"{own.iloc[0]:,.0f}" if len(own) else "" for own in counts)]))
-    return lines
+    return _by_scene(frame, "initial points", lambda own: f"{own.num_init_points.iloc[0]:,.0f}")
 
 
 def scenes_table(frame: pd.DataFrame) -> list[str]:
     """LPIPS by arm and scene: mean over seeds and its trials' deviation."""
+    return _by_scene(frame, "arm", lambda own: f"{own.lpips_squeeze.mean():.3f} ± {own.lpips_squeeze.std():.3f}")
+
+
+def _by_scene(frame: pd.DataFrame, title: str, cell: Callable[[pd.DataFrame], str]) -> list[str]:
     scenes = list(dict.fromkeys(frame.scene))
-    lines = [_row(["arm", *scenes]), _row(["---"] + ["--:"] * len(scenes))]
+    lines = [_row([title, *scenes]), _row(["---"] + ["--:"] * len(scenes))]
     for arm in _arms(frame):
-        values = [frame[(frame.arm == arm) & (frame.scene == scene)].lpips_squeeze for scene in scenes]
-        lines.append(_row([arm, *(f"{v.mean():.3f} ± {v.std():.3f}" if len(v) else "" for v in values)]))
+        groups = [frame[(frame.arm == arm) & (frame.scene == scene)] for scene in scenes]
+        lines.append(_row([arm, *("" if own.empty else cell(own) for own in groups)]))
     return lines
 
 
