@@ -9,10 +9,11 @@
 ARG PYTHON=3.11
 FROM docker.io/library/python:${PYTHON}-slim-bookworm AS run
 ARG PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu
+ENV PIP_NO_CACHE_DIR=1
 RUN apt-get update && apt-get install -y --no-install-recommends make && rm -rf /var/lib/apt/lists/*
 WORKDIR /opt/gsbench
 COPY . .
-RUN PIP_NO_CACHE_DIR=1 make .venv/.stamp-run
+RUN make .venv/.stamp-run
 ENV PATH=/opt/gsbench/.venv/bin:$PATH GSBENCH_RUNS=/runs
 WORKDIR /work
 ENTRYPOINT ["gsbench"]
