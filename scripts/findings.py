@@ -26,7 +26,7 @@ from gsbench.eval.facts import MetricFacts, find
 
 PAGE = Path(__file__).parents[1] / "docs" / "findings.md"
 DATA = PAGE.with_suffix("")
-EXPERIMENTS = ("bonsai_growth", "bonsai_larger", "fair_governor", "fair_hard", "initialisers")
+EXPERIMENTS = ("bonsai_growth", "fair_governor", "fair_hard", "initialisers")
 BASELINES = ("adc", "sfm")  # what the others are held against: among densifiers, among initialisers
 METRICS = {"lpips_squeeze": ("LPIPS (squeeze)", 3), "psnr": ("PSNR, dB", 2), "ssim": ("SSIM", 3), "flip": ("FLIP", 3)}
 WHICH = ["scene", "init", "densify", "seed", "iterations", "width", "height"]
@@ -43,7 +43,7 @@ def collect(runs: Path) -> None:
             experiment = read_experiment(runs / name)
             to_frame(experiment).reindex(columns=kept).to_csv(DATA / f"{name}.csv", index=False, float_format="%.6g")
             _rounds(experiment).to_csv(DATA / f"{name}_rounds.csv", index=False, float_format="%.5g")
-            if name.startswith("bonsai"):
+            if name == "bonsai_growth":
                 _picture(experiment).save(DATA / f"{name}.png")
 
 

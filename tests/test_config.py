@@ -68,7 +68,7 @@ def test_every_densifier_can_be_built_and_matches_its_class(option: str) -> None
 
 @pytest.mark.parametrize("option", options("init"))
 def test_every_initialiser_shows_all_its_options(option: str, tmp_path: Path) -> None:
-    (tmp_path / "model.ply").touch()
+    (tmp_path / "model.ply").write_text("ply\nend_header\n")
     extra = [f"init.path={tmp_path / 'model.ply'}"] if option in ("ply", "points") else []
     values = composed(f"init={option}", *extra)["init"]
     initializer = build("init", values, [])

@@ -389,7 +389,8 @@ def check_target(target: str | None, group: str, allowed: list[str]) -> None:
     ):
         prefix = target.split(".")[0]
         raise InputError(
-            f"{group}._target_={target} is not gsbench's own; if you trust that code, add allow_targets=[{prefix}]"
+            f"{group}._target_={target} is not gsbench's own{closest(prefix, allowed)}; if you trust that code, "
+            f"add allow_targets=[{prefix}]"
         )
 
 

@@ -104,6 +104,16 @@ def test_the_verdict_comes_first(page: str) -> None:
     assert "LPIPS Alex" not in page.split("</section>")[0].split("<tbody>")[1]  # not run: no row
 
 
+def test_what_a_verdict_does_not_say_stands_beside_it(page: str) -> None:
+    """The arms have other counts, equal trials other times, and nobody kept the maps."""
+    assert re.search(
+        r"Gaussians \+[\d.]+%[^<]*; so this is no comparison at one count, which densify.cap=governor", page
+    )
+    assert re.search(r"Training time [^<]*; times of equal trials differ by up to \d+%", page)
+    assert page.count("eval.maps=true keeps them") == 1
+    assert "Errors by depth, distance, volume: not shown, the trials kept no maps" in page
+
+
 def test_the_same_files_give_the_same_page(experiment: Experiment, page: str) -> None:
     assert build_report(experiment) == page
 
@@ -130,7 +140,7 @@ def test_texture_energy_is_the_squared_gradient() -> None:
 
 
 def test_a_map_sorts_the_errors_where_it_is_at_hand(experiment: Experiment) -> None:
-    with pytest.raises(InputError, match=r"view000\.npz has no map 'depth'"):
+    with pytest.raises(InputError, match=r"kept no maps; eval\.maps=true keeps them"):
         errors_by_region(experiment.trials, ADC, VOLUMETRIC, "depth")
     depth = np.ones((120, 160))
     depth[:, TEXTURED] = 2.0
@@ -140,6 +150,8 @@ def test_a_map_sorts_the_errors_where_it_is_at_hand(experiment: Experiment) -> N
             np.savez(trial.path / "maps" / f"view{view:03d}.npz", depth=depth)
     found = errors_by_region(experiment.trials, ADC, VOLUMETRIC, "depth", bins=2)
     assert [comparison.verdict for comparison in found.comparisons] == ["worse", "better"]
+    with pytest.raises(InputError, match=r"view000\.npz has no map 'volume'"):
+        errors_by_region(experiment.trials, ADC, VOLUMETRIC, "volume")
     with pytest.raises(InputError, match="unknown property 'hue'"):
         errors_by_region(experiment.trials, ADC, VOLUMETRIC, "hue")
 

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import shutil
+from pathlib import Path
+
+import pytest
 
 from tests.conftest import ROOT
 
@@ -20,6 +24,16 @@ def test_the_tables_of_the_page_are_those_of_the_result_files() -> None:
     assert len(findings.SECTION.findall(page)) >= 4
     assert findings.with_tables(page) == page
     assert "nan" not in page
+
+
+def test_curves_can_be_drawn_from_the_published_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = sorted(findings.DATA.glob("*_rounds.csv"))
+    for file in files:
+        shutil.copy(file, tmp_path)
+    monkeypatch.setattr(findings, "DATA", tmp_path)
+    findings.draw()
+    assert len(files) >= 2
+    assert all((tmp_path / file.with_suffix(".png").name).stat().st_size > 5_000 for file in files)
 
 
 def test_every_file_that_the_page_names_is_there_and_small() -> None:

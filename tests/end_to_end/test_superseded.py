@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -64,3 +65,13 @@ def test_an_edited_densifier_is_never_averaged_with_what_it_was(
     (tmp_path / "mine.py").write_text(MINE)  # the old code comes back: its trials are in the store
     assert "iteration" not in train(0, 1)
     assert "3 trials: 2 done, 1 superseded" in ask("status", "edited")
+
+    (folder,) = (tmp_path / "runs" / "edited").glob("*/*/*-seed0")
+    stale = gsbench("explain", "--stale", str(folder), GSBENCH_RUNS=runs)  # finds the class beside the user
+    assert stale.returncode == 0, stale.stderr
+    assert "not in the store" not in stale.stdout
+    shutil.rmtree(folder)
+    again = gsbench("retry", "edited", GSBENCH_RUNS=runs)
+    assert again.returncode == 0, again.stderr
+    assert "configuration has changed" not in again.stderr
+    assert folder.is_dir()

@@ -95,3 +95,6 @@ def test_a_trained_model_becomes_points_under_the_cameras_and_is_kept_whole(cour
     assert torch.equal(kept.log_scales, gaussians.log_scales)
     with pytest.raises(InputError, match=r"init\.path=nowhere\.ply"):
         Ply(path="nowhere.ply")
+    (tmp_path / "words.ply").write_text("no model")
+    with pytest.raises(InputError, match=r"words\.ply: not a readable PLY of Gaussians \(it has no header\)"):
+        Ply(path=str(tmp_path / "words.ply"))  # before any photograph is looked at

@@ -133,6 +133,8 @@ def _property_reader(name: str) -> Reader:
 
 def _read_map(trial: Trial, view: str, name: str, shape: tuple[int, int]) -> Array:
     path = trial.path / MAPS / f"{view}.npz"
+    if not path.is_file():
+        raise InputError("the trials kept no maps; eval.maps=true keeps them")
     try:
         with np.load(path) as maps:
             values = np.asarray(maps[name], dtype=np.float64)

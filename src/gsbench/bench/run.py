@@ -10,6 +10,7 @@ from typing import Any
 from gsbench.bench.peer import PEER, PEER_NOTE
 from gsbench.bench.stepper import WARM_UP_STEPS, Setting, Stepper, peak_memory
 from gsbench.isolate import run_isolated
+from gsbench.progress import Report, progress
 
 
 def run_bench(
@@ -33,19 +34,23 @@ def run_bench(
     false. With ``ply`` that model is timed instead of ``counts``. Raises InputError for a raster that cannot run here.
     """
     rows = []
-    for width, height in sizes:
-        for count in counts if ply is None else [0]:
-            setting = Setting(scene, width, height, count, ply, threads)
-            rows += _compare(rasters, setting, repeats, memory)
+    with progress("bench") as report:
+        for width, height in sizes:
+            for count in counts if ply is None else [0]:
+                setting = Setting(scene, width, height, count, ply, threads)
+                rows += _compare(rasters, setting, repeats, memory, report)
     return rows
 
 
-def _compare(rasters: list[str], setting: Setting, repeats: int, memory: bool) -> list[dict[str, Any]]:
+def _compare(rasters: list[str], setting: Setting, repeats: int, memory: bool, report: Report) -> list[dict[str, Any]]:
+    model = f"{setting.count:,} Gaussians" if setting.ply is None else setting.ply.name
+    what, turns = f"{setting.width}x{setting.height}, {model}", WARM_UP_STEPS + repeats
     steppers = {raster: Stepper(raster, setting) for raster in rasters}
     parts: dict[str, list[dict[str, float]]] = {raster: [] for raster in rasters}
     speeds: dict[str, list[float]] = {raster: [] for raster in rasters}
-    for repeat in range(WARM_UP_STEPS + repeats):
+    for repeat in range(turns):
         for raster, stepper in steppers.items():
+            report(what, repeat, turns, raster)
             sample, speed = stepper.step(), stepper.steps_per_second()
             if repeat >= WARM_UP_STEPS:
                 parts[raster].append(sample)
@@ -73,6 +78,7 @@ def _compare(rasters: list[str], setting: Setting, repeats: int, memory: bool) -
         rows.append(row)
     del steppers, stepper  # their memory: the processes below need it
     for row in rows:
+        report(f"{what}, memory", len(rows), len(rows), row["raster"])
         row["peak_memory_mb"] = _measure_memory(row["raster"], setting) if memory else None
     return rows
 

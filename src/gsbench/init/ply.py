@@ -33,6 +33,9 @@ class Ply(PlacedCloud):
         super().__post_init__()
         if not self.file.is_file():
             raise InputError(f"init.path={self.path} is no file: name a PLY of Gaussians, as a trial's point_cloud.ply")
+        from gsbench.gaussians.ply import check_ply
+
+        check_ply(self.file)
 
     @property
     def file(self) -> Path:

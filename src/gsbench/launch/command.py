@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
 from collections.abc import Sequence
 
@@ -17,6 +16,7 @@ from gsbench.launch.plan import describe_plan
 from gsbench.launch.preflight import check_components, missing_folders, need_no_check
 from gsbench.launch.queries import QUERIES, ask_hydra
 from gsbench.launch.task import Enough, Task
+from gsbench.source import import_from_here
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ def launch(argv: list[str]) -> int:
 
     Raises InputError for a configuration that does not compose or hold together, and for a single trial's bad input.
     """
-    sys.path.insert(0, os.getcwd())  # a user's own class lies beside the user
+    import_from_here()
     if any(word.split("=")[0] in QUERIES for word in argv):
         return ask_hydra(argv)
     words, multirun, dry_run = parse(argv)
@@ -66,6 +66,8 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Composed]) -> int:
         advice = f"how far the others are: gsbench status {name}"
     else:
         advice = f"again: gsbench retry {name}" if failed else f"the table: gsbench tables {name}"
+        if len(outcomes) == 1:
+            advice += f"; renders and model: {outcomes[0].folder}"
     log.info("%d of %d trials done; %s", done, len(outcomes), advice)
     if failed and all(outcome.status == "failed" and outcome.bad_input for outcome in outcomes):
         return 2

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
@@ -26,6 +24,7 @@ from gsbench.launch.grids import words_of_grids
 from gsbench.launch.outcome import Outcome, objective, outcome_of_error
 from gsbench.logs import set_up_logging
 from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.source import import_from_here
 
 OWN = "gsbench"  # the names of gsbench's own launcher and sweeper
 
@@ -50,8 +49,7 @@ class Task:
 
     def __call__(self, config: DictConfig) -> float | None:
         """One trial, as other launchers call it, perhaps in a process of its own; raises GsbenchError if it failed."""
-        if os.getcwd() not in sys.path:
-            sys.path.insert(0, os.getcwd())
+        import_from_here()
         set_up_logging()
         for_hydra, words = words_of(HydraConfig.get().overrides)
         (outcome,) = self.handle([ready_trial(config, [*for_hydra, *words])])

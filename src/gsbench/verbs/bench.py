@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ from gsbench.arguments import ArgumentParser, path
 from gsbench.errors import InputError
 from gsbench.raster.executors import AUTO, EXECUTORS
 from gsbench.scene.sizes import MIN_SIZE
+from gsbench.source import import_from_here
 
 COLUMNS = (  # of the table
     "raster",
@@ -75,8 +74,7 @@ def main(argv: Sequence[str], _runs: Path | None = None) -> int:
     rasters = options.raster.split(",")
     if AUTO in rasters:
         raise InputError(f"--raster {AUTO} is a choice among executors: name those to time")
-    if "" not in sys.path:
-        sys.path.insert(0, os.getcwd())  # a user's own class lies beside the user
+    import_from_here()
 
     from gsbench.bench import run_bench
 

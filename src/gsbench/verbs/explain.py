@@ -9,6 +9,7 @@ from gsbench.analysis.explain import ADDRESS, explain_cell
 from gsbench.arguments import ArgumentParser
 from gsbench.errors import InputError
 from gsbench.layout import CONFIG, STORE
+from gsbench.source import import_from_here
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -34,6 +35,7 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
     )
     parser.add_argument("trial", nargs="+", help="a trial's folder, or the settings of one (scene=... densify=...)")
     words = parser.parse_args(argv).trial
+    import_from_here()
     from gsbench.launch.hydra_app import compose_trials
     from gsbench.pipeline.entered import is_entered
     from gsbench.pipeline.stale import explain_steps

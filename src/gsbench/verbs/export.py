@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,6 +16,8 @@ from gsbench.view import ADDRESS
 
 if TYPE_CHECKING:
     from gsbench.gaussians.model import Gaussians
+
+log = logging.getLogger(__name__)
 
 FORMATS = {
     "ply": "the 3DGS point cloud, as every viewer and trainer reads it (248 bytes a Gaussian)",
@@ -61,6 +64,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
             export_model(model_file(trial), options.to or _format_of(out), out)
     except OSError as error:
         raise InputError(f"cannot write {out} ({error.strerror or error}); give another --out") from error
+    log.info("%s", trial.label)
     print(out)
     return 0
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from gsbench.errors import InputError
 from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.pipeline.trial_files import TrialPaths, label_of, read_config
+from gsbench.source import import_from_here
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +49,6 @@ def main(argv: Sequence[str], runs: Path) -> int:
     replaced = [old for old, trial in zip(unfinished, trials, strict=True) if TrialPaths.of(trial.values).folder != old]
     for old in replaced:
         log.info("%s: its configuration has changed since; the new one is run", label_of(old))
-    sys.path.insert(0, os.getcwd())
     code = run_trials(trials)
     forget(home, [old for old in replaced if old in planned])
     return code
@@ -65,6 +64,7 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
         where = planned.cwd if Path(planned.cwd).is_dir() else os.getcwd()
         if where != os.getcwd():
             os.chdir(where)  # relative paths were meant from there, and the trials are run from there
+        import_from_here()
         trial = compose_one([*own, *changes])
         if changes and _identity(trial) != _identity(compose_one(planned.overrides)):
             raise InputError(
@@ -75,6 +75,7 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
         raise InputError(
             f"{label_of(folder)} is in no plan, so no setting of it can be changed: run it by its own command"
         )
+    import_from_here()
     values = read_config(folder) | {"runs": str(runs)}
     return Composed(values, yaml.safe_dump(values, sort_keys=False), ())
 

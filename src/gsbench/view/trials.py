@@ -44,7 +44,10 @@ class ViewedTrial:
 
 
 def find_trial(address: str, runs: Path) -> Trial:
-    """The trial at ``address`` (see ``ADDRESS``); raises InputError where there is none or more than one."""
+    """The trial at ``address`` (see ``ADDRESS``), of several seeds the first.
+
+    Raises InputError where there is none, and where several arms answer to it.
+    """
     folder = Path(address).expanduser()
     if folder.is_dir():
         return _trial_in(folder.resolve())

@@ -28,6 +28,7 @@ from gsbench.words import signed
 CROPS = 4  # places of each kind
 COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time"}
 EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)
+EQUAL_COUNTS = 0.02  # relative: arms closer than this have one count, as governed ones do
 CURVES = (  # key of metrics.jsonl, title, y axis
     ("num_gaussians", "Gaussians during training", "Gaussians"),
     ("loss", "Training loss (of single views, averaged over trials)", "loss"),
@@ -80,12 +81,14 @@ def compare_arms(
     pairs = pair_trials(own, first, second)
     gained, lost, faults = choose_crops(pairs, CROPS)
     regions = []
+    without: dict[str, list[str]] = {}  # properties by the reason for which they are not shown
     for name in ("texture", *MAP_PROPERTIES):
         try:
             found = errors_by_region(own, first, second, name)
             regions.append((found, _region_chart(found, first, second)))
         except InputError as error:
-            notes.append(f"Errors by {name}: not shown, {error}")
+            without.setdefault(str(error), []).append(name)
+    notes += [f"Errors by {', '.join(names)}: not shown, {reason}" for reason, names in without.items()]
     return Versus(
         first,
         second,
@@ -287,11 +290,22 @@ def _costs(trials: Sequence[Trial], first: Arm, second: Arm) -> list[str]:
     for name, key in (("Gaussians", "gaussians"), ("Training time", "seconds")):
         change = cost_change(arms[0], arms[1], COST_READERS[key])
         if change is not None:
-            lines.append(f"{name} {change_words(*change)}")
+            lines.append(f"{name} {change_words(*change)}{_cost_caution(key, change[0], arms)}")
         gap = curve_gap(*(training_curve(own, key, "psnr") for own in arms))
         if gap is not None:
             lines.append(_gap_words(gap, COST_LABELS[key]))
     return lines
+
+
+def _cost_caution(key: str, change: float, arms: Sequence[Sequence[Trial]]) -> str:
+    """What a reader has to know beside a relative change of a cost: unequal counts, or how far equal trials differ."""
+    if key == "gaussians":
+        unequal = abs(change) > EQUAL_COUNTS
+        return "; so this is no comparison at one count, which densify.cap=governor makes" if unequal else ""
+    cells = by_key([trial for arm in arms for trial in arm], lambda trial: (trial.arm, trial.scene)).values()
+    times = [[t for trial in cell if (t := COST_READERS[key](trial))] for cell in cells]
+    spread = max((max(own) / min(own) - 1 for own in times if own), default=0.0)
+    return f"; times of equal trials differ by up to {spread:.0%}" if spread else ""
 
 
 def _gap_words(gap: CurveGap, cost: str) -> str:
