@@ -66,16 +66,17 @@ def _rounds(experiment: Experiment) -> pd.DataFrame:
 
 
 def _picture(experiment: Experiment, zoom: int = 2) -> Image.Image:
-    """A held-out view as photograph, by adc, and by the best and the worst seed of volumetric.
+    """A held-out view as photograph, by adc, by the best and the worst seed of volumetric, and by volumetric_once.
 
-    It is the view in whose PSNR the seeds of volumetric differ the most.
+    It is the view in whose PSNR the seeds of volumetric differ the most; the other arms are of its worst seed.
     """
     trials = [trial for trial in experiment.trials if trial.densify == "volumetric"]
     trials.sort(key=lambda trial: -trial.metrics["psnr"])
     best, worst = read_views(trials[0]), read_views(trials[-1])
     name = max(best, key=lambda view: abs(best[view]["psnr"] - worst[view]["psnr"]))
-    base = next(t for t in experiment.trials if t.densify == "adc" and t.seed == trials[-1].seed)
-    folders = [base.path / "ground_truth", *(trial.path / "renders" for trial in (base, trials[0], trials[-1]))]
+    beside = {trial.densify: trial for trial in experiment.trials if trial.seed == trials[-1].seed}
+    shown = (beside["adc"], trials[0], trials[-1], beside["volumetric_once"])
+    folders = [shown[0].path / "ground_truth", *(trial.path / "renders" for trial in shown)]
     pictures = [Image.open(folder / f"{Path(name).stem}.png") for folder in folders]
     width, height = pictures[0].width * zoom, pictures[0].height * zoom
     joined = Image.new("RGB", (len(pictures) * (width + 4) - 4, height), "white")
