@@ -46,5 +46,5 @@ def test_every_file_that_the_page_names_is_there_and_small() -> None:
 def test_the_experiments_of_the_page_are_configurations() -> None:
     page = findings.PAGE.read_text(encoding="utf-8")
     named = set(re.findall(r"\+experiment=(\w+)", page))
-    assert named >= {"bonsai_growth", "fair_governor", "fair_hard"}
+    assert named >= {"bonsai_growth", "fair_governor", "fair_hard", "initialisers"}
     assert all((ROOT / "conf" / "experiment" / f"{name}.yaml").is_file() for name in named)
