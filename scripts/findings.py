@@ -41,7 +41,7 @@ def collect(runs: Path) -> None:
     for name in EXPERIMENTS:
         if name in list_experiments(runs):
             experiment = read_experiment(runs / name)
-            to_frame(experiment).reindex(columns=kept).to_csv(DATA / f"{name}.csv", index=False, float_format="%.6g")
+            to_frame(experiment).reindex(columns=kept).to_csv(DATA / f"{name}.csv", index=False, float_format="%.9g")
             _rounds(experiment).to_csv(DATA / f"{name}_rounds.csv", index=False, float_format="%.5g")
             if name == "bonsai_growth":
                 _picture(experiment).save(DATA / f"{name}.png")

@@ -78,7 +78,8 @@ def _compare(rasters: list[str], setting: Setting, repeats: int, memory: bool, r
         rows.append(row)
     del steppers, stepper  # their memory: the processes below need it
     for row in rows:
-        report(f"{what}, memory", len(rows), len(rows), row["raster"])
+        if memory:
+            report(f"{what}, memory", len(rows), len(rows), row["raster"])
         row["peak_memory_mb"] = _measure_memory(row["raster"], setting) if memory else None
     return rows
 
