@@ -50,18 +50,14 @@ def collect(runs: Path) -> None:
 def _rounds(experiment: Experiment) -> pd.DataFrame:
     """The count after every round of the first seed, and what the governor did to the thresholds."""
     rows = []
-    by_init = len({trial.densify for trial in experiment.trials}) == 1
     for trial in experiment.trials:
         if trial.seed == min(t.seed for t in experiment.trials):
             for line in (trial.path / "events.jsonl").read_text().splitlines():
                 event = json.loads(line)
-                row = {
-                    "scene": trial.scene,
-                    "arm": trial.init if by_init else trial.densify,
-                    "step": event["step"],
-                    "count": event["after"],
-                }
-                rows.append(row | {"strictness": event.get("strictness"), "cull": event.get("cull")})
+                row = {"scene": trial.scene, "init": trial.init, "densify": trial.densify, "step": event["step"]}
+                rows.append(
+                    row | {"count": event["after"], "strictness": event.get("strictness"), "cull": event.get("cull")}
+                )
     return pd.DataFrame(rows).dropna(axis=1, how="all")
 
 
@@ -164,8 +160,12 @@ def pair(frame: pd.DataFrame, arm: str, metric: str) -> Paired:
 
 
 def read(name: str) -> pd.DataFrame:
-    """The trials of an experiment, with the column ``arm``: the densifier, or the initialiser where those differ."""
-    frame = pd.read_csv(DATA / f"{name}.csv")
+    """The trials of an experiment, with their arms."""
+    return _with_arms(pd.read_csv(DATA / f"{name}.csv"))
+
+
+def _with_arms(frame: pd.DataFrame) -> pd.DataFrame:
+    """With the column ``arm``: the densifier, or the initialiser where those differ."""
     return frame.assign(arm=frame.init if frame.densify.nunique() == 1 else frame.densify)
 
 
@@ -210,7 +210,7 @@ def draw() -> None:
     from matplotlib import pyplot as plt
 
     for file in sorted(DATA.glob("*_rounds.csv")):
-        rounds = pd.read_csv(file).assign(thousands=lambda frame: frame["count"] / 1000)
+        rounds = _with_arms(pd.read_csv(file)).assign(thousands=lambda frame: frame["count"] / 1000)
         drawn = {"thousands": "Gaussians (thousands)"}
         if "strictness" in rounds:
             drawn["strictness"] = "thresholds, times their own"

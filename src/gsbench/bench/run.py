@@ -78,9 +78,10 @@ def _compare(rasters: list[str], setting: Setting, repeats: int, memory: bool, r
         rows.append(row)
     del steppers, stepper  # their memory: the processes below need it
     for row in rows:
+        row["peak_memory_mb"] = None
         if memory:
             report(f"{what}, memory", len(rows), len(rows), row["raster"])
-        row["peak_memory_mb"] = _measure_memory(row["raster"], setting) if memory else None
+            row["peak_memory_mb"] = _measure_memory(row["raster"], setting)
     return rows
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +32,6 @@ MAX_HEADER = 1 << 16  # bytes
 MIN_TEXT_BYTES = 2  # of a value in an ASCII file: a digit and a space
 SIZES = {"short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4}
 SIZES |= {"float": 4, "float32": 4, "double": 8, "float64": 8}  # bytes; all other types have one
-UNREADABLE = (
-    OSError,
-    LookupError,
-    PlyParseError,
-    ValueError,
-    TypeError,
-    OverflowError,
-    MemoryError,
-)  # what reading raises
 
 
 def write_ply(gaussians: Gaussians, path: Path) -> None:
@@ -62,23 +55,24 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
 
 
 def _read_vertices(path: Path) -> NDArray[Any]:
-    try:
+    with _reading(path):
         _check_length(path)
         return PlyData.read(str(path))["vertex"].data
-    except UNREADABLE as error:
-        raise _not_readable(path, error) from error
 
 
 def check_ply(path: Path) -> None:
     """Raise InputError where a file cannot be a PLY of Gaussians, judged by its header and its length alone."""
-    try:
+    with _reading(path):
         _check_length(path)
-    except UNREADABLE as error:
-        raise _not_readable(path, error) from error
 
 
-def _not_readable(path: Path, error: Exception) -> InputError:
-    return InputError(f"{path}: not a readable PLY of Gaussians ({error})")
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Whatever a damaged file raises becomes an InputError that names it."""
+    try:
+        yield
+    except (OSError, LookupError, PlyParseError, ValueError, TypeError, OverflowError, MemoryError) as error:
+        raise InputError(f"{path}: not a readable PLY of Gaussians ({error})") from error
 
 
 def _check_length(path: Path) -> None:

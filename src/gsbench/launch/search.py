@@ -107,8 +107,8 @@ def search(
             f"a search of {counted(wanted.trials, 'point')} with {seeds} each; the point of the lowest values would be"
         )
         task.launch(first)
-    home = TrialPaths.of(first[0].values).home
     make_runs_folder(checked_runs_folder(first[0].values["runs"]))
+    home = TrialPaths.of(first[0].values).home
     home.mkdir(exist_ok=True)
     with hold(home / f".{SEARCH}.lock", "the search"):
         study = _open(home, wanted, _identity(first[0], wanted, space))

@@ -56,15 +56,14 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[str]) -> Composed:
     """The trial in ``folder``: from its planned overrides, else from the configuration that it wrote."""
+    if planned is not None and Path(planned.cwd).is_dir():
+        os.chdir(planned.cwd)  # relative paths were meant from there, and the trials are run from there
+    import_from_here()
     if planned is not None:
         changed = {change.split("=")[0] for change in changes}
         own = [word for word in planned.overrides if word.split("=")[0] not in changed]
         if any(change.startswith("launch=") and change not in planned.overrides for change in changes):
             own = [word for word in own if not word.startswith("launch.")]  # they were meant for the other launcher
-        where = planned.cwd if Path(planned.cwd).is_dir() else os.getcwd()
-        if where != os.getcwd():
-            os.chdir(where)  # relative paths were meant from there, and the trials are run from there
-        import_from_here()
         trial = compose_one([*own, *changes])
         if changes and _identity(trial) != _identity(compose_one(planned.overrides)):
             raise InputError(
@@ -75,7 +74,6 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
         raise InputError(
             f"{label_of(folder)} is in no plan, so no setting of it can be changed: run it by its own command"
         )
-    import_from_here()
     values = read_config(folder) | {"runs": str(runs)}
     return Composed(values, yaml.safe_dump(values, sort_keys=False), ())
 

@@ -287,23 +287,28 @@ def _by_scene(verdicts: Sequence[Verdict]) -> list[str]:
 def _costs(trials: Sequence[Trial], first: Arm, second: Arm) -> list[str]:
     arms = [[trial for trial in trials if trial.arm == arm] for arm in (first, second)]
     lines = []
-    for name, key in (("Gaussians", "gaussians"), ("Training time", "seconds")):
+    for name, key, caution in (
+        ("Gaussians", "gaussians", _unequal_counts),
+        ("Training time", "seconds", _unsteady_times),
+    ):
         change = cost_change(arms[0], arms[1], COST_READERS[key])
         if change is not None:
-            lines.append(f"{name} {change_words(*change)}{_cost_caution(key, change[0], arms)}")
+            lines.append(f"{name} {change_words(*change)}{caution(change[0], arms)}")
         gap = curve_gap(*(training_curve(own, key, "psnr") for own in arms))
         if gap is not None:
             lines.append(_gap_words(gap, COST_LABELS[key]))
     return lines
 
 
-def _cost_caution(key: str, change: float, arms: Sequence[Sequence[Trial]]) -> str:
-    """What a reader has to know beside a relative change of a cost: unequal counts, or how far equal trials differ."""
-    if key == "gaussians":
-        unequal = abs(change) > EQUAL_COUNTS
-        return "; so this is no comparison at one count, which densify.cap=governor makes" if unequal else ""
+def _unequal_counts(change: float, _: Sequence[Sequence[Trial]]) -> str:
+    unequal = abs(change) > EQUAL_COUNTS
+    return "; so this is no comparison at one count, which densify.cap=governor makes" if unequal else ""
+
+
+def _unsteady_times(_: float, arms: Sequence[Sequence[Trial]]) -> str:
+    """How far the training times of equal trials differ, without which a change of them says little."""
     cells = by_key([trial for arm in arms for trial in arm], lambda trial: (trial.arm, trial.scene)).values()
-    times = [[t for trial in cell if (t := COST_READERS[key](trial))] for cell in cells]
+    times = [[t for trial in cell if (t := COST_READERS["seconds"](trial))] for cell in cells]
     spread = max((max(own) / min(own) - 1 for own in times if own), default=0.0)
     return f"; times of equal trials differ by up to {spread:.0%}" if spread else ""
 
