@@ -9,13 +9,13 @@ PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c co
 # for each processor, so the ordinary ones stay.
 GENERIC := NUMBA_CPU_NAME=generic OPENBLAS_CORETYPE=Prescott ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 \
 	DNNL_MAX_CPU_ISA=SSE41 NPY_DISABLE_CPU_FEATURES='X86_V3 X86_V4 AVX512_ICL'
-GENERIC_TESTS := tests/test_machine.py tests/raster/test_cpu.py tests/raster/test_contract.py tests/gaussians tests/densify \
-	tests/pipeline/test_loss.py tests/pipeline/test_trainer.py tests/pipeline/test_resume.py tests/eval/test_metrics.py \
-	tests/init/test_alignment.py tests/init/test_sfm.py
+GENERIC_TESTS := tests/system/test_machine.py tests/raster/test_cpu.py tests/raster/test_contract.py tests/gaussians tests/densify \
+	tests/train/test_loss.py tests/train/test_trainer.py tests/train/test_resume.py tests/eval/test_metrics.py \
+	tests/init/colmap/test_alignment.py tests/init/test_sfm.py
 
 # The next version of Hydra, as far as it is released, laid over .venv for the tests of what Hydra does.
 NEXT_HYDRA := 'hydra-core>=1.4.0rc1,<1.5' 'omegaconf>=2.4.1rc1,<2.5'
-NEXT_HYDRA_TESTS := tests/launch/test_joined_sweeps.py tests/test_config.py
+NEXT_HYDRA_TESTS := tests/app/test_joined_sweeps.py tests/config/test_schema.py
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-generic test-next-hydra lint

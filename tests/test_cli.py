@@ -16,19 +16,19 @@ import pytest
 import torch
 
 from gsbench import cli
-from gsbench.compose import compose_one
+from gsbench.app.hydra_app import compose_trials
+from gsbench.config.compose import compose_one
 from gsbench.errors import GsbenchError, InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.gaussians.spherical_harmonics import colors
-from gsbench.launch.hydra_app import compose_trials
 from gsbench.launch.plan import add_to_plan
-from gsbench.pipeline.stages import EVALUATE, INIT, TRAIN
-from gsbench.pipeline.stale import explain_steps
-from gsbench.pipeline.step import Step
-from gsbench.pipeline.stopping import Stopped
-from gsbench.pipeline.store import Store
-from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.runs.explain_cache import explain_steps
+from gsbench.runs.stages import EVALUATE, INIT, TRAIN
+from gsbench.runs.step import Step
+from gsbench.runs.store import Store
+from gsbench.runs.trial_files import TrialPaths
+from gsbench.system.stopping import Stopped
 from gsbench.verbs import doctor, export, retry, ui
 from tests.gaussians.helpers import random_gaussians
 
@@ -79,7 +79,7 @@ def test_errors_become_a_line_and_an_exit_code(
     def fail(argv: list[str]) -> int:
         raise error
 
-    monkeypatch.setattr("gsbench.launch.command.launch", fail)
+    monkeypatch.setattr("gsbench.app.command.launch", fail)
     assert cli.run(["seed=1"]) == code
     assert capsys.readouterr().err == text
 
@@ -134,7 +134,7 @@ def test_retry_runs_the_unfinished_with_their_own_settings(
 ) -> None:
     make_experiment(runs)
     ran: list[Any] = []
-    monkeypatch.setattr("gsbench.launch.command.run_trials", lambda trials: ran.extend(trials) or 0)
+    monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: ran.extend(trials) or 0)
     assert cli.run(["retry", "x", "--dry-run"]) == 0
     assert "2 trials: 1 missing, 1 failed" in capsys.readouterr().out
     assert cli.run(["retry", "x", "launch=local", "launch.parallel=3"]) == 0

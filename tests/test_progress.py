@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from gsbench.progress import progress
+from gsbench.logs import progress
 
 
 def test_a_log_gets_the_first_line_of_a_phase_and_the_last(caplog: pytest.LogCaptureFixture) -> None:

@@ -15,11 +15,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gsbench import cli
-from gsbench.compose import compose_values
-from gsbench.config import GROUP_SCHEMAS, check_values, plain
+from gsbench.app.hydra_app import compose_trials
+from gsbench.config.compose import compose_values
+from gsbench.config.schema import GROUP_SCHEMAS, check_values, plain
 from gsbench.errors import InputError
-from gsbench.hashing import config_hash
-from gsbench.launch.hydra_app import compose_trials
+from gsbench.runs.hashing import config_hash
 from gsbench.settings import option_fields
 
 REFUSED = {  # command line: a part of the line that refuses it

@@ -15,7 +15,7 @@ from gsbench import __version__
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder
 from gsbench.logs import set_up_logging
-from gsbench.verb_table import VERBS
+from gsbench.verbs.table import VERBS
 from gsbench.words import closest
 
 DONE, TRIAL_FAILED, BAD_INPUT = 0, 1, 2
@@ -77,13 +77,13 @@ def _verb(name: str, argv: list[str]) -> int:
 
 
 def _trials(argv: list[str]) -> int:
-    from gsbench.launch.command import launch
+    from gsbench.app.command import launch
 
     return launch(argv)
 
 
 def _help() -> int:
-    from gsbench.compose import options_text
+    from gsbench.config.compose import options_text
 
     print("gsbench: does an idea help 3D Gaussian Splatting?\n")
     print("  gsbench scene=courtyard init=sfm densify=volumetric seed=0     one trial")

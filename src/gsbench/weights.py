@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from gsbench.errors import InputError
 from gsbench.files import CHUNK, atomic
-from gsbench.progress import progress
+from gsbench.logs import progress
 from gsbench.words import readable_bytes
 
 if TYPE_CHECKING:

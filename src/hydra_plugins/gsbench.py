@@ -23,7 +23,7 @@ class GsbenchLauncher(Launcher):
         self.context, self.task, self.config = hydra_context, task_function, config
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
-        from gsbench.launch.task import launch_jobs
+        from gsbench.app.task import launch_jobs
 
         return launch_jobs(self.task, self.context, self.config, job_overrides, initial_job_idx)
 
@@ -43,7 +43,7 @@ class GsbenchSweeper(Sweeper):
         )
 
     def sweep(self, arguments: list[str]) -> Any:
-        from gsbench.launch.task import sweep
+        from gsbench.app.task import sweep
 
         return sweep(self.task, self.context, self.config, self.launcher, self.params, arguments)
 
@@ -56,7 +56,7 @@ class OptunaSweeper(GsbenchSweeper):
         self.settings = settings
 
     def sweep(self, arguments: list[str]) -> None:
-        from gsbench.launch.search import search
+        from gsbench.app.search import search
 
         words = [*(f"{key}={value}" for key, value in self.params.items()), *arguments]
         search(self.task, self.context, self.config, self.launcher, self.settings, words)
@@ -64,7 +64,7 @@ class OptunaSweeper(GsbenchSweeper):
 
 LAUNCHER = {"_target_": "hydra_plugins.gsbench.GsbenchLauncher"}
 SWEEPER = {"_target_": "hydra_plugins.gsbench.GsbenchSweeper", "params": {}, "grids": []}
-SEARCH = {"metric": "psnr", "trials": 20, "seed": 0, "at_once": 1, "params": {}}  # gsbench.launch.search
+SEARCH = {"metric": "psnr", "trials": 20, "seed": 0, "at_once": 1, "params": {}}  # gsbench.app.search
 ConfigStore.instance().store(group="hydra/launcher", name="gsbench", node=LAUNCHER, provider="gsbench")
 ConfigStore.instance().store(group="hydra/sweeper", name="gsbench", node=SWEEPER, provider="gsbench")
 ConfigStore.instance().store(

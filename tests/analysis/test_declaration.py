@@ -24,7 +24,7 @@ from gsbench.analysis.statistics import (
     units_needed,
 )
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.verdicts import Judged, judge
+from gsbench.analysis.verdicts import ArmVerdicts, judge
 from tests.analysis.false_verdicts import measure
 from tests.analysis.synthetic import Plan, write_runs
 
@@ -43,7 +43,7 @@ def declared_experiment(runs: Path, *records: tuple[str, str], **plan: object) -
     return load_experiment(runs, "exp")
 
 
-def judged(experiment: Experiment) -> list[Judged]:
+def judged(experiment: Experiment) -> list[ArmVerdicts]:
     trials = experiment.trials
     pairs = choose_pairs(sorted({trial.arm for trial in trials}))
     return list(judge(trials, pairs, ViewCache(), standing(experiment.folder, trials)).values())

@@ -8,7 +8,7 @@ import pytest
 
 from gsbench.analysis.published import load_published, published_names, published_table
 from gsbench.analysis.results import load_experiment
-from gsbench.config import conf_dir
+from gsbench.config.schema import conf_dir
 from gsbench.errors import InputError
 from gsbench.eval.facts import find
 from gsbench.verbs import tables

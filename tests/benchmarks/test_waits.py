@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from gsbench.bench.waits import counting_waits
-from gsbench.readback import Readback
+from gsbench.raster.readback import Readback
 from tests.conftest import ROOT
 
 ONE = torch.ones(4)
@@ -89,7 +89,7 @@ def test_one_wait_in_a_training_step(raster: str) -> None:
         "TRITON_INTERPRET": "1",
         "PYTHONPATH": os.pathsep.join(path for path in [str(ROOT), *sys.path] if path),
     }
-    command = [sys.executable, "-m", "tests.pipeline.one_step", raster]
+    command = [sys.executable, "-m", "tests.train.one_step", raster]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
     counts = {name: count for line in done.stdout.splitlines() for name, count in json.loads(line).items()}

@@ -11,10 +11,10 @@ from gsbench.densify import DensifyContext, EdgeAware, Refinement, Taming
 from gsbench.densify.adc import ADC
 from gsbench.densify.scores import blended_sums, by_median, draw, edge_map
 from gsbench.errors import InputError
+from gsbench.eval.ssim import torch_photometric_loss
 from gsbench.events import RefineEvent
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
-from gsbench.pipeline.ssim import torch_photometric_loss
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.reference import ReferenceRasterizer, bin_gaussians, blending_weights, project, tile_rectangles
 from gsbench.scene.camera import Camera

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.pipeline.resources import assign_gpu, available_threads, take_slot
+from gsbench.system.resources import assign_gpu, available_threads, take_slot
 from tests.end_to_end.conftest import SMALL
 from tests.end_to_end.test_kills import results_of, start
 

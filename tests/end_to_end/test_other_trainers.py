@@ -23,7 +23,7 @@ from PIL import Image
 
 from gsbench.cli import run
 from gsbench.datasets.catalog import read_catalog
-from gsbench.scene.courtyard import render_courtyard
+from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.view.trials import find_trial, load_viewed
 from tests.datasets.server import serve
 from tests.end_to_end.conftest import Run

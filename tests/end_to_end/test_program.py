@@ -139,10 +139,10 @@ def test_wheel_runs_a_trial_outside_the_checkout(environment: dict[str, str], tm
         check=True,
     )
     clean = {key: value for key, value in environment.items() if key != "PYTHONPATH"}  # not the checkout's modules
-    where = "import gsbench, gsbench.config as c; print(gsbench.__file__); print(c.conf_dir())"
+    where = "import gsbench, gsbench.config.schema as c; print(gsbench.__file__); print(c.conf_dir())"
     found = subprocess.run([python, "-c", where], cwd=tmp_path, env=clean, capture_output=True, text=True, check=True)
     assert all(line.startswith(str(packages)) for line in found.stdout.split())
-    hint = "from gsbench.install import install_command; print(install_command('view'))"
+    hint = "from gsbench.system.install import install_command; print(install_command('view'))"
     found = subprocess.run([python, "-c", hint], cwd=tmp_path, env=clean, capture_output=True, text=True, check=True)
     assert found.stdout == "pip install 'gsbench-3dgs[view]'\n"
     arguments = [*SMALL, "train.iterations=10", "tracking=none"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.scene.courtyard import render_courtyard
+from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.readers import read_colmap
 from gsbench.scene.types import Capture
 

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 import gsbench.init
-from gsbench.compose import compose_one
-from gsbench.hashing import sha256_of, without_later
+from gsbench.config.compose import compose_one
+from gsbench.runs.hashing import sha256_of, without_later
 
 FOLDER = Path(__file__).parents[2] / "conf" / "init"
 NAMES = sorted(path.stem for path in FOLDER.glob("*.yaml"))

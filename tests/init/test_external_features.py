@@ -12,7 +12,7 @@ from PIL import Image
 
 from gsbench.init import Sfm
 from gsbench.init.base import no_progress
-from gsbench.init.colmap_database import (
+from gsbench.init.colmap.database import (
     create_database,
     database_counts,
     guessed_groups,
@@ -20,11 +20,11 @@ from gsbench.init.colmap_database import (
     write_keypoints,
     write_matches,
 )
-from gsbench.init.extractors import build_extractor, extract_features
-from gsbench.init.features import Features, FeatureSettings
-from gsbench.init.reconstruct import MappingSettings, Verification, map_images
-from gsbench.init.sift import extract_sift
-from gsbench.init.sift_matching import match_sift
+from gsbench.init.colmap.reconstruct import MappingSettings, Verification, map_images
+from gsbench.init.colmap.sift import extract_sift
+from gsbench.init.colmap.sift_matching import match_sift
+from gsbench.init.networks.extractors import build_extractor, extract_features
+from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.scene.types import Capture
 
 MAPPING = MappingSettings(seed=0, threads=1, min_model_size=3, two_view_tracks=False, fixed_intrinsics=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsbench.init.pairs import exhaustive_pairs
+from gsbench.init.colmap.pairs import exhaustive_pairs
 from gsbench.init.preview import STRONGEST, best_pairs, count_agreements
 
 

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from gsbench.init.colmap.reconstruct import similarity_to
 from gsbench.init.plot import draw_cloud, view_from_above
-from gsbench.init.reconstruct import similarity_to
 from gsbench.init.report import compare_poses, make_report, measure_gauge, training_extent
 from gsbench.scene.types import Capture
 

@@ -16,8 +16,8 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, OWN_GAUGE_FOLDER, PICTURE_FILE, REPORT_FILE, Sfm, SfmDense, read_cloud
 from gsbench.init.base import InitReport
-from gsbench.init.colmap_initializer import WORK_FOLDER
-from gsbench.scene.courtyard import surface_distance
+from gsbench.init.colmap.initializer import WORK_FOLDER
+from gsbench.scene.courtyard.render import surface_distance
 from gsbench.scene.types import Capture
 
 

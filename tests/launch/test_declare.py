@@ -12,7 +12,7 @@ import pytest
 from gsbench.analysis.declaration import measured, read_declarations, standing
 from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
-from gsbench.compose import Composed, compose_one
+from gsbench.config.compose import Composed, compose_one
 from gsbench.errors import InputError
 from gsbench.launch.declare import declare, declared_metrics
 from tests.end_to_end.conftest import SMALL

@@ -11,15 +11,14 @@ from typing import Any
 
 import pytest
 
-from gsbench.command_words import GROUPS, options, parse
-from gsbench.compose import Composed, compose_one
-from gsbench.config import check_target
+from gsbench.app.command import launch, run_trials
+from gsbench.app.hydra_app import compose_trials
+from gsbench.config.command_words import GROUPS, options, parse
+from gsbench.config.compose import Composed, compose_one
+from gsbench.config.schema import check_target
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError, explain_storage
-from gsbench.hashing import config_hash
 from gsbench.launch import serial
-from gsbench.launch.command import launch, run_trials
-from gsbench.launch.hydra_app import compose_trials
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.plan import (
     Estimator,
@@ -30,11 +29,12 @@ from gsbench.launch.plan import (
     same_trial_elsewhere,
 )
 from gsbench.launch.states import states_of_experiment
-from gsbench.pipeline.locks import BusyError, hold, is_held
-from gsbench.pipeline.stages import TRAIN
-from gsbench.pipeline.step import Step
-from gsbench.pipeline.store import Store
-from gsbench.pipeline.trial_files import TrialPaths, find_finished, record_inputs, state_of
+from gsbench.runs.hashing import config_hash
+from gsbench.runs.stages import TRAIN
+from gsbench.runs.step import Step
+from gsbench.runs.store import Store
+from gsbench.runs.trial_files import TrialPaths, find_finished, record_inputs, state_of
+from gsbench.system.locks import BusyError, hold, is_held
 
 
 @pytest.fixture(autouse=True)

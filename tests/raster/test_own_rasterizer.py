@@ -14,11 +14,11 @@ import torch
 
 from gsbench.densify import ADC, PixelGS
 from gsbench.errors import InputError
-from gsbench.hashing import config_hash
 from gsbench.pipeline.components import build_rasterizer, check_footprint, rasterizer_inputs
 from gsbench.raster import create_rasterizer
+from gsbench.runs.hashing import config_hash
+from tests.config.test_schema import composed
 from tests.conftest import ROOT
-from tests.test_config import composed
 
 CPU = torch.device("cpu")
 TINY = ["scene.views=10", "scene.width=48", "scene.height=36", "init=random", "init.count=150", "init.size=1.2"]

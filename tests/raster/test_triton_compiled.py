@@ -15,11 +15,11 @@ from torch.utils._pytree import tree_leaves
 pytest.importorskip("triton")
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.pipeline.loss_triton import TritonLoss
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.contract import Case
 from gsbench.raster.triton import composite, executor
 from gsbench.raster.triton.executor import TritonRasterizer
+from gsbench.train.loss_triton import TritonLoss
 from tests.raster.ahead_of_time import TARGETS, Launch, compile_for, recorded, specialization
 
 CASE = Case(33, 49, 50, sh_degree=3)
@@ -31,7 +31,7 @@ WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "is_nonz
 
 
 class Answer:
-    """In place of `gsbench.readback.Readback`: as if 2 rows of blocks and 7 pairs had been counted."""
+    """In place of `gsbench.raster.readback.Readback`: as if 2 rows of blocks and 7 pairs had been counted."""
 
     asked = 0
 

@@ -12,13 +12,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsbench.config import TrainConfig
+from gsbench.config.schema import TrainConfig
 from gsbench.densify import ADC
+from gsbench.eval.ssim import torch_photometric_loss
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
-from gsbench.pipeline.loss_triton import TritonLoss
-from gsbench.pipeline.ssim import torch_photometric_loss
-from gsbench.pipeline.trainer import Trainer
 from gsbench.raster.base import Rasterizer, RenderOutput
 from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.reference import ReferenceRasterizer
@@ -26,6 +24,8 @@ from gsbench.raster.triton import executor
 from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import Scene, View
+from gsbench.train.loss_triton import TritonLoss
+from gsbench.train.trainer import Trainer
 from tests.gaussians.helpers import random_gaussians
 
 BLACK = torch.zeros(3)

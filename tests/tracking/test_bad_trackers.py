@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 import psutil
 import pytest
 
-from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.runs.trial_files import TrialPaths
 from gsbench.tracking import connect, mirror_trial, prepare
 from tests.end_to_end.conftest import SMALL
 from tests.processes import heed_interrupts
@@ -41,7 +41,7 @@ TINY = [*SMALL, "train.iterations=20", "scene.views=8", "init.count=500", "eval.
 MIRROR = """
 import sys
 from pathlib import Path
-from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.runs.trial_files import TrialPaths
 from gsbench.tracking import Mirror
 from tests.tracking.helpers import options, trial_values, write_trial
 runs, uri, seed, patience = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), float(sys.argv[4])

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from gsbench.errors import InputError
-from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.runs.trial_files import TrialPaths
 from gsbench.tracking import Mirror, connect, default_uri, mirror_trial, prepare, tracker_uri
 from gsbench.tracking.process import MirrorProcesses
 from gsbench.tracking.source import source_tags

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.runs.trial_files import TrialPaths
 from gsbench.tracking import connect, mirror_trial
 from tests.tracking.helpers import RECORDS, child_environment, found_runs, history, options, trial_values
 
@@ -17,7 +17,7 @@ JOBS = 8
 CHILD = """
 import json, sys
 from tests.tracking.helpers import options, trial_values, write_trial
-from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.runs.trial_files import TrialPaths
 from gsbench.tracking import Mirror
 from pathlib import Path
 runs, uri, seed = Path(sys.argv[1]), sys.argv[2] or None, int(sys.argv[3])

@@ -14,7 +14,7 @@ from typing import Any
 import psutil
 import pytest
 
-from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.runs.trial_files import TrialPaths
 from gsbench.tracking import Mirror, connect, ensure_experiment, mirror_trial, prepare
 from gsbench.tracking.process import SECONDS_IN_VAIN, MirrorProcesses
 from gsbench.tracking.trial_run import STATE

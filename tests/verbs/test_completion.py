@@ -13,9 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.shells import SCRIPTS
-from gsbench.verb_table import VERBS
-from gsbench.verbs.completion import complete
+from gsbench.verbs.completion import SCRIPTS, complete
+from gsbench.verbs.table import VERBS
 from tests.conftest import ROOT
 
 SECONDS = 120  # within which what never comes is told from a slow machine

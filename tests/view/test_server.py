@@ -16,8 +16,8 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.events import Cause
-from gsbench.install import install_command
 from gsbench.raster import create_rasterizer
+from gsbench.system.install import install_command
 from gsbench.verbs import view as verb
 from gsbench.view.picture import Layers, TrialPainter
 from gsbench.view.server import Viewer, check_port, free_port

@@ -19,7 +19,7 @@ NOT_RECORDED = "not recorded"
 
 
 @dataclass(frozen=True)
-class Said:
+class PaperChoice:
     """What a paper says of one choice, in words that follow "the paper"; ``value`` is set where it states all of it."""
 
     words: str
@@ -36,18 +36,18 @@ class Topic:
     detail: Callable[[Sequence[Trial]], str] = lambda trials: ""  # of all trials, after their choices
 
 
-def read_setup(content: Mapping[str, Any]) -> dict[str, Said]:
+def read_setup(content: Mapping[str, Any]) -> dict[str, PaperChoice]:
     """``setup`` of a paper's YAML: for each topic words, or words with a value. Raises ValueError for another topic."""
     known = [topic.key for topic in TOPICS]
     if unknown := content.keys() - set(known):
         raise ValueError(f"setup: unknown {', '.join(sorted(unknown))}; known are {', '.join(known)}")
     return {
-        key: Said(said) if isinstance(said, str) else Said(said["words"], str(said["value"]))
+        key: PaperChoice(said) if isinstance(said, str) else PaperChoice(said["words"], str(said["value"]))
         for key, said in content.items()
     }
 
 
-def choice_lines(trials: Sequence[Trial], setup: Mapping[str, Said]) -> list[str]:
+def choice_lines(trials: Sequence[Trial], setup: Mapping[str, PaperChoice]) -> list[str]:
     """A line for each topic of ``setup`` in which our trials and the paper do not state the same."""
     own = [trial for trial in trials if not trial.made_elsewhere]
     lines = []

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.results import Trial, read_json_lines
-from gsbench.layout import DECLARED
+from gsbench.runs.layout import DECLARED
 from gsbench.words import counted
 
 STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
@@ -37,7 +37,7 @@ class Declaration:
 
 
 @dataclass(frozen=True)
-class Standing:
+class ActiveDeclaration:
     """The declaration that holds for an experiment, with what was there before it.
 
     ``seen`` are the trials that were measured before; ``earlier`` the declarations that it took the place of.
@@ -84,14 +84,14 @@ def read_declarations(folder: Path, trials: Sequence[Trial] = ()) -> list[Declar
     return sorted(dict.fromkeys(found), key=lambda declaration: declaration.time)
 
 
-def standing(folder: Path, trials: Sequence[Trial]) -> Standing | None:
+def standing(folder: Path, trials: Sequence[Trial]) -> ActiveDeclaration | None:
     """The declaration that holds for the experiment in ``folder`` with these trials: the latest; None without any."""
     declared = read_declarations(folder, trials)
     if not declared:
         return None
     latest = declared[-1]
     seen = tuple(trial for trial in trials if measured(trial) < latest.time)
-    return Standing(latest, seen, len(trials), tuple(declared[:-1]))
+    return ActiveDeclaration(latest, seen, len(trials), tuple(declared[:-1]))
 
 
 def measured(trial: Trial) -> float:

@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 
 from gsbench.analysis.results import Trial, canonical
-from gsbench.source import OWN, SHOWN
+from gsbench.runs.source import OWN, SHOWN
 
 Versions = dict[str, list[Trial]]  # version -> the trials that it made
 

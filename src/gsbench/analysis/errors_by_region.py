@@ -20,7 +20,7 @@ from gsbench.analysis.pairing import Paired, pair_trials
 from gsbench.analysis.results import Arm, Trial
 from gsbench.analysis.statistics import Comparison, compare
 from gsbench.errors import InputError
-from gsbench.layout import GROUND_TRUTH, MAPS, RENDERS
+from gsbench.runs.layout import GROUND_TRUTH, MAPS, RENDERS
 
 BINS = 5
 TEXTURE_SIGMA = 2.0  # px: texture energy is the gradient's square averaged over such a Gaussian

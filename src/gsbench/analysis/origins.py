@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.results import Trial
-from gsbench.machine import kind_of_machine
-from gsbench.source import SHOWN
+from gsbench.runs.source import SHOWN
+from gsbench.system.machine import kind_of_machine
 from gsbench.words import counted
 
 

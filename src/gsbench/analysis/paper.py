@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from gsbench.analysis.choices import Said, read_setup
+from gsbench.analysis.choices import PaperChoice, read_setup
 
 TABLE1_QUANTITIES = ("ssim", "psnr", "lpips_vgg_raw", "gaussians_millions", "train_minutes")
 TABLE1_ARMS = (("dim", "adc"), ("dim", "volumetric"))
@@ -52,7 +52,7 @@ class Paper:
     table2: Mapping[Key, Printed]
     datasets: Mapping[str, str]  # scene -> data set, as in Table 1
     claims: Mapping[str, Any]
-    setup: Mapping[str, Said]
+    setup: Mapping[str, PaperChoice]
 
     def table(self, name: str) -> Mapping[Key, Printed]:
         return {"table1": self.table1, "table2": self.table2}[name]

@@ -21,8 +21,8 @@ import yaml
 
 from gsbench.errors import InputError
 from gsbench.files import read_object
-from gsbench.layout import CONFIG, FAILED, IN_RUNS, INPUTS, PER_VIEW, RESULTS
-from gsbench.nested import flatten
+from gsbench.runs.hashing import flatten
+from gsbench.runs.layout import CONFIG, FAILED, IN_RUNS, INPUTS, PER_VIEW, RESULTS
 
 TRIAL_FOLDER = re.compile(r"(?P<hash>[0-9a-f]{8})-seed(?P<seed>\d+)")
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.results import Arm, Trial, read_json_lines
-from gsbench.layout import CURVES
+from gsbench.runs.layout import CURVES
 
 GRID = 200  # points at which two curves are compared
 

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from gsbench.analysis.declaration import Standing
+from gsbench.analysis.declaration import ActiveDeclaration
 from gsbench.analysis.pairing import Paired, ViewCache, arm_name, pair_arms
 from gsbench.analysis.quantities import Quantity, choose_quantities, metric_quantity
 from gsbench.analysis.results import Arm, Trial
@@ -45,7 +45,7 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Judged:
+class ArmVerdicts:
     """The verdicts of one pair of arms, the declared metric first; ``notes`` say what could not be had.
 
     ``missing`` says, of a declared metric that has no verdict here, why.
@@ -65,8 +65,8 @@ class _Question:
 
 
 def judge(
-    trials: Sequence[Trial], pairs: Sequence[Pair], views: ViewCache, declared: Standing | None = None
-) -> dict[Pair, Judged]:
+    trials: Sequence[Trial], pairs: Sequence[Pair], views: ViewCache, declared: ActiveDeclaration | None = None
+) -> dict[Pair, ArmVerdicts]:
     """Compare each pair of arms in every metric that has a direction, in the families that ``declared`` makes."""
     primary = None if declared is None else declared_quantity(trials, declared)
     questions: list[_Question] = []
@@ -98,16 +98,16 @@ def judge(
             else:
                 notes.append(f"{one.name}: {faults[pair][one.key]}")
         missing = faults[pair].get(primary.key, "") if primary is not None else ""
-        judged[pair] = Judged(own_verdicts, tuple(notes), primary, missing)
+        judged[pair] = ArmVerdicts(own_verdicts, tuple(notes), primary, missing)
     return judged
 
 
-def declared_quantity(trials: Sequence[Trial], declared: Standing) -> Quantity:
+def declared_quantity(trials: Sequence[Trial], declared: ActiveDeclaration) -> Quantity:
     """The declared metric; also one of the user's own that no trial could compute."""
     return metric_quantity(declared.metric, trials)
 
 
-def declared_lines(declared: Standing, judged: dict[Pair, Judged]) -> list[str]:
+def declared_lines(declared: ActiveDeclaration, judged: dict[Pair, ArmVerdicts]) -> list[str]:
     """What was declared, and the verdict on it for each pair of arms, for the notes below a table."""
     quantity = next(iter(judged.values())).declared if judged else None
     lines = declared.sentences(declared.metric if quantity is None else quantity.name)
@@ -120,7 +120,7 @@ def declared_lines(declared: Standing, judged: dict[Pair, Judged]) -> list[str]:
     return lines
 
 
-def families(judged: Sequence[Judged]) -> list[str]:
+def families(judged: Sequence[ArmVerdicts]) -> list[str]:
     """How many tests each family had, and how it was adjusted; nothing where nothing was declared."""
     sizes: dict[Role, int] = {}
     for one in judged:
@@ -142,7 +142,7 @@ def families(judged: Sequence[Judged]) -> list[str]:
     return lines
 
 
-def _answer(questions: Sequence[_Question], declared: Standing | None) -> list[tuple[_Question, Verdict]]:
+def _answer(questions: Sequence[_Question], declared: ActiveDeclaration | None) -> list[tuple[_Question, Verdict]]:
     """Every question's verdict, in the order of ``questions``."""
     if declared is None:
         return [(one, _verdict(one.quantity, compare(one.paired, one.quantity.direction), "")) for one in questions]
@@ -156,7 +156,7 @@ def _answer(questions: Sequence[_Question], declared: Standing | None) -> list[t
     return [(one, answers[place]) for place, one in enumerate(questions)]
 
 
-def _role(question: _Question, declared: Standing) -> Role:
+def _role(question: _Question, declared: ActiveDeclaration) -> Role:
     if not declared.beforehand:
         return "one of all"
     return "declared" if question.quantity.key == declared.metric else "secondary"

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
-from gsbench.install import install_command
 from gsbench.raster.base import RenderOutput
 from gsbench.scene.camera import Camera
+from gsbench.system.install import install_command
 
 PEER = "gsplat-torch"
 PEER_NOTE = "projection and colour only, no compositing: gsplat's torch reference needs CUDA for the rest"

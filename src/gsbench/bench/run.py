@@ -9,8 +9,8 @@ from typing import Any
 
 from gsbench.bench.peer import PEER, PEER_NOTE
 from gsbench.bench.stepper import WARM_UP_STEPS, Setting, Stepper, peak_memory
-from gsbench.isolate import run_isolated
-from gsbench.progress import Report, progress
+from gsbench.logs import Report, progress
+from gsbench.system.isolate import run_isolated
 
 
 def run_bench(

@@ -13,14 +13,14 @@ import torch
 from gsbench.bench.peer import PEER, TorchPeer
 from gsbench.bench.scenes import SEED, make_scene
 from gsbench.bench.waits import counting_waits
-from gsbench.config import TrainConfig
+from gsbench.config.schema import TrainConfig
 from gsbench.densify import ADC
 from gsbench.errors import InputError
-from gsbench.memory import peak_memory_mb, reset_peak_memory
 from gsbench.pipeline.components import build_rasterizer, keep_float32
-from gsbench.pipeline.trainer import Trainer
 from gsbench.raster.base import Rasterizer
 from gsbench.raster.executors import find
+from gsbench.system.memory import peak_memory_mb, reset_peak_memory
+from gsbench.train.trainer import Trainer
 
 WARM_UP_STEPS = 2  # compile, and let memory pools grow
 SH_DEGREE = 3

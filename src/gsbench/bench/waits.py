@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from gsbench.readback import Readback
+from gsbench.raster.readback import Readback
 
 # Operations whose result, or its size, the host has to know before it goes on.
 WAITING = frozenset(

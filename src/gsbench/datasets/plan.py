@@ -9,7 +9,7 @@ from pathlib import Path
 
 import yaml
 
-from gsbench.config import conf_dir
+from gsbench.config.schema import conf_dir
 from gsbench.datasets.archive import Member, holds
 from gsbench.datasets.catalog import DATA_VARIABLE
 from gsbench.datasets.records import SceneRecord, record_key

@@ -4,7 +4,6 @@ from gsbench.densify.adc import ADC
 from gsbench.densify.base import Densifier, DensifyContext, NoDensifier, Refinement, Rule
 from gsbench.densify.budgeted import Budgeted
 from gsbench.densify.edge_aware import EdgeAware
-from gsbench.densify.external import External
 from gsbench.densify.lineage import Lineage
 from gsbench.densify.long_axis import LongAxis
 from gsbench.densify.mcmc import MCMC
@@ -13,6 +12,7 @@ from gsbench.densify.scores import TrainingViews
 from gsbench.densify.taming import Taming
 from gsbench.densify.volumetric import Volumetric
 from gsbench.events import Cause, RefineEvent
+from gsbench.external.settings import External
 
 __all__ = [
     "ADC",

@@ -13,12 +13,12 @@ from pydantic import NonNegativeFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.init.base import Preparation, Progress, Timer
-from gsbench.init.colmap_initializer import ColmapInitializer
-from gsbench.init.colmap_options import MIN_DETECTION_SIZE, DatabaseTask
-from gsbench.init.features import FeatureSettings
-from gsbench.init.network_weights import ALIKED_WEIGHTS, EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS, SUPERPOINT_LICENCE
-from gsbench.init.pairs import Pairing
-from gsbench.init.relay import run_with_progress
+from gsbench.init.colmap.initializer import ColmapInitializer
+from gsbench.init.colmap.options import MIN_DETECTION_SIZE, DatabaseTask
+from gsbench.init.colmap.pairs import Pairing
+from gsbench.init.colmap.progress_pipe import run_with_progress
+from gsbench.init.networks.features import FeatureSettings
+from gsbench.init.networks.weights import ALIKED_WEIGHTS, EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS, SUPERPOINT_LICENCE
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath, Fraction
 from gsbench.weights import find_all_weights
@@ -63,15 +63,15 @@ class FeatureInitializer(ColmapInitializer):
         self.find_weights()
 
     def prepare(self, capture: Capture, work_dir: Path, reference: Path | None, progress: Progress) -> Preparation:
-        from gsbench.init.extract_and_match import NetworkJob, extract_and_match
+        from gsbench.init.networks.extract_and_match import NetworkJob, extract_and_match
 
         job = NetworkJob(self, self.feature_settings(), self.device, capture, reference, work_dir, *self.find_weights())
         return run_with_progress(extract_and_match, job, progress, what=f"{self.name}: features and matches")
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
-        from gsbench.init.colmap_database import verify_pairs, write_keypoints, write_matches
-        from gsbench.init.extract_and_match import NetworkJob, choose_pairs, open_store
-        from gsbench.init.reconstruct import Verification
+        from gsbench.init.colmap.database import verify_pairs, write_keypoints, write_matches
+        from gsbench.init.colmap.reconstruct import Verification
+        from gsbench.init.networks.extract_and_match import NetworkJob, choose_pairs, open_store
 
         weights = self.find_weights()
         job = NetworkJob(self, self.feature_settings(), self.device, task.capture, None, task.work_dir, *weights)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsbench.errors import InputError
 from gsbench.init.base import Initializer, InitReport, PointCloud, Progress, Timer, no_progress
-from gsbench.init.relay import run_with_progress
+from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.scene.types import Capture
 from gsbench.settings import check_settings
 
@@ -51,7 +51,8 @@ class PlacedCloud(Initializer):
 def _place(job: tuple[PlacedCloud, Capture, Path, Path | None], progress: Progress) -> InitReport:
     import pycolmap
 
-    from gsbench.init import reconstruct, report
+    from gsbench.init import report
+    from gsbench.init.colmap import reconstruct
 
     initializer, capture, output_dir, reference = job
     timer = Timer()

@@ -9,7 +9,7 @@ import pycolmap
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from gsbench.init.alignment import Array
+from gsbench.init.colmap.alignment import Array
 from gsbench.scene.colmap import points_of, read_model
 
 SIDE_INCHES = 8.0

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyParseError
 
 from gsbench.errors import InputError
-from gsbench.init.alignment import Array, Similarity
+from gsbench.init.colmap.alignment import Array, Similarity
 
 COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts")

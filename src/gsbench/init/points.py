@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.init.alignment import Array
 from gsbench.init.base import PointCloud, Seed
+from gsbench.init.colmap.alignment import Array
 from gsbench.init.placed import PlacedCloud
 from gsbench.init.point_files import read_points, read_similarity
 from gsbench.scene.types import Capture

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.init.pairs import Pair, exhaustive_pairs
+from gsbench.init.colmap.pairs import Pair, exhaustive_pairs
 
 ALL_PAIRS_UP_TO = 30  # images: 435 pairs take no longer than a preview is worth
 STRONGEST = 256  # features of an image in the preview

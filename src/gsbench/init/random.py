@@ -32,7 +32,8 @@ class Random(PlacedCloud):
     seed: Seed = 0
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        from gsbench.init import reconstruct, report
+        from gsbench.init import report
+        from gsbench.init.colmap import reconstruct
 
         poses = reconstruct.poses_by_name(model)
         centers = [poses[name][0] for name in capture.train_names if name in poses]

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from gsbench.init.alignment import Similarity, rotation_angles, transformed_rotations
 from gsbench.init.base import MODEL_FOLDER, PICTURE_FILE, REPORT_FILE, Gauge, InitReport, PoseErrors
+from gsbench.init.colmap.alignment import Similarity, rotation_angles, transformed_rotations
+from gsbench.init.colmap.reconstruct import common_poses, poses_by_name, save_reconstruction
 from gsbench.init.plot import draw_cloud
-from gsbench.init.reconstruct import common_poses, poses_by_name, save_reconstruction
 from gsbench.scene.types import EXTENT_MARGIN, Capture
 
 PAPER_VOLUME_THRESHOLD = 0.03  # V_th of the paper, in raw units of its COLMAP models

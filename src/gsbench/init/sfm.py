@@ -10,8 +10,8 @@ from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.init.base import Progress, Timer
-from gsbench.init.colmap_initializer import ColmapInitializer
-from gsbench.init.colmap_options import MIN_DETECTION_SIZE, DatabaseTask
+from gsbench.init.colmap.initializer import ColmapInitializer
+from gsbench.init.colmap.options import MIN_DETECTION_SIZE, DatabaseTask
 
 DEFAULT_PEAK_THRESHOLD = 0.02 / 3  # COLMAP's defaults
 DEFAULT_EDGE_THRESHOLD = 10.0
@@ -40,11 +40,11 @@ class Sfm(ColmapInitializer):
     guided_matching: bool = False
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
-        from gsbench.init.colmap_database import database_counts, strongest_descriptors
+        from gsbench.init.colmap.database import database_counts, strongest_descriptors
+        from gsbench.init.colmap.reconstruct import Verification
+        from gsbench.init.colmap.sift import extract_sift
+        from gsbench.init.colmap.sift_matching import match_sift
         from gsbench.init.preview import STRONGEST, proposed_pairs
-        from gsbench.init.reconstruct import Verification
-        from gsbench.init.sift import extract_sift
-        from gsbench.init.sift_matching import match_sift
 
         with timer.phase("extract"):
             extract_sift(task.database, task.images, task.names, self, self.num_threads, progress)

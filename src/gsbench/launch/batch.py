@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from gsbench.compose import Composed
+from gsbench.config.compose import Composed
 from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.declare import declare, declared_metrics
@@ -17,11 +17,11 @@ from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
 from gsbench.launch.preflight import check_components, missing_folders, missing_weights
 from gsbench.launch.serial import run_serial
-from gsbench.layout import STORE
-from gsbench.pipeline.stages import STAGES
-from gsbench.pipeline.stopping import stop_on_signals
-from gsbench.pipeline.store import Store
-from gsbench.pipeline.trial_files import TrialPaths, find_finished
+from gsbench.runs.layout import STORE
+from gsbench.runs.stages import STAGES
+from gsbench.runs.store import Store
+from gsbench.runs.trial_files import TrialPaths, find_finished
+from gsbench.system.stopping import stop_on_signals
 
 log = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ def _unavailable_metrics(options: dict[str, Any]) -> frozenset[str]:
 @cache
 def _unavailable(options: str) -> frozenset[str]:
     """The metrics that cannot be computed here and now; weights are looked for, and fetched, once for a sweep."""
-    from gsbench.config import EvalConfig
+    from gsbench.config.schema import EvalConfig
     from gsbench.pipeline.components import make_evaluator
 
     return frozenset(make_evaluator(EvalConfig(**json.loads(options))).awaited)

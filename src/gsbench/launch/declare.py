@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gsbench.analysis.declaration import Declaration, read_declarations
-from gsbench.compose import Composed
+from gsbench.config.compose import Composed
 from gsbench.errors import InputError
 from gsbench.files import write_text
-from gsbench.layout import DECLARED
-from gsbench.pipeline.locks import hold
-from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.runs.layout import DECLARED
+from gsbench.runs.trial_files import TrialPaths
+from gsbench.system.locks import hold
 
 log = logging.getLogger(__name__)
 

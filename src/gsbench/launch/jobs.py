@@ -19,15 +19,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gsbench.compose import Composed
+from gsbench.config.compose import Composed
+from gsbench.config.hydra_job import HydraJob
 from gsbench.errors import InputError
-from gsbench.hydra_job import HydraJob
-from gsbench.install import install_command
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.queue import forget_submission
-from gsbench.pipeline.resources import assign_gpu, assign_threads, take_slot
-from gsbench.pipeline.stopping import Stopped, stop_on_signals
-from gsbench.pipeline.trial_files import TrialPaths, find_finished
+from gsbench.runs.trial_files import TrialPaths, find_finished
+from gsbench.system.install import install_command
+from gsbench.system.resources import assign_gpu, assign_threads, take_slot
+from gsbench.system.stopping import Stopped, stop_on_signals
 
 if TYPE_CHECKING:
     from submitit import Executor, Job

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import DiskFullError
-from gsbench.pipeline.trial_files import label_of
+from gsbench.runs.trial_files import label_of
 
 OBJECTIVE = "psnr"  # what a trial returns to Hydra's sweepers
 Status = Literal["done", "failed", "queued"]

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbench.compose import Composed
+from gsbench.config.compose import Composed
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import read_object, write_json
 from gsbench.launch.queue import ask_queue, state_in_queue
-from gsbench.layout import PLAN, RESULTS, STORE, TRIAL_GLOB
-from gsbench.pipeline.locks import hold
-from gsbench.pipeline.trial_files import TrialPaths, find_finished, stage_and_step, state_of
+from gsbench.runs.layout import PLAN, RESULTS, STORE, TRIAL_GLOB
+from gsbench.runs.trial_files import TrialPaths, find_finished, stage_and_step, state_of
+from gsbench.system.locks import hold
 from gsbench.words import counted, readable_time
 
 PLAN_VERSION = 1
@@ -138,8 +138,8 @@ def _stage_finder(trials: Sequence[Composed]) -> Callable[[dict[str, Any]], list
     store = TrialPaths.of(trials[0].values).runs / STORE if trials else None
     if store is None or not store.is_dir():
         return lambda values: []
-    from gsbench.pipeline.store import Store
     from gsbench.pipeline.wiring import StepFinder
+    from gsbench.runs.store import Store
 
     finder = StepFinder(Store(store))
 

@@ -8,9 +8,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsbench.command_words import options
-from gsbench.compose import Composed
-from gsbench.config import COMPONENTS
+from gsbench.config.command_words import options
+from gsbench.config.compose import Composed
+from gsbench.config.schema import COMPONENTS
 
 READ = ("colmap", "photos")  # the kinds of scenes that are read from scene.path
 

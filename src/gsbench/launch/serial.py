@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from gsbench.compose import Composed
+from gsbench.config.compose import Composed
 from gsbench.launch.outcome import Outcome, objective, outcome_of_error, outcome_of_results
-from gsbench.layout import LOCK
-from gsbench.pipeline.locks import BusyError, describe_holder, is_held
-from gsbench.pipeline.trial_files import TrialPaths, label_of
+from gsbench.runs.layout import LOCK
+from gsbench.runs.trial_files import TrialPaths, label_of
+from gsbench.system.locks import BusyError, describe_holder, is_held
 
 log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gsbench.compose import Composed
+from gsbench.config.compose import Composed
 from gsbench.errors import InputError
 from gsbench.launch.jobs import SECONDS_BETWEEN_POLLS, collect, job_folder, job_of, need_submitit, prepare_tracking
 from gsbench.launch.outcome import Outcome
@@ -21,8 +21,8 @@ from gsbench.launch.queue import (
     read_submission,
     record_submission,
 )
-from gsbench.pipeline.locks import hold
-from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.runs.trial_files import TrialPaths
+from gsbench.system.locks import hold
 from gsbench.words import counted
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from typing import Literal
 
 from gsbench.launch.plan import read_plan
 from gsbench.launch.queue import Queue, ask_queue, read_submission, state_in_queue
-from gsbench.layout import CONFIG, FAILED, LOCK, RESULTS, TRIAL_GLOB
-from gsbench.pipeline.locks import read_holder
-from gsbench.pipeline.trial_files import State, failure_of, stage_and_step, state_of
+from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, TRIAL_GLOB
+from gsbench.runs.trial_files import State, failure_of, stage_and_step, state_of
+from gsbench.system.locks import read_holder
 
 
 @dataclass(frozen=True)

@@ -13,17 +13,17 @@ from typing import Any
 
 import torch
 
-from gsbench.config import ALLOWED_TARGETS, EvalConfig, check_target, require_values
+from gsbench.config.schema import ALLOWED_TARGETS, EvalConfig, check_target, require_values
 from gsbench.densify import External
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import facts_of
 from gsbench.eval.metric import Metric
 from gsbench.eval.protocol import get_protocol
-from gsbench.hashing import WITHOUT_EFFECT, without_later
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
+from gsbench.runs.hashing import WITHOUT_EFFECT, without_later
+from gsbench.runs.source import has_changed_since_import, source_of
 from gsbench.settings import checked, unknown_setting
-from gsbench.source import has_changed_since_import, source_of
 
 log = logging.getLogger(__name__)
 

@@ -13,16 +13,16 @@ from gsbench import __version__
 from gsbench.analysis.declaration import read_declarations
 from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS, MADE_ELSEWHERE
 from gsbench.events import sum_events
-from gsbench.hashing import config_hash, sha256_of
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
-from gsbench.layout import EVENTS
-from gsbench.pipeline.stages import EVALUATE, INIT, STAGES, TRAIN
 from gsbench.pipeline.steps.evaluate import METRICS_FILE
 from gsbench.pipeline.steps.train import TRAINING_FILE
-from gsbench.pipeline.store import MANIFEST, Entry
-from gsbench.pipeline.trial_files import TrialPaths
+from gsbench.runs.hashing import config_hash, sha256_of
+from gsbench.runs.layout import EVENTS
+from gsbench.runs.source import sources_of
+from gsbench.runs.stages import EVALUATE, INIT, STAGES, TRAIN
+from gsbench.runs.store import MANIFEST, Entry
+from gsbench.runs.trial_files import TrialPaths
 from gsbench.scene.types import Scene
-from gsbench.source import sources_of
 
 # What an evaluation has beside metrics, and its name in results: of the unavailable metrics those that may still come;
 # how a user's own metrics are to be read; metrics at earlier iterations.

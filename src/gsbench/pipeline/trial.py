@@ -13,22 +13,22 @@ from typing import Any
 import pycolmap  # noqa: F401 - here, so that what its import does to signals can be undone
 import torch
 
-from gsbench import layout
 from gsbench.errors import GsbenchError
 from gsbench.files import link_or_copy, read_object, remove_temporaries, storage_errors, write_json, write_text
 from gsbench.init.base import PICTURE_FILE, REPORT_FILE
-from gsbench.layout import BUILDING, CONFIG, FAILED, LOG, RESULTS
 from gsbench.logs import log_to
-from gsbench.pipeline.locks import hold
 from gsbench.pipeline.results import results_of
-from gsbench.pipeline.stages import EVALUATE, GROUND_TRUTH, INIT, TRAIN
-from gsbench.pipeline.step import Stage
-from gsbench.pipeline.stopping import take_signals_back
-from gsbench.pipeline.store import Entry, Store
-from gsbench.pipeline.trial_files import TrialPaths, find_finished, record_inputs
 from gsbench.pipeline.wiring import Parts, Trial
+from gsbench.runs import layout
+from gsbench.runs.layout import BUILDING, CONFIG, FAILED, LOG, RESULTS
+from gsbench.runs.stages import EVALUATE, GROUND_TRUTH, INIT, TRAIN
+from gsbench.runs.step import Stage
+from gsbench.runs.store import Entry, Store
+from gsbench.runs.trial_files import TrialPaths, find_finished, record_inputs
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture
+from gsbench.system.locks import hold
+from gsbench.system.stopping import take_signals_back
 from gsbench.tracking import Mirror
 
 log = logging.getLogger(__name__)

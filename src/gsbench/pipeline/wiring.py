@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from gsbench.config import EvalConfig, SceneConfig, TrainConfig
+from gsbench.config.schema import EvalConfig, SceneConfig, TrainConfig
 from gsbench.densify import Densifier, External
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.metric import Metric
@@ -28,8 +28,6 @@ from gsbench.pipeline.components import (
     make_evaluator,
     select_device,
 )
-from gsbench.pipeline.resources import available_threads
-from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.capture import capture_step, read_capture
 from gsbench.pipeline.steps.evaluate import evaluate_step, measure_step
 from gsbench.pipeline.steps.external import external_step
@@ -37,9 +35,11 @@ from gsbench.pipeline.steps.ground_truth import ground_truth_step
 from gsbench.pipeline.steps.init import init_step
 from gsbench.pipeline.steps.train import train_step
 from gsbench.pipeline.steps.views import Views
-from gsbench.pipeline.store import Store
 from gsbench.raster import Rasterizer
+from gsbench.runs.step import Step
+from gsbench.runs.store import Store
 from gsbench.scene.types import Capture
+from gsbench.system.resources import available_threads
 
 CaptureReader = Callable[[SceneConfig, Path | None], Capture]
 

@@ -11,7 +11,7 @@ import os
 from dataclasses import dataclass
 
 from gsbench.errors import InputError
-from gsbench.install import install_command
+from gsbench.system.install import install_command
 
 log = logging.getLogger(__name__)
 

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.isolate import CrashError, run_isolated
 from gsbench.scene.images import Resample, read_image, resize_image
 from gsbench.scene.sizes import downscaled_size
+from gsbench.system.isolate import CrashError, run_isolated
 
 PINHOLE_NAMES = ("SIMPLE_PINHOLE", "PINHOLE")
 _PNG_COMPRESSION = 1  # zlib level: lossless at any level, and this one writes about five times as fast as the default

@@ -14,7 +14,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-from gsbench.pipeline.locks import BusyError, hold
+from gsbench.system.locks import BusyError, hold
 from gsbench.tracking.client import connect, ensure_experiment
 from gsbench.tracking.source import source_tags
 from gsbench.tracking.trial_run import LOCK, TrackedTrial, mirror_trial

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from filelock import FileLock
 
 from gsbench.files import atomic
-from gsbench.layout import ARTIFACTS, DATABASE
+from gsbench.runs.layout import ARTIFACTS, DATABASE
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

@@ -21,7 +21,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
-from gsbench.isolate import describe_exit, python_command, telling_lines
+from gsbench.system.isolate import describe_exit, python_command, telling_lines
 
 SECONDS_IN_VAIN = 10.0  # patience with a tracker that the last trial waited for in vain
 SECONDS_TO_EXIT = 1.0  # patience with a process that has nothing to do and was told to end

@@ -13,12 +13,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsbench import layout
 from gsbench.files import read_object, write_json
-from gsbench.hashing import sha256_of
-from gsbench.nested import flatten
-from gsbench.pipeline.locks import hold
-from gsbench.pipeline.trial_files import failure_of
+from gsbench.runs import layout
+from gsbench.runs.hashing import flatten, sha256_of
+from gsbench.runs.trial_files import failure_of
+from gsbench.system.locks import hold
 from gsbench.tracking.client import connect, default_uri, ensure_experiment
 from gsbench.tracking.source import user_tags
 

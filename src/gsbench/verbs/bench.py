@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gsbench.arguments import ArgumentParser, path
 from gsbench.errors import InputError
 from gsbench.raster.executors import AUTO, EXECUTORS
+from gsbench.runs.source import import_from_here
 from gsbench.scene.sizes import MIN_SIZE
-from gsbench.source import import_from_here
+from gsbench.verbs.arguments import ArgumentParser, path
 
 COLUMNS = (  # of the table
     "raster",

@@ -1,6 +1,6 @@
 """``gsbench completion``: what the Tab key offers, as folders tell of experiments and trials, and Hydra of settings.
 
-A shell's script (`gsbench.shells`) asks ``gsbench completion query LINE``, which prints a line for each word that
+A shell's script (`gsbench.verbs.completion`) asks ``gsbench completion query LINE``, which prints a line for each word that
 the last one of ``LINE`` may become. Loads no torch, and Hydra for settings only.
 """
 
@@ -14,13 +14,12 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from gsbench.analysis.results import list_experiments
-from gsbench.arguments import ArgumentParser
 from gsbench.datasets.catalog import read_catalog
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys
-from gsbench.layout import TRIAL_GLOB
-from gsbench.shells import SCRIPTS, how_to_install
-from gsbench.verb_table import VERBS
+from gsbench.runs.layout import TRIAL_GLOB
+from gsbench.verbs.arguments import ArgumentParser
+from gsbench.verbs.table import VERBS
 
 QUERY = "query"
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
@@ -50,7 +49,7 @@ def complete(line: str, runs: Path) -> list[str]:
     if words and words[0] in VERBS:
         found = _of_verb(words[0], words[1:], word, runs)
     elif word.startswith("-"):
-        from gsbench.command_words import OPTIONS
+        from gsbench.config.command_words import OPTIONS
 
         found = list(OPTIONS)
     else:
@@ -163,8 +162,8 @@ def _settings(words: Sequence[str], word: str) -> list[str]:
     from hydra.core.global_hydra import GlobalHydra
     from hydra.plugins.completion_plugin import DefaultCompletionPlugin
 
-    from gsbench.command_words import parse
-    from gsbench.compose import composing
+    from gsbench.config.command_words import parse
+    from gsbench.config.compose import composing
 
     head, comma, last = word.rpartition(",")
     key = head.partition("=")[0] + "=" if comma else ""
@@ -189,3 +188,64 @@ def _settings(words: Sequence[str], word: str) -> list[str]:
 def _closed(candidate: str) -> str:
     """A group that has folders below it is chosen as any other."""
     return candidate if re.search(r"[=./]", candidate) else f"{candidate}="
+
+
+BASH = r"""
+_gsbench() {
+  local line="${COMP_LINE:0:COMP_POINT}" program="${COMP_WORDS[0]/#\~/$HOME}" found
+  local word="${line##*[[:space:]]}" breaks="${COMP_WORDBREAKS//[^=:]/}" kept=""
+  [[ -n $breaks ]] && kept="${word%"${word##*[$breaks]}"}"  # readline replaces what follows the last = or :
+  COMPREPLY=()
+  while IFS= read -r found; do
+    [[ -n $found ]] && COMPREPLY+=("${found#"$kept"}")
+  done < <("$program" completion query "$line" 2>/dev/null)
+  [[ ${#COMPREPLY[@]} == 1 && ${COMPREPLY[0]} == *[=.:/] ]] && compopt -o nospace 2>/dev/null
+  return 0
+}
+complete -o default -F _gsbench gsbench
+"""
+
+ZSH = r"""
+_gsbench() {
+  local -a found
+  local program="${words[1]/#\~/$HOME}"
+  found=("${(@f)$("$program" completion query "${(j: :)words[1,CURRENT-1]} $PREFIX" 2>/dev/null)}")
+  found=(${found:#})
+  if (( ! $#found )); then
+    compset -P '*='
+    _files
+    return
+  fi
+  compadd -S '' -- ${(M)found:#*[=.:/]}
+  compadd -- ${found:#*[=.:/]}
+}
+(( $+functions[compdef] )) || { autoload -Uz compinit && compinit -i; }
+compdef _gsbench gsbench
+"""
+
+FISH = r"""
+function __gsbench_complete
+    set -l program (string replace -r '^~' $HOME (commandline -po)[1])
+    set -l found ($program completion query (commandline -cp | string collect) 2>/dev/null | string match -v '')
+    if test (count $found) -gt 0
+        printf '%s\n' $found
+        return
+    end
+    set -l setting (string match -r '^[^=]*=' -- (commandline -ct))
+    for path in (__fish_complete_path (string replace -r '^[^=]*=' '' -- (commandline -ct)))
+        printf '%s%s\n' "$setting" $path
+    end
+end
+complete -c gsbench -f -a '(__gsbench_complete)'
+"""
+
+SCRIPTS = {"bash": BASH.strip(), "zsh": ZSH.strip(), "fish": FISH.strip()}
+
+
+def how_to_install() -> dict[str, str]:
+    """The one line for a shell's start-up file."""
+    return {
+        "bash": 'eval "$(gsbench completion bash)" in ~/.bashrc',
+        "zsh": 'eval "$(gsbench completion zsh)" in ~/.zshrc',
+        "fish": "gsbench completion fish | source in ~/.config/fish/config.fish",
+    }

@@ -13,12 +13,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
-from gsbench.arguments import ArgumentParser
 from gsbench.datasets.catalog import DATA_VARIABLE, data_dir, read_catalog
-from gsbench.install import install_command
-from gsbench.layout import DATABASE, STORE
-from gsbench.pipeline.resources import available_threads, installed_gpus
 from gsbench.raster.executors import EXECUTORS, resolve
+from gsbench.runs.layout import DATABASE, STORE
+from gsbench.system.install import install_command
+from gsbench.system.resources import available_threads, installed_gpus
+from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_bytes
 
 Verdict = Literal["ok", "note", "bad"]
@@ -225,7 +225,7 @@ def check_tracking(runs: Path) -> Iterator[Finding]:
 def check_weights() -> Iterator[Finding]:
     """Weights that are at hand; nothing is downloaded."""
     from gsbench.eval.lpips import BACKBONES
-    from gsbench.init.network_weights import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
+    from gsbench.init.networks.weights import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
     from gsbench.weights import WEIGHTS_VARIABLE, MissingWeights, WeightsFile, find_weights, hub_cache
 
     wanted: list[tuple[str, tuple[WeightsFile, ...]]] = []
@@ -251,8 +251,8 @@ def check_weights() -> Iterator[Finding]:
 
 def check_store(runs: Path) -> Iterator[Finding]:
     """Every stored result, read whole."""
-    from gsbench.pipeline.stages import STAGES
-    from gsbench.pipeline.store import read_manifest
+    from gsbench.runs.stages import STAGES
+    from gsbench.runs.store import read_manifest
 
     sound = 0
     for stage in STAGES:

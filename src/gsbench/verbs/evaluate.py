@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.arguments import ArgumentParser
 from gsbench.eval.protocol import PROTOCOLS
+from gsbench.verbs.arguments import ArgumentParser
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: 0 if every photograph was measured."""
     options = _parser().parse_intermixed_args(argv)
-    from gsbench.pipeline.measure_renders import measure_renders
+    from gsbench.renders.measure import measure_renders
 
     measure_renders(options, runs)
     return 0

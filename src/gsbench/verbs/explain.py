@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.explain import ADDRESS, explain_cell
-from gsbench.arguments import ArgumentParser
 from gsbench.errors import InputError
-from gsbench.layout import CONFIG, STORE
-from gsbench.source import import_from_here
+from gsbench.runs.layout import CONFIG, STORE
+from gsbench.runs.source import import_from_here
+from gsbench.verbs.arguments import ArgumentParser
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -36,12 +36,12 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("trial", nargs="+", help="a trial's folder, or the settings of one (scene=... densify=...)")
     words = parser.parse_args(argv).trial
     import_from_here()
-    from gsbench.launch.hydra_app import compose_trials
-    from gsbench.pipeline.entered import is_entered
-    from gsbench.pipeline.stale import explain_steps
-    from gsbench.pipeline.store import Store
-    from gsbench.pipeline.trial_files import read_config
+    from gsbench.app.hydra_app import compose_trials
     from gsbench.pipeline.wiring import Parts, Trial
+    from gsbench.renders.import_renders import is_entered
+    from gsbench.runs.explain_cache import explain_steps
+    from gsbench.runs.store import Store
+    from gsbench.runs.trial_files import read_config
 
     if len(words) == 1 and (Path(words[0]) / CONFIG).exists():
         values = read_config(Path(words[0]))

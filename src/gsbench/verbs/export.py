@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gsbench.arguments import ArgumentParser, path
 from gsbench.errors import InputError
 from gsbench.files import atomic
-from gsbench.layout import STORE
+from gsbench.runs.layout import STORE
+from gsbench.verbs.arguments import ArgumentParser, path
 from gsbench.view import ADDRESS
 
 if TYPE_CHECKING:

@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gsbench.arguments import ArgumentParser
 from gsbench.datasets.catalog import DATA_VARIABLE, Archive, Dataset, data_dir, read_catalog
 from gsbench.datasets.fetch import STAGING, Fetcher
 from gsbench.datasets.plan import SceneFiles, describe, wanted_files
@@ -14,8 +13,9 @@ from gsbench.datasets.records import SceneRecord, read_records
 from gsbench.datasets.remote import Patience, RangesRefusedError
 from gsbench.errors import InputError
 from gsbench.files import remove_temporaries, storage_errors
-from gsbench.pipeline.locks import hold
-from gsbench.progress import progress
+from gsbench.logs import progress
+from gsbench.system.locks import hold
+from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import closest, readable_bytes
 
 MIRROR_VARIABLE = "GSBENCH_MIRROR"

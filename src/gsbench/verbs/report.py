@@ -7,9 +7,9 @@ from pathlib import Path
 
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.results import load_experiment
-from gsbench.arguments import ArgumentParser, path
 from gsbench.errors import InputError
 from gsbench.files import write_text
+from gsbench.verbs.arguments import ArgumentParser, path
 
 REPORT_NAME = "report.html"
 FILE_SUFFIXES = (".html", ".htm")

@@ -10,20 +10,20 @@ from pathlib import Path
 import yaml
 
 from gsbench.analysis.results import experiment_home
-from gsbench.arguments import ArgumentParser
-from gsbench.compose import Composed, compose_one
+from gsbench.config.compose import Composed, compose_one
 from gsbench.errors import InputError
 from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
-from gsbench.pipeline.trial_files import TrialPaths, label_of, read_config
-from gsbench.source import import_from_here
+from gsbench.runs.source import import_from_here
+from gsbench.runs.trial_files import TrialPaths, label_of, read_config
+from gsbench.verbs.arguments import ArgumentParser
 
 log = logging.getLogger(__name__)
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: as the sweep's own command, the exit code says whether some trial failed."""
-    from gsbench.launch.command import run_trials
+    from gsbench.app.command import run_trials
 
     parser = ArgumentParser(
         prog="gsbench retry", description="Run the failed, stopped and missing trials of an experiment again."

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from gsbench.analysis.results import Trial, experiment_home, list_experiments, read_experiment
 from gsbench.analysis.superseded import find_superseded
-from gsbench.arguments import ArgumentParser
 from gsbench.launch.plan import forget, read_plan, remove
 from gsbench.launch.states import TrialState, states_of_experiment
-from gsbench.pipeline.trial_files import label_of
-from gsbench.source import source_on_disk
+from gsbench.runs.source import source_on_disk
+from gsbench.runs.trial_files import label_of
+from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
 ORDER = ("failed", "running", "queued", "partial", "missing", "superseded", "done")

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.results import experiment_home, list_experiments
-from gsbench.arguments import ArgumentParser
 from gsbench.errors import GsbenchError
-from gsbench.layout import TRIAL_GLOB
-from gsbench.pipeline.trial_files import label_of, read_config, state_of
+from gsbench.runs.layout import TRIAL_GLOB
+from gsbench.runs.trial_files import label_of, read_config, state_of
 from gsbench.tracking.client import tracker_uri
 from gsbench.tracking.process import MirrorError, MirrorProcess
+from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted
 
 

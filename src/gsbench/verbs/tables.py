@@ -15,9 +15,9 @@ from gsbench.analysis.published import published_names, published_table
 from gsbench.analysis.results import Experiment, Trial, load_experiment
 from gsbench.analysis.table_formats import FORMATS
 from gsbench.analysis.tables import DEFAULT_ROWS, build_table
-from gsbench.arguments import ArgumentParser, names, path
 from gsbench.errors import InputError
 from gsbench.files import write_text
+from gsbench.verbs.arguments import ArgumentParser, names, path
 
 TRIALS = "trials"
 PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsistencies

@@ -8,9 +8,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.arguments import ArgumentParser, port
 from gsbench.errors import InputError
-from gsbench.layout import DATABASE
+from gsbench.runs.layout import DATABASE
+from gsbench.verbs.arguments import ArgumentParser, port
 
 DEFAULT_PORT = 5000
 

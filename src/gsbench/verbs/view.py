@@ -7,9 +7,9 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.arguments import ArgumentParser, port
 from gsbench.errors import InputError
-from gsbench.install import install_command
+from gsbench.system.install import install_command
+from gsbench.verbs.arguments import ArgumentParser, port
 from gsbench.view import ADDRESS
 
 DEFAULT_PORT = 8080

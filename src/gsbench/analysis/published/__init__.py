@@ -11,7 +11,7 @@ from importlib.resources import files
 import yaml
 
 from gsbench.analysis.cells import by_key, check_averageable, make_cell
-from gsbench.analysis.choices import Said, choice_lines, read_setup
+from gsbench.analysis.choices import PaperChoice, choice_lines, read_setup
 from gsbench.analysis.paper import Printed
 from gsbench.analysis.paper_tables import Agreement, compare_with_printed, legend
 from gsbench.analysis.quantities import quantity
@@ -32,7 +32,7 @@ class Published:
     densify: str  # the densifier of ours that is the paper's method
     quantities: tuple[str, ...]
     printed: Mapping[tuple[str, str], Printed]
-    setup: Mapping[str, Said]
+    setup: Mapping[str, PaperChoice]
 
 
 def published_names() -> list[str]:

@@ -29,7 +29,7 @@ from gsbench.analysis.results import Experiment, Trial
 from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdicts import families, judge
-from gsbench.layout import FIGURES
+from gsbench.runs.layout import FIGURES
 from gsbench.words import signed
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 from gsbench.analysis.errors_by_region import absolute_error, read_image, view_names
 from gsbench.analysis.results import Trial
 from gsbench.errors import InputError
-from gsbench.layout import GROUND_TRUTH, RENDERS
+from gsbench.runs.layout import GROUND_TRUTH, RENDERS
 
 CROP = 128  # px a side, but at most a third of the image
 SHOWN = 288  # px: crops are enlarged to it without smoothing, so that pixels stay pixels

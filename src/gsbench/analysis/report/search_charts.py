@@ -10,7 +10,7 @@ from typing import Any
 from gsbench.analysis.report.charts import Series, line_chart
 from gsbench.eval.facts import find
 from gsbench.files import read_object
-from gsbench.layout import SEARCH
+from gsbench.runs.layout import SEARCH
 from gsbench.words import counted
 
 

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gsbench import layout
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import short_version
 from gsbench.analysis.errors_by_region import MAP_PROPERTIES, RegionErrors, errors_by_region
@@ -20,9 +19,10 @@ from gsbench.analysis.results import Arm, Trial, read_json_lines
 from gsbench.analysis.statistics import ALPHA
 from gsbench.analysis.tables import change_words, cost_change
 from gsbench.analysis.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve
-from gsbench.analysis.verdicts import Judged, Verdict, judge
+from gsbench.analysis.verdicts import ArmVerdicts, Verdict, judge
 from gsbench.errors import InputError
 from gsbench.events import Cause, RefineEvent
+from gsbench.runs import layout
 from gsbench.words import signed
 
 CROPS = 4  # places of each kind
@@ -68,7 +68,7 @@ class Versus:
 
 
 def compare_arms(
-    trials: Sequence[Trial], first: Arm, second: Arm, views: ViewCache, judged: Judged | None = None
+    trials: Sequence[Trial], first: Arm, second: Arm, views: ViewCache, judged: ArmVerdicts | None = None
 ) -> Versus:
     """Verdicts, costs, forest plots, regions and crops of two arms; what cannot be had is said in the notes.
 
@@ -223,7 +223,7 @@ def provenance(trials: Sequence[Trial]) -> list[dict[str, str]]:
     ]
 
 
-def _headline(judged: Judged, first: Arm, second: Arm) -> str:
+def _headline(judged: ArmVerdicts, first: Arm, second: Arm) -> str:
     verdicts, against = judged.verdicts, f"{arm_name(second)} against {arm_name(first)}"
     if not verdicts:
         return f"{arm_name(second)} and {arm_name(first)} cannot be compared: no metric has paired trials."
@@ -246,7 +246,7 @@ def _headline(judged: Judged, first: Arm, second: Arm) -> str:
     return f"{against}, on {scope}: {_in_words(verdicts[:1])}, which was declared beforehand."
 
 
-def _secondary(judged: Judged) -> str:
+def _secondary(judged: ArmVerdicts) -> str:
     others = [verdict for verdict in judged.verdicts if verdict.role == "secondary"]
     decidable = any(verdict.comparison.p is not None for verdict in others)
     return f"Secondary, adjusted for their number: {_in_words(others)}." if decidable else ""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsbench.analysis.results import Trial
 from gsbench.errors import InputError
-from gsbench.layout import POINT_CLOUD
+from gsbench.runs.layout import POINT_CLOUD
 
 LOG10_SPHERE = math.log10(4 / 3 * math.pi)
 BIN_WIDTH = 0.25  # decades

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from gsbench.config import SceneConfig
-from gsbench.hashing import sha256_of
-from gsbench.pipeline.stages import CAPTURE
-from gsbench.pipeline.step import Step
-from gsbench.progress import progress
-from gsbench.scene.courtyard import render_courtyard
+from gsbench.config.schema import SceneConfig
+from gsbench.logs import progress
+from gsbench.runs.hashing import sha256_of
+from gsbench.runs.stages import CAPTURE
+from gsbench.runs.step import Step
+from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.images import image_size
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.sizes import check_final_size

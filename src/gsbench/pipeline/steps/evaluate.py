@@ -20,19 +20,19 @@ from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.layout import FIGURES, LINEAGE, MAPS, PER_VIEW, POINT_CLOUD, RENDERS
+from gsbench.logs import progress
 from gsbench.pipeline.components import options_of, rasterizer_inputs
-from gsbench.pipeline.figures import draw_ellipsoids
-from gsbench.pipeline.maps import view_maps
-from gsbench.pipeline.stages import EVALUATE
-from gsbench.pipeline.step import Step
+from gsbench.pipeline.steps.figures import draw_ellipsoids
 from gsbench.pipeline.steps.ground_truth import png_name
+from gsbench.pipeline.steps.maps import view_maps
 from gsbench.pipeline.steps.views import Views
-from gsbench.pipeline.trainer import snapshot_file
-from gsbench.progress import progress
 from gsbench.raster import Rasterizer
+from gsbench.runs.layout import FIGURES, LINEAGE, MAPS, PER_VIEW, POINT_CLOUD, RENDERS
+from gsbench.runs.stages import EVALUATE
+from gsbench.runs.step import Step
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Scene
+from gsbench.train.trainer import snapshot_file
 
 METRICS_FILE = "metrics.json"
 FIGURE_VOLUME = 0.03  # the paper's V_th, for baseline and idea alike

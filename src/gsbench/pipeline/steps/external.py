@@ -16,22 +16,22 @@ import torch
 
 from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS
 from gsbench.densify import External, Lineage
-from gsbench.densify.external import DATA, OUTPUT, TEST_CAMERAS
 from gsbench.errors import InputError, TrainingError
+from gsbench.external.inputs import write_test_cameras, write_training_views
+from gsbench.external.outputs import take_model, take_renders
+from gsbench.external.placeholders import fill, words_of
+from gsbench.external.program import run_program
+from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS
 from gsbench.files import write_json
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG
-from gsbench.machine import describe_machine
 from gsbench.pipeline.components import options_of
-from gsbench.pipeline.external.inputs import write_test_cameras, write_training_views
-from gsbench.pipeline.external.outputs import take_model, take_renders
-from gsbench.pipeline.external.program import run_program
-from gsbench.pipeline.stages import EXTERNAL
-from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.train import TRAINING_FILE
 from gsbench.pipeline.steps.views import Views
-from gsbench.placeholders import fill, words_of
+from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG
+from gsbench.runs.stages import EXTERNAL
+from gsbench.runs.step import Step
+from gsbench.system.machine import describe_machine
 from gsbench.words import readable_time
 
 CONTRACT = 1  # raise when programs are given, or asked for, something else

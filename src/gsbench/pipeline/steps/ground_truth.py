@@ -6,9 +6,9 @@ from pathlib import Path
 
 from PIL import Image
 
-from gsbench.pipeline.stages import GROUND_TRUTH
-from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.views import Views
+from gsbench.runs.stages import GROUND_TRUTH
+from gsbench.runs.step import Step
 
 
 def ground_truth_step(views: Views) -> Step:

@@ -7,15 +7,15 @@ from importlib.metadata import version
 from pathlib import Path
 
 from gsbench.init.base import MODEL_FOLDER, Initializer
+from gsbench.logs import Report, progress
 from gsbench.pipeline.components import options_of
-from gsbench.pipeline.resources import available_threads
-from gsbench.pipeline.stages import INIT
-from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.capture import split_of
-from gsbench.pipeline.store import Store
-from gsbench.progress import Report, progress
+from gsbench.runs.stages import INIT
+from gsbench.runs.step import Step
+from gsbench.runs.store import Store
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Capture
+from gsbench.system.resources import available_threads
 
 
 def init_step(store: Store, capture: Capture, initializer: Initializer, reference: Step | None = None) -> Step:

@@ -10,25 +10,25 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsbench.config import TrainConfig
+from gsbench.config.schema import TrainConfig
 from gsbench.densify import Densifier
 from gsbench.files import write_json
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
-from gsbench.hashing import without_later
 from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
-from gsbench.layout import LINEAGE, POINT_CLOUD
-from gsbench.machine import describe_machine
-from gsbench.memory import peak_memory_mb, reset_peak_memory
+from gsbench.logs import progress
 from gsbench.pipeline.components import options_of, rasterizer_inputs
-from gsbench.pipeline.stages import TRAIN
-from gsbench.pipeline.step import Step
 from gsbench.pipeline.steps.views import Views
-from gsbench.pipeline.trainer import Status, Trainer
-from gsbench.progress import progress
 from gsbench.raster import Rasterizer
+from gsbench.runs.hashing import without_later
+from gsbench.runs.layout import LINEAGE, POINT_CLOUD
+from gsbench.runs.stages import TRAIN
+from gsbench.runs.step import Step
+from gsbench.system.machine import describe_machine
+from gsbench.system.memory import peak_memory_mb, reset_peak_memory
+from gsbench.train.trainer import Status, Trainer
 
 TRAINING_FILE = "training.json"
 # Options that cannot change the model.

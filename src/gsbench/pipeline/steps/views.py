@@ -5,12 +5,12 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
-from gsbench.config import SceneConfig
+from gsbench.config.schema import SceneConfig
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.pipeline.step import Step
+from gsbench.logs import progress
 from gsbench.pipeline.steps.capture import split_of
-from gsbench.pipeline.store import Store
-from gsbench.progress import progress
+from gsbench.runs.step import Step
+from gsbench.runs.store import Store
 from gsbench.scene.load import load_scene
 from gsbench.scene.types import Capture, Scene
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsbench.cores import available_cores
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, RenderOutput
 from gsbench.raster.cpu import layout as at
@@ -26,6 +25,7 @@ from gsbench.raster.cpu.workspace import Arena, ArenaPool, ShardRunner, TensorPo
 from gsbench.raster.footprint import Footprint, view_depths
 from gsbench.raster.validate import check_settings, raise_for_values
 from gsbench.scene.camera import Camera
+from gsbench.system.resources import available_cores
 
 # Fixed, so that the bits of every result are the same for any number of threads.
 GAUSSIAN_SHARDS = 16

@@ -13,8 +13,8 @@ from typing import Any
 
 import numba
 
-from gsbench.machine import numba_target
 from gsbench.raster.cpu.imports import PACKAGE, import_closure
+from gsbench.system.machine import numba_target
 
 FIRST_COMPILE_SECONDS = 10  # about; measured 7.5 s of processor time on a 2024 server core
 DIGEST_CHARACTERS = 16

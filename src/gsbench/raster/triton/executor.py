@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, RenderOutput
 from gsbench.raster.footprint import Footprint, view_depths
+from gsbench.raster.readback import Readback
 from gsbench.raster.triton.backprojection import backproject, sum_units
 from gsbench.raster.triton.binning import find_units, summarise, write_pairs
 from gsbench.raster.triton.composite import composite, decomposite
@@ -23,7 +24,6 @@ from gsbench.raster.triton.projection import project
 from gsbench.raster.triton.toolchain import load_driver
 from gsbench.raster.triton.workspace import Workspace, WorkspacePool
 from gsbench.raster.validate import check_settings, raise_for_values
-from gsbench.readback import Readback
 from gsbench.scene.camera import Camera
 
 MAX_INT16, MAX_INT32 = 2**15 - 1, 2**31 - 1

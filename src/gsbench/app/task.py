@@ -1,0 +1,156 @@
+"""What Hydra runs: all trials of a sweep at once through gsbench's own launcher, or one a call through any other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext
+from omegaconf import DictConfig
+
+from gsbench.app.grids import words_of_grids
+from gsbench.config.command_words import check_sweep
+from gsbench.config.compose import Composed, compose_jobs, explained, ready_trial
+from gsbench.config.hydra_job import words_of
+from gsbench.errors import GsbenchError, InputError
+from gsbench.launch.batch import begin_for_another_launcher
+from gsbench.launch.outcome import Outcome, objective, outcome_of_error
+from gsbench.logs import set_up_logging
+from gsbench.runs.source import import_from_here
+from gsbench.runs.trial_files import TrialPaths
+
+OWN = "gsbench"  # the names of gsbench's own launcher and sweeper
+
+
+class StopAfterListing(Exception):  # noqa: N818 - it is no error
+    """The trials were looked at, and none is to be run."""
+
+
+@dataclass
+class Task:
+    """The function that Hydra runs. ``handle`` runs trials, or only looks at them and raises `StopAfterListing`.
+
+    ``grids`` are what gsbench's sweeper joins (`gsbench.app.grids`); ``trials`` and ``outcomes`` are what has come
+    together, over all batches of a sweep.
+    """
+
+    handle: Callable[[Sequence[Composed]], list[Outcome]]
+    look_only: bool = False
+    grids: list[dict[str, str]] = field(default_factory=list)
+    trials: list[Composed] = field(default_factory=list)
+    outcomes: list[Outcome] = field(default_factory=list)
+
+    def __call__(self, config: DictConfig) -> float | None:
+        """One trial, as other launchers call it, perhaps in a process of its own; raises GsbenchError if it failed."""
+        import_from_here()
+        set_up_logging()
+        for_hydra, words = words_of(HydraConfig.get().overrides)
+        (outcome,) = self.handle([ready_trial(config, [*for_hydra, *words])])
+        if outcome.status != "done":
+            raise (InputError if outcome.bad_input else GsbenchError)(outcome.message)
+        return objective(outcome.metrics or {})
+
+    def launch(self, trials: Sequence[Composed]) -> list[JobReturn]:
+        """Run a batch of trials; raises GsbenchError where no other trial can succeed either."""
+        self.trials += trials
+        outcomes = self.handle(trials)
+        self.outcomes += outcomes
+        if fatal := next((outcome for outcome in outcomes if outcome.fatal), None):
+            raise (InputError if fatal.bad_input else GsbenchError)(fatal.message)
+        ended = {outcome.folder: outcome for outcome in outcomes}
+        return [_returned(trial, ended[TrialPaths.of(trial.values).folder]) for trial in trials]
+
+
+def launch_jobs(
+    task: Task, context: HydraContext, master: DictConfig, jobs: Sequence[Sequence[str]], first: int
+) -> list[JobReturn]:
+    """What gsbench's launcher does with the jobs of a sweep: each is the list of its words."""
+    return task.launch(compose_jobs(context, master, jobs, first))
+
+
+def sweep(
+    task: Task,
+    context: HydraContext,
+    master: DictConfig,
+    launcher: Launcher,
+    params: Mapping[str, Any],
+    words: Sequence[str],
+) -> Sequence[JobReturn]:
+    """What gsbench's sweeper does with the words of a sweep: all points of its grids at once.
+
+    ``params`` are the settings and values of ``hydra.sweeper.params``.
+    """
+    parser = OverridesParser.create(context.config_loader)
+    with explained(words):
+        jobs = [
+            point
+            for of_grid in words_of_grids(params, task.grids, words)
+            for point in grid(parser.parse_overrides(of_grid))
+        ]
+    return launch_trials(task, master, launcher, compose_jobs(context, master, jobs))
+
+
+def launch_trials(
+    task: Task, master: DictConfig, launcher: Launcher, trials: Sequence[Composed]
+) -> Sequence[JobReturn]:
+    """Run trials that a sweeper of gsbench's has composed, by any launcher.
+
+    Another launcher than gsbench's gets them after a look at all, so that what is refused is refused before any work.
+    """
+    name = master.hydra.runtime.choices["hydra/launcher"]
+    if name == OWN or task.look_only:
+        return task.launch(trials)
+    begin_for_another_launcher(trials)
+    jobs = [trial.job for trial in trials if trial.job is not None]
+    try:
+        returned = launcher.launch([list(job.words) for job in jobs], initial_job_idx=jobs[0].number or 0)
+    except GsbenchError:
+        raise
+    except Exception as error:
+        message = " ".join(str(error).split()) or type(error).__name__
+        raise GsbenchError(f"hydra/launcher={name}: {message} (gsbench status tells how far it came)") from error
+    task.trials += trials
+    task.outcomes += [_outcome(trial, ended) for trial, ended in zip(trials, returned, strict=True)]
+    return returned
+
+
+def grid(overrides: Sequence[Override]) -> list[list[str]]:
+    """The words of every point of the grid that ``overrides`` span; of two for one key the later counts."""
+    choices: dict[str, list[str]] = {}
+    for override in overrides:
+        key = override.get_key_element()
+        if override.is_sweep_override():
+            check_sweep(override)
+            try:
+                choices[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+            except ValueError as error:  # such as a range of steps of 0
+                raise InputError(f"{override.input_line}: {error}") from error
+            if not choices[key]:
+                raise InputError(f"{override.input_line} lists no value")
+        else:
+            choices[key] = [key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"]
+    return [list(point) for point in product(*choices.values())]
+
+
+def _returned(trial: Composed, outcome: Outcome) -> JobReturn:
+    words = trial.job.words if trial.job is not None else trial.overrides
+    returned = JobReturn(overrides=list(words), task_name="gsbench")
+    if outcome.status == "done":
+        returned.return_value, returned.status = objective(outcome.metrics or {}), JobStatus.COMPLETED
+    elif outcome.status == "failed":
+        returned.return_value, returned.status = GsbenchError(outcome.message), JobStatus.FAILED
+    return returned  # left to Slurm: not known
+
+
+def _outcome(trial: Composed, returned: JobReturn) -> Outcome:
+    """How a trial ended that another launcher ran."""
+    folder = TrialPaths.of(trial.values).folder
+    value: Any = returned._return_value  # the property of that name would write a line to stderr
+    return outcome_of_error(folder, value) if isinstance(value, Exception) else Outcome(folder, "done")

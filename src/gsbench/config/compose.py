@@ -1,0 +1,235 @@
+"""Configurations as Hydra composes them, made ready for trials; Hydra's errors in one line."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from hydra import initialize_config_dir
+from hydra._internal.hydra import Hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import HydraContext, RunMode
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from gsbench.config.command_words import GROUPS, check_words, is_sweep, options
+from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, number_job, words_of
+from gsbench.config.schema import Config, check, check_values, conf_dir, plain, register_schemas
+from gsbench.errors import InputError
+from gsbench.settings import checked
+from gsbench.words import closest
+
+MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood
+PLUGIN_HINTS = {  # where a word may name a plug-in of Hydra's that is not installed
+    "hydra/launcher": "; other launchers are packages of their own, which launch=serial, local or slurm do not need",
+    "hydra/sweeper": "; other sweepers are packages of their own",
+}
+SEED = re.compile(r"seed=(\d+)")
+
+
+@dataclass(frozen=True)
+class Composed:
+    """The configuration of one trial: resolved values, the same as YAML, and the overrides that give it.
+
+    ``job`` is what Hydra knows of the trial where it runs as a job of Hydra's.
+    """
+
+    values: dict[str, Any]
+    yaml: str
+    overrides: tuple[str, ...]
+    job: HydraJob | None = field(default=None, compare=False, repr=False)
+
+
+@contextmanager
+def composing() -> Iterator[Hydra]:
+    """Hydra with gsbench's configuration, as ``hydra.main`` would make it."""
+    register_schemas()
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(conf_dir()), version_base="1.3", job_name="gsbench"):
+            hydra = GlobalHydra.instance().hydra
+            assert hydra is not None
+            yield hydra
+    finally:
+        HydraConfig.instance().cfg = None
+
+
+def compose_master(hydra: Hydra, words: Sequence[str], mode: RunMode = RunMode.RUN) -> DictConfig:
+    """What Hydra makes of ``words``, with its own settings in the node ``hydra``. Raises InputError, one line."""
+    with explained(words), warnings.catch_warnings():
+        warnings.filterwarnings("error", message=r".* is not available\.", module="hydra")  # a folder to search in
+        return hydra.compose_config(CONFIG_NAME, list(words), run_mode=mode)
+
+
+def compose_jobs(
+    context: HydraContext, master: DictConfig, jobs: Sequence[Sequence[str]], first: int = 0
+) -> list[Composed]:
+    """The trials of a sweep from the words of each; those that differ in the seed alone share a composition."""
+    shared: dict[tuple[str, ...], DictConfig] = {}
+    trials = []
+    for_hydra, _ = words_of(master.hydra.overrides)
+    for number, words in enumerate(jobs, first):
+        given = (*for_hydra, *words)
+        seeds = [match for word in words if (match := SEED.fullmatch(word))]
+        rest = tuple(word for word in words if not SEED.fullmatch(word))
+        job = HydraJob(master, tuple(words), number, context.config_loader, context.callbacks)
+        if rest in shared:
+            config = shared[rest]
+            for match in seeds:
+                config.seed = checked(Config, {"seed": int(match.group(1))}, "")["seed"]
+            trials.append(_resolved(config, given, job))
+            continue
+        with explained(given):
+            config = context.config_loader.load_sweep_config(master, list(words))
+        number_job(config, number)
+        asks = settle(config, given)
+        trials.append(_resolved(config, given, job))
+        if not asks:
+            shared[rest] = config
+    return trials
+
+
+def compose_one(overrides: Sequence[str]) -> Composed:
+    """The configuration of the single trial that ``overrides`` describe, as ``Composed.overrides`` has them."""
+    check_words(overrides)
+    if swept := [word for word in overrides if is_sweep(word)]:
+        raise InputError(f"{swept[0]} lists several values: choose one")
+    with composing() as hydra:
+        return ready_trial(compose_master(hydra, overrides), overrides)
+
+
+def compose_values(overrides: Sequence[str]) -> DictConfig:
+    """The configuration to look at: every value is allowed, and what a trial needs may still be missing."""
+    with composing() as hydra:
+        config = compose_master(hydra, overrides)
+        with explained(overrides):
+            _take_hydra_away(config)
+            check_values(config)
+    return config
+
+
+def ready_trial(config: DictConfig, overrides: Sequence[str], job: HydraJob | None = None) -> Composed:
+    """The trial of a composed configuration, checked, whose node ``hydra`` is taken away."""
+    settle(config, overrides)
+    return _resolved(config, overrides, job)
+
+
+def settle(config: DictConfig, overrides: Sequence[str]) -> bool:
+    """Take the node ``hydra`` away from ``config`` and check what is left; whether a value asks Hydra (``${hydra:…}``).
+
+    Such a value differs from trial to trial, or may.
+    """
+    with explained(overrides):  # such as an interpolation that leads nowhere
+        asks = _take_hydra_away(config)
+        check(config)
+    return asks
+
+
+def _take_hydra_away(config: DictConfig) -> bool:
+    raw = OmegaConf.to_container(config, resolve=False)
+    assert isinstance(raw, dict)
+    if "hydra" not in raw:  # Hydra has taken it already, and knows it: it runs the job
+        return True
+    del raw["hydra"]
+    asks = "${hydra" in repr(raw)
+    if asks:
+        HydraConfig.instance().set_config(config)
+    with open_dict(config):
+        del config["hydra"]
+    return asks
+
+
+def _resolved(config: DictConfig, overrides: Sequence[str], job: HydraJob | None) -> Composed:
+    with explained(overrides):
+        return Composed(plain(config), OmegaConf.to_yaml(config, resolve=True), tuple(overrides), job)
+
+
+@contextmanager
+def explained(overrides: Sequence[str]) -> Iterator[None]:
+    """Raise what the block raises as InputError, one line in terms of the words that were given."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # Hydra lets errors of any kind through, and all that it works on is the user's
+        raise InputError(explain(error, overrides)) from error
+
+
+def explain(error: BaseException, overrides: Sequence[str]) -> str:
+    """Hydra's error in one line that names the key, what is allowed, and the nearest choice."""
+    text = " ".join(_chain(error))
+    override = re.search(r"Could not override '([^']+)'", text)
+    unknown = re.search(r"Key '([^']+)' (?:is not in struct|not in '[^']+')", text)
+    if unknown:
+        key = override.group(1) if override else unknown.group(1)
+        bad = unknown.group(1)
+        if bad == "grids":
+            return "hydra.sweeper.grids: gsbench's own sweeper alone joins grids, so leave out hydra/sweeper"
+        parent = key[: key.rindex(bad)].rstrip(".") if bad in key else key.rpartition(".")[0]
+        where = re.search(r"In '([^']+)'", text)
+        file = ""
+        if where and not override:  # in a YAML file, whose folder is the group
+            file, parent = f" in {where.group(1)}.yaml", where.group(1).rpartition("/")[0]
+        known = _keys_below(parent, overrides)
+        own = any(word.startswith(f"{parent}._target_=") for word in overrides)
+        hint = f"; a key that only your class has is added with a plus: +{key}=…" if own else ""
+        near = f"{closest(bad, known)}{hint}"
+        return f"{key} is not a setting{file}{near} ({parent or 'top level'} has: {', '.join(known) or 'no settings'})"
+    group = re.search(
+        r"Could not override '([\w/]+)'\.?\s*(?:Did you mean to override|No match in the defaults list)", text
+    )
+    if group:
+        word = group.group(1)
+        known = [*GROUPS, *_keys_below("", overrides)]
+        return f"{word} is not a group or setting{closest(word, known)} (groups: {', '.join(GROUPS)})"
+    missing = re.search(
+        r"Could not find '([^']+)'.*?Available options in '([^']+)':\s*(.*?)(?:\n\n|Config search|$)", text, re.S
+    )
+    if missing:
+        wanted, name = missing.group(1), missing.group(2)
+        choices = sorted({*options(name), *re.findall(r"[\w.-]+", missing.group(3))})
+        word = wanted.rpartition("/")[2]
+        near = closest(word, choices) or PLUGIN_HINTS.get(name, "")
+        return f"{name}={word} does not exist{near} (choose: {', '.join(choices)})"
+    absent = re.search(r"[Mm]issing mandatory value: ([\w.]+)", text)
+    if absent:
+        return f"{absent.group(1)} is not set: give it a value"
+    folder = re.search(r"provider=.* path=(.*) is not available", text)
+    if folder:
+        return f"hydra.searchpath names {folder.group(1)}: no such folder"
+    place = re.search(r"full_key: ([\w.\[\]]+)", text)
+    text = re.sub(r"\s*(full_key|reference_type|object_type)[:=].*", "", text)
+    return (f"{place.group(1)}: " if place else "") + " ".join(text.split())[:MAX_MESSAGE]
+
+
+def _chain(error: BaseException | None) -> list[str]:
+    messages = []
+    while error is not None:
+        messages.append(str(error))
+        error = error.__cause__
+    return messages
+
+
+def _keys_below(parent: str, overrides: Sequence[str]) -> list[str]:
+    """The settings below ``parent`` with the group choices among ``overrides``, as far as these compose."""
+    choices = [word for word in overrides if re.fullmatch(r"\w+=[\w-]+", word) and word.split("=")[0] in GROUPS]
+    with composing() as hydra:
+        try:
+            config = hydra.compose_config(CONFIG_NAME, choices, RunMode.RUN)
+        except Exception:  # noqa: BLE001 - the choices may be what is wrong
+            config = hydra.compose_config(CONFIG_NAME, [], RunMode.RUN)
+    node = OmegaConf.select(config, parent) if parent else config
+    return [str(key) for key in node if key != "hydra"] if isinstance(node, DictConfig) else []
+
+
+def options_text() -> str:
+    """The choices of every group."""
+    lines = ["Groups:"]
+    for group in GROUPS:
+        prefix = "+experiment" if group == "experiment" else group
+        lines.append(f"  {prefix + '=':<13}{', '.join(options(group))}")
+    return "\n".join(lines)

@@ -1,0 +1,100 @@
+"""Another program, run to its end or to a limit of time: in a process group of its own, of which nothing is left."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from gsbench.errors import TrainingError
+from gsbench.system.isolate import CrashError, describe_exit, run_isolated, telling_lines
+from gsbench.system.memory import MIB, peak_child_mb
+from gsbench.words import readable_time
+
+SECONDS_BETWEEN_LOOKS = 0.5  # at the memory of the program and its children
+FIRST_LOOK = 0.02  # seconds; the pauses double up to the above, so that a short program is seen too
+SECONDS_TO_END = 5.0  # patience with a program that was asked to end
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a program ended: its exit code (negative: by a signal), whether its time was up, and what it took."""
+
+    code: int
+    timed_out: bool
+    seconds: float
+    peak_memory_mb: float  # resident, of the program and its children together
+
+
+def run_program(
+    command: Sequence[str],
+    log: Path,
+    folder: Path,
+    environment: Mapping[str, str],
+    limit: float | None,
+) -> Ended:
+    """Run ``command`` in ``folder`` with ``environment``, its output in the file ``log``; ``limit`` is in seconds.
+
+    Its process group ends with it, with the limit, and with gsbench, however that ends. Raises `TrainingError`, with
+    the last words of the log, unless the program ends well and in time.
+    """
+    name = Path(command[0]).name
+    try:
+        ended = run_isolated(watch, list(command), folder, dict(environment), limit, what=name, log=log)
+    except CrashError as error:
+        raise TrainingError(f"{error}; log: {log}") from error
+    said = f"its last words: {telling_lines(log.read_bytes())}; log: {log}"
+    if ended.timed_out:
+        assert limit is not None
+        raise TrainingError(f"{name} still ran after {readable_time(limit)} (densify.time_limit_minutes); {said}")
+    if ended.code != 0:
+        raise TrainingError(f"{name} {describe_exit(ended.code)}; {said}")
+    return ended
+
+
+def watch(command: Sequence[str], folder: Path, environment: Mapping[str, str], limit: float | None) -> Ended:
+    """Run ``command`` as a child of this process, which `run_isolated` started, and measure it."""
+    started = time.monotonic()
+    program = subprocess.Popen(command, cwd=folder, env=dict(environment), stdin=subprocess.DEVNULL)
+    pause, peak = FIRST_LOOK, 0.0
+    while True:
+        peak = max(peak, resident_mb(program.pid))
+        left = float("inf") if limit is None else limit - (time.monotonic() - started)
+        try:
+            code = program.wait(max(0.0, min(pause, left)))
+            return Ended(code, False, time.monotonic() - started, max(peak, peak_child_mb()))
+        except subprocess.TimeoutExpired:
+            if left <= 0:
+                return Ended(_stop(program), True, time.monotonic() - started, peak)
+            pause = min(2 * pause, SECONDS_BETWEEN_LOOKS)
+
+
+def _stop(program: subprocess.Popen[bytes]) -> int:
+    """Ask the whole group to end; who does not heed it is killed when this process has ended."""
+    if hasattr(os, "killpg"):
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # this process is of the group
+        os.killpg(0, signal.SIGTERM)
+    else:
+        program.terminate()
+    with suppress(subprocess.TimeoutExpired):
+        return program.wait(SECONDS_TO_END)
+    program.kill()
+    return program.wait()
+
+
+def resident_mb(pid: int) -> float:
+    """The memory that a process and its descendants have resident now; MiB, 0 where it is gone."""
+    total = 0
+    with suppress(psutil.Error):
+        program = psutil.Process(pid)
+        for process in [program, *program.children(recursive=True)]:
+            with suppress(psutil.Error):
+                total += process.memory_info().rss
+    return total / MIB

@@ -1,0 +1,98 @@
+"""Another program as an arm: the settings of what trains in place of gsbench.
+
+It stands in this group because an arm of a table is an initialiser and a densifier; `gsbench.external` runs
+it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from annotated_types import MinLen, Predicate, doc
+from pydantic import PositiveFloat
+
+from gsbench.errors import InputError
+from gsbench.external.placeholders import fill, names_in, program_of, words_of
+from gsbench.settings import check_settings
+
+# What a command may ask for beside the options of its YAML.
+DATA = "data"  # folder of the training views: images/ and the COLMAP model sparse/0
+TEST_CAMERAS = "test_cameras"  # folder of the test views' cameras: transforms.json and the COLMAP model sparse/0
+OUTPUT = "output"  # empty folder, in which the program also starts
+KNOWN = (DATA, TEST_CAMERAS, OUTPUT, "iterations", "seed", "device", "threads")
+NOT_GIVEN = "???"  # Hydra's: a value that must be given
+MODEL_SUFFIX = ".ply"
+
+Text = Annotated[str, MinLen(1), Predicate(lambda text: text != NOT_GIVEN and bool(text.strip())), doc("a text")]
+CommandLine = Annotated[list[str] | str, doc("a list of words, or a text that is split as a shell would")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class External:
+    """A program that trains on a folder of training views and leaves a model, or renders of the test views.
+
+    ``command`` is run without a shell; ``{data}``, ``{output}`` and the other names of `KNOWN`, and those of
+    ``options``, are replaced in it, in ``result`` and in ``environment``. ``result`` is a pattern below the output
+    folder: of one 3DGS PLY, or of the pictures of the test views, whose names are matched (or ``by_order``).
+    ``version`` names the program's version: it is part of the results' key. ``version_command`` prints something that
+    must contain it.
+    """
+
+    command: CommandLine
+    result: Text
+    version: Text
+    version_command: CommandLine | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    environment: dict[str, str] = field(default_factory=dict)  # further variables
+    by_order: bool = False
+    time_limit_minutes: PositiveFloat | None = None  # then the program is ended, and the trial has failed
+
+    def __post_init__(self) -> None:
+        check_settings(self, "densify")
+        for name, value in self.options.items():
+            if value == NOT_GIVEN:
+                raise InputError(f"densify.options.{name} is not set: give it a value")
+            if not str(name).isidentifier() or name in KNOWN or isinstance(value, Mapping | list):
+                raise InputError(
+                    f"densify.options.{name}: an option is one value with a name of its own, none of {', '.join(KNOWN)}"
+                )
+        known = dict.fromkeys((*KNOWN, *self.options))
+        for key, text in [("command", word) for word in self.words] + [("result", self.result)]:
+            fill(text, known, f"densify.{key}")
+        if not names_in(self.words) & {DATA}:
+            raise InputError("densify.command has no {data}: the folder that the program is to train on")
+
+    @property
+    def words(self) -> list[str]:
+        """The command's words, with their placeholders."""
+        return words_of(self.command, "densify.command")
+
+    @property
+    def leaves_model(self) -> bool:
+        """Whether the result is a model; else it is pictures."""
+        return self.result.lower().endswith(MODEL_SUFFIX)
+
+    @property
+    def needs_test_cameras(self) -> bool:
+        return TEST_CAMERAS in names_in([*self.words, *self.environment.values()])
+
+    @property
+    def program(self) -> str:
+        """The program as it is called."""
+        return program_of(self.command, self.options)
+
+    def executable(self) -> str:
+        """Where the program lies. Raises InputError where this machine has none."""
+        path = self.environment.get("PATH", os.environ.get("PATH"))
+        found = shutil.which(Path(self.program).expanduser(), path=path)
+        if found is None:
+            raise InputError(
+                f"densify.command: this machine has no program {self.program!r}: install it (docs/other_trainers.md "
+                "says how), or give its path"
+            )
+        return str(Path(found).absolute())

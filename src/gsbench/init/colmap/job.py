@@ -1,0 +1,116 @@
+"""From photographs and options to a reported COLMAP model. Calls native code that can abort: run it isolated."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import pycolmap
+
+from gsbench.errors import InputError
+from gsbench.init import report
+from gsbench.init.base import OWN_GAUGE_FOLDER, InitReport, Preparation, Progress, Timer
+from gsbench.init.colmap import database as colmap_database
+from gsbench.init.colmap import reconstruct
+from gsbench.init.colmap.alignment import Similarity
+from gsbench.init.colmap.options import ColmapOptions, DatabaseTask
+from gsbench.scene.types import Capture
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of an initialiser, as it is handed to the isolated process."""
+
+    options: ColmapOptions
+    capture: Capture
+    output_dir: Path
+    work_dir: Path
+    reference: Path | None
+    preparation: Preparation
+
+
+def build_model(job: Job, progress: Progress) -> InitReport:
+    """Cameras, features, matches, model, report. Calls native code that can abort: run it isolated."""
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
+    options, capture = job.options, job.capture
+    timer = Timer(dict(job.preparation.seconds))
+    reference = reconstruct.load_reference(capture, job.reference)
+    database = job.work_dir / "database.db"
+    images = colmap_database.readable_images(capture.images, capture.image_names, job.work_dir)
+    if reference is not None and options.takes_reference_cameras:
+        cameras = colmap_database.reference_groups(reference)
+    else:
+        cameras = colmap_database.guessed_groups(
+            images, capture.image_names, options.camera, options.camera_model, options.focal_length
+        )
+    names = list(colmap_database.create_database(database, cameras))
+    pairs = reconstruct.select_pairs(capture.images, names, options, reference)
+    task = DatabaseTask(database, images, names, pairs, capture, job.work_dir)
+    counts = options.fill_database(task, progress, timer)
+    counts = {**job.preparation.counts, **counts, **colmap_database.database_counts(database)}
+    if counts["pairs_verified"] == 0:
+        raise InputError(
+            f"{options.name}: no pair of images shares enough matches: the photos need more overlap or texture"
+        )
+    settings = reconstruct.MappingSettings(
+        options.seed,
+        options.mapper_threads,
+        options.min_model_size,
+        options.two_view_tracks,
+        fixed_intrinsics=options.intrinsics == "reference",
+    )
+    scratch = job.work_dir / "mapping"
+    shutil.rmtree(scratch, ignore_errors=True)
+    if options.poses == "shared" and reference is not None:
+        with timer.phase("triangulate"):
+            model = reconstruct.triangulate(database, images, scratch, reference, settings, progress)
+        return _finish(job, "shared", model, reference, None, timer, counts)
+    with timer.phase("map"):
+        model, counts["models"] = reconstruct.map_images(database, images, scratch, settings, progress)
+    similarity = None if reference is None else reconstruct.similarity_to(model, reference)
+    return _finish(job, "own", model, reference, similarity, timer, counts)
+
+
+def _finish(
+    job: Job,
+    poses: str,
+    model: pycolmap.Reconstruction,
+    reference: pycolmap.Reconstruction | None,
+    similarity: Similarity | None,
+    timer: Timer,
+    counts: Mapping[str, int],
+) -> InitReport:
+    """Align the model where it has poses of its own, write it, and report."""
+    options, capture = job.options, job.capture
+    warnings = list(job.preparation.warnings)
+    pose_errors, own_gauge, scale = None, None, 1.0 if poses == "shared" else None
+    if poses == "own" and reference is not None and similarity is None:
+        warnings.append("too few common cameras with the reference: poses are neither aligned nor compared")
+    if reference is not None and similarity is not None:
+        exact = capture.exact_poses and job.reference is None
+        reference_extent = report.training_extent(reference, capture)
+        pose_errors = report.compare_poses(model, reference, similarity, reference_extent, exact)
+        scale = similarity.scale
+        if options.align:
+            own_gauge = report.measure_gauge(report.training_extent(model, capture), scale)
+            reconstruct.save_reconstruction(model, job.output_dir / OWN_GAUGE_FOLDER)
+            reconstruct.apply_similarity(model, similarity)
+            scale = 1.0
+    result = report.make_report(
+        options.name,
+        poses,
+        capture,
+        model,
+        scale,
+        settings={**asdict(options), **job.preparation.settings},
+        seconds=timer.rounded(),
+        packages=options.packages(),
+        own_gauge=own_gauge,
+        pose_errors=pose_errors,
+        counts=counts,
+        warnings=warnings,
+    )
+    report.write_result(model, result, job.output_dir)
+    return result

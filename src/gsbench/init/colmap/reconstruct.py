@@ -1,0 +1,222 @@
+"""From a database of verified matches to a model: cameras and points, or points under known cameras.
+
+Everything here calls native code that can abort the process: run it isolated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import pycolmap
+
+from gsbench.errors import InputError
+from gsbench.init.base import MIN_IMAGES, Progress
+from gsbench.init.colmap.alignment import Array, Similarity, align_poses
+from gsbench.init.colmap.pairs import exhaustive_pairs, gps_positions, sequential_pairs, spatial_pairs
+from gsbench.scene.colmap import read_reference
+from gsbench.scene.types import Capture
+
+
+class Pairing(Protocol):
+    """The options that choose pairs."""
+
+    @property
+    def pairs(self) -> str: ...
+    @property
+    def overlap(self) -> int: ...
+    @property
+    def neighbors(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class Verification:
+    """COLMAP's geometric verification of a pair's matches."""
+
+    seed: int  # of each pair's RANSAC
+    min_inliers: int  # matches that must fit one geometry
+    min_inlier_ratio: float = 0.0  # … and as a share of all of the pair
+
+    def options(self) -> pycolmap.TwoViewGeometryOptions:
+        """As COLMAP takes them."""
+        options = pycolmap.TwoViewGeometryOptions()
+        options.ransac.random_seed = self.seed
+        options.min_num_inliers = self.min_inliers
+        options.min_inlier_ratio = self.min_inlier_ratio
+        return options
+
+
+@dataclass(frozen=True)
+class MappingSettings:
+    """How COLMAP's mapper and triangulator run; see the fields of `gsbench.init.Sfm`."""
+
+    seed: int
+    threads: int
+    min_model_size: int
+    two_view_tracks: bool
+    fixed_intrinsics: bool
+
+
+def load_reference(capture: Capture, reference: Path | None) -> pycolmap.Reconstruction | None:
+    """The reference cameras, scaled to the image files and restricted to the capture's images; None without any."""
+    if reference is not None:
+        capture = replace(capture, model=reference)
+    return None if capture.model is None else read_reference(capture)
+
+
+def select_pairs(
+    images: Path, names: Sequence[str], options: Pairing, reference: pycolmap.Reconstruction | None
+) -> list[tuple[str, str]]:
+    """The pairs of image names to match; ``spatial`` goes by the reference's camera centres, else by EXIF GPS.
+
+    For ``auto`` and ``lowres`` these are all, of which features will tell those that are worth it.
+
+    Raises ``InputError`` where ``spatial`` has neither.
+    """
+    if options.pairs in ("exhaustive", "auto", "lowres"):
+        pairs = exhaustive_pairs(len(names))
+    elif options.pairs == "sequential":
+        pairs = sequential_pairs(len(names), options.overlap)
+    else:
+        poses = {} if reference is None else poses_by_name(reference)
+        if all(name in poses for name in names):
+            positions: Array | None = np.array([poses[name][0] for name in names], dtype=np.float64)
+        else:
+            positions = gps_positions([images / name for name in names])
+        if positions is None:
+            raise InputError("init.pairs=spatial: the photos have neither reference cameras nor GPS: use exhaustive")
+        pairs = spatial_pairs(positions, options.neighbors)
+    return [(names[first], names[second]) for first, second in pairs]
+
+
+def map_images(
+    database: Path, images: Path, output: Path, settings: MappingSettings, progress: Progress
+) -> tuple[pycolmap.Reconstruction, int]:
+    """COLMAP's incremental mapping: the model with the most images, not the first, and how many models there were.
+
+    Raises ``InputError`` where no model with at least `MIN_IMAGES` images comes out.
+    """
+    with pycolmap.Database.open(database) as opened:
+        total = opened.num_images()
+    registered = 0
+
+    def one_more() -> None:
+        nonlocal registered
+        registered += 1
+        progress("map", min(registered, total), total)
+
+    progress("map", 0, total)
+    pycolmap.set_random_seed(settings.seed)
+    output.mkdir(parents=True, exist_ok=True)
+    models = pycolmap.incremental_mapping(
+        database, images, output, options=_pipeline_options(settings), next_image_callback=one_more
+    )
+    progress("map", total, total)
+    if not models:
+        raise InputError(
+            "structure from motion found no pair of images to start from: the photos need more overlap (60 % and more "
+            "between neighbours), more texture, or a focal length (init.focal_length, px)"
+        )
+    largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    if largest.num_reg_images() < MIN_IMAGES:
+        raise InputError(
+            f"structure from motion placed only {largest.num_reg_images()} of {total} images: the photos need more "
+            "overlap, more texture, or a focal length (init.focal_length, px)"
+        )
+    return largest, len(models)
+
+
+def triangulate(
+    database: Path,
+    images: Path,
+    output: Path,
+    reference: pycolmap.Reconstruction,
+    settings: MappingSettings,
+    progress: Progress,
+) -> pycolmap.Reconstruction:
+    """Points from the verified matches under the reference's cameras, which stay as they are, to the bit."""
+    progress("triangulate", 0, 1)
+    pycolmap.set_random_seed(settings.seed)
+    output.mkdir(parents=True, exist_ok=True)
+    known = pycolmap.Reconstruction()  # its ids must be the database's
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            known.add_camera_with_trivial_rig(camera)
+        for stored in opened.read_all_images():
+            pose = reference.find_image_with_name(stored.name).cam_from_world()
+            image = pycolmap.Image(name=stored.name, camera_id=stored.camera_id, image_id=stored.image_id)
+            known.add_image_with_trivial_frame(image, pose)
+    model = pycolmap.triangulate_points(
+        known, database, images, output, clear_points=True, options=_pipeline_options(settings), refine_intrinsics=False
+    )
+    progress("triangulate", 1, 1)
+    if model.num_points3D() == 0:
+        raise InputError(
+            "no point could be triangulated under the reference cameras: the matches contradict them (are they the "
+            "cameras of these photos?), or the photos have too little texture or overlap"
+        )
+    for image in model.images.values():  # the solver turns them by a rounding error, on some processors
+        image.frame.set_cam_from_world(image.camera_id, reference.find_image_with_name(image.name).cam_from_world())
+    return model
+
+
+def poses_by_name(model: pycolmap.Reconstruction) -> dict[str, tuple[Array, Array]]:
+    """Camera centre [3] and world-to-camera rotation [3, 3] of each registered image."""
+    return {
+        image.name: (image.projection_center(), image.cam_from_world().rotation.matrix())
+        for image in model.images.values()
+        if image.has_pose
+    }
+
+
+def common_poses(
+    model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction
+) -> tuple[Array, Array, Array, Array]:
+    """Centres [N, 3] and rotations [N, 3, 3] of the images placed in both: the model's, then the reference's."""
+    ours, theirs = poses_by_name(model), poses_by_name(reference)
+    names = sorted(ours.keys() & theirs.keys())
+    sides = [
+        np.array([poses[name][part] for name in names], dtype=np.float64).reshape(-1, *shape)
+        for poses in (ours, theirs)
+        for part, shape in ((0, (3,)), (1, (3, 3)))
+    ]
+    return sides[0], sides[1], sides[2], sides[3]
+
+
+def similarity_to(model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction) -> Similarity | None:
+    """The similarity that takes ``model`` to ``reference``; None where too few cameras are common to tell."""
+    try:
+        return align_poses(*common_poses(model, reference))
+    except ValueError:
+        return None
+
+
+def save_reconstruction(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write cameras, images and points of ``model`` in COLMAP's binary form."""
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write_binary(folder)
+
+
+def apply_similarity(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
+    """Transform points and poses of ``model`` in place."""
+    model.transform(pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation))
+
+
+def _pipeline_options(settings: MappingSettings) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = settings.threads
+    options.random_seed = settings.seed
+    options.mapper.num_threads = settings.threads
+    options.mapper.random_seed = settings.seed
+    options.triangulation.random_seed = settings.seed
+    options.triangulation.ignore_two_view_tracks = not settings.two_view_tracks
+    options.multiple_models = True  # a stray first model of a few images must not be the last (see map_images)
+    options.min_model_size = settings.min_model_size
+    options.ba_refine_focal_length = not settings.fixed_intrinsics
+    options.ba_refine_extra_params = not settings.fixed_intrinsics
+    options.mapper.abs_pose_refine_focal_length = not settings.fixed_intrinsics
+    options.mapper.abs_pose_refine_extra_params = not settings.fixed_intrinsics
+    return options

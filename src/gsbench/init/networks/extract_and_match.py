@@ -1,0 +1,198 @@
+"""The networks' part of deep image matching: features of every image and matches of every pair, into the store."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+
+from gsbench.errors import InputError
+from gsbench.init.base import Preparation, Progress, Timer
+from gsbench.init.colmap.options import ColmapOptions
+from gsbench.init.colmap.reconstruct import load_reference, select_pairs
+from gsbench.init.networks.extractors import build_extractor, extract_features
+from gsbench.init.networks.feature_store import FeatureStore
+from gsbench.init.networks.features import Features, FeatureSettings
+from gsbench.init.networks.matching import build_matcher, match_within_memory
+from gsbench.init.preview import STRONGEST, proposed_pairs
+from gsbench.scene.types import Capture
+from gsbench.weights import file_sha256
+
+CACHE_BYTES = 1 << 30  # of descriptors held in memory while pairs are matched
+NAMES_IN_WARNING = 5
+# deep-image-matching's `matching_lowres`, its default way to choose pairs (pairs_generator.py, state of December 2024)
+LOWRES_SIZE = 1000  # px
+LOWRES_KEYPOINTS = 2048
+LOWRES_FILTER = 0.3  # least score of a match
+LOWRES_MATCHES = 20  # a pair with more is matched at full size
+
+
+@dataclass(frozen=True)
+class NetworkJob:
+    """What the isolated process needs; the weights are checked files, None where none are needed."""
+
+    options: ColmapOptions
+    settings: FeatureSettings
+    device: str
+    capture: Capture
+    reference: Path | None
+    work_dir: Path
+    extractor_weights: Path | None
+    matcher_weights: Path | None
+
+
+def open_store(job: NetworkJob) -> FeatureStore:
+    """The store of features and matches for the job's settings and weights."""
+    extraction = {**job.settings.extraction(), "weights": _digest(job.extractor_weights)}
+    matching = {**job.settings.matching(), "weights": _digest(job.matcher_weights)}
+    return FeatureStore(job.work_dir, job.capture.images, extraction, matching)
+
+
+def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
+    """Fill the store with what is not there yet, and tell what it took.
+
+    Raises ``InputError`` where no image has a keypoint or no pair a match.
+    """
+    options, capture = job.options, job.capture
+    torch.set_num_threads(options.num_threads)
+    device = choose_device(job.device)
+    store = open_store(job)
+    reference = load_reference(capture, job.reference)
+    names = options.select_images(capture, reference)
+    pairs = select_pairs(capture.images, names, options, reference)
+    timer = Timer()
+    with timer.phase("extract"):
+        empty = _extract_all(job, store, names, device, progress)
+    if len(empty) == len(names):
+        raise InputError(
+            f"{options.name}: no keypoint in any image: lower init.keypoint_threshold, or check the photos"
+        )
+    if options.pairs == "lowres":
+        with timer.phase("preselect"):
+            small = at_low_resolution(job)
+            _extract_all(small, open_store(small), names, device, progress)
+            _match_all(small, open_store(small), pairs, device, progress)
+    candidates, pairs = len(pairs), choose_pairs(job, names, pairs)
+    with timer.phase("match"):
+        without, halved = _match_all(job, store, pairs, device, progress)
+    if len(without) == len(pairs):  # where no pair was selected, too
+        raise InputError(f"{options.name}: no pair of images has a match: the photos need more overlap or texture")
+    warnings = []
+    if empty:
+        warnings.append(f"no keypoint in {_some(empty)}: no point comes from these images")
+    if halved:
+        warnings.append(f"out of GPU memory: {len(halved)} pairs were matched with fewer keypoints")
+    weights = [path for path in (job.extractor_weights, job.matcher_weights) if path is not None]
+    return Preparation(
+        seconds=timer.seconds,
+        counts={
+            "pairs_selected": len(pairs),
+            **({"pairs_left_out": candidates - len(pairs)} if options.pairs in ("auto", "lowres") else {}),
+            "pairs_without_matches": len(without),
+            "images_without_keypoints": len(empty),
+        },
+        settings={
+            **job.settings.extraction(),
+            **job.settings.matching(),
+            "weights_sha256": {path.name: file_sha256(path) for path in weights},
+        },
+        warnings=tuple(warnings),
+    )
+
+
+def choose_pairs(job: NetworkJob, names: Sequence[str], pairs: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Those of ``pairs`` to be matched, now that the features of the images ``names`` are in the store."""
+    if job.options.pairs == "auto":
+        store = open_store(job)
+        return proposed_pairs(names, lambda name: store.require_features(name).strongest(STRONGEST).descriptors)
+    if job.options.pairs == "lowres":
+        small = open_store(at_low_resolution(job))
+        matches = {pair: small.read_matches(*pair) for pair in pairs}  # none where memory did not suffice for all
+        return [pair for pair, found in matches.items() if found is None or len(found) > LOWRES_MATCHES]
+    return pairs
+
+
+def at_low_resolution(job: NetworkJob) -> NetworkJob:
+    """The same job on small images, for a look at which pairs overlap."""
+    settings = replace(
+        job.settings,
+        max_image_size=min(job.settings.max_image_size, LOWRES_SIZE),
+        max_keypoints=min(job.settings.max_keypoints, LOWRES_KEYPOINTS),
+        filter_threshold=max(job.settings.filter_threshold, LOWRES_FILTER),
+    )
+    return replace(job, settings=settings)
+
+
+def choose_device(name: str) -> torch.device:
+    """The torch device of that name, ``auto`` being the GPU if there is one; ``InputError`` if there is none such."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"init.device={name}: no such device here (use auto, cpu or cuda)") from error
+    return device
+
+
+def _extract_all(
+    job: NetworkJob, store: FeatureStore, names: Sequence[str], device: torch.device, progress: Progress
+) -> list[str]:
+    """Features of all images into the store; returns the names of those without any."""
+    settings, empty = job.settings, []
+    extractor = None
+    progress("extract", 0, len(names))
+    for done, name in enumerate(names, start=1):
+        features = store.read_features(name)
+        if features is None:
+            extractor = extractor or build_extractor(settings, job.extractor_weights, device)
+            path = job.capture.images / name
+            features = extract_features(path, extractor, settings.max_image_size, settings.max_keypoints, device)
+            store.write_features(name, features)
+        if len(features.keypoints) == 0:
+            empty.append(name)
+        progress("extract", done, len(names))
+    return empty
+
+
+def _match_all(
+    job: NetworkJob, store: FeatureStore, pairs: Sequence[tuple[str, str]], device: torch.device, progress: Progress
+) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
+    """Matches of all pairs into the store; returns the pairs without a match, and those matched in part."""
+    settings = job.settings
+    matcher, without, halved = None, [], []
+    read = _cached_reader(store, pairs)
+    progress("match", 0, len(pairs))
+    for done, (first, second) in enumerate(pairs, start=1):
+        matches = store.read_matches(first, second)
+        if matches is None:
+            matcher = matcher or build_matcher(settings, job.matcher_weights, device)
+            matches, in_part = match_within_memory(matcher, read(first), read(second))
+            if in_part:
+                halved.append((first, second))
+            else:
+                store.write_matches(first, second, matches)
+        if len(matches) == 0:
+            without.append((first, second))
+        progress("match", done, len(pairs))
+    return without, halved
+
+
+def _cached_reader(store: FeatureStore, pairs: Sequence[tuple[str, str]]) -> Callable[[str], Features]:
+    """`FeatureStore.require_features` that keeps as many images as `CACHE_BYTES` hold."""
+    if not pairs:
+        return store.require_features
+    example = store.require_features(pairs[0][0])
+    return lru_cache(maxsize=2 + CACHE_BYTES // max(example.descriptors.nbytes, 1))(store.require_features)
+
+
+def _digest(path: Path | None) -> str | None:
+    return None if path is None else file_sha256(path)
+
+
+def _some(names: Sequence[str]) -> str:
+    more = len(names) - NAMES_IN_WARNING
+    return ", ".join(names[:NAMES_IN_WARNING]) + (f" and {more} more" if more > 0 else "")

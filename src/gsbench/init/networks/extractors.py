@@ -1,0 +1,188 @@
+"""The extractors that can be chosen by name, built with their weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.init.networks.features import Features, FeatureSettings
+from gsbench.scene.images import read_image
+from gsbench.scene.sizes import downscaled_size
+from gsbench.system.install import install_command
+from gsbench.weights import MissingWeights, load_state
+
+GPU_MEMORY_MEND = "lower init.max_image_size or init.max_keypoints, or set init.device=cpu"
+SUPERPOINT_BORDER = 4  # px without keypoints, as in deep-image-matching; its network has no margin of its own
+LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."  # of SuperPoint within a LightGlue checkpoint of transformers
+
+
+class Extractor(Protocol):
+    """Finds features in an image [1, 3, H, W], RGB in [0, 1].
+
+    Returns keypoints [K, 2] in px with the centre of the first pixel at (0, 0), descriptors [K, D] and scores [K].
+    """
+
+    def __call__(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]: ...
+
+
+def build_extractor(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
+    """The extractor with its network on ``device``; ``weights`` is the checked file, None for one without weights.
+
+    Raises ``MissingWeights`` where the file does not fit the network.
+    """
+    return _BUILDERS[settings.extractor](settings, weights, device)
+
+
+def extract_features(
+    path: Path, extractor: Extractor, max_image_size: int, max_keypoints: int, device: torch.device
+) -> Features:
+    """The ``max_keypoints`` strongest features of an image file, shrunk to ``max_image_size`` px for the network.
+
+    Raises ``InputError`` where the image cannot be read or the device runs out of memory.
+    """
+    pixels = read_image(path)  # [H, W, 3]
+    height, width = pixels.shape[:2]
+    network_size = downscaled_size(width, height, max_size=max_image_size)
+    if network_size != (width, height):
+        pixels = np.asarray(Image.fromarray(pixels).resize(network_size, Image.Resampling.LANCZOS))
+    image = torch.from_numpy(pixels.astype(np.float32) / 255.0).permute(2, 0, 1)[None]  # [1, 3, h, w]
+    try:
+        with torch.inference_mode():
+            keypoints, descriptors, scores = (part.float().cpu() for part in extractor(image.to(device)))
+    except torch.OutOfMemoryError as error:
+        size = f"{network_size[0]}x{network_size[1]}"
+        raise InputError(f"{path.name}: {device} ran out of memory at {size} px: {GPU_MEMORY_MEND}") from error
+    order = torch.sort(scores, descending=True, stable=True).indices[:max_keypoints]
+    return Features(
+        keypoints[order].numpy(), descriptors[order].numpy(), scores[order].numpy(), network_size, (width, height)
+    )
+
+
+def load_into(network: torch.nn.Module, state: Mapping[str, torch.Tensor], path: Path) -> None:
+    """Load ``state`` into ``network``: every parameter must be there in its shape, buffers may be absent."""
+    try:
+        missing, unexpected = network.load_state_dict(dict(state), strict=False)
+    except RuntimeError as error:
+        raise MissingWeights(f"weights file {path} has tensors of other shapes than the network: replace it") from error
+    learned = {name for name, _ in network.named_parameters()}
+    missing = sorted(learned.intersection(missing))
+    if missing or unexpected:
+        example = (missing or unexpected)[0]
+        raise MissingWeights(
+            f"weights file {path} is for another network ({len(missing)} tensors missing, {len(unexpected)} foreign, "
+            f"for example {example}): replace it"
+        )
+
+
+def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
+    try:
+        from transformers import SuperPointConfig, SuperPointForKeypointDetection
+    except ImportError as error:
+        raise InputError(
+            f"init.extractor=superpoint needs the package transformers: {install_command('dim')} "
+            "(and pip uninstall torchvision where that cannot be imported)"
+        ) from error
+
+    assert weights is not None
+    network = SuperPointForKeypointDetection(
+        SuperPointConfig(
+            keypoint_threshold=settings.keypoint_threshold,
+            nms_radius=settings.nms_radius,
+            max_keypoints=-1,
+            border_removal_distance=0,
+        )
+    )
+    state = load_state(weights)
+    prefix = LIGHTGLUE_DETECTOR_PREFIX
+    if any(name.startswith(prefix) for name in state):
+        state = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+    load_into(network, state, weights)
+    torch.nn.Module.to(network.eval(), device)
+
+    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        height, width = image.shape[-2:]
+        output = network(_gray(image))  # reads the first channel only
+        size = torch.tensor([width, height], device=image.device)
+        # The output is relative; its own post-processing cuts to whole px after the division, one too few at 5 % of
+        # the columns of some widths. Keypoints are whole px, so rounding restores them.
+        keypoints = (output.keypoints[0] * size).round()  # [K, 2]
+        # border removal is done here: the network's own looks at the right and bottom border in the wrong unit
+        inside = ((keypoints >= SUPERPOINT_BORDER) & (keypoints < size - SUPERPOINT_BORDER)).all(dim=1)
+        keep = inside & output.mask[0].bool()
+        return keypoints[keep], output.descriptors[0][keep], output.scores[0][keep]
+
+    return extract
+
+
+def _aliked(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
+    from kornia.feature import ALIKED
+
+    assert weights is not None
+    network = ALIKED(
+        f"aliked-{settings.aliked_model}",
+        max_num_keypoints=settings.max_keypoints,
+        detection_threshold=settings.keypoint_threshold,
+        nms_radius=settings.nms_radius,
+    )
+    load_into(network, load_state(weights), weights)
+    network.to(device).eval()
+
+    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        features = network(image)[0]
+        return features.keypoints, features.descriptors, features.keypoint_scores
+
+    return extract
+
+
+def _disk(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
+    from kornia.feature import DISK
+
+    assert weights is not None
+    network = DISK()
+    load_into(network, load_state(weights, entry="extractor"), weights)
+    network.to(device).eval()
+
+    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        features = network(
+            image,
+            n=settings.max_keypoints,
+            window_size=2 * settings.nms_radius + 1,
+            score_threshold=settings.keypoint_threshold,
+            pad_if_not_divisible=True,
+        )[0]
+        return features.keypoints, features.descriptors, features.detection_scores
+
+    return extract
+
+
+def _sift_kornia(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
+    from kornia.feature import SIFTFeatureScaleSpace, laf_is_filled
+
+    network = SIFTFeatureScaleSpace(settings.max_keypoints, device=device, descriptor_backend="pyramid").eval()
+
+    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        frames, responses, descriptors = network(_gray(image)[:, :1])
+        filled = laf_is_filled(frames)[0]  # [K]: an image with few extrema leaves slots empty
+        return frames[0, filled, :, 2], descriptors[0, filled], responses[0, filled]
+
+    return extract
+
+
+def _gray(image: torch.Tensor) -> torch.Tensor:
+    """Luma by ITU-R BT.601, in three equal channels [1, 3, H, W]."""
+    weights = image.new_tensor([0.299, 0.587, 0.114])[None, :, None, None]
+    return (image * weights).sum(dim=1, keepdim=True).expand(-1, 3, -1, -1)
+
+
+_BUILDERS: dict[str, Callable[[FeatureSettings, Path | None, torch.device], Extractor]] = {
+    "superpoint": _superpoint,
+    "aliked": _aliked,
+    "disk": _disk,
+    "sift_kornia": _sift_kornia,
+}

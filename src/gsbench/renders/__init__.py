@@ -1,0 +1,1 @@
+"""Renders of other programs: measured as they are, or entered as trials."""

@@ -1,0 +1,176 @@
+"""Renders of another program as a trial of an experiment, beside trials that gsbench ran.
+
+Such a trial has metrics and pictures and nothing else: no model, no times, and nobody knows its iterations. Tables show
+what is unknown as missing, and say which arms were evaluated from renders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from PIL import Image
+
+from gsbench.analysis.results import FROM_RENDERS, MADE_ELSEWHERE, Trial, read_experiment
+from gsbench.config.schema import is_folder_name
+from gsbench.errors import InputError
+from gsbench.eval.evaluator import Evaluator
+from gsbench.eval.pictures import Pair
+from gsbench.files import atomic, write_json, write_text
+from gsbench.pipeline.results import EVALUATED, versions
+from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
+from gsbench.pipeline.steps.ground_truth import png_name
+from gsbench.renders.reference_images import Truth
+from gsbench.runs.hashing import sha256_of
+from gsbench.runs.layout import CONFIG, GROUND_TRUTH, PER_VIEW, RENDERS, RESULTS
+from gsbench.runs.stages import EVALUATE
+from gsbench.scene.images import read_image
+from gsbench.weights import file_sha256
+
+UNKNOWN = f"{MADE_ELSEWHERE}, of which only the renders are known"
+KEPT_GROUPS = ("scene", "eval", "tracking", "launch")  # of the configuration: what is true of renders too
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where renders are to stand: an experiment, a scene, an arm (initialiser and densifier), a seed."""
+
+    experiment: str
+    scene: str
+    init: str
+    densify: str
+    seed: int
+
+
+def find_place(word: str, scene: str | None, seed: int, truth: Truth, runs: Path) -> Place:
+    """The place that ``EXPERIMENT:ARM`` names; ARM is a name, or INIT-NAME.
+
+    Where ARM names no initialiser, it is the one of the experiment's own trials of the scene, or that of the trial
+    behind ``truth``. Raises `InputError` where that is not one.
+    """
+    experiment, _, arm = word.partition(":")
+    where = scene or truth.scene
+    if not is_folder_name(experiment) or not is_folder_name(arm):
+        raise InputError(f"--as {word} is not EXPERIMENT:ARM, such as table1:sfm-mine")
+    if where is None:
+        raise InputError("--as: a folder of photographs has no scene's name: give it with --scene")
+    init, dash, name = arm.partition("-")
+    if not dash:
+        init, name = truth.init or "", arm
+        trials = _trials(runs / experiment, where)
+        known = sorted({trial.init for trial in trials if not trial.from_renders}) or sorted({t.init for t in trials})
+        if len(known) > 1:
+            raise InputError(
+                f"{experiment} has {', '.join(known)} on {where}: say which, as in --as {experiment}:{known[0]}-{arm}"
+            )
+        init = known[0] if known else init or "renders"
+    return Place(experiment, where, init, name, seed)
+
+
+def check_place(place: Place, truth: Truth, runs: Path) -> None:
+    """Raise `InputError` where the experiment's other trials of the scene were tested on other photographs."""
+    for trial in _trials(runs / place.experiment, place.scene):
+        conditions = trial.conditions()
+        size = "x".join(map(str, truth.resolution))
+        if conditions["data"] != truth.data or conditions["resolution"] != size:
+            raise InputError(
+                f"{place.experiment} tests {place.scene} on other photographs (such as {trial.label}, "
+                f"{conditions['resolution']} px) than {truth.what} ({size} px), so nothing could be compared: give "
+                f"--truth {place.experiment}:{place.scene}:{trial.init}-{trial.densify}"
+            )
+
+
+def is_entered(config: Mapping[str, Any]) -> bool:
+    """Whether ``config`` is that of a trial that was entered here."""
+    return config["densify"].get("evaluated_from") == FROM_RENDERS
+
+
+def enter(
+    place: Place,
+    truth: Truth,
+    pairs: Sequence[Pair],
+    per_view: Mapping[str, Mapping[str, float]],
+    evaluator: Evaluator,
+    source: Mapping[str, str],
+    runs: Path,
+) -> Path:
+    """Write the trial's folder and return it; what is entered twice is written once.
+
+    ``source`` says where the renders came from. Raises `InputError` where the place is taken by other renders.
+    """
+    renders = {pair.view: file_sha256(pair.picture) for pair in pairs}
+    identity = sha256_of({"renders": renders, "data": truth.data, "protocol": evaluator.protocol.id})
+    arm = runs / place.experiment / place.scene / f"{place.init}-{place.densify}"
+    folder = arm / f"{identity[:8]}-seed{place.seed}"
+    if taken := [other for other in arm.glob(f"*-seed{place.seed}") if other != folder]:
+        raise InputError(
+            f"seed {place.seed} of {place.init}-{place.densify} on {place.scene} is taken ({taken[0]}): give another "
+            "--seed, or remove that folder"
+        )
+    for name, files in (
+        (RENDERS, {png_name(pair.view): pair.picture for pair in pairs}),
+        (GROUND_TRUTH, {png_name(pair.view): pair.photograph for pair in pairs}),
+    ):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        for target, file in files.items():
+            with atomic(folder / name / target, sync=False) as temporary:
+                Image.fromarray(read_image(file)).save(temporary, format="PNG")
+    write_text(folder / CONFIG, yaml.safe_dump(_config(place, truth, runs), sort_keys=False))
+    write_per_view(folder / PER_VIEW, per_view)
+    write_json(folder / RESULTS, _results(place, truth, identity, per_view, evaluator, source))
+    return folder
+
+
+def _results(
+    place: Place,
+    truth: Truth,
+    identity: str,
+    per_view: Mapping[str, Mapping[str, float]],
+    evaluator: Evaluator,
+    source: Mapping[str, str],
+) -> dict[str, Any]:
+    summary = summary_of(evaluator, per_view)
+    unknown = dict.fromkeys(("gaussians", "train_time", "init_points", "total_time", "peak_memory_mb"), UNKNOWN)
+    return {
+        "status": "complete",
+        "experiment": place.experiment,
+        "scene": place.scene,
+        "init": place.init,
+        "densify": place.densify,
+        "seed": place.seed,
+        "evaluated_from": FROM_RENDERS,
+        "raster": "unknown",
+        "protocol": evaluator.protocol.id,
+        "iterations": 0,
+        "metrics": summary["metrics"],
+        "unavailable": summary["unavailable"] | unknown,
+        **{key: summary[name] for name, key in EVALUATED.items() if name in summary},
+        "num_init_points": None,
+        "num_gaussians": None,
+        "seconds": {},
+        "peak_memory_mb": None,
+        "budget": None,
+        "test_views": len(per_view),
+        "resolution": list(truth.resolution),
+        "events": {},
+        "renders": dict(source),
+        "hashes": {"config": identity, "data": truth.data},
+        "code": {"sources": {}, "stages": {EVALUATE.name: EVALUATE.version}},
+        "versions": versions(),
+    }
+
+
+def _config(place: Place, truth: Truth, runs: Path) -> dict[str, Any]:
+    groups = {group: truth.config[group] for group in KEPT_GROUPS}
+    own = truth.config["init"] if truth.config["init"]["name"] == place.init else {"name": place.init}
+    names: dict[str, Any] = {"name": place.experiment, "seed": place.seed, "runs": str(runs)}
+    groups["scene"] = dict(groups["scene"]) | {"name": place.scene}
+    return names | groups | {"init": own, "densify": {"name": place.densify, "evaluated_from": FROM_RENDERS}}
+
+
+def _trials(home: Path, scene: str) -> list[Trial]:
+    """The experiment's trials of a scene; none where there is no such experiment yet."""
+    return [trial for trial in read_experiment(home).trials if trial.scene == scene] if home.is_dir() else []

@@ -1,0 +1,125 @@
+"""The work of ``gsbench evaluate``: renders of any program measured, and entered beside the arms of an experiment."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsbench.analysis.results import read_experiment
+from gsbench.config.compose import compose_one
+from gsbench.config.schema import EvalConfig
+from gsbench.errors import InputError
+from gsbench.eval.evaluator import Evaluator, summarize
+from gsbench.eval.facts import METRICS
+from gsbench.eval.matching import Matching, match_by_order, match_pictures
+from gsbench.eval.pictures import Pair, measure
+from gsbench.files import storage_errors
+from gsbench.logs import progress
+from gsbench.pipeline.components import build_metrics, make_evaluator, select_device
+from gsbench.renders.import_renders import check_place, enter, find_place
+from gsbench.renders.reference_images import Truth, find_truth, truth_of_trial
+from gsbench.scene.readers import list_images
+from gsbench.system.resources import available_threads
+from gsbench.words import counted, some_of
+
+
+def measure_renders(options: argparse.Namespace, runs: Path) -> None:
+    """Measure what the ``options`` of the verb name, and print it."""
+    truth = _truth(options, runs)
+    place = None
+    if options.place is not None:
+        place = find_place(options.place, options.scene, options.seed, truth, runs)
+        check_place(place, truth, runs)
+    renders = Path(options.renders).expanduser()
+    if not renders.is_dir():
+        raise InputError(f"{renders} is no folder of renders")
+    matching = _match(truth, list_images(renders), options.by_order)
+    pairs = [Pair(view, path, renders / matching.pairs[view]) for view, path in truth.photographs.items()]
+    torch.set_num_threads(available_threads())
+    evaluator = _evaluator(truth, options.protocol, options.settings)
+    with progress("evaluate") as report:
+        per_view = measure(pairs, evaluator, lambda done, total: report("views", done, total))
+    folder = None
+    if place is not None:
+        source = {"folder": str(renders.resolve()), "names matched": matching.rule or "as they are"}
+        with storage_errors(runs):
+            folder = enter(place, truth, pairs, per_view, evaluator, source, runs)
+    if options.json:
+        print(json.dumps(_as_dict(evaluator, matching, per_view, folder), indent=1))
+    else:
+        print("\n".join(_lines(truth, evaluator, matching, per_view, folder)))
+
+
+def _truth(options: argparse.Namespace, runs: Path) -> Truth:
+    """The photographs; a scene that the experiment of ``--as`` has trials of is taken as these saw it."""
+    others = [word for word in options.settings if not word.startswith("eval")]
+    experiment = runs / (options.place or "").partition(":")[0]
+    if not others and options.place and not Path(options.truth).is_dir() and experiment.is_dir():
+        trials = [trial for trial in read_experiment(experiment).trials if not trial.from_renders]
+        if known := next((trial for trial in trials if trial.scene == options.truth), None):
+            return truth_of_trial(known)
+    truth = find_truth(options.truth, options.settings, runs)
+    if truth.init is not None and others:
+        raise InputError(f"{others[0]}: the settings of {truth.what} are as they are; only eval.… can be set here")
+    return truth
+
+
+def _match(truth: Truth, renders: Sequence[str], by_order: bool) -> Matching:
+    photographs = list(truth.photographs)
+    return match_by_order(photographs, renders) if by_order else match_pictures(photographs, renders)
+
+
+def _evaluator(truth: Truth, protocol: str | None, settings: Sequence[str]) -> Evaluator:
+    """As the settings of the photographs' trial or scene say, unless the command says otherwise."""
+    config: Mapping[str, Any] = truth.config
+    if any(word.startswith("eval") for word in settings):
+        config = compose_one([word for word in settings if word.startswith(("eval", "allow_targets"))]).values
+    chosen = dict(config["eval"]) | ({} if protocol is None else {"protocol": protocol})
+    own = build_metrics(chosen, config.get("allow_targets", []))
+    return make_evaluator(EvalConfig(**chosen), select_device(config.get("device", "auto")), own)
+
+
+def _lines(
+    truth: Truth,
+    evaluator: Evaluator,
+    matching: Matching,
+    per_view: Mapping[str, Mapping[str, float]],
+    folder: Path | None,
+) -> list[str]:
+    metrics = summarize(per_view, evaluator.unavailable)
+    width = max(len(view) for view in ("mean", *per_view))
+    facts = {known.key: known for known in METRICS} | evaluator.own
+    names = {key: facts[key].name for key in metrics}
+    lines = [f"{counted(len(per_view), 'view')}: {truth.what}; protocol {evaluator.protocol.id}"]
+    if matching.rule:
+        lines.append(f"names matched {matching.rule}")
+    if matching.left_out:
+        lines.append(f"left out, for want of a photograph: {some_of(matching.left_out)}")
+    lines.append("  ".join([" " * width, *names.values()]))
+    for view, row in [*per_view.items(), ("mean", metrics)]:
+        cells = [f"{row[key]:.{facts[key].decimals + 1}f}".rjust(len(names[key])) for key in metrics]
+        lines.append("  ".join([view.ljust(width), *cells]))
+    lines += [f"{key}: n/a, {evaluator.unavailable[key]}" for key in sorted(evaluator.awaited)]
+    if folder is not None:
+        lines.append(f"entered as {folder}")
+    return lines
+
+
+def _as_dict(
+    evaluator: Evaluator, matching: Matching, per_view: Mapping[str, Mapping[str, float]], folder: Path | None
+) -> dict[str, Any]:
+    return {
+        "protocol": evaluator.protocol.id,
+        "metrics": summarize(per_view, evaluator.unavailable),
+        "unavailable": evaluator.unavailable,
+        "views": per_view,
+        "pictures": dict(matching.pairs),
+        "names_matched": matching.rule,
+        "left_out": list(matching.left_out),
+        "entered": None if folder is None else str(folder),
+    }

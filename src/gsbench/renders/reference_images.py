@@ -1,0 +1,103 @@
+"""The photographs that renders are held against: those of a trial, of a scene as a trial would see it, or a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsbench.analysis.results import Trial, read_views
+from gsbench.config.compose import compose_one, options
+from gsbench.errors import InputError
+from gsbench.pipeline.steps.ground_truth import png_name
+from gsbench.pipeline.wiring import Parts
+from gsbench.pipeline.wiring import Trial as TrialSteps
+from gsbench.runs import stages
+from gsbench.runs.layout import GROUND_TRUTH, RENDERS, RESULTS, STORE
+from gsbench.runs.store import Store
+from gsbench.runs.trial_files import read_config
+from gsbench.scene.images import image_size
+from gsbench.scene.readers import fingerprint, list_images
+from gsbench.view.trials import find_trial
+from gsbench.words import closest
+
+CAMERAS_ONLY = ("init=random", "init.count=100")  # the quickest initialiser; its points are not used
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Photographs by the names of their views, in the order of an evaluation.
+
+    ``data`` is the fingerprint of the capture that they come from, ``resolution`` (width, height) its size in px;
+    ``config`` is the configuration of a trial that is tested on them. ``scene`` is None for a mere folder of pictures,
+    ``init`` where no trial stands behind them.
+    """
+
+    photographs: Mapping[str, Path]
+    what: str
+    data: str
+    resolution: tuple[int, int]
+    config: Mapping[str, Any]
+    scene: str | None = None
+    init: str | None = None
+
+
+def find_truth(place: str, settings: Sequence[str], runs: Path) -> Truth:
+    """The photographs at ``place``: a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or the name of a scene.
+
+    ``settings`` are overrides of the configuration. Raises `InputError` for what is none of these.
+    """
+    folder = Path(place).expanduser()
+    if folder.is_dir():
+        home = folder.parent if folder.name in (GROUND_TRUTH, RENDERS) else folder
+        return truth_of_trial(find_trial(str(home), runs)) if (home / RESULTS).is_file() else _folder(folder, settings)
+    if ":" in place:
+        return truth_of_trial(find_trial(place, runs))
+    scenes = options("scene")
+    if place not in scenes:
+        raise InputError(
+            f"--truth {place} is no folder, no trial EXPERIMENT:SCENE:DENSIFY and no scene{closest(place, scenes)} "
+            f"(scenes: {', '.join(scenes)})"
+        )
+    return _scene(place, settings)
+
+
+def truth_of_trial(trial: Trial) -> Truth:
+    """What a finished trial was tested on, under the names and in the order of its own evaluation."""
+    photographs = {view: trial.path / GROUND_TRUTH / png_name(view) for view in read_views(trial)}
+    width, height = trial.data["resolution"]
+    data = str(trial.data["hashes"]["data"])
+    what = f"the test views of {trial.label}"
+    return Truth(photographs, what, data, (width, height), read_config(trial.path), trial.scene, trial.init)
+
+
+def _scene(name: str, settings: Sequence[str]) -> Truth:
+    """The test views of a scene as a trial with these settings sees them: undistorted, at its size.
+
+    Where cameras come with the scene, they are all that is asked of the initialiser, unless the settings choose one.
+    """
+    config = compose_one([f"scene={name}", *settings]).values
+    if not any(word.startswith("init=") for word in settings) and config["scene"]["kind"] != "photos":
+        config = compose_one([f"scene={name}", *CAMERAS_ONLY, *settings]).values
+    store = Store(Path(config["runs"]).expanduser().resolve() / STORE)
+    trial = TrialSteps(Parts.of(config), store)
+    for step in trial.steps():
+        if step.stage in (stages.CAPTURE, stages.INIT, stages.GROUND_TRUTH):
+            entry = store.get(step)
+            if step.stage is stages.GROUND_TRUTH:
+                folder = entry.path
+    scene = trial.views.scene
+    photographs = {view.name: folder / png_name(view.name) for view in scene.test}
+    sizes = [(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]]
+    return Truth(photographs, f"the test views of {name}", trial.capture.fingerprint, max(sizes), config, name)
+
+
+def _folder(folder: Path, settings: Sequence[str]) -> Truth:
+    names = list_images(folder)
+    if not names:
+        raise InputError(f"--truth {folder} holds no pictures")
+    photographs = {name: folder / name for name in names}
+    resolution = max(image_size(path) for path in photographs.values())
+    config = compose_one(list(settings)).values
+    return Truth(photographs, f"the pictures in {folder}", fingerprint(folder, names), resolution, config)

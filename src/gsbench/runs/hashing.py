@@ -1,0 +1,66 @@
+"""What of a configuration determines a result, and its hash. Loads neither Hydra nor torch."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from gsbench.runs.source import source_of
+
+WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")  # options that cannot change a result
+DECLARED = {"eval": ("primary",)}  # settings of a group that say how results will be read, whatever they are
+NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
+# Settings that are younger than the first results, with the default at which a result is what it was before them. There
+# they are left out of hashes and keys, so that nothing is computed anew for a setting that changes nothing.
+ADDED_LATER: dict[str, dict[str, Any]] = {
+    "init": {"min_inlier_ratio": 0.0},
+    "raster": {"_target_": None},
+    "eval": {"at": [], "extra": {}},
+}
+
+
+def config_hash(values: dict[str, Any]) -> str:
+    """sha256 of what determines a result apart from the seed: not names, devices, folders, tracking or launchers."""
+    kept = {key: value for key, value in values.items() if key not in NOT_HASHED}
+    for key, group in kept.items():
+        if isinstance(group, dict):
+            dropped = (*WITHOUT_EFFECT, *DECLARED.get(key, ()))
+            kept[key] = without_later(key, {name: value for name, value in group.items() if name not in dropped})
+    return sha256_of(_with_sources(kept))
+
+
+def _with_sources(values: Any) -> Any:
+    """``values`` with the source of each user's own class beside its ``_target_``, at any depth."""
+    if not isinstance(values, dict):
+        return values
+    target = values.get("_target_")
+    sources = source_of(target) if isinstance(target, str) else {}
+    return {key: _with_sources(value) for key, value in values.items()} | sources
+
+
+def without_later(group: str, values: dict[str, Any]) -> dict[str, Any]:
+    """``values`` of a group as they are hashed: without the settings of `ADDED_LATER` that stand at their defaults."""
+    later = ADDED_LATER.get(group, {})
+    return {name: value for name, value in values.items() if name not in later or value != later[name]}
+
+
+def sha256_of(values: Any) -> str:
+    """sha256 of canonical JSON: sorted keys, no spaces, floats by repr."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def flatten(mapping: Mapping[str, Any], keep_empty: bool = False) -> dict[str, Any]:
+    """Nested mappings as one with dotted keys; an empty one within is dropped, unless ``keep_empty``.
+
+    >>> flatten({"a": {"b": 1, "c": {}}, "d": [2]})
+    {'a.b': 1, 'd': [2]}
+    """
+    flat: dict[str, Any] = {}
+    for key, value in mapping.items():
+        if isinstance(value, Mapping) and (value or not keep_empty):
+            flat |= {f"{key}.{name}": entry for name, entry in flatten(value, keep_empty).items()}
+        else:
+            flat[str(key)] = value
+    return flat

@@ -1,0 +1,44 @@
+"""A stage of the pipeline, and a step: a stage with its inputs, which knows its key without running. Loads no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from gsbench.runs.hashing import sha256_of
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A kind of work. Bump ``version`` by hand when its code changes what it computes.
+
+    ``resumable`` stages find what a killed build left and go on from it; the others start in an empty folder. Files
+    that match ``scratch`` serve the build only: they are removed when the result is complete.
+    """
+
+    name: str
+    version: int
+    resumable: bool = False
+    scratch: tuple[str, ...] = ()
+
+    def key(self, inputs: dict[str, Any]) -> str:
+        """sha256 of canonical JSON of the stage and all that it reads, upstream keys included."""
+        return sha256_of({"stage": self.name, "version": self.version, "inputs": inputs})
+
+
+@dataclass(frozen=True)
+class Step:
+    """One piece of a trial: ``build(folder)`` computes its result, which ``inputs`` determine (upstream keys among
+    them)."""
+
+    stage: Stage
+    inputs: dict[str, Any]
+    build: Callable[[Path], None] = field(repr=False)
+
+    @cached_property
+    def key(self) -> str:
+        """What its result is stored under."""
+        return self.stage.key(self.inputs)

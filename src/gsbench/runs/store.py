@@ -1,0 +1,202 @@
+"""A content-addressed store of stage results: the same inputs are never computed twice.
+
+Layout: ``<root>/<stage>/<key>/`` holds a finished result, with ``manifest.json`` written last; ``.<key>.partial/`` is
+where it is built, and what a killed build leaves; ``.<key>.lock`` lets one process build while others wait, and stays
+(it is empty).
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsbench import __version__
+from gsbench.files import remove_temporaries, storage_errors, sync_to_disk, write_json
+from gsbench.runs.hashing import sha256_of
+from gsbench.runs.step import Stage, Step
+from gsbench.system.locks import BusyError, hold
+from gsbench.weights import file_sha256
+
+log = logging.getLogger(__name__)
+
+MANIFEST = "manifest.json"
+LEFTOVER_AGE = 24 * 3600.0  # seconds: temporary files outside the locks are swept when older
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A finished result in the store."""
+
+    path: Path
+    key: str
+    seconds: float
+    cached: bool
+
+
+class Store:
+    """The store below ``root``; ``on_build`` is told of each stage that is built, and of the folder where."""
+
+    def __init__(self, root: Path, on_build: Callable[[Stage, Path], None] = lambda stage, folder: None) -> None:
+        self.root, self.on_build = root, on_build
+
+    def folder(self, stage: Stage, key: str) -> Path:
+        """Where the finished result of ``stage`` under ``key`` lies."""
+        return self.root / stage.name / key
+
+    def path(self, step: Step) -> Path:
+        """Where the result of ``step`` lies once it is finished."""
+        return self.folder(step.stage, step.key)
+
+    def partial(self, stage: Stage, key: str) -> Path:
+        """Where it is built."""
+        return self.root / stage.name / f".{key}.partial"
+
+    def find(self, step: Step) -> Entry | None:
+        """The finished and sound result of ``step``, or None."""
+        try:
+            return self._read(self.path(step))
+        except ValueError:
+            return None
+
+    def get(self, step: Step) -> Entry:
+        """The result of ``step``, built unless it is there; published by an atomic rename.
+
+        A damaged result is named and built again. Raises DiskFullError, or InputError where the store is read-only.
+        """
+        found = self.find(step)
+        if found is not None:
+            return found
+        final = self.path(step)
+        with storage_errors(self.root.parent):
+            final.parent.mkdir(parents=True, exist_ok=True)
+            with hold(final.parent / f".{step.key}.lock", f"{step.stage.name} {step.key[:8]}"):
+                if final.exists():
+                    try:
+                        return self._read(final)
+                    except ValueError as error:
+                        log.warning("store: %s is damaged (%s) and is built again", final, error)
+                        _remove(final)
+                return self._build(step)
+
+    def _read(self, path: Path) -> Entry:
+        return Entry(path, path.name, float(read_manifest(path)["seconds"]), cached=True)
+
+    def _build(self, step: Step) -> Entry:
+        """Build or finish the partial folder and publish it; the caller holds the lock of the step's key."""
+        final, partial, stage = self.path(step), self.partial(step.stage, step.key), step.stage
+        seconds = _finished_seconds(partial, step.key)
+        if seconds is None:
+            if partial.exists() and not stage.resumable:
+                _remove(partial)
+            partial.mkdir(exist_ok=True)
+            remove_temporaries(partial)
+            (partial / MANIFEST).unlink(missing_ok=True)
+            self.on_build(stage, partial)
+            started = time.perf_counter()
+            step.build(partial)
+            seconds = time.perf_counter() - started
+            write_manifest(partial, step, seconds)
+        for pattern in stage.scratch:
+            for path in partial.rglob(pattern):
+                path.unlink()
+        os.replace(partial, final)
+        sync_to_disk(final.parent)
+        return Entry(final, step.key, seconds, cached=False)
+
+    def sweep(self, stages: Iterable[Stage]) -> None:
+        """Remove what killed processes left and nobody goes on with; what a living process holds is left alone."""
+        for stage in stages:
+            for partial in (self.root / stage.name).glob(".*.partial"):
+                key = partial.name[1 : -len(".partial")]
+                if not stage.resumable or self.folder(stage, key).exists():
+                    with suppress(BusyError, OSError), hold(partial.with_name(f".{key}.lock"), key, wait=False):
+                        _remove(partial)
+            for doomed in (self.root / stage.name).glob(".*.removed"):
+                shutil.rmtree(doomed, ignore_errors=True)
+        for work in (self.root / "views").glob(".*"):  # prepared images are published by a rename from such folders
+            with suppress(OSError):
+                if work.is_dir() and time.time() - work.stat().st_mtime > LEFTOVER_AGE:
+                    shutil.rmtree(work, ignore_errors=True)
+
+
+def write_manifest(folder: Path, step: Step, seconds: float) -> None:
+    """Record what made ``folder`` and a checksum of every file in it, after all of them are on the disk."""
+    scratch = {path for pattern in step.stage.scratch for path in folder.rglob(pattern)}
+    outputs = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path not in scratch:
+            sync_to_disk(path)
+            state = path.stat()
+            recorded = {"size": state.st_size, "mtime_ns": state.st_mtime_ns, "sha256": file_sha256(path)}
+            outputs[path.relative_to(folder).as_posix()] = recorded
+    manifest = {
+        "stage": step.stage.name,
+        "version": step.stage.version,
+        "key": step.key,
+        "inputs": step.inputs,
+        "outputs": outputs,
+        "seconds": seconds,
+        "gsbench": __version__,
+        "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+    write_json(folder / MANIFEST, manifest)
+
+
+def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) -> dict[str, Any]:
+    """The manifest of the result of ``key`` (else the folder's name); raises ValueError naming what is damaged.
+
+    A file whose size and time of change are as recorded counts as sound unless ``thorough``; others are read whole.
+    """
+    try:
+        manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        outputs = manifest["outputs"].items()
+        if manifest["key"] != (key or folder.name):
+            raise ValueError(f"{MANIFEST} belongs to another key")
+        expected = sha256_of({name: manifest[name] for name in ("stage", "version", "inputs")})
+        if expected != manifest["key"]:
+            raise ValueError(f"{MANIFEST} does not match its key")
+        float(manifest["seconds"])
+    except (OSError, KeyError, TypeError, AttributeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{MANIFEST} is missing or unreadable") from error
+    for name, recorded in outputs:
+        if not _is_sound(folder / name, recorded, thorough):
+            raise ValueError(f"{name} differs from what was written")
+    return manifest
+
+
+def _is_sound(path: Path, recorded: dict[str, Any], thorough: bool) -> bool:
+    try:
+        state = path.stat()
+        if state.st_size != recorded["size"]:
+            return False
+        if not thorough and state.st_mtime_ns == recorded["mtime_ns"]:
+            return True
+        return file_sha256(path) == recorded["sha256"]
+    except (OSError, KeyError, TypeError):
+        return False
+
+
+def _finished_seconds(partial: Path, key: str) -> float | None:
+    """The build's time, where ``partial`` was killed after its last file was written and only has to be published."""
+    if not (partial / MANIFEST).exists():
+        return None
+    try:
+        return float(read_manifest(partial, key)["seconds"])
+    except ValueError:
+        return None
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder so that a kill in between leaves nothing that looks like a result."""
+    doomed = folder.with_name(f".{folder.name.lstrip('.')}.removed")
+    shutil.rmtree(doomed, ignore_errors=True)
+    os.replace(folder, doomed)
+    shutil.rmtree(doomed, ignore_errors=True)

@@ -1,0 +1,275 @@
+"""Ray casting and distances for the courtyard, compiled with numba; scalar and without any shared state."""
+
+from __future__ import annotations
+
+from math import exp, floor, inf, sqrt
+
+import numba
+import numpy as np
+
+from gsbench.scene.courtyard.layout import BOX, SPHERE
+from gsbench.scene.courtyard.textures import clamp, ground, octaves2, shade_factors
+
+GROUND, SKY = -1, -2
+SUN = (-0.5130, -0.4305, 0.7426)  # unit vector towards the sun: from the south-west, 48 degrees high
+SUN_LIGHT = (2.55, 2.30, 1.90)
+SKY_LIGHT = (0.42, 0.50, 0.64)  # from above
+BOUNCE_LIGHT = (0.19, 0.18, 0.13)  # from below
+OCCLUSION_STEPS = (0.1, 0.35)  # m along the normal
+EXPOSURE = 1.12
+SUBSAMPLES = 2  # per side of a pixel
+_EPSILON = 1e-4  # m, how far a shadow ray starts above the surface
+
+_inline = numba.njit(nogil=True, error_model="numpy")
+
+
+@_inline
+def to_local(rotation, x, y, z):
+    """World to local direction: the transpose of ``rotation`` [3, 3] times (x, y, z)."""
+    return (
+        rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z,
+        rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z,
+        rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z,
+    )
+
+
+@_inline
+def inverse(value):
+    """1 / value, large but finite at 0, so that a ray along a face of a box gives no NaN."""
+    return 1.0 / value if abs(value) > 1e-12 else 1e12
+
+
+@_inline
+def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
+    """(entry, exit) of a ray with inverse direction i through the box from l to h; entry > exit where it misses."""
+    ax, bx = (lx - ox) * ix, (hx - ox) * ix
+    ay, by = (ly - oy) * iy, (hy - oy) * iy
+    az, bz = (lz - oz) * iz, (hz - oz) * iz
+    return max(min(ax, bx), min(ay, by), min(az, bz)), min(max(ax, bx), max(ay, by), max(az, bz))
+
+
+@_inline
+def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
+    """The first distance > 0 at which a ray meets a capped cylinder, or one with a bore; inf where it misses."""
+    best = inf
+    a = dx * dx + dy * dy
+    for radius in (outer, inner):
+        if radius > 0.0 and a > 1e-12:
+            b, c = ox * dx + oy * dy, ox * ox + oy * oy - radius * radius
+            root = b * b - a * c
+            if root > 0.0:
+                root = sqrt(root)
+                for t in ((-b - root) / a, (-b + root) / a):
+                    if 0.0 < t < best and abs(oz + t * dz) <= half:
+                        best = t
+    if abs(dz) > 1e-12:
+        for cap in (-half, half):
+            t = (cap - oz) / dz
+            if 0.0 < t < best:
+                x, y = ox + t * dx, oy + t * dy
+                if inner * inner <= x * x + y * y <= outer * outer:
+                    best = t
+    return best
+
+
+@_inline
+def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
+    """The first distance > 0 along a local ray to the primitive, inf where it misses."""
+    if kind == BOX:
+        entry, exit_ = enter_box(
+            -size[0], -size[1], -size[2], size[0], size[1], size[2], ox, oy, oz, inverse(dx), inverse(dy), inverse(dz)
+        )
+        return entry if 0.0 < entry <= exit_ else inf
+    if kind == SPHERE:
+        b, c = ox * dx + oy * dy + oz * dz, ox * ox + oy * oy + oz * oz - size[0] * size[0]
+        root = b * b - c
+        if root <= 0.0:
+            return inf
+        t = -b - sqrt(root)
+        return t if t > 0.0 else inf
+    return hit_tube(size[0], size[1], size[2], ox, oy, oz, dx, dy, dz)
+
+
+@_inline
+def cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz, anything):
+    """(distance, primitive) of the first hit, GROUND or SKY included; with ``anything`` the first one found will do."""
+    best, index = inf, SKY
+    ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
+    if dz < -1e-9 and not anything:
+        best, index = -oz / dz, GROUND
+    for g in range(len(start) - 1):
+        entry, exit_ = enter_box(
+            low[g, 0], low[g, 1], low[g, 2], high[g, 0], high[g, 1], high[g, 2], ox, oy, oz, ix, iy, iz
+        )
+        if entry > exit_ or exit_ < 0.0 or entry > best:
+            continue
+        for i in range(start[g], start[g + 1]):
+            x, y, z = ox - center[i, 0], oy - center[i, 1], oz - center[i, 2]
+            along = x * dx + y * dy + z * dz
+            if along * along < x * x + y * y + z * z - size[i, 3] * size[i, 3]:
+                continue  # passes the bounding sphere
+            lx, ly, lz = to_local(rotation[i], x, y, z)
+            ux, uy, uz = to_local(rotation[i], dx, dy, dz)
+            t = hit_primitive(kind[i], size[i], lx, ly, lz, ux, uy, uz)
+            if t < best:
+                best, index = t, i
+                if anything:
+                    return best, index
+    return best, index
+
+
+@_inline
+def signed_distance(kind, size, x, y, z):
+    """Distance from a local point to the primitive's surface, negative inside."""
+    if kind == SPHERE:
+        return sqrt(x * x + y * y + z * z) - size[0]
+    if kind == BOX:
+        qx, qy, qz = abs(x) - size[0], abs(y) - size[1], abs(z) - size[2]
+    else:
+        middle = 0.5 * (size[0] + size[2]) if size[2] > 0.0 else 0.0
+        qx, qy, qz = abs(sqrt(x * x + y * y) - middle) - (size[0] - middle), -inf, abs(z) - size[1]
+    outside = sqrt(max(qx, 0.0) ** 2 + max(qy, 0.0) ** 2 + max(qz, 0.0) ** 2)
+    return outside + min(max(qx, qy, qz), 0.0)
+
+
+@_inline
+def nearest_surface(kind, center, rotation, size, start, low, high, x, y, z, limit):
+    """The smallest |distance| from a point to any surface, the ground included, if below ``limit``, else ``limit``."""
+    best = min(abs(z), limit)
+    for g in range(len(start) - 1):
+        qx = max(low[g, 0] - x, 0.0, x - high[g, 0])
+        qy = max(low[g, 1] - y, 0.0, y - high[g, 1])
+        qz = max(low[g, 2] - z, 0.0, z - high[g, 2])
+        if qx * qx + qy * qy + qz * qz >= best * best:
+            continue
+        for i in range(start[g], start[g + 1]):
+            rx, ry, rz = x - center[i, 0], y - center[i, 1], z - center[i, 2]
+            if rx * rx + ry * ry + rz * rz >= (best + size[i, 3]) ** 2:
+                continue
+            lx, ly, lz = to_local(rotation[i], rx, ry, rz)
+            best = min(best, abs(signed_distance(kind[i], size[i], lx, ly, lz)))
+    return best
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def distances(kind, center, rotation, size, start, low, high, points, limit):
+    """`nearest_surface` of points [P, 3] -> [P]."""
+    result = np.empty(len(points))
+    for p in range(len(points)):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        result[p] = nearest_surface(kind, center, rotation, size, start, low, high, x, y, z, limit)
+    return result
+
+
+@_inline
+def local_normal(kind, size, x, y, z):
+    """The outward normal at a local surface point, and coordinates (u, v) in m along the face."""
+    if kind == SPHERE:
+        r = size[0]
+        return x / r, y / r, z / r, (x + y) * 0.8, z + 0.4 * (x - y)
+    if kind == BOX:
+        qx, qy, qz = abs(x) - size[0], abs(y) - size[1], abs(z) - size[2]
+        if qx >= qy and qx >= qz:
+            return (1.0 if x > 0 else -1.0), 0.0, 0.0, (y if size[1] > size[2] else z), (z if size[1] > size[2] else y)
+        if qy >= qz:
+            return 0.0, (1.0 if y > 0 else -1.0), 0.0, (x if size[0] > size[2] else z), (z if size[0] > size[2] else x)
+        return 0.0, 0.0, (1.0 if z > 0 else -1.0), (x if size[0] > size[1] else y), (y if size[0] > size[1] else x)
+    radius = sqrt(x * x + y * y)
+    if abs(abs(z) - size[1]) < min(abs(radius - size[0]), abs(radius - size[2])):
+        return 0.0, 0.0, (1.0 if z > 0 else -1.0), x, y
+    side = 1.0 if abs(radius - size[0]) <= abs(radius - size[2]) else -1.0
+    return side * x / radius, side * y / radius, 0.0, np.arctan2(y, x) * size[0], z
+
+
+@_inline
+def sky(dx, dy, dz, seed):
+    """The colour of the sky in a direction: a gradient with faint clouds."""
+    up = clamp(dz, 0.0, 1.0)
+    mist = exp(-5.0 * up)
+    scale = 1.0 / (up + 0.18)
+    cloud = clamp(octaves2(dx * scale, dy * scale, 1.1, 5, 0.55, 0.02, seed + 301) * 0.9, 0.0, 1.0)
+    red, green, blue = 0.24 + 0.50 * mist, 0.42 + 0.42 * mist, 0.80 + 0.16 * mist
+    return red + cloud * (0.95 - red), green + cloud * (0.96 - green), blue + cloud * (0.98 - blue)
+
+
+@_inline
+def shade(kind, center, rotation, size, material, tint, start, low, high, ox, oy, oz, dx, dy, dz, pixel, seed):
+    """The linear colour that a camera ray sees; ``pixel`` is the angle that one subsample covers, in rad."""
+    t, i = cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz, False)
+    if i == SKY:
+        return sky(dx, dy, dz, seed)
+    x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+    if i == GROUND:
+        nx, ny, nz = 0.0, 0.0, 1.0
+        footprint = t * pixel / max(sqrt(-dz), 0.15)
+        red, green, blue = ground(x, y, footprint, seed)
+    else:
+        px, py, pz = to_local(rotation[i], x - center[i, 0], y - center[i, 1], z - center[i, 2])
+        lx, ly, lz, u, v = local_normal(kind[i], size[i], px, py, pz)
+        nx = rotation[i, 0, 0] * lx + rotation[i, 0, 1] * ly + rotation[i, 0, 2] * lz
+        ny = rotation[i, 1, 0] * lx + rotation[i, 1, 1] * ly + rotation[i, 1, 2] * lz
+        nz = rotation[i, 2, 0] * lx + rotation[i, 2, 1] * ly + rotation[i, 2, 2] * lz
+        facing = abs(nx * dx + ny * dy + nz * dz)
+        footprint = t * pixel / max(sqrt(facing), 0.15)
+        light, warmth = shade_factors(material[i], px, py, pz, u, v, footprint, seed + 1009 * (i + 1))
+        red, green, blue = (
+            tint[i, 0] * light * (1.0 + 0.30 * warmth),
+            tint[i, 1] * light,
+            tint[i, 2] * light * (1.0 - 0.30 * warmth),
+        )
+    occlusion = 1.0
+    for step in OCCLUSION_STEPS:
+        free = nearest_surface(
+            kind, center, rotation, size, start, low, high, x + step * nx, y + step * ny, z + step * nz, step
+        )
+        occlusion -= 0.38 * (1.0 - free / step)
+    sun = nx * SUN[0] + ny * SUN[1] + nz * SUN[2]
+    if sun > 0.0:
+        sx, sy, sz = x + _EPSILON * nx, y + _EPSILON * ny, z + _EPSILON * nz
+        _, blocker = cast(kind, center, rotation, size, start, low, high, sx, sy, sz, SUN[0], SUN[1], SUN[2], True)
+        sun = sun if blocker == SKY else 0.0
+    sun = max(sun, 0.0)
+    up = 0.5 + 0.5 * nz
+    return (
+        red * (sun * SUN_LIGHT[0] + occlusion * (up * SKY_LIGHT[0] + (1 - up) * BOUNCE_LIGHT[0])),
+        green * (sun * SUN_LIGHT[1] + occlusion * (up * SKY_LIGHT[1] + (1 - up) * BOUNCE_LIGHT[1])),
+        blue * (sun * SUN_LIGHT[2] + occlusion * (up * SKY_LIGHT[2] + (1 - up) * BOUNCE_LIGHT[2])),
+    )
+
+
+@_inline
+def encode(value):
+    """Linear light to an 8-bit sRGB value, with a soft shoulder instead of clipping."""
+    value = EXPOSURE * value
+    if value > 0.6:
+        value = 0.6 + 0.4 * (1.0 - exp(-(value - 0.6) / 0.4))
+    srgb = 12.92 * value if value <= 0.0031308 else 1.055 * value ** (1 / 2.4) - 0.055
+    return floor(255.0 * clamp(srgb, 0.0, 1.0) + 0.5)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def render(
+    kind, center, rotation, size, material, tint, start, low, high, camera_rotation, origin, intrinsics, image, seed
+):
+    """Render one view into ``image`` [H, W, 3] uint8; ``intrinsics`` is (fx, fy, cx, cy) in px."""
+    fx, fy, cx, cy = intrinsics
+    ox, oy, oz = origin
+    share = 1.0 / (SUBSAMPLES * SUBSAMPLES)
+    pixel = 1.0 / (fx * SUBSAMPLES)
+    for row in range(image.shape[0]):
+        for column in range(image.shape[1]):
+            red, green, blue = 0.0, 0.0, 0.0
+            for sub in range(SUBSAMPLES * SUBSAMPLES):
+                across = (column + (sub % SUBSAMPLES + 0.5) / SUBSAMPLES - cx) / fx
+                down = (row + (sub // SUBSAMPLES + 0.5) / SUBSAMPLES - cy) / fy
+                scale = 1.0 / sqrt(across * across + down * down + 1.0)
+                dx, dy, dz = to_local(camera_rotation, across * scale, down * scale, scale)
+                r, g, b = shade(
+                    kind, center, rotation, size, material, tint, start, low, high, ox, oy, oz, dx, dy, dz, pixel, seed
+                )
+                red += share * min(r, 1.5)
+                green += share * min(g, 1.5)
+                blue += share * min(b, 1.5)
+            image[row, column, 0] = encode(red)
+            image[row, column, 1] = encode(green)
+            image[row, column, 2] = encode(blue)

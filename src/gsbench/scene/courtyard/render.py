@@ -1,0 +1,108 @@
+"""The embedded scene: a procedural courtyard, rendered to photographs with exactly known cameras.
+
+A well, crates, a bench and pots on a large lawn of faint texture, a gravel path, stone walls and a house front: detail
+for structure from motion beside the low-texture ground on which 3DGS grows oversized Gaussians. One seed, one result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from math import cos, pi, radians, sin, tan
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.scene.camera import Camera
+from gsbench.scene.courtyard.kernels import distances, render
+from gsbench.scene.courtyard.layout import Layout, build_layout
+
+VERSION = 1  # raise when the pictures change
+MAX_STEP = radians(7.5)  # between neighbouring views; wider steps gave wrong SfM models on scenes like this one
+RING_RADIUS = 4.55  # m
+FIELD_OF_VIEW = radians(56.0)  # horizontal
+TARGET = (0.0, 0.0, 0.72)  # m, what all cameras look at
+MIN_VIEWS = 3
+
+
+def render_courtyard(
+    output_dir: Path,
+    views: int = 48,
+    width: int = 400,
+    height: int = 300,
+    seed: int = 0,
+    threads: int = 2,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write the capture: ``output_dir/images/*.png`` and the exact COLMAP model ``output_dir/sparse/0`` without points.
+
+    ``width`` and ``height`` are in px. The same arguments give the same bytes, whatever ``threads`` is. ``progress`` is
+    called with (views done, all views). Raises `InputError` for fewer than 3 views or images below 16 px.
+    """
+    from gsbench.scene.colmap import write_model  # pycolmap is needed for writing alone
+
+    cameras = courtyard_cameras(views, width, height)
+    layout = build_layout(seed)
+    images = output_dir / "images"
+    images.mkdir(parents=True, exist_ok=True)
+
+    def work(item: tuple[str, Camera]) -> None:
+        name, camera = item
+        Image.fromarray(render_view(layout, camera, seed)).save(images / name, format="PNG")
+
+    with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
+        for done, _ in enumerate(pool.map(work, cameras.items()), start=1):
+            if progress is not None:
+                progress(done, views)
+    write_model(output_dir / "sparse" / "0", cameras)
+
+
+def courtyard_cameras(views: int, width: int, height: int) -> dict[str, Camera]:
+    """The cameras by file name: a wavy ring in steps of 7.5 degrees or, for more than 48 views, less."""
+    if views < MIN_VIEWS:
+        raise InputError(f"scene.views must be at least {MIN_VIEWS}, got {views}")
+    if min(width, height) < 16:
+        raise InputError(f"scene.width and scene.height must be at least 16 px, got {width}x{height}")
+    step = min(MAX_STEP, 2 * pi / views)
+    return {f"{index:04d}.png": ring_camera(index * step - 0.5 * pi, width, height) for index in range(views)}
+
+
+def ring_camera(angle: float, width: int, height: int) -> Camera:
+    """The camera at an azimuth (rad); its height and distance are smooth, periodic functions of it."""
+    radius = RING_RADIUS + 0.2 * cos(2 * angle)
+    center = np.array([radius * cos(angle), radius * sin(angle), 1.95 + 0.40 * sin(5 * angle)])
+    forward = np.array(TARGET) - center
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])  # [3, 3] world to camera
+    focal = 0.5 * width / tan(0.5 * FIELD_OF_VIEW)
+    return Camera(width, height, focal, focal, width / 2, height / 2, rotation, -rotation @ center)
+
+
+def render_view(layout: Layout, camera: Camera, seed: int) -> NDArray[np.uint8]:
+    """One photograph, [H, W, 3] uint8 sRGB; surfaces are matt, so a point has one colour in all views."""
+    image = np.empty((camera.height, camera.width, 3), dtype=np.uint8)
+    render(
+        layout.kind, layout.center, layout.rotation, layout.size, layout.material, layout.tint,
+        layout.group_start, layout.group_low, layout.group_high,
+        np.ascontiguousarray(camera.rotation), np.ascontiguousarray(camera.center),
+        (camera.fx, camera.fy, camera.cx, camera.cy), image, seed,
+    )  # fmt: skip
+    return image
+
+
+def surface_distance(points: NDArray[np.float64], seed: int = 0, limit: float = 1e3) -> NDArray[np.float64]:
+    """The distance in m from points [P, 3] (world coordinates) to the nearest true surface, at most ``limit``; [P].
+
+    Exact outside all solids; inside, the distance to the nearest surface of any primitive, hidden ones included.
+    """
+    layout = build_layout(seed)
+    return distances(
+        layout.kind, layout.center, layout.rotation, layout.size,
+        layout.group_start, layout.group_low, layout.group_high,
+        np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3), limit,
+    )  # fmt: skip

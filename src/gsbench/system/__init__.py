@@ -1,0 +1,1 @@
+"""The machine and its processes: locks, signals, memory, cores, installation."""

@@ -1,0 +1,169 @@
+"""Run a function in a process of its own, so that a crash in native code becomes an error with a reason.
+
+The child is a fresh interpreter (never a fork, so no threads or locks are inherited) that imports only what the
+function needs: the parent's ``__main__`` is not imported again, so it works alike from a console script, a notebook,
+pytest and Hydra. The child, and every program that it started, ends when the parent does, even when the parent is
+killed; no such program outlives the function.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, BinaryIO, ParamSpec, TypeVar
+
+from gsbench.errors import GsbenchError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_BOOTSTRAP = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from {module} import {name}; {name}()"
+_SECONDS_TO_END = 5.0  # patience with a child that was asked to end, before it is killed
+_TAIL_LINES = 3
+_STACK_LINE = re.compile(r"^\s*(@|PC:|\*\*\* )|^\s*File |^\s*$")  # glog's crash dump, blank lines
+_REASON_LINE = re.compile(r"what\(\)|terminate called|Check failed|Error|error|free\(\)|malloc|corrupt")
+
+
+class CrashError(GsbenchError):
+    """An isolated function ended without a result: its process crashed, was killed, or ran out of memory."""
+
+
+def run_isolated(
+    function: Callable[..., R],
+    *args: Any,
+    what: str | None = None,
+    log: Path | None = None,
+    **kwargs: Any,
+) -> R:
+    """Return ``function(*args, **kwargs)``, computed in a fresh child process.
+
+    ``function`` must be importable by name (a top-level function of a module, not of ``__main__``); it, the arguments
+    and the result travel by pickle. ``what`` names the work in errors ("undistortion"). The child's whole output, that
+    of native libraries included, is appended to the file ``log`` if one is given, else dropped on success.
+
+    An exception that the function raises is raised here again, with the child's traceback as a note. A crash of the
+    process raises `CrashError`, one line that ends with the last telling lines of its output.
+    """
+    what = what or function.__name__
+    if function.__module__ == "__main__" or "<" in function.__qualname__:
+        raise ValueError(f"run_isolated: {function.__qualname__} must be a top-level function of an importable module")
+    with tempfile.TemporaryDirectory(prefix="gsbench-isolate-") as folder:
+        call, result = Path(folder, "call.pickle"), Path(folder, "result.pickle")
+        call.write_bytes(pickle.dumps((function, args, kwargs)))
+        output = log if log is not None else Path(folder, "output.txt")
+        with output.open("ab") as stream:
+            start = stream.seek(0, os.SEEK_END)
+            code = _run_child(call, result, stream)
+        if code != 0 or not result.is_file():
+            raise CrashError(f"{what} {describe_exit(code)}; its last words: {_telling_tail(output, start)}")
+        succeeded, value, trace = pickle.loads(result.read_bytes())
+    if succeeded:
+        return value
+    value.add_note(f"raised in the isolated process of {what}:\n{trace}")
+    raise value
+
+
+def python_command(module: str, name: str, *arguments: str) -> list[str]:
+    """A fresh interpreter that finds the modules which this one finds, and calls the function ``name`` of ``module``.
+
+    The function takes nothing; it finds ``arguments`` in ``sys.argv[2:]``.
+    """
+    return [sys.executable, "-c", _BOOTSTRAP.format(module=module, name=name), json.dumps(sys.path), *arguments]
+
+
+def _run_child(call: Path, result: Path, output: BinaryIO) -> int:
+    """Start the child, wait for it and return its exit code; end it on any exception here (Ctrl-C included)."""
+    command = python_command("gsbench.system.isolate", "_child", str(call), str(result))
+    # A session of its own: Ctrl-C reaches the parent only, which then ends the child: one traceback, not two.
+    # stdin is a pipe that is never written: its end of file tells the child that the parent is gone.
+    child = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+    )
+    try:
+        return child.wait()
+    finally:
+        if child.poll() is None:
+            child.terminate()
+            try:
+                child.wait(_SECONDS_TO_END)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
+        _end_group(child.pid)
+        if child.stdin is not None:
+            child.stdin.close()
+
+
+def _end_group(leader: int) -> None:
+    """End what the child started and left behind: its session is the process group ``leader``."""
+    if hasattr(os, "killpg"):
+        with suppress(ProcessLookupError, PermissionError):  # nobody is left (macOS: only the dead are)
+            os.killpg(leader, signal.SIGKILL)
+
+
+def _child() -> None:
+    """The child's whole life: arguments are the paths of the pickled call and of the result to write."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    call, result = Path(sys.argv[2]), Path(sys.argv[3])
+    function, args, kwargs = pickle.loads(call.read_bytes())
+    try:
+        outcome = (True, function(*args, **kwargs), "")
+    except Exception as error:  # noqa: BLE001  whatever it is, it is raised again in the parent
+        outcome = (False, _portable(error), traceback.format_exc())
+    result.write_bytes(pickle.dumps(outcome))
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)  # native libraries may crash while they are unloaded; the result is already safe
+
+
+def _exit_with_parent() -> None:
+    while os.read(0, 1):
+        pass
+    _end_group(os.getpid())  # this process too, which leads the group
+    os._exit(1)
+
+
+def _portable(error: Exception) -> Exception:
+    """The error itself if it survives pickling, else a RuntimeError with its text."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:  # noqa: BLE001  a class may fail in any way in its own reduce or init
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error
+
+
+def describe_exit(code: int) -> str:
+    """How a process ended that should not have, by its exit code: "crashed (SIGSEGV)", "ended early (exit code 1)"."""
+    if code < 0:
+        try:
+            name = signal.Signals(-code).name
+        except ValueError:
+            name = f"signal {-code}"
+        return f"crashed ({name}{', perhaps out of memory' if name == 'SIGKILL' else ''})"
+    return f"ended early (exit code {code})"
+
+
+def _telling_tail(output: Path, start: int) -> str:
+    with output.open("rb") as stream:
+        stream.seek(start)
+        return telling_lines(stream.read())
+
+
+def telling_lines(output: bytes) -> str:
+    """The last lines of a process's output that look like a reason, on one line."""
+    lines = output.decode("utf-8", "replace").splitlines()
+    lines = [line.strip() for line in lines if not _STACK_LINE.match(line)]
+    telling = [line for line in lines if _REASON_LINE.search(line)] or lines
+    return " | ".join(telling[-_TAIL_LINES:]) or "(no output)"

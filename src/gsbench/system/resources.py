@@ -1,0 +1,77 @@
+"""Cores, GPUs and slots for trials that run at once on a machine. Loads no torch."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from gsbench.system.locks import BusyError, hold
+
+SECONDS_BETWEEN_TRIES = 0.5
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+def available_threads(parallel: int = 1) -> int:
+    """The CPU threads for one of ``parallel`` trials: what Slurm gave, else this process's cores, shared evenly."""
+    slurm = os.environ.get("SLURM_CPUS_PER_TASK", "")
+    if slurm.isdigit() and int(slurm) > 0:
+        return int(slurm)
+    return max(1, available_cores() // parallel)
+
+
+@contextmanager
+def take_slot(runs: Path, count: int) -> Iterator[int]:
+    """Hold the first free one of ``count`` slots of this machine: no more trials run at once, whoever started them."""
+    folder = runs / ".slots" / socket.gethostname()
+    folder.mkdir(parents=True, exist_ok=True)
+    while True:
+        for slot in range(count):
+            with ExitStack() as stack:
+                try:
+                    stack.enter_context(hold(folder / f"{slot}.lock", f"slot {slot}", wait=False))
+                except BusyError:
+                    continue
+                yield slot
+                return
+        time.sleep(SECONDS_BETWEEN_TRIES)
+
+
+def assign_gpu(slot: int, visible: str | None) -> None:
+    """Let this process see one GPU: the slot's turn among those that the parent saw. Before torch is loaded."""
+    gpus = [gpu.strip() for gpu in visible.split(",") if gpu.strip()] if visible is not None else installed_gpus()
+    if gpus:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[slot % len(gpus)]
+    elif visible is None:
+        os.environ.pop("CUDA_VISIBLE_DEVICES", None)  # submitit has emptied it
+
+
+def installed_gpus() -> list[str]:
+    """The indices of NVIDIA GPUs of this machine, as its driver lists them."""
+    try:
+        listing = subprocess.run(
+            ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return []
+    return listing.stdout.split()
+
+
+def assign_threads(threads: int | str, parallel: int) -> None:
+    """Limit the libraries' threads in this process to ``threads``, for "auto" to its share. Before torch is loaded."""
+    count = available_threads(parallel) if threads == "auto" else int(threads)
+    for variable in THREAD_VARIABLES:
+        os.environ[variable] = str(count)
+
+
+def available_cores() -> int:
+    """The cores that this process may use, at least 1."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

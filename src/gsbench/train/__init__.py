@@ -1,0 +1,1 @@
+"""The trainer and its parts, a library: options, loss, learning rates, checkpoints."""

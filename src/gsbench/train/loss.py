@@ -1,0 +1,62 @@
+"""The photometric loss of 3DGS, by the quickest executor for a device; `gsbench.eval.ssim` defines it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from gsbench.eval.ssim import SSIM_WEIGHT, torch_photometric_loss
+from gsbench.raster.executors import find
+
+Loss = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+
+
+def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT) -> tuple[Tensor, Tensor, Tensor]:
+    """The loss, L1 and SSIM of ``image`` [H, W, 3] against ``target`` [H, W, 3] (uint8, taken as /255, or floating).
+
+    Three scalars; only the loss carries a gradient, to ``image``. On the CPU in float32 this is a compiled kernel; a
+    caller with many images keeps a ``PhotometricLoss`` instead, which has threads and keeps its memory.
+    """
+    return PhotometricLoss(ssim_weight, threads=1)(image, target)
+
+
+class PhotometricLoss:
+    """``photometric_loss`` as an object: float32 images go through compiled kernels.
+
+    On a CPU these run on ``threads`` threads, with the same bits for any number of them; on a GPU where Triton is
+    installed they read nothing back. Any other device or dtype goes through torch.
+    """
+
+    def __init__(self, ssim_weight: float = SSIM_WEIGHT, threads: int | None = None) -> None:
+        if not 0 <= ssim_weight <= 1:
+            raise ValueError(f"ssim_weight: must be between 0 and 1, got {ssim_weight}")
+        self.ssim_weight = ssim_weight
+        self._threads = threads
+        self._compiled: dict[str, Loss] = {}  # by type of device
+
+    def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        if image.dim() != 3 or image.shape[-1] != 3 or image.shape != target.shape:
+            raise ValueError(
+                f"image {tuple(image.shape)} and target {tuple(target.shape)} must be of one shape [H, W, 3]"
+            )
+        if image.dtype != torch.float32:
+            return torch_photometric_loss(image, target, self.ssim_weight)
+        kind = image.device.type
+        if kind not in self._compiled:
+            self._compiled[kind] = self._compile(kind)
+        return self._compiled[kind](image, target)
+
+    def _compile(self, device_type: str) -> Loss:
+        """Loads the packages that this type of device needs, and no others."""
+        if device_type == "cpu":
+            from gsbench.train.loss_cpu import CompiledLoss
+
+            return CompiledLoss(self.ssim_weight, self._threads)
+        if find("triton").obstacle(device_type) is None:
+            from gsbench.train.loss_triton import TritonLoss
+
+            return TritonLoss(self.ssim_weight)
+        return partial(torch_photometric_loss, ssim_weight=self.ssim_weight)

@@ -1,0 +1,290 @@
+"""The photometric loss compiled for the CPU: one fused forward pass over rows, and a hand-written gradient.
+
+Images stay interleaved [H, W, 3]: a row is 3 W numbers and a horizontal neighbour is 3 numbers away, so one vector
+covers 16 numbers of any channel. Rows are filtered horizontally once into a ring of 11 and combined vertically from
+there. The statistics of the target are computed again at each step, so that no memory is needed for each view.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
+from gsbench.raster.cpu.jit import inlined, kernel
+from gsbench.raster.cpu.simd import LANES, absolute, fma, lane_sums, load, select, splat, store
+from gsbench.raster.cpu.workspace import ArenaPool, ShardRunner, TensorPool
+from gsbench.system.resources import available_cores
+
+SHARDS = 8  # fixed, so that the bits are the same for any number of threads
+CHANNELS = 3
+PAD = LANES  # zeros on both sides of a row: at least CHANNELS * WINDOW_RADIUS
+TAPS = 2 * WINDOW_RADIUS + 1
+WEIGHTS = window().numpy().astype(np.float32)[WINDOW_RADIUS:].copy()  # from the centre outwards
+LANE = np.arange(LANES, dtype=np.float32)
+ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
+F_C1, F_C2 = np.float32(C1), np.float32(C2)
+BYTE_MAX = np.float32(255)
+
+
+@inlined
+def _blur_row(source: Any, start: int, target: Any, place: int, numbers: int) -> None:
+    """Filter the padded row at ``source[start:]`` horizontally into ``target[place:]``, without padding."""
+    for i in range(0, numbers, LANES):
+        center = start + PAD + i
+        total = load(source, center) * WEIGHTS[0]
+        for k in range(1, WINDOW_RADIUS + 1):
+            pair = load(source, center - CHANNELS * k) + load(source, center + CHANNELS * k)
+            total = fma(pair, WEIGHTS[k], total)
+        store(target, place + i, total)
+
+
+@inlined
+def _blur_column(ring: Any, first: int, i: int, row: int, stride: int) -> Any:
+    """Filter vertically around ``row`` at number ``i``: rows of the ring starting at ``first``, ``stride`` apart."""
+    total = load(ring, first + row % TAPS * stride + i) * WEIGHTS[0]
+    for k in range(1, WINDOW_RADIUS + 1):
+        pair = load(ring, first + (row - k + TAPS) % TAPS * stride + i) + load(
+            ring, first + (row + k) % TAPS * stride + i
+        )
+        total = fma(pair, WEIGHTS[k], total)
+    return total
+
+
+@inlined
+def _sum(vector: Any, scratch: Any) -> float:
+    """The sum of the 16 lanes as float64."""
+    store(scratch, 0, lane_sums((vector, vector)))
+    return np.float64(scratch[0])
+
+
+@inlined
+def _read_row(image: Any, row: int, numbers: int, out: Any) -> None:
+    """A row of an image (float32, or uint8 in 255ths) behind PAD zeros that ``out`` has already."""
+    start = row * numbers
+    for i in range(numbers):
+        out[PAD + i] = image[start + i]
+
+
+@inlined
+def _scale_row(out: Any, numbers: int, divisor: Any) -> None:
+    if divisor != ONE:
+        for i in range(numbers):
+            out[PAD + i] /= divisor
+
+
+@kernel
+def similarity_rows(
+    memory: Any,
+    begin: int,
+    end: int,
+    height: int,
+    width: int,
+    image: Any,
+    target: Any,
+    divisor: Any,
+    derivatives: Any,
+    sums: Any,
+) -> None:
+    """Rows ``begin`` to ``end``, with scratch ``memory``: ``sums`` [2] gets the sum of SSIM and of |image - target|.
+
+    ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if not empty, gets the derivative of SSIM's sum with respect to
+    the blurred image, its blurred square and its blurred product with the target, between zeros.
+    """
+    numbers = width * CHANNELS
+    length = (numbers + LANES - 1) // LANES * LANES
+    padded = length + 2 * PAD
+    part = TAPS * length
+    x, y, xx = memory[:padded], memory[padded:], memory[2 * padded :]
+    yy, xy, ring = memory[3 * padded :], memory[4 * padded :], memory[5 * padded :]
+    scratch = ring[5 * part :]
+    for i in range(0, 5 * padded, LANES):
+        store(memory, i, splat(ZERO))
+    total_similarity, total_l1 = 0.0, 0.0
+    lane = load(LANE, 0)
+    for row in range(begin - WINDOW_RADIUS, end + WINDOW_RADIUS):
+        slot = (row + TAPS) % TAPS * length
+        if 0 <= row < height:
+            _read_row(image, row, numbers, x)
+            _read_row(target, row, numbers, y)
+            _scale_row(y, numbers, divisor)
+            l1 = splat(ZERO)
+            for i in range(PAD, PAD + length, LANES):
+                a, b = load(x, i), load(y, i)
+                store(xx, i, a * a)
+                store(yy, i, b * b)
+                store(xy, i, a * b)
+                l1 += absolute(a - b)
+            if begin <= row < end:
+                total_l1 += _sum(l1, scratch)
+            _blur_row(x, 0, ring, slot, numbers)
+            _blur_row(y, 0, ring, part + slot, numbers)
+            _blur_row(xx, 0, ring, 2 * part + slot, numbers)
+            _blur_row(yy, 0, ring, 3 * part + slot, numbers)
+            _blur_row(xy, 0, ring, 4 * part + slot, numbers)
+        else:
+            for m in range(5):
+                for i in range(0, length, LANES):
+                    store(ring, m * part + slot + i, splat(ZERO))
+        center = row - WINDOW_RADIUS
+        if center < begin:
+            continue
+        similarity = splat(ZERO)
+        for i in range(0, numbers, LANES):
+            mean_x, mean_y = _blur_column(ring, 0, i, center, length), _blur_column(ring, part, i, center, length)
+            square_x = _blur_column(ring, 2 * part, i, center, length)
+            square_y = _blur_column(ring, 3 * part, i, center, length)
+            product = _blur_column(ring, 4 * part, i, center, length)
+            a1 = fma(mean_x * mean_y, TWO, F_C1)
+            a2 = fma(product - mean_x * mean_y, TWO, F_C2)
+            means = mean_x * mean_x + mean_y * mean_y
+            b1 = means + F_C1
+            b2 = (square_x + square_y) - means + F_C2
+            inside = lane < np.float32(numbers - i)
+            inverse = ONE / (b1 * b2)
+            value = select(inside, a1 * a2 * inverse, ZERO)
+            similarity += value
+            if len(derivatives) > 0:
+                at = center * padded + PAD + i
+                d_mean = (mean_y * (a2 - a1) - value * mean_x * (b2 - b1)) * inverse * TWO
+                store(derivatives, at, select(inside, d_mean, ZERO))
+                store(derivatives, height * padded + at, select(inside, -value * b1 * inverse, ZERO))
+                store(derivatives, 2 * height * padded + at, select(inside, TWO * a1 * inverse, ZERO))
+        total_similarity += _sum(similarity, scratch)
+        if len(derivatives) > 0:
+            for m in range(3):
+                start = (m * height + center) * padded
+                store(derivatives, start, splat(ZERO))
+                store(derivatives, start + PAD + length, splat(ZERO))
+    sums[0] = total_similarity
+    sums[1] = total_l1
+
+
+@kernel
+def gradient_rows(
+    memory: Any,
+    begin: int,
+    end: int,
+    height: int,
+    width: int,
+    image: Any,
+    target: Any,
+    divisor: Any,
+    derivatives: Any,
+    l1_factor: Any,
+    ssim_factor: Any,
+    gradient: Any,
+) -> None:
+    """Rows ``begin`` to ``end`` of ``gradient`` [H * W * 3]; the blur is symmetric, so it pulls derivatives back."""
+    numbers = width * CHANNELS
+    length = (numbers + LANES - 1) // LANES * LANES
+    padded = length + 2 * PAD
+    part = TAPS * length
+    x, y, line, ring = memory[:padded], memory[padded:], memory[2 * padded :], memory[3 * padded :]
+    for i in range(0, 2 * padded, LANES):
+        store(memory, i, splat(ZERO))
+    for row in range(begin - WINDOW_RADIUS, end + WINDOW_RADIUS):
+        slot = (row + TAPS) % TAPS * length
+        for m in range(3):
+            if 0 <= row < height:
+                _blur_row(derivatives, (m * height + row) * padded, ring, m * part + slot, numbers)
+            else:
+                for i in range(0, length, LANES):
+                    store(ring, m * part + slot + i, splat(ZERO))
+        center = row - WINDOW_RADIUS
+        if center < begin:
+            continue
+        _read_row(image, center, numbers, x)
+        _read_row(target, center, numbers, y)
+        _scale_row(y, numbers, divisor)
+        for i in range(0, numbers, LANES):
+            a, b = load(x, PAD + i), load(y, PAD + i)
+            d_mean = _blur_column(ring, 0, i, center, length)
+            d_square = _blur_column(ring, part, i, center, length)
+            d_product = _blur_column(ring, 2 * part, i, center, length)
+            similarity = fma(d_square * TWO, a, fma(d_product, b, d_mean))
+            sign = select(a > b, splat(l1_factor), select(a < b, splat(-l1_factor), ZERO))
+            store(line, i, fma(similarity, -ssim_factor, sign))
+        start = center * numbers
+        for i in range(numbers):
+            gradient[start + i] = line[i]
+
+
+class CompiledLoss:
+    """The kernels with their threads and memory; see ``loss.PhotometricLoss``."""
+
+    def __init__(self, ssim_weight: float, threads: int | None) -> None:
+        self.ssim_weight = ssim_weight
+        self._runner = ShardRunner(threads or available_cores())
+        self._arenas = ArenaPool()
+        self._tensors = TensorPool()
+
+    def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return _Loss.apply(self, image, target)
+
+    def compute(self, image: Tensor, target: Tensor, differentiate: bool) -> tuple[float, float, Tensor | None]:
+        """Mean SSIM, mean L1, and the gradient of the loss at ``image`` if ``differentiate``."""
+        height, width, _ = image.shape
+        numbers = image.numel()
+        pixels = image.detach().contiguous().numpy().reshape(-1)
+        if target.dtype != torch.uint8:
+            target = target.to(torch.float32)
+        wanted = target.contiguous().numpy().reshape(-1)
+        divisor = BYTE_MAX if target.dtype == torch.uint8 else ONE
+        edges = [height * shard // SHARDS for shard in range(SHARDS + 1)]
+        sums = np.zeros((SHARDS, 2))
+        holder = _Holder()
+        arena = self._arenas.lease(holder)
+        padded = -(-width * CHANNELS // LANES) * LANES + 2 * PAD
+        derivatives = arena.take("derivatives", (3 * height * padded if differentiate else 0,), np.float32)
+        memory = arena.take("memory", (SHARDS, 5 * (TAPS + 1) * padded + LANES), np.float32)
+        common = (height, width, pixels, wanted, divisor, derivatives)
+
+        def similarity(shard: int) -> None:
+            if edges[shard] < edges[shard + 1]:
+                similarity_rows(memory[shard], edges[shard], edges[shard + 1], *common, sums[shard])
+
+        self._runner.run(SHARDS, similarity)
+        total_similarity, total_l1 = (float(value) / numbers for value in sums.sum(0))
+        if not differentiate:
+            return total_similarity, total_l1, None
+
+        gradient = self._tensors.empty(tuple(image.shape))
+        factors = (np.float32((1 - self.ssim_weight) / numbers), np.float32(self.ssim_weight / numbers))
+        flat = gradient.numpy().reshape(-1)
+
+        def differentiate_rows(shard: int) -> None:
+            if edges[shard] < edges[shard + 1]:
+                gradient_rows(memory[shard], edges[shard], edges[shard + 1], *common, *factors, flat)
+
+        self._runner.run(SHARDS, differentiate_rows)
+        return total_similarity, total_l1, gradient
+
+
+class _Holder:
+    """Lives as long as the arena is needed."""
+
+
+class _Loss(torch.autograd.Function):
+    """The gradient is computed with the value, from rows that are in the cache, and scaled in ``backward``."""
+
+    @staticmethod
+    def forward(ctx: Any, compiled: CompiledLoss, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        similarity, l1, ctx.gradient = compiled.compute(image, target, ctx.needs_input_grad[1])
+        weight = compiled.ssim_weight
+        l1_tensor, similarity_tensor = torch.tensor(l1), torch.tensor(similarity)
+        ctx.mark_non_differentiable(l1_tensor, similarity_tensor)
+        ctx.set_materialize_grads(False)
+        return torch.tensor((1 - weight) * l1 + weight * (1 - similarity)), l1_tensor, similarity_tensor
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_loss: Tensor | None, *_: None) -> tuple[None, Tensor | None, None]:
+        if g_loss is None or ctx.gradient is None:
+            return None, None, None
+        scale = float(g_loss)
+        return None, ctx.gradient if scale == 1.0 else ctx.gradient * scale, None

@@ -1,0 +1,273 @@
+"""The photometric loss in Triton kernels: nothing is read back from the device, neither values nor gradient.
+
+Images stay interleaved [H, W, 3]: a row is 3 W numbers, and a horizontal neighbour is 3 numbers away. A program goes
+down a strip of rows, a lane a number of a row. It filters each row horizontally as it comes, and adds it to eleven
+running sums, of which one is complete at each row.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
+from gsbench.raster.triton.toolchain import load_driver
+from gsbench.raster.triton.workspace import WorkspacePool
+
+STRIP = 128  # numbers of a row that a program takes
+ROWS = 32  # rows that it takes
+RADIUS = tl.constexpr(WINDOW_RADIUS)
+CHANNELS = tl.constexpr(3)
+W0, W1, W2, W3, W4, W5 = (tl.constexpr(weight) for weight in window()[WINDOW_RADIUS:].tolist())  # from the centre
+F_C1, F_C2 = tl.constexpr(C1), tl.constexpr(C2)
+
+
+@triton.jit
+def _weight(k: tl.constexpr):
+    """The window's weight ``k`` px from its centre."""
+    return (W0, W1, W2, W3, W4, W5)[k]
+
+
+@triton.jit
+def _zeros(like):
+    """Eleven running sums of nothing."""
+    zero = tl.zeros_like(like)
+    return (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
+
+
+@triton.jit
+def _push(sums, value):
+    """The running sums one row further, where the row's blurred ``value`` comes in; the first is complete."""
+    return (
+        tl.fma(value, W5, sums[1]),
+        tl.fma(value, W4, sums[2]),
+        tl.fma(value, W3, sums[3]),
+        tl.fma(value, W2, sums[4]),
+        tl.fma(value, W1, sums[5]),
+        tl.fma(value, W0, sums[6]),
+        tl.fma(value, W1, sums[7]),
+        tl.fma(value, W2, sums[8]),
+        tl.fma(value, W3, sums[9]),
+        tl.fma(value, W4, sums[10]),
+        value * W5,
+    )
+
+
+@triton.jit
+def _load(array, row, number, height, numbers, scale):
+    """Numbers of one row as float32, times ``scale``; 0 outside the image."""
+    inside = (row >= 0) & (row < height) & (number >= 0) & (number < numbers)
+    return tl.load(array + row * numbers + number, mask=inside, other=0).to(tl.float32) * scale
+
+
+@triton.jit
+def _add(sums, x, y, weight):
+    """Five weighted sums: of x, y, x^2, y^2 and x y."""
+    wx, wy = x * weight, y * weight
+    return (sums[0] + wx, sums[1] + wy, tl.fma(wx, x, sums[2]), tl.fma(wy, y, sums[3]), tl.fma(wx, y, sums[4]))
+
+
+@triton.jit(do_not_specialize=["height", "numbers"])
+def measure_similarity(
+    image,
+    target,
+    scale,
+    height,
+    numbers,
+    derivatives,
+    sums,
+    DIFFERENTIATE: tl.constexpr,
+    STRIP: tl.constexpr,
+    ROWS: tl.constexpr,
+):
+    """``sums`` [programs, 2] gets this program's sums of SSIM and of |image - target|, where the target is
+    ``target * scale``.
+
+    ``derivatives`` [3, H, 3 W], if ``DIFFERENTIATE``, gets the derivative of SSIM's sum with respect to the blurred
+    image, its blurred square and its blurred product with the target.
+    """
+    number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
+    first = tl.program_id(1) * ROWS
+    zero = tl.zeros([STRIP], tl.float32)
+    mean_x, mean_y, square_x, square_y, product = _zeros(zero), _zeros(zero), _zeros(zero), _zeros(zero), _zeros(zero)
+    total_similarity, total_l1 = zero, zero
+    plane = height.to(tl.int64) * numbers
+    for row in range(first - RADIUS, tl.minimum(first + ROWS, height) + RADIUS):
+        x = _load(image, row, number, height, numbers, 1.0)
+        y = _load(target, row, number, height, numbers, scale)
+        total_l1 += tl.where((row >= first) & (row < first + ROWS), tl.abs(x - y), 0.0)
+        blurred = _add((zero, zero, zero, zero, zero), x, y, W0)
+        for k in tl.static_range(1, RADIUS + 1):
+            for side in tl.static_range(-1, 2, 2):
+                neighbour = number + side * k * CHANNELS
+                x = _load(image, row, neighbour, height, numbers, 1.0)
+                y = _load(target, row, neighbour, height, numbers, scale)
+                blurred = _add(blurred, x, y, _weight(k))
+        mean_x, mean_y = _push(mean_x, blurred[0]), _push(mean_y, blurred[1])
+        square_x, square_y = _push(square_x, blurred[2]), _push(square_y, blurred[3])
+        product = _push(product, blurred[4])
+
+        center = row - RADIUS
+        inside = (center >= first) & (number < numbers)
+        mx, my = mean_x[0], mean_y[0]
+        means = mx * mx + my * my
+        a1 = 2 * mx * my + F_C1
+        a2 = 2 * (product[0] - mx * my) + F_C2
+        b1 = means + F_C1
+        b2 = square_x[0] + square_y[0] - means + F_C2
+        inverse = 1.0 / (b1 * b2)
+        similarity = a1 * a2 * inverse
+        total_similarity += tl.where(inside, similarity, 0.0)
+        if DIFFERENTIATE:
+            place = derivatives + center * numbers + number
+            d_mean = 2 * (my * (a2 - a1) - similarity * mx * (b2 - b1)) * inverse
+            tl.store(place, d_mean, mask=inside)
+            tl.store(place + plane, -similarity * b1 * inverse, mask=inside)
+            tl.store(place + 2 * plane, 2 * a1 * inverse, mask=inside)
+    program = tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)
+    tl.store(sums + 2 * program, tl.sum(total_similarity, 0))
+    tl.store(sums + 2 * program + 1, tl.sum(total_l1, 0))
+
+
+@triton.jit(do_not_specialize=["programs"])
+def add_up(sums, programs, size, ssim_weight, values, GROUP: tl.constexpr):
+    """``values`` [3]: loss, mean L1 and mean SSIM, from the ``sums`` [programs, 2] of images of ``size`` numbers."""
+    similarity, l1 = tl.zeros([GROUP], tl.float32), tl.zeros([GROUP], tl.float32)
+    for start in range(0, programs, GROUP):
+        program = start + tl.arange(0, GROUP)
+        similarity += tl.load(sums + 2 * program, mask=program < programs, other=0.0)
+        l1 += tl.load(sums + 2 * program + 1, mask=program < programs, other=0.0)
+    mean_similarity, mean_l1 = tl.sum(similarity, 0) / size, tl.sum(l1, 0) / size
+    tl.store(values, (1.0 - ssim_weight) * mean_l1 + ssim_weight * (1.0 - mean_similarity))
+    tl.store(values + 1, mean_l1)
+    tl.store(values + 2, mean_similarity)
+
+
+@triton.jit(do_not_specialize=["height", "numbers"])
+def differentiate(
+    image,
+    target,
+    scale,
+    height,
+    numbers,
+    derivatives,
+    g_loss,
+    ssim_weight,
+    gradient,
+    STRIP: tl.constexpr,
+    ROWS: tl.constexpr,
+):
+    """The ``gradient`` [H, 3 W] at the image; the blur is symmetric, so it pulls derivatives back."""
+    number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
+    first = tl.program_id(1) * ROWS
+    zero = tl.zeros([STRIP], tl.float32)
+    d_mean, d_square, d_product = _zeros(zero), _zeros(zero), _zeros(zero)
+    plane = height.to(tl.int64) * numbers
+    factor = tl.load(g_loss) / (height * numbers).to(tl.float32)
+    l1_factor, ssim_factor = factor * (1.0 - ssim_weight), factor * ssim_weight
+    for row in range(first - RADIUS, tl.minimum(first + ROWS, height) + RADIUS):
+        mean = W0 * _load(derivatives, row, number, height, numbers, 1.0)
+        square = W0 * _load(derivatives + plane, row, number, height, numbers, 1.0)
+        product = W0 * _load(derivatives + 2 * plane, row, number, height, numbers, 1.0)
+        for k in tl.static_range(1, RADIUS + 1):
+            for side in tl.static_range(-1, 2, 2):
+                neighbour = number + side * k * CHANNELS
+                mean += _load(derivatives, row, neighbour, height, numbers, _weight(k))
+                square += _load(derivatives + plane, row, neighbour, height, numbers, _weight(k))
+                product += _load(derivatives + 2 * plane, row, neighbour, height, numbers, _weight(k))
+        d_mean, d_square, d_product = _push(d_mean, mean), _push(d_square, square), _push(d_product, product)
+
+        center = row - RADIUS
+        inside = (center >= first) & (number < numbers)
+        x = tl.load(image + center * numbers + number, mask=inside, other=0.0)
+        y = tl.load(target + center * numbers + number, mask=inside, other=0).to(tl.float32) * scale
+        similarity = d_mean[0] + 2 * d_square[0] * x + d_product[0] * y
+        sign = tl.where(x > y, l1_factor, tl.where(x < y, -l1_factor, 0.0))
+        tl.store(gradient + center * numbers + number, sign - ssim_factor * similarity, mask=inside)
+
+
+class TritonLoss:
+    """The kernels with their memory; see ``loss.PhotometricLoss``. The same bits on every run of one GPU."""
+
+    def __init__(self, ssim_weight: float) -> None:
+        self.ssim_weight = ssim_weight
+        self.pool = WorkspacePool()
+
+    def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        if image.device.type == "cuda":
+            load_driver()
+        if target.dtype != torch.uint8:
+            target = target.to(torch.float32)
+        loss, l1, similarity = _Loss.apply(self, image, target.contiguous())
+        return loss, l1, similarity
+
+
+class _Holder:
+    """Lives as long as the memory is needed."""
+
+
+class _Loss(torch.autograd.Function):
+    """The bridge between the kernels and autograd."""
+
+    @staticmethod
+    def forward(ctx: Any, loss: TritonLoss, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        image = image.contiguous()
+        height, numbers = image.shape[0], 3 * image.shape[1]
+        differentiated = ctx.needs_input_grad[1]
+        grid = -(-numbers // STRIP), -(-height // ROWS)
+        scale = 1 / 255 if target.dtype == torch.uint8 else 1.0
+        ctx.holder = _Holder()
+        with torch.cuda.device_of(image):
+            memory = loss.pool.lease(ctx.holder, image.device)
+            derivatives = memory.take("derivatives", 3 * image.numel() if differentiated else 0, torch.float32)
+            sums = memory.take("sums", 2 * grid[0] * grid[1], torch.float32)
+            values = torch.empty(3, dtype=torch.float32, device=image.device)
+            measure_similarity[grid](
+                image,
+                target,
+                scale,
+                height,
+                numbers,
+                derivatives,
+                sums,
+                DIFFERENTIATE=differentiated,
+                STRIP=STRIP,
+                ROWS=ROWS,
+            )
+            add_up[(1,)](sums, grid[0] * grid[1], float(image.numel()), loss.ssim_weight, values, GROUP=1024)
+        ctx.weight, ctx.scale, ctx.derivatives = loss.ssim_weight, scale, derivatives
+        ctx.save_for_backward(image, target)
+        ctx.set_materialize_grads(False)
+        total, l1, similarity = values.unbind()
+        ctx.mark_non_differentiable(l1, similarity)
+        return total, l1, similarity
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_loss: Tensor | None, *_: None) -> tuple[None, Tensor | None, None]:
+        if g_loss is None:
+            return None, None, None
+        image, target = ctx.saved_tensors
+        height, numbers = image.shape[0], 3 * image.shape[1]
+        gradient = torch.empty_like(image)
+        grid = -(-numbers // STRIP), -(-height // ROWS)
+        with torch.cuda.device_of(image):
+            differentiate[grid](
+                image,
+                target,
+                ctx.scale,
+                height,
+                numbers,
+                ctx.derivatives,
+                g_loss.contiguous(),
+                ctx.weight,
+                gradient,
+                STRIP=STRIP,
+                ROWS=ROWS,
+            )
+        return None, gradient, None

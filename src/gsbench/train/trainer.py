@@ -1,0 +1,310 @@
+"""The training loop: the schedule of 3DGS, any rasterizer, any densifier."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsbench.config.schema import TrainConfig
+from gsbench.densify import Densifier, DensifyContext, NoDensifier
+from gsbench.densify.volume import log_volume
+from gsbench.errors import TrainingError
+from gsbench.events import RefineEvent
+from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
+from gsbench.gaussians.ply import write_ply
+from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.raster import Rasterizer
+from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
+from gsbench.scene.types import Scene
+from gsbench.system.stopping import deferred, requested
+from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
+from gsbench.train.loss import PhotometricLoss
+from gsbench.train.loss_log import LossLog
+from gsbench.train.memory_budget import explain_full, free_bytes, room_for_images
+from gsbench.train.targets import Targets
+from gsbench.train.training_views import SceneViews
+
+log = logging.getLogger(__name__)
+
+LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, a quarter decade each
+STREAMS = ("cameras", "densify")  # every random draw of a training belongs to one
+
+
+@dataclass(frozen=True)
+class Status:
+    """What a progress bar shows."""
+
+    step: int
+    loss: float
+    num_gaussians: int
+    iterations_per_second: float
+
+
+class CameraOrder:
+    """Training views in random order without replacement, drawn anew when all were used."""
+
+    def __init__(self, num_views: int, rng: torch.Generator) -> None:
+        self.num_views = num_views
+        self.rng = rng
+        self.remaining: list[int] = []
+
+    def next(self) -> int:
+        if not self.remaining:
+            self.remaining = torch.randperm(self.num_views, generator=self.rng).tolist()
+        return self.remaining.pop()
+
+    @property
+    def following(self) -> int | None:
+        """What `next` will give, or None where that is not drawn yet."""
+        return self.remaining[-1] if self.remaining else None
+
+
+class Trainer:
+    """Trains Gaussians on the training views of a scene.
+
+    All randomness comes from generators made of ``seed``. ``run`` writes metrics, events and checkpoints into a
+    folder, and goes on from the newest checkpoint that it finds there: on the CPU, to the same bits as an undisturbed
+    run. A signal to stop (see `gsbench.system.stopping`) ends it after the iteration, with a checkpoint. At the
+    iterations ``snapshot_at`` the model is kept as well (see `snapshot_file`).
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        initial: Gaussians,
+        densifier: Densifier,
+        rasterizer: Rasterizer,
+        options: TrainConfig,
+        seed: int,
+        snapshot_at: Collection[int] = (),
+    ) -> None:
+        self.scene, self.densifier, self.rasterizer, self.options = scene, densifier, rasterizer, options
+        self.snapshot_at = frozenset(snapshot_at)
+        self.device = initial.means.device
+        initial = densifier.prepare(initial)
+        self.background = torch.tensor(list(options.background), dtype=torch.float32, device=self.device)  # [3]
+        self.gaussians = TrainableGaussians(initial, learning_rates(options), scene.extent)
+        self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
+        self.rngs = {name: generator(seed, stream) for stream, name in enumerate(STREAMS)}
+        self.order = CameraOrder(len(scene.train), self.rngs["cameras"])
+        self.step = 0
+        self.seconds = 0.0
+        self.losses = LossLog()
+        cap = getattr(densifier, "max_gaussians", None)
+        pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
+        room = room_for_images(free_bytes(self.device), len(initial), cap, pixels)
+        self.targets = Targets(scene.train, self.device, room)
+        views = SceneViews(
+            scene.train, self.targets, rasterizer, self.background, self.loss, partial(sh_degree_at, options)
+        )
+        self.context = DensifyContext(scene.extent, bool((self.background == 1).all()), self.device, views)
+        densifier.begin(initial, self.context)
+
+    def run(self, folder: Path, on_status: Callable[[Status], None] = lambda status: None) -> Gaussians:
+        """Train to the last iteration, or to the end of the time budget; returns the Gaussians, detached."""
+        self._resume(folder)
+        if self.snapshot_at:
+            (folder / snapshot_file(0)).parent.mkdir(exist_ok=True)
+        writer = CheckpointWriter(folder, background=self.device.type != "cpu")
+        try:
+            with deferred(), self._explained(folder):
+                self._loop(folder, writer, on_status)
+        finally:
+            writer.close()
+        if not isinstance(self.densifier, NoDensifier) and (folder / EVENTS).stat().st_size == 0:
+            log.warning(
+                "not one refinement was due in %d iterations: the densifier changed nothing (see train.densify_start, "
+                "now %d)", self.step, self.options.densify_start,
+            )  # fmt: skip
+        return self.gaussians.values.detach()
+
+    def _loop(self, folder: Path, writer: CheckpointWriter, on_status: Callable[[Status], None]) -> None:
+        """Iterate to the end, a signal to stop or the end of the time budget; write down what happens."""
+        options = self.options
+        first_step, started, before = self.step, time.perf_counter(), self.seconds
+        last_checkpoint = time.monotonic()
+        with (folder / CURVES).open("a") as metrics, (folder / EVENTS).open("a") as events:
+            while self.step < options.iterations:
+                counts = {"num_gaussians": len(self.gaussians)}
+                event = self.iterate(folder)
+                self.seconds = before + time.perf_counter() - started
+                out_of_time = options.max_seconds is not None and self.seconds >= options.max_seconds
+                last = self.step == options.iterations or out_of_time
+                if event is not None:
+                    _append(events, event.as_dict())
+                if self.step in options.volume_histogram:
+                    with (folder / HISTOGRAMS).open("a") as stream:
+                        _append(stream, self._volume_histogram())
+                if self.step % options.log_every == 0 or last:
+                    record = self.losses.settle() | counts | {"sh_degree": self.sh_degree}
+                    self.seconds = before + time.perf_counter() - started
+                    rate = (self.step - first_step) / max(self.seconds - before, 1e-9)
+                    _append(metrics, record | {"seconds": round(self.seconds, 3)})
+                    on_status(Status(self.step, self.losses.smoothed, len(self.gaussians), rate))
+                minutes = (time.monotonic() - last_checkpoint) / 60
+                due = self.step % options.checkpoint_every == 0 or minutes >= options.checkpoint_minutes
+                stop = requested()
+                if stop or (due and not last):
+                    writer.save(self.step, self._state())
+                    last_checkpoint = time.monotonic()
+                if stop:
+                    writer.finish()
+                    log.info("stopping at iteration %d, with a checkpoint", self.step)
+                if last or stop:
+                    break
+
+    def iterate(self, folder: Path) -> RefineEvent | None:
+        """One iteration in 3DGS's order: rates, SH degree, render, backward, statistics, refinement, optimiser step.
+
+        Its losses go to ``losses``, perhaps later; ``folder`` takes the snapshots. Raises TrainingError where a
+        parameter is out of range or no Gaussian is left.
+        """
+        self.step += 1
+        step, options = self.step, self.options
+        self.gaussians.set_step(step)
+        index = self.order.next()
+        target = self.targets.get(index)
+        if self.order.following is not None:
+            self.targets.prefetch(self.order.following)
+        try:
+            render = self.rasterizer.render(
+                self.gaussians.values,
+                self.scene.train[index].camera,
+                self.sh_degree,
+                self.background,
+                self.densifier.needs_absolute_gradient,
+            )
+        except ValueError as error:  # the optimiser has driven a parameter out of range
+            raise TrainingError(f"iteration {step}: {error}; {_last_state(folder)}") from error
+        loss, l1, ssim = self.loss(render.image, target)
+        regularizer = self.densifier.regularizer(self.gaussians.values)
+        total = loss if regularizer is None else loss + regularizer
+        self.losses.add(step, loss, l1, ssim, total)
+        total.backward()
+        if step == options.iterations:  # 3DGS saves before it would refine or step
+            return None
+        if step in self.snapshot_at:
+            write_ply(self.gaussians.values, folder / snapshot_file(step))
+        self.densifier.observe(step, render)
+        if options.step_after_refine:
+            self._optimize(render.visible)
+        event = self.densifier.refine(step, self.gaussians, self.rngs["densify"])
+        if not options.step_after_refine:
+            self._optimize(render.visible)
+        self.densifier.after_step(step, self.gaussians, self.rngs["densify"])
+        if len(self.gaussians) == 0:
+            raise TrainingError(f"no Gaussian was left after iteration {step}; the pruning thresholds are too high")
+        return event
+
+    @contextmanager
+    def _explained(self, folder: Path) -> Iterator[None]:
+        """Name the last good state where the loss stopped being finite or the device's memory is full."""
+        try:
+            yield
+        except FloatingPointError as error:
+            raise TrainingError(f"{error}; {_last_state(folder)}") from error
+        except torch.OutOfMemoryError as error:
+            raise explain_full(self.step, len(self.gaussians), self.device, _last_state(folder)) from error
+
+    @property
+    def sh_degree(self) -> int:
+        return sh_degree_at(self.options, self.step)
+
+    def _optimize(self, visible: torch.Tensor) -> None:
+        self.gaussians.optimizer_step(self.sh_degree, visible if self.options.visible_adam else None)
+
+    def _volume_histogram(self) -> dict[str, Any]:
+        volumes = (log_volume(self.gaussians.values.log_scales.detach()) / math.log(10)).cpu().numpy()
+        clipped = np.clip(volumes, LOG_VOLUME_BINS[0], LOG_VOLUME_BINS[-1])
+        counts, edges = np.histogram(clipped, LOG_VOLUME_BINS)
+        return {"step": self.step, "log10_edges": edges.tolist(), "counts": counts.tolist()}
+
+    def _state(self) -> dict[str, Any]:
+        self.losses.settle()  # no state is saved that a loss would have condemned
+        return {
+            "step": self.step,
+            "seconds": self.seconds,
+            "smoothed_loss": self.losses.smoothed,
+            "gaussians": self.gaussians.state_dict(),
+            "densifier": self.densifier.state_dict(),
+            "rngs": {name: rng.get_state() for name, rng in self.rngs.items()},
+            "remaining_views": list(self.order.remaining),
+        }
+
+    def _resume(self, folder: Path) -> None:
+        state = load_checkpoint(folder)
+        if state is not None:
+            self.step, self.seconds, self.losses.smoothed = state["step"], state["seconds"], state["smoothed_loss"]
+            self.gaussians = TrainableGaussians.load(
+                state["gaussians"], self.gaussians.rates, self.gaussians.spatial_scale, self.device
+            )
+            self.densifier.load_state_dict(state["densifier"], self.context)
+            for name, rng in self.rngs.items():
+                rng.set_state(state["rngs"][name])
+            self.order.remaining = list(state["remaining_views"])
+            log.info("going on from iteration %d", self.step)
+        for name in (CURVES, EVENTS, HISTOGRAMS):
+            drop_after(folder / name, self.step)
+
+
+def _last_state(folder: Path) -> str:
+    return f"the last good state is the newest checkpoint in {folder}"
+
+
+def snapshot_file(step: int) -> str:
+    """The file, below a training's folder, of the model as 3DGS saves it at iteration ``step``: before it refines."""
+    return f"snapshots/iteration_{step}.ply"
+
+
+def sh_degree_at(options: TrainConfig, step: int) -> int:
+    """The degree of harmonics that iteration ``step`` renders with."""
+    return min(MAX_SH_DEGREE, step // options.sh_interval)
+
+
+def learning_rates(options: TrainConfig) -> LearningRates:
+    return LearningRates(
+        position_initial=options.position_initial,
+        position_final=options.position_final,
+        position_steps=options.position_steps,
+        sh_dc=options.sh_dc,
+        sh_rest=options.sh_rest,
+        opacity=options.opacity,
+        scale=options.scale,
+        rotation=options.rotation,
+    )
+
+
+def generator(seed: int, stream: int) -> torch.Generator:
+    """A CPU generator for one stream of a trial's randomness; streams of all seeds are independent."""
+    state = np.random.SeedSequence([seed, stream]).generate_state(1, np.uint64)[0]
+    return torch.Generator().manual_seed(int(state >> np.uint64(1)))
+
+
+def drop_after(path: Path, step: int) -> None:
+    """Remove the records later than ``step``, and a torn last line, from a JSON-lines file, if it is there."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text().splitlines():
+        try:
+            if json.loads(line)["step"] <= step:
+                kept.append(line)
+        except (json.JSONDecodeError, KeyError):
+            break
+    path.write_text("".join(line + "\n" for line in kept))
+
+
+def _append(stream: Any, record: dict[str, Any]) -> None:
+    stream.write(json.dumps(record) + "\n")
+    stream.flush()

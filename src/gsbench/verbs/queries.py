@@ -1,0 +1,72 @@
+"""Questions about the configuration, which Hydra answers: ``--cfg job``, ``--info``, tab completion."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from gsbench.config.command_words import check_words, is_sweep, search_path
+from gsbench.config.compose import compose_values
+from gsbench.config.schema import conf_dir, register_schemas
+from gsbench.errors import InputError
+from gsbench.verbs.arguments import ArgumentParser
+
+QUERIES = ("--cfg", "-c", "--info", "-i", "--hydra-help", "--shell-completion", "-sc", "--resolve", "--package", "-p")
+COMPLETION = re.compile(r"(install|uninstall|query)=(bash|zsh|fish)")
+
+
+def ask_hydra(argv: list[str]) -> int:
+    """Let Hydra answer about the configuration; no trial is run. Raises InputError for what it would not understand."""
+    options = _parser().parse_args(argv)
+    asked = [options.cfg is not None, options.info is not None, options.shell_completion, options.hydra_help]
+    if sum(asked) != 1 or ((options.resolve or options.package) and options.cfg is None):
+        raise InputError("ask one thing: --cfg job (with --resolve or --package KEY), --info, or --hydra-help")
+    if options.shell_completion:
+        if len(options.overrides) != 1 or not COMPLETION.fullmatch(options.overrides[0]):
+            raise InputError("-sc takes install=bash or uninstall=bash, and zsh and fish likewise")
+    else:
+        _check(options.overrides, options.config_dir, options.package)
+    return _call_hydra(argv)
+
+
+def _check(overrides: list[str], config_dir: Path | None, package: str | None) -> None:
+    check_words(overrides)
+    if swept := [word for word in overrides if is_sweep(word)]:
+        raise InputError(f"{swept[0]} lists several values: choose one whose configuration is shown")
+    config = compose_values([*search_path([config_dir] if config_dir else [], overrides), *overrides])
+    if package is not None and OmegaConf.select(config, package) is None:
+        raise InputError(f"--package {package}: there is no such part of the configuration")
+
+
+def _call_hydra(argv: list[str]) -> int:
+    import hydra
+
+    def task(config: Any) -> None:
+        raise AssertionError("Hydra was asked a question, and ran the task instead")
+
+    register_schemas()
+    saved = sys.argv
+    sys.argv = ["gsbench", *argv]
+    try:
+        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(task)()
+    finally:
+        sys.argv = saved
+    return 0
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser(prog="gsbench", add_help=False, allow_abbrev=False)
+    parser.add_argument("overrides", nargs="*")
+    parser.add_argument("--cfg", "-c", choices=["job", "hydra", "all"])
+    parser.add_argument("--resolve", action="store_true")
+    parser.add_argument("--package", "-p")
+    info = ["all", "config", "defaults", "defaults-tree", "plugins", "searchpath"]
+    parser.add_argument("--info", "-i", nargs="?", const="all", choices=info)
+    parser.add_argument("--hydra-help", action="store_true")
+    parser.add_argument("--shell-completion", "-sc", action="store_true")
+    parser.add_argument("--config-dir", "-cd", type=Path)
+    return parser

@@ -1,0 +1,123 @@
+"""Several grids in one experiment: what trials they make, and that plan, dry run and retry see one experiment."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from gsbench import cli
+from gsbench.app.grids import words_of_grids
+from gsbench.app.hydra_app import compose_trials
+from gsbench.config.compose import compose_one
+from gsbench.errors import InputError
+from gsbench.launch.plan import add_to_plan, read_plan
+from gsbench.runs.trial_files import TrialPaths
+
+# Trials of `threshold` as they were named when it was one grid with a threshold of a million in place of the baseline.
+KNOWN = {
+    "sfm-volumetric-0.001/92bf8234-seed0",
+    "sfm-volumetric-0.003/f3d951b7-seed1",
+    "sfm-volumetric-0.01/0ec006c5-seed2",
+    "sfm-volumetric-0.03/e48bb87c-seed0",
+    "sfm-volumetric-0.1/de1096b7-seed1",
+    "sfm-volumetric-0.3/89c52e53-seed2",
+}
+
+
+@pytest.fixture(autouse=True)
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "runs"
+
+
+def arms(*words: str) -> list[tuple[str, int]]:
+    """Densifier and seed of each trial, in order."""
+    return [(trial.values["densify"]["name"], trial.values["seed"]) for trial in compose_trials(words)]
+
+
+def test_words_are_shared_own_or_given() -> None:
+    grids = [{"densify": "adc"}, {"densify": "volumetric", "densify.volume_threshold": "1,2", "seed": "7"}]
+    given = ["train=quick", "densify.volume_threshold=3", "+experiment=x"]
+    assert words_of_grids({"seed": "0,1"}, grids, given) == [
+        ["densify=adc", "seed=0,1", "train=quick", "+experiment=x"],
+        ["densify=volumetric", "densify.volume_threshold=1,2", "seed=7", *given],
+    ]
+    assert words_of_grids({"seed": "0,1"}, [], given) == [["seed=0,1", *given]]
+
+
+def test_thresholds_beside_a_baseline_that_knows_none() -> None:
+    trials = compose_trials(["+experiment=threshold"])
+    places = ["/".join(TrialPaths.of(trial.values).folder.parts[-2:]) for trial in trials]
+    assert len(places) == len(set(places)) == 21
+    assert set(places) > KNOWN  # results from before are found again
+    assert [place.split("/")[0] for place in places[:4]] == ["sfm-adc"] * 3 + ["sfm-volumetric-0.001"]
+    assert "volume_threshold" not in trials[0].values["densify"]
+    for trial in (trials[0], trials[-1]):
+        assert compose_one(trial.overrides).values == trial.values  # as `retry` composes it
+
+
+def test_the_command_line_speaks_to_every_grid_that_knows_the_setting() -> None:
+    own = arms("+experiment=threshold", "densify.volume_threshold=0.5,0.7", "seed=4")
+    assert own == [("adc", 4), ("volumetric-0.5", 4), ("volumetric-0.7", 4)]
+    trials = compose_trials(["+experiment=threshold", "seed=4", "densify.max_gaussians=5000", "train.iterations=7"])
+    assert {(t.values["densify"]["max_gaussians"], t.values["train"]["iterations"]) for t in trials} == {(5000, 7)}
+    with pytest.raises(InputError, match=r"densify\.volume_threshold is not a setting"):
+        arms("+experiment=threshold", "densify=mcmc")
+
+
+def test_grids_in_a_users_own_experiment(tmp_path: Path) -> None:
+    (tmp_path / "own" / "experiment").mkdir(parents=True)
+    file = tmp_path / "own" / "experiment" / "mine.yaml"
+    search = f"hydra.searchpath=[file://{tmp_path}/own]"
+    head = "# @package _global_\nname: mine\nhydra:\n  mode: MULTIRUN\n  sweeper:\n    grids: "
+    file.write_text(head + '[{densify: adc, seed: "0,1"}, {densify: none, train.iterations: 0}, {eval.flip: false}]\n')
+    assert arms(search, "+experiment=mine") == [("adc", 0), ("adc", 1), ("none", 0), ("volumetric", 0)]
+    for wrong in ("[densify]", "[{}]", "[{seed: [0, 1]}]"):
+        file.write_text(f"{head}{wrong}\n")
+        with pytest.raises(InputError, match=r"^hydra\.sweeper\.grids"):
+            arms(search, "+experiment=mine")
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["+experiment=demo,threshold"], "two experiments are two sweeps"),
+        (["+experiment=demo", "+experiment=threshold"], "two experiments are two sweeps"),
+        (["+experiment=threshold", "hydra/sweeper=basic"], "gsbench's own sweeper alone joins grids"),
+        (["hydra.sweeper.grids=[{seed: 1}]"], "add -m"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_what_cannot_be_is_refused_in_a_line(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["-m", *words] if len(words) < 2 and "grids" not in words[0] else words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert text in line
+
+
+def test_plan_dry_run_and_retry_see_one_experiment(
+    runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["+experiment=threshold", "densify.volume_threshold=0.5", "seed=0"]
+    assert cli.run([*words, "--dry-run"]) == 0
+    assert "2 trials: 2 missing" in capsys.readouterr().out
+    trials = compose_trials(words)
+    add_to_plan(trials)
+    first, second = (TrialPaths.of(trial.values).folder for trial in trials)
+    assert [trial.folder for trial in read_plan(runs / "threshold")] == [first, second]
+    first.mkdir(parents=True)
+    (first / "config.yaml").write_text(trials[0].yaml)
+    (first / "results.json").write_text(json.dumps({"status": "complete"}))
+    ran: list[Path] = []
+
+    def run_trials(again: list[object]) -> int:
+        ran.extend(TrialPaths.of(trial.values).folder for trial in again)  # type: ignore[attr-defined]
+        return 0
+
+    monkeypatch.setattr("gsbench.app.command.run_trials", run_trials)
+    assert cli.run(["status", "threshold"]) == 1
+    assert "2 trials: 1 done, 1 missing" in capsys.readouterr().out
+    assert cli.run(["retry", "threshold"]) == 0
+    assert ran == [second]

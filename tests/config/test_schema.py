@@ -1,0 +1,223 @@
+"""Every file in ``conf`` composes, its classes can be built, and what is written there is what the code defaults to."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from gsbench.config.schema import TrainConfig, check, check_target, conf_dir, plain, register_schemas
+from gsbench.errors import InputError
+from gsbench.pipeline.components import build, build_metrics
+from gsbench.runs.hashing import config_hash
+
+GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch")
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in Path(conf_dir(), group).glob("*.yaml"))
+
+
+def composed(*overrides: str) -> dict[str, Any]:
+    register_schemas()
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        config = compose("config", overrides=list(overrides))
+    check(config)
+    return plain(config)
+
+
+# What the user of another program must say: its version, where it lies, and that it may run.
+PROGRAMS = {
+    "external": ["densify.command=[mine,'{data}']", "densify.result=x.ply", "allow_targets=[mine]"],
+    "3dgs": ["densify.options.code=/code", "allow_targets=[python]"],
+    "gsplat": ["densify.options.code=/code", "allow_targets=[python]"],
+    "opensplat": ["allow_targets=[opensplat]"],
+    "brush": ["allow_targets=[brush]"],
+    "nerfstudio": ["allow_targets=[bash]"],
+}
+
+
+def needs(option: str) -> list[str]:
+    return [*PROGRAMS[option], "densify.version='1'"] if option in PROGRAMS else []
+
+
+@pytest.mark.parametrize(("group", "option"), [(group, option) for group in GROUPS for option in options(group)])
+def test_every_option_composes(group: str, option: str) -> None:
+    extra = ["scene.path=/data/capture"] if group == "scene" else []
+    extra += ["init.path=/data/model.ply"] if option in ("ply", "points") else []
+    extra += ["densify=none"] if (group, option) == ("train", "none") else []
+    extra += needs(option) if group == "densify" else []
+    values = composed(f"{group}={option}", *extra)
+    assert values[group]["name"] == option
+
+
+@pytest.mark.parametrize("option", options("densify"))
+def test_every_densifier_can_be_built_and_matches_its_class(option: str) -> None:
+    values = composed(f"densify={option}", "train=paper", *needs(option))["densify"]
+    densifier = build("densify", values, [])
+    if dataclasses.is_dataclass(densifier):
+        names = {field.name for field in dataclasses.fields(densifier) if field.init}
+        assert names == set(values) - {"_target_", "name"}  # the YAML shows every option
+    if option in ("adc", "volumetric", "mcmc"):
+        assert densifier == type(densifier)()  # and the values of the class
+
+
+@pytest.mark.parametrize("option", options("init"))
+def test_every_initialiser_shows_all_its_options(option: str, tmp_path: Path) -> None:
+    (tmp_path / "model.ply").write_text("ply\nend_header\n")
+    extra = [f"init.path={tmp_path / 'model.ply'}"] if option in ("ply", "points") else []
+    values = composed(f"init={option}", *extra)["init"]
+    initializer = build("init", values, [])
+    names = {field.name for field in dataclasses.fields(initializer) if field.init}
+    assert names == set(values) - {"_target_", "name"}
+
+
+def test_the_paper_schedule_is_the_class_default() -> None:
+    values = composed("train=paper")["train"]
+    defaults = dataclasses.asdict(TrainConfig(name="paper"))
+    assert {key: list(v) if isinstance(v, tuple) else v for key, v in defaults.items()} == {
+        key: list(v) if isinstance(v, tuple) else v for key, v in values.items()
+    }
+
+
+def sweep_size(experiment: str) -> int:
+    register_schemas()
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        config = compose("config", overrides=[f"+experiment={experiment}"], return_hydra_config=True)
+    size = 1
+    for value in OmegaConf.to_container(config.hydra.sweeper.params).values():  # type: ignore[union-attr]
+        size *= len(str(value).split(","))
+    return size
+
+
+def test_experiments_have_the_size_of_the_paper() -> None:
+    assert sweep_size("table1") == 13 * 2 * 3
+    assert sweep_size("table2") == 12 * 2 * 2 * 3
+    assert sweep_size("demo") == 6
+    assert {path.stem for path in Path(conf_dir(), "experiment").glob("*.yaml")} >= {
+        "table1",
+        "table2",
+        "threshold",
+        "budget",
+    }
+
+
+@pytest.mark.parametrize(
+    ("overrides", "key"),
+    [
+        (["scene.test_every=1"], "scene.test_every"),
+        (["train.iterations=0"], "train.iterations"),
+        (["eval.protocol=best"], "eval.protocol"),
+        (["threads=0"], "threads"),
+        (["name=a/b"], "name"),
+        (["train.background=[0,0,2]"], "train.background"),
+    ],
+)
+def test_rules_name_the_key(overrides: list[str], key: str) -> None:
+    with pytest.raises(InputError, match=key):
+        composed(*overrides)
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["eval.primary=lpips_vg"], r"is no metric; did you mean lpips_vgg\? \(known are psnr, ssim, .*flip"),
+        (["eval.primary=sharpness"], "is no metric .*eval.extra"),
+        (["eval.primary=lpips_alex", "eval.lpips=[vgg]"], r"lpips_alex is not measured: add alex to eval\.lpips"),
+        (["eval.primary=flip", "eval.flip=false"], r"eval\.flip=false"),
+    ],
+)
+def test_a_declared_metric_exists_and_is_measured(words: list[str], error: str) -> None:
+    with pytest.raises(InputError, match=error):
+        composed(*words)
+
+
+def test_a_metric_of_ones_own_can_be_declared_if_it_says_what_is_better(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    text = "class Known:\n    direction = 1\n    def measure(self, image, truth): return 1.0\n"
+    text += "class Unknown(Known):\n    direction = 0\n"
+    (tmp_path / "declared_metrics.py").write_text(text)
+    for name in ("Known", "Unknown"):
+        own = [f"eval.extra.mine._target_=declared_metrics.{name}", "allow_targets=[declared_metrics]"]
+        values = composed(*own, "eval.primary=mine")["eval"]
+        if name == "Known":
+            assert set(build_metrics(values, ["declared_metrics"])) == {"mine"}
+        else:
+            with pytest.raises(InputError, match=r"eval\.primary=mine: declared_metrics\.Unknown does not say"):
+                build_metrics(values, ["declared_metrics"])
+
+
+def test_wrong_type_in_a_component_names_the_key() -> None:
+    with pytest.raises(InputError, match=r"densify\.max_gaussians"):
+        build("densify", composed("densify.max_gaussians=1.5")["densify"], [])
+    with pytest.raises(InputError, match=r"densify\.cap.*'soft'"):
+        build("densify", composed("densify.cap=squishy")["densify"], [])
+
+
+def test_only_trusted_code_is_imported() -> None:
+    check_target("gsbench.densify.ADC", "densify", [])
+    check_target("mine.Densifier", "densify", ["mine"])
+    for target in ("os.system", "gsbench_evil.X", "minefield.X"):
+        with pytest.raises(InputError, match="allow_targets"):
+            check_target(target, "densify", ["mine"])
+
+
+def test_hash_ignores_what_cannot_change_a_result() -> None:
+    base = config_hash(composed())
+    assert config_hash(composed("name=other", "seed=5", "threads=1", "tracking=none", "device=cpu")) == base
+    assert config_hash(composed("eval.primary=psnr")) == base  # how a result will be read does not change it
+    assert config_hash(composed("densify.volume_threshold=0.04")) != base
+    assert config_hash(composed("scene.max_size=200")) != base
+
+
+def test_hash_follows_the_source_of_a_users_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    own = ["densify._target_=own_densifier.Mine", "allow_targets=[own_densifier]"]
+    hashes = []
+    for text in ("A = 1\n", "A = 2\n", "A = 1\n"):
+        (tmp_path / "own_densifier.py").write_text(text)
+        hashes.append(config_hash(composed(*own)))
+    assert hashes[0] == hashes[2] != hashes[1]
+
+
+def test_hash_follows_the_source_of_a_users_metric_and_not_that_there_could_be_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    values = composed()
+    before = {key: value for key, value in values["eval"].items() if key != "extra"}  # as settings were without it
+    assert config_hash(values | {"eval": before}) == config_hash(values)
+    own = ["eval.extra.edges._target_=own_metric.Mine", "allow_targets=[own_metric]"]
+    hashes = []
+    for text in ("A = 1\n", "A = 2\n", "A = 1\n"):
+        (tmp_path / "own_metric.py").write_text(text)
+        hashes.append(config_hash(composed(*own)))
+    assert hashes[0] == hashes[2] != hashes[1]
+    assert config_hash(values) not in hashes
+
+
+@pytest.mark.parametrize("name", ["psnr", "lpips", "view", "Edges", "a-b"])
+def test_names_of_own_metrics_are_their_own(name: str) -> None:
+    with pytest.raises(InputError, match=rf"eval\.extra\.{name}: name your metric"):
+        composed(f"eval.extra.{name}._target_=mine.X", "allow_targets=[mine]")
+
+
+def test_an_own_metric_must_be_allowed_and_name_a_class() -> None:
+    with pytest.raises(InputError, match=r"eval\.extra\.edges\._target_=mine\.X is not gsbench's own"):
+        composed("eval.extra.edges._target_=mine.X")
+    with pytest.raises(InputError, match=r"eval\.extra\.edges must name a class"):
+        composed("eval.extra.edges=3")
+
+
+def test_no_training_needs_no_densifier() -> None:
+    with pytest.raises(InputError, match="add densify=none"):
+        composed("train=none", "densify=adc")
+    assert composed("train=none", "densify=none")["train"]["iterations"] == 0
+    with pytest.raises(InputError, match=r"train\.iterations must be a whole number of at least 0"):
+        composed("train.iterations=-1")

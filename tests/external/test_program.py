@@ -1,0 +1,155 @@
+"""Another program as a trainer: its command, what it is given, how it is run."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pycolmap
+import pytest
+from PIL import Image
+
+from gsbench.densify import External
+from gsbench.errors import InputError, TrainingError
+from gsbench.external.inputs import write_test_cameras, write_training_views
+from gsbench.external.placeholders import fill, words_of
+from gsbench.external.program import run_program
+from gsbench.init.base import PointCloud
+from gsbench.runs.hashing import config_hash
+from gsbench.scene.camera import Camera
+from gsbench.scene.types import View
+from tests.config.test_schema import composed
+
+PATIENCE = 60.0  # seconds within which what never comes is told from a slow machine
+
+
+@pytest.fixture
+def views() -> list[View]:
+    """Three views of different cameras and sizes, one in a folder of its own."""
+    rng = np.random.default_rng(0)
+    found = []
+    for index, name in enumerate(("a.JPG", "left/b.png", "c.jpeg")):
+        rotation = pycolmap.Rotation3d(np.append(rng.normal(size=3), 1.0) / 2).matrix()
+        rotation, _ = np.linalg.qr(rotation)
+        rotation *= np.sign(np.linalg.det(rotation))
+        width, height = 40 + index, 30 - index
+        camera = Camera(width, height, 50.0, 51.0 + index, 19.5, 16.0, rotation, rng.normal(size=3))
+        found.append(View(name, camera, rng.integers(0, 256, (height, width, 3), dtype=np.uint8)))
+    return found
+
+
+def project(camera: Camera, points: np.ndarray) -> np.ndarray:
+    local = points @ camera.rotation.T + camera.translation
+    return local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+
+
+def test_the_training_folder_as_pycolmap_reads_it(views: list[View], tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    cloud = PointCloud(rng.normal(size=(50, 3)), rng.integers(0, 256, (50, 3), dtype=np.uint8))
+    write_training_views(tmp_path, views, cloud)
+    model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+    points = [point for _, point in sorted(model.points3D.items())]
+    np.testing.assert_array_equal([point.xyz for point in points], cloud.points)
+    np.testing.assert_array_equal([point.color for point in points], cloud.colors)
+    assert not any(point.track.elements for point in points)
+    assert not any(len(image.points2D) for image in model.images.values())
+    named = {image.name: image for image in model.images.values()}
+    assert sorted(named) == ["a.png", "c.png", "left__b.png"]
+    for view, name in zip(views, ("a.png", "left__b.png", "c.png"), strict=True):
+        np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "images" / name)), view.image)
+        assert model.cameras[named[name].camera_id].model_name == "PINHOLE"
+        ahead = named[name].cam_from_world().inverse() * np.array([0.3, -0.2, 5.0])
+        np.testing.assert_allclose(named[name].project_point(ahead), project(view.camera, ahead[None])[0], atol=1e-6)
+
+
+def test_test_cameras_have_no_pixel_and_project_alike(views: list[View], tmp_path: Path) -> None:
+    write_test_cameras(tmp_path, views)
+    files = {path.name for path in tmp_path.rglob("*") if path.is_file()}
+    assert files == {"transforms.json", "cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"}
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    for view, frame in zip(views, frames, strict=True):
+        points = view.camera.center + np.random.default_rng(2).normal(size=(20, 3))
+        local = np.linalg.inv(frame["transform_matrix"]) @ np.column_stack([points, np.ones(20)]).T  # OpenGL's axes
+        seen = local[2] < 0  # it looks along -z, y is up
+        pixels = np.column_stack(
+            [frame["cx"] - frame["fl_x"] * local[0] / local[2], frame["cy"] + frame["fl_y"] * local[1] / local[2]]
+        )
+        assert 0 < seen.sum() < 20
+        np.testing.assert_allclose(pixels[seen], project(view.camera, points)[seen], atol=1e-6)
+        assert (frame["w"], frame["h"]) == (view.camera.width, view.camera.height)
+
+
+def test_placeholders() -> None:
+    assert words_of("a 'b c' {d}", "x") == ["a", "b c", "{d}"]
+    assert fill("{a}-{b}-{a}", {"a": "{b}", "b": 2}, "x") == "{b}-2-{b}"  # each is replaced once
+    for command, said in (("", "x is empty"), ("'a", "cannot be split")):
+        with pytest.raises(InputError, match=said):
+            words_of(command, "x")
+    with pytest.raises(InputError, match=r"x: nothing is known as \{tset\}; did you mean test\?"):
+        fill("{tset}", {"test": 1}, "x")
+
+
+def test_yaml_of_the_original_code_hands_our_schedule_on() -> None:
+    words = ["densify=3dgs", "densify.options.code=/code", "densify.version='1'", "allow_targets=[python]"]
+    command = composed(*words, "train=paper", "train.densify_stop=9000")["densify"]["command"]
+    assert str(command[command.index("--densify_until_iter") + 1]) == "9000"
+    assert str(command[command.index("--opacity_lr") + 1]) == "0.05"
+
+
+def test_a_limit_of_time_makes_no_other_trial_but_an_option_does() -> None:
+    words = ["densify=opensplat", "densify.version='1'", "allow_targets=[opensplat]"]
+    base = config_hash(composed(*words))
+    assert config_hash(composed(*words, "densify.time_limit_minutes=5")) == base
+    assert config_hash(composed(*words, "densify.options.num_downscales=0")) != base
+    assert config_hash(composed(*words, "densify.version='2'")) != base
+
+
+def test_it_must_take_the_data() -> None:
+    with pytest.raises(InputError, match=r"has no \{data\}"):
+        External(command=["a"], result="*.ply", version="1")
+    assert External(command=["a", "{data}"], result="x/*.PLY", version="1").leaves_model
+    assert not External(command=["a", "{data}"], result="x/*.png", version="1").leaves_model
+
+
+def run(tmp_path: Path, code: str, limit: float | None = None) -> float:
+    environment = {"PATH": "/usr/bin:/bin", "MINE": "here"}
+    return run_program([sys.executable, "-c", code], tmp_path / "log", tmp_path, environment, limit).peak_memory_mb
+
+
+def test_a_program_runs_in_its_folder_with_its_environment(tmp_path: Path) -> None:
+    run(tmp_path, "import os; open('mark', 'w').write(os.environ['MINE']); print('said', sorted(os.environ)[:1])")
+    assert (tmp_path / "mark").read_text() == "here"
+    assert "said" in (tmp_path / "log").read_text()
+
+
+def test_memory_of_its_children_counts(tmp_path: Path) -> None:
+    child = "x = bytearray(300 << 20); import time; time.sleep(2)"
+    assert run(tmp_path, f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])") > 290
+
+
+def test_nothing_is_left_running(tmp_path: Path) -> None:
+    code = "import subprocess, sys; print(subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)']).pid)"
+    run(tmp_path, code)
+    left, deadline = int((tmp_path / "log").read_text().split()[-1]), time.monotonic() + PATIENCE
+    while psutil.pid_exists(left) and psutil.Process(left).status() != "zombie" and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not psutil.pid_exists(left) or psutil.Process(left).status() == "zombie"
+
+
+@pytest.mark.parametrize(
+    ("code", "limit", "said"),
+    [
+        ("raise SystemExit('Error: no paint')", None, r"ended early \(exit code 1\); its last words: Error: no paint"),
+        ("import os; os.kill(os.getpid(), 9)", None, "crashed .SIGKILL, perhaps out of memory."),
+        ("import time; print('working', flush=True); time.sleep(600)", 3.0, "still ran after 3 s"),
+    ],
+)
+def test_bad_ends_are_one_line_with_the_log(tmp_path: Path, code: str, limit: float | None, said: str) -> None:
+    with pytest.raises(TrainingError, match=said) as caught:
+        run(tmp_path, code, limit)
+    assert str(caught.value).endswith(f"log: {tmp_path / 'log'}")
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,77 @@
+"""The similarity between camera sets, against scikit-image, pycolmap and known transformations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+from skimage.transform import SimilarityTransform
+
+from gsbench.init.colmap.alignment import align_poses, fit_similarity, rotation_angles, transformed_rotations
+
+TRUE_SCALE = 2.5
+TRUE_ROTATION = Rotation.from_rotvec([0.3, -1.1, 2.0]).as_matrix()
+TRUE_TRANSLATION = np.array([4.0, -1.0, 0.5])
+
+
+def poses(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Random cameras, and the same cameras after the true similarity."""
+    rng = np.random.default_rng(seed)
+    centers = rng.normal(size=(count, 3))
+    rotations = Rotation.random(count, rng=rng).as_matrix()
+    moved = TRUE_SCALE * centers @ TRUE_ROTATION.T + TRUE_TRANSLATION
+    return centers, rotations, moved, rotations @ TRUE_ROTATION.T
+
+
+def test_fit_agrees_with_two_libraries_on_noisy_points():
+    rng = np.random.default_rng(3)
+    source, _, target, _ = poses(20)
+    target = target + 0.3 * rng.normal(size=target.shape)
+    ours = fit_similarity(source, target)
+    theirs = SimilarityTransform.from_estimate(source, target)
+    assert ours.scale == pytest.approx(theirs.scale, rel=1e-9)
+    np.testing.assert_allclose(ours(source), theirs(source), atol=1e-9)
+    colmap = pycolmap.estimate_sim3d(source, target)
+    assert ours.scale == pytest.approx(colmap.scale, rel=1e-9)
+    np.testing.assert_allclose(ours.rotation, colmap.rotation.matrix(), atol=1e-9)
+
+
+def test_reflected_points_give_a_rotation():
+    source, _, target, _ = poses(10)
+    assert np.linalg.det(fit_similarity(source, target * [1, 1, -1]).rotation) == pytest.approx(1.0)
+
+
+def test_wrong_cameras_do_not_move_the_alignment():
+    centers, rotations, moved, moved_rotations = poses(30)
+    wrong = moved.copy()
+    wrong[:10] += np.random.default_rng(1).normal(size=(10, 3)) * 20
+    similarity = align_poses(centers, rotations, wrong, moved_rotations)
+    assert similarity.scale == pytest.approx(TRUE_SCALE, rel=1e-9)
+    np.testing.assert_allclose(similarity(centers), moved, atol=1e-8)
+    assert abs(fit_similarity(centers, wrong).scale - TRUE_SCALE) > 0.5  # plain least squares is moved
+    angles = rotation_angles(transformed_rotations(similarity, rotations), moved_rotations)
+    assert angles.max() < 1e-6
+
+
+def test_cameras_on_a_line_are_aligned_by_their_orientations():
+    _, rotations, _, moved_rotations = poses(6)
+    centers = np.linspace(-1, 2, 6)[:, None] * [1.0, 2.0, 3.0]
+    moved = TRUE_SCALE * centers @ TRUE_ROTATION.T + TRUE_TRANSLATION
+    similarity = align_poses(centers, rotations, moved, moved_rotations)
+    np.testing.assert_allclose(similarity.rotation, TRUE_ROTATION, atol=1e-9)
+    np.testing.assert_allclose(similarity(centers), moved, atol=1e-9)
+
+
+@pytest.mark.parametrize("centers", [np.zeros((2, 3)), np.ones((5, 3))])
+def test_too_few_or_coinciding_cameras_are_refused(centers: np.ndarray):
+    rotations = np.tile(np.eye(3), (len(centers), 1, 1))
+    with pytest.raises(ValueError, match="similarity needs"):
+        align_poses(centers, rotations, centers, rotations)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-6, 0.05, 30.0, 179.9, 180.0])
+def test_rotation_angles_are_those_of_scipy(degrees: float):
+    turn = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, 0.0, 0.8])).as_matrix()
+    base = Rotation.random(4, rng=np.random.default_rng(0)).as_matrix()
+    np.testing.assert_allclose(rotation_angles(base, turn @ base), degrees, rtol=1e-6, atol=1e-9)

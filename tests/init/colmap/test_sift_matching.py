@@ -1,0 +1,154 @@
+"""Matching on several cores: what COLMAP gives on one thread, whatever the number of processes."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsbench.init import MODEL_FOLDER, Sfm
+from gsbench.init.base import Timer, no_progress
+from gsbench.init.colmap.database import create_database, guessed_groups
+from gsbench.init.colmap.options import DatabaseTask
+from gsbench.init.colmap.reconstruct import Verification
+from gsbench.init.colmap.sift import extract_sift
+from gsbench.init.colmap.sift_matching import deal, divide, match_sift
+from gsbench.init.preview import best_pairs
+from gsbench.scene.types import Capture
+
+pairs_of_some_images = st.integers(2, 40).flatmap(
+    lambda count: st.sets(st.sampled_from(list(itertools.combinations(range(1, count + 1), 2))))
+)
+
+
+@given(pairs_of_some_images, st.integers(1, 9), st.integers(1, 5))
+def test_every_pair_is_matched_once(pairs: set[tuple[int, int]], block: int, processes: int):
+    parts = divide(sorted(pairs), block)
+    shares = deal(parts, processes)
+    assert sorted(pair for share in shares for part in share for pair in part) == sorted(pairs)
+    assert all(len(part) <= block * block for part in parts)
+    assert 1 <= len(shares) <= processes
+
+
+def test_shares_are_about_equal_and_parts_hold_few_images():
+    pairs = list(itertools.combinations(range(1, 101), 2))
+    parts = divide(pairs, 10)
+    assert max(len({image for pair in part for image in pair}) for part in parts) <= 2 * 10
+    sizes = [sum(map(len, share)) for share in deal(parts, 4)]
+    assert max(sizes) - min(sizes) <= 10 * 10
+
+
+@pytest.fixture(scope="module")
+def features(bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[str, str]]]:
+    """A database with features of photographs whose names have spaces, and all pairs of them."""
+    folder = tmp_path_factory.mktemp("features")
+    (folder / "images").mkdir()
+    names = [f"IMG {index} (1).png" for index in range(len(bare_photos.image_names))]
+    for name, original in zip(names, bare_photos.image_names, strict=True):
+        shutil.copy(bare_photos.images / original, folder / "images" / name)
+    create_database(folder / "database.db", guessed_groups(folder / "images", names, "single", "PINHOLE", 300.0))
+    extract_sift(folder / "database.db", folder / "images", names, Sfm(), 1, no_progress)
+    return folder / "database.db", list(itertools.combinations(names, 2))
+
+
+def read_matches(database: Path) -> tuple[dict[int, bytes], dict[int, tuple[bytes, ...]]]:
+    """Matches and verified geometries by pair, as bytes."""
+    with pycolmap.Database.open(database) as opened:
+        pair_ids, matches = opened.read_all_matches()
+        geometry_ids, geometries = opened.read_two_view_geometries()
+    return (
+        {pair: np.asarray(indices).tobytes() for pair, indices in zip(pair_ids, matches, strict=True)},
+        {
+            pair: (
+                np.asarray(geometry.inlier_matches).tobytes(),
+                *(b"" if part is None else np.asarray(part).tobytes() for part in (geometry.E, geometry.F, geometry.H)),
+            )
+            for pair, geometry in zip(geometry_ids, geometries, strict=True)
+        },
+    )
+
+
+@pytest.mark.parametrize("processes", [1, 3])
+def test_matches_are_those_of_colmap_on_one_thread(
+    features: tuple[Path, list[tuple[str, str]]], tmp_path: Path, processes: int
+):
+    database, pairs = features
+    shutil.copy(database, tmp_path / "colmap.db")
+    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching.num_threads, matching.use_gpu = 1, False
+    verification.ransac.random_seed = 0
+    pycolmap.match_exhaustive(
+        tmp_path / "colmap.db",
+        matching_options=matching,
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
+    )
+    shutil.copy(database, tmp_path / "database.db")
+    told: list[int] = []
+    match_sift(
+        tmp_path / "database.db",
+        pairs,
+        Sfm(),
+        Verification(0, 15),
+        processes,
+        lambda phase, done, total: told.append(done),
+    )
+    ours, theirs = read_matches(tmp_path / "database.db"), read_matches(tmp_path / "colmap.db")
+    assert ours == theirs
+    assert sum(len(matches) > 0 for matches in theirs[0].values()) > 10
+    assert (told[0], max(told)) == (0, len(pairs))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["colmap.db", "database.db"]
+    with pycolmap.Database.open(tmp_path / "database.db") as opened:  # the names are the photographs' again
+        assert {image.name for image in opened.read_all_images()} == {name for pair in pairs for name in pair}
+
+
+def test_colmaps_matcher_never_gets_a_second_thread(
+    features: tuple[Path, list[tuple[str, str]]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Two threads of it in one process can spoil each other's matches, too rarely for a test to see."""
+    database, pairs = features
+    shutil.copy(database, tmp_path / "database.db")
+    threads = []
+    match = pycolmap.match_image_pairs
+
+    def noting(path: Path, **options: object) -> None:
+        threads.append(options["matching_options"].num_threads)
+        match(path, **options)
+
+    monkeypatch.setattr(pycolmap, "match_image_pairs", noting)
+    match_sift(tmp_path / "database.db", pairs, Sfm(), Verification(0, 15), 1, no_progress)
+    assert set(threads) == {1}
+
+
+def test_auto_leaves_out_what_a_preview_does_not_propose(
+    features: tuple[Path, list[tuple[str, str]]], bare_photos: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Few images: all pairs, to the bit. More than that (here: more than five): each with its best partners."""
+    exhaustive = Sfm(threads=1).run(bare_photos, tmp_path / "all")
+    auto = Sfm(threads=1, pairs="auto").run(bare_photos, tmp_path / "auto")
+    assert auto.counts["pairs_left_out"] == 0
+    assert {**auto.counts, "pairs_matched": exhaustive.counts["pairs_matched"]}.items() >= exhaustive.counts.items()
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        written = (tmp_path / "auto" / MODEL_FOLDER / name).read_bytes()
+        assert written == (tmp_path / "all" / MODEL_FOLDER / name).read_bytes()
+
+    database, pairs = features
+    shutil.copy(database, tmp_path / "database.db")
+    names = sorted({name for pair in pairs for name in pair})
+    task = DatabaseTask(tmp_path / "database.db", bare_photos.images, names, pairs, bare_photos, tmp_path)
+    monkeypatch.setattr("gsbench.init.preview.ALL_PAIRS_UP_TO", 5)
+    monkeypatch.setattr("gsbench.init.preview.best_pairs", lambda descriptors: best_pairs(descriptors, 2))
+    monkeypatch.setattr("gsbench.init.colmap.sift.extract_sift", lambda *_: None)
+    counts = Sfm(threads=1, pairs="auto").fill_database(task, no_progress, Timer())
+    assert counts["pairs_selected"] + counts["pairs_left_out"] == len(pairs)
+    assert counts["pairs_left_out"] > 10
+    matched = read_matches(task.database)[0]
+    assert len(matched) == counts["pairs_selected"]
+    kept = {tuple(sorted(pycolmap.pair_id_to_image_pair(pair))) for pair in matched}
+    assert {(index, index + 1) for index in range(1, len(names))} <= kept  # neighbours on the arc agree best

@@ -1,0 +1,18 @@
+"""Flattening: one function for configurations, stage inputs and MLflow's parameters."""
+
+from __future__ import annotations
+
+import doctest
+
+from gsbench.runs import hashing as nested
+from gsbench.runs.hashing import flatten
+
+
+def test_the_example_of_the_documentation_holds() -> None:
+    assert doctest.testmod(nested).failed == 0
+
+
+def test_empty_mappings_are_kept_where_they_matter() -> None:
+    values = {"a": {"b": {"c": 1}, "e": {}}, "f": None}
+    assert flatten(values) == {"a.b.c": 1, "f": None}
+    assert flatten(values, keep_empty=True) == {"a.b.c": 1, "a.e": {}, "f": None}

@@ -1,0 +1,269 @@
+"""The store: done once, whole or absent, damage named and mended, kills and rivals survived."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gsbench.errors import InputError
+from gsbench.files import DiskFullError
+from gsbench.runs.step import Stage, Step
+from gsbench.runs.store import MANIFEST, Store, read_manifest
+from tests.runs.toy import TOY, expected_text, toy_inputs
+
+LETTERS = Stage("letters", 1)
+
+
+def write_letters(folder: Path) -> None:
+    (folder / "sub").mkdir()
+    (folder / "a.txt").write_text("alpha")
+    (folder / "sub" / "b.bin").write_bytes(bytes(range(256)))
+
+
+def refuse(folder: Path) -> None:
+    raise AssertionError("built again")
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store")
+
+
+def test_second_request_is_not_built(store: Store) -> None:
+    first = store.get(Step(LETTERS, {"x": 1}, write_letters))
+    second = store.get(Step(LETTERS, {"x": 1}, refuse))
+    assert not first.cached
+    assert second.cached
+    assert second.path == first.path
+    assert (second.path / "a.txt").read_text() == "alpha"
+    assert second.seconds == first.seconds
+
+
+def test_every_input_and_the_version_make_another_key(store: Store) -> None:
+    keys = {
+        LETTERS.key({"x": 1}),
+        LETTERS.key({"x": 2}),
+        LETTERS.key({"y": 1}),
+        LETTERS.key({"x": 1.5}),
+        Stage("letters", 2).key({"x": 1}),
+        Stage("other", 1).key({"x": 1}),
+    }
+    assert len(keys) == 6
+    assert LETTERS.key({"x": 1, "y": 2}) == LETTERS.key({"y": 2, "x": 1})
+
+
+@pytest.mark.parametrize("name", ["a.txt", "sub/b.bin", MANIFEST])
+@pytest.mark.parametrize("damage", ["flip", "truncate", "delete"])
+def test_damage_is_named_and_mended(store: Store, name: str, damage: str, caplog: pytest.LogCaptureFixture) -> None:
+    path = store.get(Step(LETTERS, {"x": 1}, write_letters)).path / name
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 4
+    if damage == "delete":
+        path.unlink()
+    else:
+        path.write_bytes(content if damage == "flip" else content[: len(content) // 2])
+    assert store.find(Step(LETTERS, {"x": 1}, refuse)) is None
+    mended = store.get(Step(LETTERS, {"x": 1}, write_letters))
+    assert not mended.cached
+    assert (mended.path / "sub" / "b.bin").read_bytes() == bytes(range(256))
+    message = " ".join(record.getMessage() for record in caplog.records)
+    assert "damaged" in message
+    assert name in message
+    assert store.get(Step(LETTERS, {"x": 1}, refuse)).cached
+
+
+def test_every_flipped_bit_of_a_manifest_is_noticed_or_harmless(store: Store) -> None:
+    folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
+    sound = (folder / MANIFEST).read_bytes()
+    rng = random.Random(0)
+    for _ in range(300):
+        content = bytearray(sound)
+        content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+        (folder / MANIFEST).write_bytes(content)
+        try:
+            manifest = read_manifest(folder)
+        except ValueError:
+            continue
+        for key in ("stage", "version", "inputs", "key"):
+            assert manifest[key] == json.loads(sound)[key]
+        assert {name: entry["size"] for name, entry in manifest["outputs"].items()} == {"a.txt": 5, "sub/b.bin": 256}
+
+
+def test_damage_that_keeps_size_and_time_is_found_by_a_thorough_look(store: Store) -> None:
+    folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
+    state = (folder / "a.txt").stat()
+    (folder / "a.txt").write_text("alphA")
+    os.utime(folder / "a.txt", ns=(state.st_atime_ns, state.st_mtime_ns))
+    read_manifest(folder)
+    with pytest.raises(ValueError, match=r"a\.txt"):
+        read_manifest(folder, thorough=True)
+
+
+def test_a_copy_of_the_store_is_believed_by_content(store: Store, tmp_path: Path) -> None:
+    folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
+    os.utime(folder / "a.txt", ns=(1, 1))  # what copying does
+    assert store.get(Step(LETTERS, {"x": 1}, refuse)).cached
+
+
+def test_failed_build_is_not_published_and_starts_afresh(store: Store) -> None:
+    def fail(folder: Path) -> None:
+        (folder / "half.txt").write_text("half")
+        raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError, match="no"):
+        store.get(Step(LETTERS, {"x": 1}, fail))
+    assert store.find(Step(LETTERS, {"x": 1}, refuse)) is None
+    assert not (store.get(Step(LETTERS, {"x": 1}, write_letters)).path / "half.txt").exists()
+
+
+def test_resumable_build_finds_what_was_left_without_temporaries(store: Store) -> None:
+    stage = Stage("long", 1, resumable=True, scratch=("*.scratch",))
+
+    def half(folder: Path) -> None:
+        (folder / "half.txt").write_text("half")
+        (folder / ".torn.tmp-123").write_text("to")
+        (folder / "work.scratch").write_text("needed until published")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        store.get(Step(stage, {}, half))
+
+    def rest(folder: Path) -> None:
+        assert {path.name for path in folder.iterdir()} == {"half.txt", "work.scratch"}
+        (folder / "rest.txt").write_text("rest")
+
+    entry = store.get(Step(stage, {}, rest))
+    assert {path.name for path in entry.path.iterdir()} == {"half.txt", "rest.txt", MANIFEST}
+    assert set(read_manifest(entry.path)["outputs"]) == {"half.txt", "rest.txt"}
+
+
+def test_killed_between_manifest_and_rename_is_only_published(store: Store) -> None:
+    entry = store.get(Step(LETTERS, {"x": 1}, write_letters))
+    os.replace(entry.path, store.partial(LETTERS, entry.key))
+    again = store.get(Step(LETTERS, {"x": 1}, refuse))
+    assert again.seconds == entry.seconds
+    assert store.find(Step(LETTERS, {"x": 1}, refuse)) is not None
+
+
+def test_sweep_removes_leftovers_and_leaves_what_serves(store: Store) -> None:
+    long = Stage("long", 1, resumable=True)
+    entry = store.get(Step(long, {"x": 1}, write_letters))
+    stale = store.partial(long, entry.key)
+    useful = store.partial(long, "1" * 64)
+    useless = store.partial(LETTERS, "2" * 64)
+    half_removed = store.root / "long" / ".33.removed"
+    for folder in (stale, useful, useless, half_removed):
+        folder.mkdir(parents=True)
+        (folder / "file").write_text("x")
+    store.sweep([long, LETTERS])
+    assert useful.exists()
+    assert not stale.exists()
+    assert not useless.exists()
+    assert not half_removed.exists()
+    assert store.get(Step(long, {"x": 1}, refuse)).cached
+
+
+def toy(store: Store, number: int, *options: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "tests.runs.toy", str(store.root), str(number), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_killed_at_random_moments_the_work_is_finished_and_right(store: Store) -> None:
+    """SIGKILL a process that builds three results, again and again; nothing torn is ever published."""
+    rng = random.Random(1)
+    kills = 0
+    for _ in range(100):
+        process = toy(store, 3, "--slow", "--ready")  # six seconds of pauses, on any machine: more than three waits
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"  # a busy machine may need longer to start than to be killed
+        try:
+            process.wait(rng.uniform(0.0, 1.4))
+            break
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            kills += 1
+        for number in range(3):
+            entry = store.find(Step(TOY, toy_inputs(number), refuse))
+            if entry is not None:
+                assert (entry.path / "lines.txt").read_text() == expected_text(number)
+    assert process.returncode == 0
+    assert kills >= 3
+    for number in range(3):
+        entry = store.get(Step(TOY, toy_inputs(number), refuse))
+        assert (entry.path / "lines.txt").read_text() == expected_text(number)
+    # Who held a lock may stand beside it, where its holder was killed between publishing and letting go.
+    left = {path.name for path in (store.root / "toy").iterdir() if not path.name.endswith((".lock", ".lock.holder"))}
+    assert left == {TOY.key(toy_inputs(number)) for number in range(3)}
+
+
+def test_rivals_do_the_work_once_and_say_what_they_wait_for(store: Store) -> None:
+    processes = [toy(store, 1, "--slow") for _ in range(4)]
+    results = [process.communicate(timeout=300) for process in processes]
+    assert [process.returncode for process in processes] == [0, 0, 0, 0]
+    assert sorted(out.strip() for out, _ in results) == ["built", "found", "found", "found"]
+    waiting = [err for out, err in results if out.strip() == "found"]
+    assert any("waiting for toy" in err and "process" in err for err in waiting)
+
+
+def test_killed_rival_frees_its_lock(store: Store) -> None:
+    first = toy(store, 1, "--slow")
+    key = TOY.key(toy_inputs(0))
+    deadline = time.monotonic() + 20
+    while not store.partial(TOY, key).exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    second = toy(store, 1)
+    time.sleep(0.3)
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    out, _ = second.communicate(timeout=300)
+    assert out.strip() == "built"
+    assert (store.folder(TOY, key) / "lines.txt").read_text() == expected_text(0)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path):  # type: ignore[no-untyped-def]
+    """A file system of one MiB; the test is skipped where this user may not mount one."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], capture_output=True, check=False
+    )
+    if mounted.returncode != 0:
+        pytest.skip("needs the right to mount a small tmpfs (root)")
+    yield disk
+    subprocess.run(["mount", "-o", "remount,rw", str(disk)], check=False)
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_full_disk_is_one_line_and_corrupts_nothing(small_disk: Path) -> None:
+    store = Store(small_disk / "store")
+    sound = store.get(Step(LETTERS, {"x": 1}, write_letters))
+
+    def big(folder: Path) -> None:
+        (folder / "big.bin").write_bytes(bytes(2 << 20))
+
+    with pytest.raises(DiskFullError, match=r"is full: free some space") as caught:
+        store.get(Step(LETTERS, {"x": 2}, big))
+    assert "\n" not in str(caught.value)
+    assert store.find(Step(LETTERS, {"x": 2}, refuse)) is None
+    assert store.get(Step(LETTERS, {"x": 1}, refuse)).path == sound.path
+    store.sweep([LETTERS])
+    assert not store.get(Step(LETTERS, {"x": 2}, write_letters)).cached
+
+
+def test_read_only_store_serves_what_it_has_and_says_so(small_disk: Path) -> None:
+    store = Store(small_disk / "store")
+    store.get(Step(LETTERS, {"x": 1}, write_letters))
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    assert store.get(Step(LETTERS, {"x": 1}, refuse)).cached
+    with pytest.raises(InputError, match="may not be written to"):
+        store.get(Step(LETTERS, {"x": 2}, write_letters))

@@ -1,0 +1,60 @@
+"""A stage that is slow enough to be killed and loads no torch: it writes numbered lines, going on where it was stopped.
+
+Run as a program: ``python -m tests.runs.toy STORE COUNT [--slow] [--ready]``; the last says so when it begins.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from gsbench.runs.step import Stage, Step
+from gsbench.runs.store import Store
+
+TOY = Stage("toy", 1, resumable=True, scratch=("*.progress",))
+LINES = 40
+
+
+def toy_inputs(number: int) -> dict[str, Any]:
+    return {"number": number}
+
+
+def expected_text(number: int) -> str:
+    return "".join(f"{number} {line}\n" for line in range(LINES))
+
+
+def build(folder: Path, number: int, pause: float) -> None:
+    """Keep the lines so far in a file that is replaced whole, as a training does with its checkpoints."""
+    progress = folder / "so_far.progress"
+    lines = progress.read_text().splitlines() if progress.exists() else []
+    while len(lines) < LINES:
+        lines.append(f"{number} {len(lines)}")
+        time.sleep(pause)
+        temporary = folder / f".so_far.tmp-{os.getpid()}"
+        temporary.write_text("".join(line + "\n" for line in lines))
+        os.replace(temporary, progress)
+    (folder / "lines.txt").write_text("".join(line + "\n" for line in lines))
+
+
+def main(argv: list[str]) -> int:
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    if "--ready" in argv:
+        print("ready", flush=True)
+    store = Store(Path(argv[0]))
+    store.sweep([TOY])
+    cached = []
+    for number in range(int(argv[1])):
+        pause = 0.05 if "--slow" in argv else 0.01
+        cached.append(
+            store.get(Step(TOY, toy_inputs(number), lambda folder, n=number, p=pause: build(folder, n, p))).cached
+        )
+    print("found" if all(cached) else "built")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,120 @@
+"""The procedural courtyard: repeatable, consistent between views, and not blank."""
+
+from __future__ import annotations
+
+import filecmp
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.scene.colmap import cameras_of, read_model
+from gsbench.scene.courtyard.layout import BOX, SPHERE, build_layout
+from gsbench.scene.courtyard.render import courtyard_cameras, render_courtyard, render_view, surface_distance
+from gsbench.scene.load import load_scene
+from gsbench.scene.readers import read_colmap
+
+
+@pytest.fixture(scope="module")
+def capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("courtyard")
+    render_courtyard(folder, views=4, width=160, height=120)
+    return folder
+
+
+def test_same_arguments_same_bytes(capture_dir: Path, tmp_path: Path):
+    render_courtyard(tmp_path, views=4, width=160, height=120, threads=1)
+    names = sorted(path.relative_to(capture_dir).as_posix() for path in capture_dir.rglob("*") if path.is_file())
+    same, different, failed = filecmp.cmpfiles(capture_dir, tmp_path, names, shallow=False)
+    assert len(same) == len(names) >= 7
+    assert not different
+    assert not failed
+
+
+def test_the_model_holds_the_exact_cameras(capture_dir: Path, tmp_path: Path):
+    written = cameras_of(read_model(capture_dir / "sparse/0"))
+    for name, camera in courtyard_cameras(4, 160, 120).items():
+        np.testing.assert_allclose(written[name].rotation, camera.rotation, atol=1e-12)
+        np.testing.assert_allclose(written[name].translation, camera.translation, atol=1e-12)
+        assert (written[name].fx, written[name].cx, written[name].cy) == (camera.fx, 80, 60)
+    capture = read_colmap("courtyard", capture_dir, exact_poses=True)
+    assert len(load_scene(capture, capture.model, tmp_path).train) == 3
+
+
+@pytest.mark.parametrize("views", [12, 48, 60])
+def test_neighbouring_views_are_close(views: int):
+    centers = np.array([camera.center for camera in courtyard_cameras(views, 40, 30).values()])
+    azimuth = np.degrees(np.unwrap(np.arctan2(centers[:, 1], centers[:, 0])))
+    assert np.abs(np.diff(azimuth)).max() <= 7.5 + 1e-9
+    assert 4.0 < np.linalg.norm(centers[:, :2], axis=1).min() < np.linalg.norm(centers[:, :2], axis=1).max() < 5.0
+    assert surface_distance(centers).min() > 0.5  # no camera in or at a thing
+
+
+def test_a_surface_point_looks_alike_from_two_views():
+    """Project lawn points by the pinhole formula alone into two neighbouring views: the colours agree."""
+    layout = build_layout(0)
+    a, b = list(courtyard_cameras(48, 400, 300).values())[10:12]
+    images = [render_view(layout, camera, 0).astype(float) for camera in (a, b)]
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-3, 3, (4000, 2)), np.zeros(4000)])
+    points = points[surface_distance(points + np.array([0, 0, 0.3])) > 0.299]  # far from all things
+    samples, kept = [], np.ones(len(points), dtype=bool)
+    for camera, image in zip((a, b), images, strict=True):
+        local = points @ camera.rotation.T + camera.translation
+        pixel = local[:, :2] / local[:, 2:] * camera.fx + [camera.cx, camera.cy]
+        inside = (pixel > 2).all(1) & (pixel < [397, 297]).all(1) & (local[:, 2] > 0)
+        # seen, not hidden: the way to the camera is free of things
+        for share in np.linspace(0.05, 0.9, 30):
+            way = points + share * (camera.center - points)
+            inside &= surface_distance(way) > 0.02
+        kept &= inside
+        column, row = np.clip(pixel.astype(int), 0, [399, 299]).T
+        samples.append(image[row, column])
+    first, second = samples[0][kept], samples[1][kept]
+    assert kept.sum() > 200
+    assert np.median(np.abs(first - second)) < 8
+    shuffled = np.median(np.abs(first - second[rng.permutation(len(second))]))
+    assert np.median(np.abs(first - second)) < 0.6 * shuffled
+
+
+def test_pictures_have_detail_and_a_quiet_lawn(capture_dir: Path):
+    for path in sorted((capture_dir / "images").iterdir()):
+        image = np.asarray(Image.open(path)).astype(float)
+        assert image.shape == (120, 160, 3)
+        assert 70 < image.mean() < 180
+        assert image.std() > 30
+        lawn = (image[..., 1] > image[..., 0]) & (image[..., 1] > 1.3 * image[..., 2])
+        assert lawn.mean() > 0.1
+
+
+def test_seeds_differ():
+    camera = courtyard_cameras(3, 64, 48)["0001.png"]
+    pictures = [render_view(build_layout(seed), camera, seed).astype(float) for seed in (0, 1)]
+    assert np.abs(pictures[0] - pictures[1]).mean() > 2
+
+
+def test_surface_distance_against_dense_samples_of_the_surfaces():
+    layout = build_layout(0)
+    rng = np.random.default_rng(1)
+    spheres, boxes = np.flatnonzero(layout.kind == SPHERE), np.flatnonzero(layout.kind == BOX)
+    directions = rng.normal(size=(len(spheres), 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    on_spheres = layout.center[spheres] + layout.size[spheres, :1] * directions
+    faces = rng.uniform(-1, 1, (len(boxes), 3))
+    faces[np.arange(len(boxes)), rng.integers(0, 3, len(boxes))] = 1.0
+    on_boxes = layout.center[boxes] + np.einsum("bij,bj->bi", layout.rotation[boxes], faces * layout.size[boxes, :3])
+    on_tube = np.array([[0.8, 0.0, 0.4], [0.58, 0.0, 0.6], [0.7 * np.cos(2), 0.7 * np.sin(2), 0.81]])  # the well
+    assert surface_distance(np.concatenate([on_spheres, on_boxes, on_tube, [[3.1, 3.1, 0.0]]])).max() < 1e-9
+    # on open lawn the ground is nearest; high above everything the roof tops are
+    np.testing.assert_allclose(surface_distance(np.array([[-2.5, 3.6, 0.2], [-2.5, 3.6, -0.1]])), [0.2, 0.1], atol=1e-9)
+    assert surface_distance(np.array([[0.0, 0.0, 8.0]]))[0] > 4
+    assert surface_distance(np.array([[0.0, 0.0, 8.0]]), limit=0.5)[0] == 0.5
+
+
+def test_bad_settings():
+    with pytest.raises(InputError, match=r"scene\.views"):
+        courtyard_cameras(2, 40, 30)
+    with pytest.raises(InputError, match=r"scene\.width"):
+        courtyard_cameras(3, 8, 8)

@@ -1,0 +1,57 @@
+"""The name under which gsbench is installed, and the commands that hints give."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from gsbench.system import install
+from gsbench.system.install import DISTRIBUTION, checkout, install_command
+from tests.conftest import ROOT
+
+
+def test_the_name_is_that_of_the_project_file() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["name"] == DISTRIBUTION
+    assert list(project["scripts"]) == ["gsbench"]
+    assert f"{DISTRIBUTION}[dim,search,slurm,view]" in project["optional-dependencies"]["dev"]
+
+
+def test_from_a_checkout_the_hint_installs_the_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert checkout() == ROOT
+    monkeypatch.chdir(ROOT)
+    assert install_command("view") == "pip install -e '.[view]'"
+    monkeypatch.chdir(tmp_path)
+    assert install_command("view") == f"pip install -e '{ROOT}[view]'"
+
+
+def test_elsewhere_the_hint_names_the_distribution(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(install, "__file__", "/usr/lib/python3/site-packages/gsbench/install.py")
+    assert install_command() == "pip install 'gsbench-3dgs'"
+    assert install_command("slurm") == "pip install 'gsbench-3dgs[slurm]'"
+
+
+def test_no_text_sends_anyone_to_the_project_that_has_our_name() -> None:
+    foreign = re.compile(r"pip install [^`\n]*\bgsbench(?!-3dgs)(\[|['\"`\s]|$)", re.MULTILINE)
+    assert foreign.search("pip install 'gsbench[view]'")
+    assert not foreign.search("pip install 'gsbench-3dgs[view]'")
+    places = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "notebooks").glob("*.py")]
+    places += [*(ROOT / "src").rglob("*.py"), *(ROOT / "conf").rglob("*.yaml")]
+    assert [str(path) for path in places if foreign.search(path.read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+def test_the_image_is_built_by_commands_that_there_are() -> None:
+    """Docker builds what the README's two commands build: every ``make`` of the Dockerfile is a target."""
+    targets = re.findall(r"RUN make (\S+)", (ROOT / "Dockerfile").read_text())
+    assert {"demo", "test"} < set(targets)
+    for target in targets:
+        done = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+    ignored = (ROOT / ".dockerignore").read_text().split()
+    assert set((ROOT / ".gitignore").read_text().split()) < set(ignored)  # nothing of this machine gets in

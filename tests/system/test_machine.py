@@ -1,0 +1,73 @@
+"""The record of the machine that a result was computed on."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsbench.system import machine
+from gsbench.system.machine import cpu_name, describe_machine, kernel_target, kind_of_machine, x86_level
+
+ARM_64 = "processor\t: 0\nBogoMIPS\t: 243.75\nCPU implementer\t: 0x41\nCPU architecture: 8\nCPU part\t: 0xd40\n"
+XEON = "processor : 0\nvendor_id : GenuineIntel\nmodel name :  Intel(R)  Xeon(R)\n\nprocessor : 1\nmodel name : other\n"
+
+
+def test_record_is_plain_text_and_full() -> None:
+    record = describe_machine(torch.device("cpu"))
+    assert json.loads(json.dumps(record)) == record
+    assert set(record) == {"cpu", "architecture", "kernels", "torch", "device"}
+    assert all(record.values())
+    assert record["device"] == "cpu"
+    assert record["cpu"] in kind_of_machine(record)
+
+
+@pytest.mark.parametrize(
+    ("content", "name"),
+    [
+        (XEON, "Intel(R) Xeon(R)"),
+        (ARM_64, "ARM implementer 0x41 part 0xd40"),
+        ("Model : Raspberry Pi 5", "Raspberry Pi 5"),
+    ],
+)
+def test_linux_names(content: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "cpuinfo").write_text(content)
+    monkeypatch.setattr(machine, "CPU_INFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert cpu_name.__wrapped__() == name
+
+
+@pytest.mark.parametrize("system", ["linux", "darwin", "win32", "sunos"])
+def test_a_system_that_gives_no_name_is_named_all_the_same(
+    system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(machine, "CPU_INFO", tmp_path / "missing")
+    monkeypatch.setenv("PATH", str(tmp_path))  # no sysctl
+    monkeypatch.delenv("PROCESSOR_IDENTIFIER", raising=False)
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(platform, "processor", lambda: "")
+    assert cpu_name.__wrapped__() == platform.machine()
+
+
+def test_levels_follow_the_psabi() -> None:
+    v2 = {"sse3", "ssse3", "sse4.1", "sse4.2", "popcnt", "cx16", "sahf", "sse2"}
+    v3 = v2 | {"avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"}
+    v4 = v3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
+    assert [x86_level(features) for features in (set(), v2, v3, v4)] == [f"x86-64-v{k}" for k in (1, 2, 3, 4)]
+    assert x86_level(v4 - {"avx512vl"}) == "x86-64-v3"
+    assert x86_level(v4 - {"sse4.2"}) == "x86-64-v1"
+
+
+def test_target_of_the_kernels_is_the_one_that_was_asked_for() -> None:
+    code = "from gsbench.system.machine import kernel_target; print(kernel_target())"
+    changed = dict(os.environ) | {"NUMBA_CPU_NAME": "generic"}
+    asked = subprocess.run([sys.executable, "-c", code], env=changed, capture_output=True, text=True, check=True)
+    assert asked.stdout.startswith("generic")
+    if "NUMBA_CPU_NAME" not in os.environ:
+        assert not kernel_target().startswith("generic")

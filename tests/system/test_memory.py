@@ -1,0 +1,55 @@
+"""Peak memory of a process, on systems that count it differently."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.system import memory
+from gsbench.system.memory import MIB, peak_memory_mb, peak_resident_mb, reset_peak_memory
+
+CPU = torch.device("cpu")
+LARGE_MB = 200
+
+
+def touch(megabytes: int) -> None:
+    np.ones(megabytes * MIB, np.uint8).sum()
+
+
+def test_peak_holds_what_was_allocated_in_between() -> None:
+    before = peak_resident_mb()
+    reset_peak_memory(CPU)
+    touch(LARGE_MB)
+    assert LARGE_MB < peak_memory_mb(CPU) < before + LARGE_MB + 200
+
+
+@pytest.mark.skipif(not memory.CLEAR_REFS.exists(), reason="only Linux starts the count anew")
+def test_peak_can_be_counted_anew() -> None:
+    touch(2 * LARGE_MB)
+    high = peak_memory_mb(CPU)
+    reset_peak_memory(CPU)
+    assert peak_memory_mb(CPU) < high - LARGE_MB
+
+
+def test_systems_without_proc_use_what_they_have(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    counted = peak_resident_mb()
+    monkeypatch.setattr(memory, "STATUS", tmp_path / "missing")
+    if memory.resource is not None:
+        assert peak_resident_mb() == pytest.approx(counted, rel=0.5)
+    monkeypatch.setattr(memory, "resource", None)
+    windows = types.SimpleNamespace(memory_info=lambda: types.SimpleNamespace(peak_wset=3 * MIB))
+    monkeypatch.setattr("psutil.Process", lambda: windows)
+    assert peak_resident_mb() == 3
+
+
+def test_the_pipeline_is_imported_where_there_is_no_resource_module() -> None:
+    """As on Windows."""
+    code = "import sys; sys.modules['resource'] = None; import gsbench.runs.stages, gsbench.bench"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,49 @@
+"""Count what would make the host wait for a GPU in one training step, on the CPU.
+
+Run as a program: ``python -m tests.train.one_step RASTER``. Triton's kernels run in its interpreter
+(``TRITON_INTERPRET=1``); every read-back is late, as on a GPU that is behind.
+Prints one JSON object for each densifier.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import torch
+
+import tests.raster.conftest  # noqa: F401 - makes the interpreter quicker
+from gsbench.bench.scenes import make_scene
+from gsbench.bench.stepper import NEVER, standing_still
+from gsbench.bench.waits import counting_waits
+from gsbench.densify import ADC, MCMC
+from gsbench.eval.ssim import torch_photometric_loss
+from gsbench.raster import create_rasterizer, validate
+from gsbench.raster.readback import Readback
+from gsbench.train.trainer import Trainer
+
+DENSIFIERS = {
+    "adc": ADC(start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER),
+    "absgrad": ADC(start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, gradient="absolute"),
+    "mcmc": MCMC(start=NEVER - 1, stop=NEVER),
+}
+
+
+def main(raster: str) -> None:
+    Readback.arrived = property(lambda self: False)  # type: ignore[assignment, method-assign]
+    validate._check_background = lambda background: None  # on a GPU its values are not looked at there
+    gaussians, scene = make_scene("trained", 20, 20, 12)
+    for name, densifier in DENSIFIERS.items():
+        rasterizer = create_rasterizer(raster, torch.device("cpu"))
+        trainer = Trainer(scene, gaussians, densifier, rasterizer, standing_still(), 0)
+        trainer.loss = torch_photometric_loss  # type: ignore[assignment] # no kernel of the CPU
+        for _ in range(2):  # one of every kind of memory is there
+            trainer.iterate(Path())
+        with counting_waits(pretend=True) as counts:
+            trainer.iterate(Path())
+        print(json.dumps({name: counts}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,193 @@
+"""Checkpoints: what is loaded is what was saved, or it is not loaded."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.system.stopping import Stopped, deferred, requested, stop_on_signals
+from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint, save_checkpoint, to_host
+from tests.gaussians.helpers import random_gaussians
+
+
+def state(step: int) -> dict[str, object]:
+    rng = torch.Generator().manual_seed(step)
+    return {
+        "step": step,
+        "tensor": torch.rand(500, generator=rng),
+        "rng": rng.get_state(),
+        "nested": {"list": [1, 2.5, "x", None]},
+    }
+
+
+def equal(first: object, second: object) -> bool:
+    if isinstance(first, torch.Tensor):
+        return torch.equal(first, second)  # type: ignore[arg-type]
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(equal(first[key], second[key]) for key in first)  # type: ignore
+    return first == second
+
+
+def test_newest_is_loaded_and_two_are_kept(tmp_path: Path) -> None:
+    assert load_checkpoint(tmp_path) is None
+    for step in (10, 20, 30):
+        save_checkpoint(tmp_path, step, state(step))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-00000020.pt", "checkpoint-00000030.pt"]
+    loaded = load_checkpoint(tmp_path)
+    assert equal(loaded, state(30))
+
+
+def test_torch_reads_the_file_by_itself(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, 1, state(1))
+    assert equal(torch.load(tmp_path / "checkpoint-00000001.pt", weights_only=True), state(1))
+
+
+def test_any_flipped_or_missing_byte_is_noticed_and_the_one_before_serves(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    save_checkpoint(tmp_path, 10, state(10))
+    save_checkpoint(tmp_path, 20, state(20))
+    newest = tmp_path / "checkpoint-00000020.pt"
+    sound = newest.read_bytes()
+    rng = random.Random(0)
+    for trial in range(60):
+        content = bytearray(sound)
+        if trial % 4:
+            content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+        else:
+            del content[rng.randrange(len(content)) :]
+        newest.write_bytes(content)
+        caplog.clear()
+        assert equal(load_checkpoint(tmp_path), state(10))
+        assert "checkpoint-00000020.pt is damaged" in caplog.text
+        assert not newest.exists()
+    newest.write_bytes(sound)
+    assert equal(load_checkpoint(tmp_path), state(20))
+
+
+def test_all_damaged_means_none(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, 10, state(10))
+    (tmp_path / "checkpoint-00000010.pt").write_bytes(b"")
+    assert load_checkpoint(tmp_path) is None
+
+
+def test_nothing_in_a_checkpoint_is_run_as_code(tmp_path: Path) -> None:
+    class Evil:
+        def __reduce__(self) -> object:
+            return os.mkdir, (str(tmp_path / "hacked"),)
+
+    save_checkpoint(tmp_path, 10, {"evil": Evil()})
+    assert load_checkpoint(tmp_path) is None
+    assert not (tmp_path / "hacked").exists()
+
+
+def test_failed_write_leaves_the_old_one_and_no_temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_checkpoint(tmp_path, 10, state(10))
+
+    def full(*arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_checkpoint(tmp_path, 20, state(20))
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint-00000010.pt"]
+
+
+def test_in_the_background_the_state_is_that_of_the_moment(tmp_path: Path) -> None:
+    """The training goes on, in place, while the thread writes."""
+    writer = CheckpointWriter(tmp_path, background=True)
+    live = {"step": 0, "nested": [{"tensor": torch.zeros(2_000_000)}], "view": torch.arange(6).view(2, 3)[:, 1]}
+    for step in (1, 2, 3):
+        live["step"] = step
+        live["nested"][0]["tensor"].fill_(step)  # type: ignore[index]
+        writer.save(step, live)
+        live["nested"][0]["tensor"].fill_(-1)  # type: ignore[index]
+    writer.close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-00000002.pt", "checkpoint-00000003.pt"]
+    loaded = load_checkpoint(tmp_path)
+    assert loaded is not None
+    assert loaded["step"] == 3
+    assert bool((loaded["nested"][0]["tensor"] == 3).all())
+    assert torch.equal(loaded["view"], live["view"])  # type: ignore[arg-type]
+
+
+def test_an_error_in_the_background_is_raised_and_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    writer = CheckpointWriter(tmp_path, background=True)
+    writer.save(10, state(10))
+    writer.finish()
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "save", lambda *arguments: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+        writer.save(20, state(20))
+        with pytest.raises(OSError, match="No space left"):
+            writer.save(30, state(30))
+    writer.save(40, state(40))
+    writer.close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-00000010.pt", "checkpoint-00000040.pt"]
+
+
+def test_a_state_goes_to_another_device_whole() -> None:
+    """Nothing of a checkpoint stays on the CPU that the model's device needs, and the other way round."""
+    rates = LearningRates()
+    gaussians = TrainableGaussians(random_gaussians(5, seed=0, dtype=torch.float32), rates, 1.0)
+    gaussians.values.means.square().sum().backward()
+    gaussians.optimizer_step()
+    moved = TrainableGaussians.load(to_host(gaussians.state_dict()), rates, 1.0, torch.device("meta"))
+    assert {tensor.device.type for tensor in moved.values.tensors().values()} == {"meta"}
+    moments = moved.optimizer.state[moved.values.means]
+    assert {moments["exp_avg"].device.type, moments["exp_avg_sq"].device.type} == {"meta"}
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_killed_while_writing_leaves_a_readable_one(background: bool, tmp_path: Path) -> None:
+    code = (
+        "import sys, torch; from pathlib import Path; from gsbench.train.checkpoint import CheckpointWriter\n"
+        f"writer = CheckpointWriter(Path(sys.argv[1]), {background})\n"
+        "for step in range(1, 10**6):\n"
+        "    writer.save(step, {'step': step, 'tensor': torch.full((200_000,), float(step))})\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)])
+    last = 0
+    deadline = time.monotonic() + 60
+    while last < 3 and time.monotonic() < deadline:
+        time.sleep(0.05)
+        last = max((int(path.stem.split("-")[1]) for path in tmp_path.glob("checkpoint-*.pt")), default=0)
+    time.sleep(0.037)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    loaded = load_checkpoint(tmp_path)
+    assert loaded is not None
+    assert loaded["step"] >= last
+    assert bool((loaded["tensor"] == loaded["step"]).all())
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR2])
+def test_signals_stop_at_once_or_where_it_suits(signum: signal.Signals) -> None:
+    earlier = signal.getsignal(signum)
+    with stop_on_signals():
+        with pytest.raises(Stopped) as stop:
+            signal.raise_signal(signum)
+        assert stop.value.exit_code == 128 + signum
+        steps = []
+        with pytest.raises(Stopped), deferred():  # noqa: PT012
+            for step in range(10):
+                if step == 3:
+                    signal.raise_signal(signum)
+                steps.append(step)
+                if requested():
+                    break
+        assert steps == [0, 1, 2, 3]
+        with stop_on_signals(), pytest.raises(Stopped), deferred():  # noqa: PT012
+            signal.raise_signal(signum)
+            signal.raise_signal(signum)  # a second one does not wait
+            raise AssertionError("went on after the second signal")
+    assert signal.getsignal(signum) is earlier
+    assert not requested()

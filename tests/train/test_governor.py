@@ -1,0 +1,52 @@
+"""Arms under the governor, in whole trainings: one count at the end, equal numbers of rounds, thresholds on record."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsbench.densify import ADC, MCMC, PixelGS, Volumetric
+from gsbench.densify.budgeted import Budgeted
+from gsbench.gaussians.initial import gaussians_from_cloud
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster import create_rasterizer
+from gsbench.scene.types import Scene
+from gsbench.train.trainer import Trainer
+from tests.train.test_trainer import options
+
+LIMIT = 400
+WINDOW = {"start": 20, "stop": 240, "interval": 20, "max_gaussians": LIMIT, "cap": "governor"}
+ARMS: dict[str, tuple[type[Budgeted], dict[str, object]]] = {
+    "adc": (ADC, {}),
+    "adc, a loose threshold": (ADC, {"gradient_threshold": 2e-5}),
+    "absgrad": (ADC, {"gradient": "absolute", "gradient_threshold": 8e-4}),
+    "volumetric": (Volumetric, {"volume_threshold": 0.003}),
+    "volumetric, not the round": (Volumetric, {"volume_threshold": 0.003, "split_isotropic": False}),
+    "volumetric, its tail": (Volumetric, {"threshold_mode": "quantile", "volume_quantile": 0.9}),
+    "pixelgs": (PixelGS, {}),
+    "mcmc": (MCMC, {}),
+}
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_arms_end_within_two_percent_of_one_count(
+    arm: str, tiny_scene: Scene, truth: Gaussians, tmp_path: Path
+) -> None:
+    kind, own = ARMS[arm]
+    if kind is not MCMC:
+        own = own | {"opacity_reset_interval": 120}  # in the middle of the window
+    densifier = kind(**(WINDOW | own))  # type: ignore[arg-type]
+    initial = gaussians_from_cloud(truth.means.double().numpy(), torch.full((len(truth), 3), 127).byte().numpy())
+    rasterizer = create_rasterizer("cpu", torch.device("cpu"), threads=1)
+    trained = Trainer(tiny_scene, initial, densifier, rasterizer, options(iterations=260), 0).run(tmp_path)
+    assert len(trained) == pytest.approx(LIMIT, rel=0.02)
+    events = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    rounds = [event for event in events if "target" in event]
+    assert [event["step"] for event in rounds] == list(range(40, 240, 20))
+    assert rounds[-1]["target"] == LIMIT
+    strictness = [event["strictness"] for event in rounds]
+    assert len(set(strictness)) > 3  # it moved
+    assert all(1e-3 <= factor <= 1e3 for factor in strictness)

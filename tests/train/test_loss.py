@@ -1,0 +1,113 @@
+"""The photometric loss against scikit-image, autograd in float64, and itself on several threads."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from gsbench.eval.ssim import ssim_map, torch_photometric_loss, window
+from gsbench.train.loss import PhotometricLoss, photometric_loss
+
+SIZES = [(3, 4), (11, 16), (37, 53), (64, 65), (100, 21)]
+
+
+def _images(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """A smooth picture with noise and, as target, an 8-bit picture like it."""
+    generator = torch.Generator().manual_seed(height)
+    y, x = torch.meshgrid(torch.arange(height) / 9, torch.arange(width) / 7, indexing="ij")
+    smooth = torch.stack([x.sin(), y.cos(), (x + y).sin()], -1) * 0.3 + 0.5
+    image = (smooth + 0.1 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1.2)
+    return image, (smooth.clamp(0, 1) * 255).to(torch.uint8)
+
+
+def test_window() -> None:
+    taps = window().numpy()
+    assert len(taps) == 11
+    assert taps.sum() == pytest.approx(1)
+    assert taps[6] / taps[5] == pytest.approx(np.exp(-1 / (2 * 1.5**2)))
+
+
+def test_ssim_matches_scikit_image_in_the_interior() -> None:
+    image, target = _images(40, 50)
+    target = target / 255
+    _, expected = structural_similarity(
+        image.double().numpy(),
+        target.double().numpy(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+        full=True,
+    )
+    ours = ssim_map(image.double(), target.double()).permute(1, 2, 0).numpy()
+    np.testing.assert_allclose(ours[5:-5, 5:-5], expected[5:-5, 5:-5], atol=1e-7)
+
+
+def test_zero_padding() -> None:
+    """At a corner the window sees zeros outside; by hand for constant pictures of 1 and 0.5."""
+    ones = torch.ones(30, 30, 3, dtype=torch.float64)
+    share = window()[:6].sum().item() ** 2  # of the window that lies inside at a corner
+    variance = share - share**2
+    expected = (2 * share * share * 0.5 + 1e-4) / (share**2 * 1.25 + 1e-4)
+    expected *= (2 * 0.5 * variance + 9e-4) / (1.25 * variance + 9e-4)
+    assert ssim_map(ones, ones / 2)[0, 0, 0].item() == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+@pytest.mark.parametrize("weight", [0.2, 0.0, 1.0])
+def test_compiled_matches_float64(size: tuple[int, int], weight: float) -> None:
+    image, target = _images(*size)
+    for wanted in (target, target / 255):
+        leaf, precise = image.clone().requires_grad_(), image.double().requires_grad_()
+        values = photometric_loss(leaf, wanted, weight)
+        expected = torch_photometric_loss(precise, target.double() / 255, weight)
+        for value, reference in zip(values, expected, strict=True):
+            assert value.item() == pytest.approx(reference.item(), abs=2e-6)
+        (3 * values[0]).backward()
+        (3 * expected[0]).backward()
+        error = (leaf.grad - precise.grad).abs().max() / precise.grad.abs().max()
+        assert error < 1e-4
+
+
+def test_equal_images() -> None:
+    image, _ = _images(20, 33)
+    leaf = image.clone().requires_grad_()
+    loss, l1, similarity = photometric_loss(leaf, image)
+    assert l1 == 0
+    assert similarity.item() == pytest.approx(1, abs=1e-6)
+    loss.backward()
+    assert leaf.grad.abs().max() < 1e-6  # L1's gradient at 0 is 0, SSIM is at its maximum
+
+
+def test_the_same_bits_for_any_number_of_threads() -> None:
+    image, target = _images(64, 65)
+    results = []
+    for threads in (1, 1, 2, 4):
+        loss = PhotometricLoss(threads=threads)
+        for _ in range(2):
+            leaf = image.clone().requires_grad_()
+            value = loss(leaf, target)[0]
+            value.backward()
+            results.append((value.item(), leaf.grad.numpy().tobytes()))
+    assert len(set(results)) == 1
+
+
+def test_without_gradient_and_other_dtypes() -> None:
+    image, target = _images(16, 18)
+    loss = PhotometricLoss(threads=1)
+    with torch.no_grad():
+        value = loss(image, target)[0]
+    assert not value.requires_grad
+    assert loss(image.double(), target)[0].item() == pytest.approx(value.item(), abs=1e-6)
+    assert loss(image.transpose(0, 1).contiguous().transpose(0, 1), target)[0] == value
+
+
+def test_inputs_that_do_not_fit_are_refused() -> None:
+    image, target = _images(16, 18)
+    with pytest.raises(ValueError, match="shape"):
+        photometric_loss(image, target[:-1])
+    with pytest.raises(ValueError, match="ssim_weight"):
+        photometric_loss(image, target, 1.5)

@@ -1,0 +1,263 @@
+"""The training loop: it learns, it follows the schedule, it is repeatable, and it goes on where it was stopped."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsbench.config.schema import TrainConfig
+from gsbench.densify import ADC, MCMC, Densifier, NoDensifier, Volumetric
+from gsbench.errors import TrainingError
+from gsbench.gaussians.initial import gaussians_from_cloud
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.ply import read_ply
+from gsbench.raster import create_rasterizer
+from gsbench.raster.base import Rasterizer, RenderOutput
+from gsbench.raster.readback import Readback
+from gsbench.scene.types import Scene
+from gsbench.train import trainer
+from gsbench.train.checkpoint import CheckpointWriter
+from gsbench.train.trainer import CameraOrder, Status, Trainer, generator, learning_rates, snapshot_file
+
+CPU = torch.device("cpu")
+
+
+def cloud(truth: Gaussians) -> Gaussians:
+    colors = torch.full((len(truth), 3), 127, dtype=torch.uint8)
+    return gaussians_from_cloud(truth.means.double().numpy(), colors.numpy())
+
+
+def options(**changes: object) -> TrainConfig:
+    values = {
+        "name": "test",
+        "iterations": 120,
+        "sh_interval": 40,
+        "position_steps": 120,
+        "checkpoint_every": 50,
+        "volume_histogram": [60],
+    }
+    return TrainConfig(**(values | changes))  # type: ignore[arg-type]
+
+
+def small(kind: type[ADC] = ADC, **changes: object) -> ADC:
+    return kind(start=20, stop=110, interval=20, opacity_reset_interval=60, **changes)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def rasterizer() -> Rasterizer:
+    return create_rasterizer("cpu", CPU, threads=1)
+
+
+def train(
+    scene: Scene,
+    truth: Gaussians,
+    rasterizer: Rasterizer,
+    folder: Path,
+    densifier: Densifier,
+    seed: int = 0,
+    **changes: object,
+) -> Gaussians:
+    folder.mkdir(parents=True, exist_ok=True)
+    return Trainer(scene, cloud(truth), densifier, rasterizer, options(**changes), seed).run(folder)
+
+
+def same(a: Gaussians, b: Gaussians) -> bool:
+    return len(a) == len(b) and all(
+        torch.equal(x, y) for x, y in zip(a.tensors().values(), b.tensors().values(), strict=True)
+    )
+
+
+def records(path: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_training_learns_the_scene(tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path) -> None:
+    train(tiny_scene, truth, rasterizer, tmp_path, NoDensifier(), iterations=500, position_steps=500)
+    metrics = records(tmp_path / "metrics.jsonl")
+    first = sum(r["l1"] for r in metrics[:3]) / 3
+    last = sum(r["l1"] for r in metrics[-3:]) / 3
+    assert last < 0.5 * first
+    assert metrics[-1]["step"] == 500
+    assert [r["sh_degree"] for r in metrics if r["step"] in (30, 40, 80, 120, 500)] == [0, 1, 2, 3, 3]
+
+
+def test_same_seed_same_bits_other_seed_not(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    runs = [train(tiny_scene, truth, rasterizer, tmp_path / str(i), small(), seed=i // 2) for i in range(3)]
+    assert same(runs[0], runs[1])
+    assert not same(runs[0], runs[2])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [small, lambda: small(Volumetric, volume_threshold=0.01), lambda: MCMC(start=20, stop=110, interval=20)],
+    ids=["adc", "volumetric", "mcmc"],
+)
+def test_interrupted_training_ends_in_the_same_bits(
+    make, tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:  # type: ignore[no-untyped-def]
+    whole = train(tiny_scene, truth, rasterizer, tmp_path / "whole", make())
+    broken = tmp_path / "broken"
+
+    class StopError(Exception):
+        pass
+
+    def stop_at_70(status: Status) -> None:
+        if status.step == 70:
+            raise StopError
+
+    broken.mkdir()
+    with pytest.raises(StopError):
+        Trainer(tiny_scene, cloud(truth), make(), rasterizer, options(), 0).run(broken, stop_at_70)
+    assert sorted(path.name for path in broken.glob("*.pt")) == ["checkpoint-00000050.pt"]
+    assert same(whole, train(tiny_scene, truth, rasterizer, broken, make()))
+    for name in ("events.jsonl", "volume_histograms.jsonl"):
+        assert (broken / name).read_text() == (tmp_path / "whole" / name).read_text()
+    steps = [r["step"] for r in records(broken / "metrics.jsonl")]
+    assert steps == list(range(10, 121, 10))
+    assert sorted(path.name for path in broken.glob("*.pt")) == ["checkpoint-00000050.pt", "checkpoint-00000100.pt"]
+
+
+def test_events_add_up_to_the_gaussians(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    densifier = small(Volumetric, volume_threshold=0.01)
+    trained = train(tiny_scene, truth, rasterizer, tmp_path, densifier)
+    events = records(tmp_path / "events.jsonl")
+    assert [event["step"] for event in events] == [40, 60, 80, 100]
+    count = len(truth)
+    for event in events:
+        assert event["before"] == count
+        count = event["after"]
+    assert count == len(trained) > len(truth)
+    living = densifier.lineage.causes_of_living()
+    assert sum(living.values()) == count
+    assert living["split_volume"] > 0
+
+
+def test_nothing_is_refined_in_the_last_iteration(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    """3DGS saves its model before it would refine or step."""
+    train(tiny_scene, truth, rasterizer, tmp_path, small(), iterations=100)
+    assert [event["step"] for event in records(tmp_path / "events.jsonl")] == [40, 60, 80]
+
+
+def test_time_budget_ends_a_training(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    train(tiny_scene, truth, rasterizer, tmp_path, NoDensifier(), iterations=10**6, max_seconds=0.3)
+    last = records(tmp_path / "metrics.jsonl")[-1]
+    assert last["seconds"] >= 0.3
+    assert last["step"] < 10**6
+
+
+def test_visible_adam_trains_too(tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path) -> None:
+    train(tiny_scene, truth, rasterizer, tmp_path, small(), visible_adam=True)
+    metrics = records(tmp_path / "metrics.jsonl")
+    assert metrics[-1]["l1"] < metrics[0]["l1"]
+
+
+def test_non_finite_loss_names_the_iteration(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    class Explode(NoDensifier):
+        def regularizer(self, gaussians: Gaussians) -> torch.Tensor | None:
+            self.calls = getattr(self, "calls", 0) + 1
+            return torch.tensor(float("inf")) if self.calls == 57 else None
+
+    with pytest.raises(TrainingError, match=r"iteration 57.*last good state"):
+        train(tiny_scene, truth, rasterizer, tmp_path, Explode())
+    assert (tmp_path / "checkpoint-00000050.pt").exists()
+
+
+def test_a_full_device_names_the_last_checkpoint_and_what_to_lower(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    class Full(NoDensifier):
+        def observe(self, step: int, render: RenderOutput) -> None:
+            if step == 57:
+                raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB\nand more")
+
+    with pytest.raises(TrainingError) as caught:
+        train(tiny_scene, truth, rasterizer, tmp_path, Full())
+    assert f"no memory left at {len(truth)} Gaussians" in str(caught.value)
+    assert f"newest checkpoint in {tmp_path}; lower densify.max_gaussians" in str(caught.value)
+    assert (tmp_path / "checkpoint-00000050.pt").exists()
+
+
+@pytest.mark.parametrize("kind", ["adc", "mcmc"])
+def test_as_on_a_device_that_is_behind(
+    kind: str,
+    tiny_scene: Scene,
+    truth: Gaussians,
+    rasterizer: Rasterizer,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Losses that arrive late, streamed images, checkpoints written by a thread: the same bits, stopped or not."""
+
+    def make() -> Densifier:
+        return small() if kind == "adc" else MCMC(start=20, stop=110, interval=20)
+
+    def stop_at_70(status: Status) -> None:
+        if status.step == 70:
+            raise KeyboardInterrupt
+
+    whole = train(tiny_scene, truth, rasterizer, tmp_path / "whole", make())
+    monkeypatch.setattr(Readback, "arrived", property(lambda self: False))
+    monkeypatch.setattr(trainer, "room_for_images", lambda *_: 0)
+    monkeypatch.setattr(trainer, "CheckpointWriter", lambda folder, background: CheckpointWriter(folder, True))
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        Trainer(tiny_scene, cloud(truth), make(), rasterizer, options(), 0).run(broken, stop_at_70)
+    assert sorted(path.name for path in broken.iterdir() if path.suffix == ".pt") == ["checkpoint-00000050.pt"]
+    assert same(whole, train(tiny_scene, truth, rasterizer, broken, make()))
+    assert (broken / "events.jsonl").read_text() == (tmp_path / "whole" / "events.jsonl").read_text()
+
+
+def test_every_view_is_used_once_before_any_is_used_again() -> None:
+    order = CameraOrder(7, generator(0, 0))
+    drawn = [order.next() for _ in range(21)]
+    assert [sorted(drawn[i : i + 7]) for i in (0, 7, 14)] == [list(range(7))] * 3
+    assert drawn[:7] != drawn[7:14]
+
+
+def test_learning_rate_of_the_means_is_log_linear() -> None:
+    rates = learning_rates(TrainConfig(name="x"))
+    assert rates.position(0) == pytest.approx(1.6e-4)
+    assert rates.position(15_000) == pytest.approx(1.6e-5)  # the geometric middle
+    assert rates.position(30_000) == pytest.approx(1.6e-6)
+    assert rates.position(99_000) == pytest.approx(1.6e-6)
+
+
+def test_a_densifier_that_was_never_due_is_told(
+    tiny_scene: Scene,
+    truth: Gaussians,
+    rasterizer: Rasterizer,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(logging.getLogger("gsbench"), "propagate", True)
+    train(tiny_scene, truth, rasterizer, tmp_path / "adc", ADC(start=500), iterations=15)
+    assert "not one refinement was due in 15 iterations" in caplog.text
+    caplog.clear()
+    train(tiny_scene, truth, rasterizer, tmp_path / "none", NoDensifier(), iterations=15)
+    assert "refinement" not in caplog.text
+
+
+def test_a_snapshot_is_the_model_of_a_training_that_ends_there(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    """Iteration 60 is due for a refinement and an opacity reset: 3DGS saves before both."""
+    (tmp_path / "long").mkdir()
+    Trainer(tiny_scene, cloud(truth), small(), rasterizer, options(), 0, snapshot_at=[60]).run(tmp_path / "long")
+    short = train(tiny_scene, truth, rasterizer, tmp_path / "short", small(), iterations=60)
+    assert same(read_ply(tmp_path / "long" / snapshot_file(60)), short)

@@ -1,0 +1,41 @@
+"""What a densifier sees of the training views is what the training sees."""
+
+from __future__ import annotations
+
+import torch
+
+from gsbench.densify import NoDensifier
+from gsbench.densify.scores import blended_sums
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster.reference import ReferenceRasterizer
+from gsbench.scene.types import Scene
+from gsbench.train.loss import photometric_loss
+from gsbench.train.trainer import Trainer
+from tests.train.test_trainer import cloud, options
+
+
+def test_views_are_rendered_and_measured_as_in_training(tiny_scene: Scene, truth: Gaussians) -> None:
+    settings = options(background=[0.2, 0.4, 0.6])
+    trainer = Trainer(tiny_scene, cloud(truth), NoDensifier(), ReferenceRasterizer(), settings, 0)
+    views, gaussians = trainer.context.training_views, trainer.gaussians.values
+    gaussians.sh_rest.data += 0.1
+    assert len(views) == len(tiny_scene.train)
+    for index, view in enumerate(tiny_scene.train[:2]):
+        assert torch.equal(views.image(index), torch.from_numpy(view.image))
+        for step, degree in ((39, 0), (40, 1), (120, 3), (400, 3)):  # a degree every 40 iterations
+            image = views.render(index, gaussians, step).image
+            own = trainer.rasterizer.render(gaussians, view.camera, degree, torch.tensor([0.2, 0.4, 0.6])).image
+            assert torch.equal(image, own)
+        expected, _, _ = photometric_loss(own.detach(), torch.from_numpy(view.image))
+        assert views.loss(index, own) == expected
+        assert not views.loss(index, own).requires_grad
+
+
+def test_looking_at_a_view_leaves_no_gradient(tiny_scene: Scene, truth: Gaussians) -> None:
+    trainer = Trainer(tiny_scene, cloud(truth), NoDensifier(), ReferenceRasterizer(), options(), 0)
+    views, gaussians = trainer.context.training_views, trainer.gaussians.values
+    with torch.no_grad():
+        sums, render = blended_sums(views, 0, gaussians, 100, torch.ones(*views.image(0).shape))
+    assert torch.equal(sums[:, 0], sums[:, 2])
+    torch.testing.assert_close(sums[:, 0].sum(), render.alpha.sum())  # light that is blended anywhere
+    assert all(tensor.grad is None for tensor in gaussians.tensors().values())
