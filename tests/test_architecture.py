@@ -13,7 +13,14 @@ import gsbench
 
 PACKAGE = Path(gsbench.__file__).parent
 LIBRARY = ("scene", "gaussians", "raster", "densify", "init", "eval")  # usable without configuration files or pipeline
-UPSTAIRS = ("cli", "compose", "hydra_job", "tracking", "bench")  # modules beside the rooms that are not ground floor
+UPSTAIRS = (
+    "cli",
+    "compose",
+    "hydra_guard",
+    "hydra_job",
+    "tracking",
+    "bench",
+)  # modules beside the rooms that are not ground floor
 GROUND_FLOOR = {path.stem for path in PACKAGE.glob("*.py")} - {*UPSTAIRS}
 # What each room may import of gsbench beside itself and the ground floor.
 MAY_IMPORT = {

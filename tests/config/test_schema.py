@@ -10,10 +10,11 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from gsbench.config.schema import TrainConfig, check, check_target, conf_dir, plain, register_schemas
+from gsbench.config.schema import TrainConfig, check, conf_dir, plain, register_schemas
 from gsbench.errors import InputError
 from gsbench.pipeline.components import build, build_metrics
 from gsbench.runs.hashing import config_hash
+from gsbench.trust import check_target
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch")
 
@@ -33,8 +34,8 @@ def composed(*overrides: str) -> dict[str, Any]:
 # What the user of another program must say: its version, where it lies, and that it may run.
 PROGRAMS = {
     "external": ["densify.command=[mine,'{data}']", "densify.result=x.ply", "allow_targets=[mine]"],
-    "3dgs": ["densify.options.code=/code", "allow_targets=[python]"],
-    "gsplat": ["densify.options.code=/code", "allow_targets=[python]"],
+    "3dgs": ["densify.options.code=/code", "allow_targets=[python,git]"],
+    "gsplat": ["densify.options.code=/code", "allow_targets=[python,git]"],
     "opensplat": ["allow_targets=[opensplat]"],
     "brush": ["allow_targets=[brush]"],
     "nerfstudio": ["allow_targets=[bash]"],
@@ -57,8 +58,8 @@ def test_every_option_composes(group: str, option: str) -> None:
 
 @pytest.mark.parametrize("option", options("densify"))
 def test_every_densifier_can_be_built_and_matches_its_class(option: str) -> None:
-    values = composed(f"densify={option}", "train=paper", *needs(option))["densify"]
-    densifier = build("densify", values, [])
+    config = composed(f"densify={option}", "train=paper", *needs(option))
+    values, densifier = config["densify"], build("densify", config["densify"], config["allow_targets"])
     if dataclasses.is_dataclass(densifier):
         names = {field.name for field in dataclasses.fields(densifier) if field.init}
         assert names == set(values) - {"_target_", "name"}  # the YAML shows every option

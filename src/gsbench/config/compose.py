@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -20,6 +21,8 @@ from gsbench.config.command_words import GROUPS, check_words, is_sweep, options
 from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, number_job, words_of
 from gsbench.config.schema import Config, check, check_values, conf_dir, plain, register_schemas
 from gsbench.errors import InputError
+from gsbench.hydra_guard import GuardedLoader, typed_permissions
+from gsbench.own_modules import import_only
 from gsbench.settings import checked
 from gsbench.words import closest
 
@@ -53,16 +56,28 @@ def composing() -> Iterator[Hydra]:
         with initialize_config_dir(str(conf_dir()), version_base="1.3", job_name="gsbench"):
             hydra = GlobalHydra.instance().hydra
             assert hydra is not None
+            _guard(hydra)
             yield hydra
     finally:
         HydraConfig.instance().cfg = None
 
 
 def compose_master(hydra: Hydra, words: Sequence[str], mode: RunMode = RunMode.RUN) -> DictConfig:
-    """What Hydra makes of ``words``, with its own settings in the node ``hydra``. Raises InputError, one line."""
+    """What Hydra makes of ``words``, with its own settings in the node ``hydra``. Raises InputError, one line.
+
+    From here on the modules are found that ``words`` allow: they are what somebody has typed.
+    """
+    _guard(hydra, words)
     with explained(words), warnings.catch_warnings():
         warnings.filterwarnings("error", message=r".* is not available\.", module="hydra")  # a folder to search in
         return hydra.compose_config(CONFIG_NAME, list(words), run_mode=mode)
+
+
+def _guard(hydra: Hydra, words: Sequence[str] = ()) -> None:
+    """Let ``hydra`` compose only what cannot make anything run that ``words`` do not allow."""
+    allowed, path = typed_permissions(words), hydra.config_loader.get_search_path()
+    hydra.config_loader = GuardedLoader(path, allowed, os.getcwd())
+    import_only(allowed)
 
 
 def compose_jobs(

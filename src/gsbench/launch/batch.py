@@ -22,12 +22,15 @@ from gsbench.runs.stages import STAGES
 from gsbench.runs.store import Store
 from gsbench.runs.trial_files import TrialPaths, find_finished
 from gsbench.system.stopping import stop_on_signals
+from gsbench.trust import check_permissions
 
 log = logging.getLogger(__name__)
 
 
 def run_batch(trials: Sequence[Composed]) -> list[Outcome]:
     """Run what is not done among ``trials`` by the launcher that they name; how each ended."""
+    for trial in trials:
+        check_permissions(trial.values)
     runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
     with storage_errors(runs), stop_on_signals():
         if launcher != "slurm" and (missing := missing_weights(trials)):  # also where all is done and none is needed

@@ -40,6 +40,7 @@ from gsbench.runs.step import Step
 from gsbench.runs.store import Store
 from gsbench.scene.types import Capture
 from gsbench.system.resources import available_threads
+from gsbench.trust import check_permissions
 
 CaptureReader = Callable[[SceneConfig, Path | None], Capture]
 
@@ -62,6 +63,7 @@ class Parts:
     @classmethod
     def of(cls, values: dict[str, Any]) -> Parts:
         """The parts of the trial with the resolved configuration ``values``. Raises InputError naming a wrong key."""
+        check_permissions(values)
         device = select_device(values["device"])
         threads = available_threads(values["launch"]["parallel"]) if values["threads"] == "auto" else values["threads"]
         densifier = build("densify", values["densify"], values["allow_targets"])

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
-from gsbench.config.command_words import check_words, is_sweep, search_path
+from gsbench.config.command_words import check_words, is_sweep, parse_word, search_path
 from gsbench.config.compose import compose_values
 from gsbench.config.schema import conf_dir, register_schemas
 from gsbench.errors import InputError
+from gsbench.hydra_guard import check_search_path, typed_permissions
 from gsbench.verbs.arguments import ArgumentParser
 
 QUERIES = ("--cfg", "-c", "--info", "-i", "--hydra-help", "--shell-completion", "-sc", "--resolve", "--package", "-p")
@@ -28,6 +31,7 @@ def ask_hydra(argv: list[str]) -> int:
     if options.shell_completion:
         if len(options.overrides) != 1 or not COMPLETION.fullmatch(options.overrides[0]):
             raise InputError("-sc takes install=bash or uninstall=bash, and zsh and fish likewise")
+        _check_typed(os.environ.get("COMP_LINE", ""))
     else:
         _check(options.overrides, options.config_dir, options.package)
     return _call_hydra(argv)
@@ -40,6 +44,16 @@ def _check(overrides: list[str], config_dir: Path | None, package: str | None) -
     config = compose_values([*search_path([config_dir] if config_dir else [], overrides), *overrides])
     if package is not None and OmegaConf.select(config, package) is None:
         raise InputError(f"--package {package}: there is no such part of the configuration")
+
+
+def _check_typed(line: str) -> None:
+    """Refuse to complete a line that would import a package which it does not allow."""
+    words = []
+    for word in line.split():
+        with suppress(InputError):  # half typed
+            parse_word(word)
+            words.append(word)
+    check_search_path(words, typed_permissions(words))
 
 
 def _call_hydra(argv: list[str]) -> int:
