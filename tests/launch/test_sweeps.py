@@ -262,7 +262,7 @@ def test_finished_trial_is_recognised_until_something_changes(runs: Path) -> Non
 )
 def test_changes_are_noticed(change: str, runs: Path) -> None:
     values = trial_values()
-    finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"} if change == "weights" else None)
+    finish(values, awaited=["lpips_vgg"] if change == "weights" else ())
     folder = TrialPaths.of(values).folder
     if change == "photo":
         (runs.parent / "photos" / "a.jpg").write_bytes(b"other")
