@@ -1,14 +1,11 @@
-"""What a tracker has to take so that trials are mirrored there, and the trackers that do."""
+"""What a tracker has to take so that trials are mirrored there."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
-
-if TYPE_CHECKING:
-    from gsbench.tracking.record import TrialRecord
+from typing import Any, Protocol
 
 DEFAULT = "mlflow"
 NAMES = {DEFAULT: "MLflow", "tensorboard": "TensorBoard", "wandb": "Weights & Biases"}
@@ -69,23 +66,3 @@ class Sink(Protocol):
 def name_of(options: dict[str, Any]) -> str:
     """The tracker's name, for people."""
     return NAMES[options.get("sink", DEFAULT)]
-
-
-def make_sink(options: dict[str, Any], record: TrialRecord, program: str | None) -> Sink:
-    """The trial's place in the tracker that ``tracking.sink`` names.
-
-    ``program`` is what runs the trial at this moment; None where the trial has ended.
-    """
-    match options.get("sink", DEFAULT):
-        case "tensorboard":
-            from gsbench.tracking.tensorboard_sink import TensorBoardSink
-
-            return TensorBoardSink(record)
-        case "wandb":
-            from gsbench.tracking.wandb_sink import WandbSink
-
-            return WandbSink(options, record)
-        case _:
-            from gsbench.tracking.mlflow_sink import MlflowSink
-
-            return MlflowSink(options, record, program)

@@ -10,7 +10,7 @@ from gsbench.runs import layout
 from gsbench.runs.trial_files import failure_of
 from gsbench.system.locks import hold
 from gsbench.tracking.record import TrialRecord
-from gsbench.tracking.sink import make_sink
+from gsbench.tracking.sink import DEFAULT, Sink
 
 LOCK = ".mlflow.lock"  # one process at a time mirrors a trial, to whichever tracker
 
@@ -85,3 +85,23 @@ def mirror_trial(options: dict[str, Any], runs: Path, folder: Path, values: dict
             return False
         run.end()
     return True
+
+
+def make_sink(options: dict[str, Any], record: TrialRecord, program: str | None) -> Sink:
+    """The trial's place in the tracker that ``tracking.sink`` names.
+
+    ``program`` is what runs the trial at this moment; None where the trial has ended.
+    """
+    match options.get("sink", DEFAULT):
+        case "tensorboard":
+            from gsbench.tracking.tensorboard_sink import TensorBoardSink
+
+            return TensorBoardSink(record)
+        case "wandb":
+            from gsbench.tracking.wandb_sink import WandbSink
+
+            return WandbSink(options, record)
+        case _:
+            from gsbench.tracking.mlflow_sink import MlflowSink
+
+            return MlflowSink(options, record, program)
