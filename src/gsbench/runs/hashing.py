@@ -16,9 +16,12 @@ NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tra
 # they are left out of hashes and keys, so that nothing is computed anew for a setting that changes nothing.
 ADDED_LATER: dict[str, dict[str, Any]] = {
     "init": {"min_inlier_ratio": 0.0},
+    "densify": {"governor_dimension": 1},
     "raster": {"_target_": None},
     "eval": {"at": [], "extra": {}},
 }
+# Settings that are read only where another has a certain value: elsewhere they are left out likewise.
+READ_ONLY_IF: dict[str, dict[str, tuple[str, Any]]] = {"densify": {"governor_dimension": ("cap", "governor")}}
 
 
 def config_hash(values: dict[str, Any]) -> str:
@@ -41,9 +44,15 @@ def _with_sources(values: Any) -> Any:
 
 
 def without_later(group: str, values: dict[str, Any]) -> dict[str, Any]:
-    """``values`` of a group as they are hashed: without the settings of `ADDED_LATER` that stand at their defaults."""
-    later = ADDED_LATER.get(group, {})
-    return {name: value for name, value in values.items() if name not in later or value != later[name]}
+    """``values`` of a group as they are hashed: without the settings of `ADDED_LATER` that stand at their defaults, and
+    those of `READ_ONLY_IF` that nothing reads."""
+    later, conditions = ADDED_LATER.get(group, {}), READ_ONLY_IF.get(group, {})
+    unread = {name for name, (other, value) in conditions.items() if other in values and values[other] != value}
+    return {
+        name: value
+        for name, value in values.items()
+        if name not in unread and (name not in later or value != later[name])
+    }
 
 
 def sha256_of(values: Any) -> str:
