@@ -12,7 +12,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsbench.config.schema import TrainConfig
 from gsbench.densify import ADC
 from gsbench.eval.ssim import torch_photometric_loss
 from gsbench.gaussians.initial import gaussians_from_cloud
@@ -25,6 +24,7 @@ from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import Scene, View
 from gsbench.train.loss_triton import TritonLoss
+from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer
 from tests.gaussians.helpers import random_gaussians
 
