@@ -11,10 +11,12 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from gsbench.config.schema import TrainConfig, check, check_target, conf_dir, plain, register_schemas
+from gsbench.config.schema import check, check_target, plain, register_schemas
 from gsbench.errors import InputError
 from gsbench.pipeline.components import build, build_metrics
 from gsbench.runs.hashing import config_hash
+from gsbench.system.install import conf_dir
+from gsbench.train.options import TrainConfig
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch")
 

@@ -30,8 +30,8 @@ from gsbench.pipeline.steps.model_metrics import (
 )
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.camera import Camera
+from gsbench.scene.courtyard.depth import courtyard_depth
 from gsbench.scene.courtyard.render import courtyard_cameras
-from gsbench.scene.courtyard_depth import courtyard_depth
 from gsbench.scene.types import Scene, View
 
 SIZE = (48, 36)

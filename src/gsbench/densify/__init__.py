@@ -12,7 +12,6 @@ from gsbench.densify.scores import TrainingViews
 from gsbench.densify.taming import Taming
 from gsbench.densify.volumetric import Volumetric
 from gsbench.events import Cause, RefineEvent
-from gsbench.external.settings import External
 
 __all__ = [
     "ADC",
@@ -22,7 +21,6 @@ __all__ = [
     "Densifier",
     "DensifyContext",
     "EdgeAware",
-    "External",
     "Lineage",
     "LongAxis",
     "NoDensifier",

@@ -14,10 +14,11 @@ from typing import Any
 
 import torch
 
-from gsbench.config.schema import EvalConfig, SceneConfig, TrainConfig
-from gsbench.densify import Densifier, External
+from gsbench.densify import Densifier
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.metric import Metric
+from gsbench.eval.options import EvalConfig
+from gsbench.external.settings import External
 from gsbench.init import Sfm
 from gsbench.init.base import Initializer
 from gsbench.pipeline.components import (
@@ -38,8 +39,10 @@ from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
+from gsbench.scene.options import SceneConfig
 from gsbench.scene.types import Capture
 from gsbench.system.resources import available_threads
+from gsbench.train.options import TrainConfig
 
 CaptureReader = Callable[[SceneConfig, Path | None], Capture]
 

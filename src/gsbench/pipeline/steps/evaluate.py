@@ -24,7 +24,6 @@ from gsbench.init.base import MODEL_FOLDER
 from gsbench.logs import progress
 from gsbench.pipeline.components import options_of, rasterizer_inputs
 from gsbench.pipeline.steps.figures import draw_ellipsoids
-from gsbench.pipeline.steps.ground_truth import png_name
 from gsbench.pipeline.steps.maps import view_maps
 from gsbench.pipeline.steps.model_metrics import (
     ModelMetrics,
@@ -38,6 +37,7 @@ from gsbench.runs.layout import FIGURES, LINEAGE, MAPS, PER_VIEW, POINT_CLOUD, R
 from gsbench.runs.stages import EVALUATE
 from gsbench.runs.step import Step
 from gsbench.scene.images import read_image
+from gsbench.scene.names import png_name
 from gsbench.scene.types import Scene
 from gsbench.train.trainer import snapshot_file
 

@@ -30,8 +30,8 @@ from gsbench.pipeline.steps.maps import paint, surface_depth, unproject
 from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
 from gsbench.scene.camera import Camera
+from gsbench.scene.courtyard.depth import courtyard_depth
 from gsbench.scene.courtyard.render import courtyard_cameras, surface_distance
-from gsbench.scene.courtyard_depth import courtyard_depth
 from gsbench.scene.types import Scene
 
 if TYPE_CHECKING:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gsbench.scene.courtyard.depth import courtyard_depth
 from gsbench.scene.courtyard.render import courtyard_cameras, surface_distance
-from gsbench.scene.courtyard_depth import courtyard_depth
 
 
 @pytest.mark.parametrize("seed", [0, 3])
