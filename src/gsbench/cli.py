@@ -77,6 +77,10 @@ def _verb(name: str, argv: list[str]) -> int:
 
 
 def _trials(argv: list[str]) -> int:
+    from gsbench.verbs.queries import QUERIES, ask_hydra
+
+    if any(word.split("=")[0] in QUERIES for word in argv):
+        return ask_hydra(argv)
     from gsbench.app.command import launch
 
     return launch(argv)

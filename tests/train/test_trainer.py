@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.config.schema import TrainConfig
 from gsbench.densify import ADC, GNS, MCMC, MRNF, Densifier, FastGS, NoDensifier, ResGS, Volumetric
 from gsbench.errors import TrainingError
 from gsbench.gaussians.initial import gaussians_from_cloud
@@ -21,6 +20,7 @@ from gsbench.raster.readback import Readback
 from gsbench.scene.types import Scene
 from gsbench.train import trainer
 from gsbench.train.checkpoint import CheckpointWriter
+from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import CameraOrder, Status, Trainer, generator, learning_rates, snapshot_file
 
 CPU = torch.device("cpu")

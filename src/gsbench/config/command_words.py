@@ -11,9 +11,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
-from gsbench.config.schema import COMPONENTS, conf_dir
+from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.runs.hashing import DECLARED, NOT_HASHED, WITHOUT_EFFECT
+from gsbench.system.install import conf_dir
 from gsbench.words import closest
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")

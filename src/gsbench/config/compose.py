@@ -18,10 +18,11 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gsbench.config.command_words import GROUPS, check_words, is_sweep, options
 from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, number_job, words_of
-from gsbench.config.schema import Config, check, check_values, conf_dir, plain, register_schemas
+from gsbench.config.old_names import know_old_names
+from gsbench.config.schema import Config, check, check_values, plain, register_schemas
 from gsbench.errors import InputError
-from gsbench.old_names import know_old_names
 from gsbench.settings import checked
+from gsbench.system.install import conf_dir
 from gsbench.words import closest
 
 MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood

@@ -18,7 +18,6 @@ from gsbench.densify.scores import TrainingViews
 from gsbench.densify.taming import Taming
 from gsbench.densify.volumetric import Volumetric
 from gsbench.events import Cause, RefineEvent
-from gsbench.external.settings import External
 
 __all__ = [
     "ADC",
@@ -31,7 +30,6 @@ __all__ = [
     "Densifier",
     "DensifyContext",
     "EdgeAware",
-    "External",
     "FastGS",
     "Lineage",
     "LongAxis",

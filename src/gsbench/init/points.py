@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
+from gsbench.files import file_sha256
 from gsbench.init.base import PointCloud, Seed
 from gsbench.init.colmap.alignment import Array
 from gsbench.init.placed import PlacedCloud
 from gsbench.init.point_files import read_points, read_similarity
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath
-from gsbench.weights import file_sha256
 
 if TYPE_CHECKING:
     import pycolmap

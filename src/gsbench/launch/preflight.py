@@ -47,7 +47,7 @@ def check_components(trials: Sequence[Composed], here: bool) -> None:
 
     With ``here``, the trials will run on this machine, whose devices are known. Raises InputError naming the key.
     """
-    from gsbench.densify import External
+    from gsbench.external.settings import External
     from gsbench.pipeline.components import build, check_footprint, select_device
     from gsbench.raster.executors import AUTO, resolve
 

@@ -13,13 +13,14 @@ from typing import Any
 
 import torch
 
-from gsbench.config.schema import ALLOWED_TARGETS, EvalConfig, check_target, require_values
-from gsbench.densify import External
+from gsbench.config.schema import ALLOWED_TARGETS, EXTERNAL, check_target, require_values
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import facts_of
 from gsbench.eval.metric import Metric
+from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import get_protocol
+from gsbench.external.settings import External
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.runs.hashing import WITHOUT_EFFECT, without_later
 from gsbench.runs.source import has_changed_since_import, source_of
@@ -27,6 +28,7 @@ from gsbench.settings import checked, unknown_setting
 
 log = logging.getLogger(__name__)
 
+MOVED = {EXTERNAL: "gsbench.external.settings.External"}  # how configurations name a class, and where it stands
 RESERVED = ("_target_", "name")  # keys of a group that are not options of its class
 METHODS = {
     "init": ("needs_reference", "content", "run"),
@@ -131,7 +133,7 @@ def _check_names(cls: Any, options: dict[str, Any], group: str) -> None:
 
 def locate(target: str, group: str) -> type:
     """The class at the import path ``package.module.Class``, which must be one that ``group`` can use."""
-    module, _, name = target.rpartition(".")
+    module, _, name = MOVED.get(target, target).rpartition(".")
     try:
         found = getattr(importlib.import_module(module), name)
     except Exception as error:  # importing a user's file runs it: it may raise anything
@@ -172,7 +174,8 @@ def make_evaluator(
     """The evaluator that the settings ``eval`` describe, with the user's own metrics; looks for networks' weights."""
     weights = None if options.weights is None else Path(options.weights).expanduser()
     protocol = get_protocol(options.protocol)
-    return Evaluator(protocol, device, tuple(options.lpips), options.flip, weights, options.download, extra)
+    lpips, more = tuple(options.lpips), tuple(options.more)
+    return Evaluator(protocol, device, lpips, options.flip, weights, options.download, extra, more)
 
 
 def select_device(name: str) -> torch.device:

@@ -12,11 +12,11 @@ import torch
 
 from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import compose_one
-from gsbench.config.schema import EvalConfig
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize
 from gsbench.eval.facts import METRICS
 from gsbench.eval.matching import Matching, match_by_order, match_pictures
+from gsbench.eval.options import EvalConfig
 from gsbench.eval.pictures import Pair, measure
 from gsbench.files import storage_errors
 from gsbench.logs import progress

@@ -18,7 +18,7 @@ ADDED_LATER: dict[str, dict[str, Any]] = {
     "init": {"min_inlier_ratio": 0.0},
     "densify": {"governor_dimension": 1},
     "raster": {"_target_": None},
-    "eval": {"at": [], "extra": {}},
+    "eval": {"at": [], "extra": {}, "more": [], "geometry": False, "flicker": False},
 }
 # Settings that are read only where another has a certain value: elsewhere they are left out likewise.
 READ_ONLY_IF: dict[str, dict[str, tuple[str, Any]]] = {"densify": {"governor_dimension": ("cap", "governor")}}

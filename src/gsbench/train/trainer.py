@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsbench.config.schema import TrainConfig
 from gsbench.densify import Densifier, DensifyContext, NoDensifier
 from gsbench.densify.volume import log_volume
 from gsbench.errors import TrainingError
@@ -32,6 +31,7 @@ from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
 from gsbench.train.loss import PhotometricLoss
 from gsbench.train.loss_log import LossLog
 from gsbench.train.memory_budget import explain_full, free_bytes, room_for_images
+from gsbench.train.options import TrainConfig
 from gsbench.train.targets import Targets
 from gsbench.train.training_views import SceneViews
 

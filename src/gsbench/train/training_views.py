@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 
 from torch import Tensor
 
-from gsbench.eval.ssim import as_unit_range, ssim_map
+from gsbench.eval.ssim import ssim_map
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster import Rasterizer, RenderOutput
 from gsbench.scene.types import View
-from gsbench.train.loss import PhotometricLoss
+from gsbench.train.loss import PhotometricLoss, as_unit_range
 from gsbench.train.targets import Targets
 
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
-from typing import Any
-
-from omegaconf import OmegaConf
 
 from gsbench.config.command_words import check_words, is_sweep, search_path
 from gsbench.config.compose import compose_values
-from gsbench.config.schema import conf_dir, register_schemas
+from gsbench.config.questions import answer, has_part
 from gsbench.errors import InputError
+from gsbench.runs.source import import_from_here
 from gsbench.verbs.arguments import ArgumentParser
 
 QUERIES = ("--cfg", "-c", "--info", "-i", "--hydra-help", "--shell-completion", "-sc", "--resolve", "--package", "-p")
@@ -21,6 +18,7 @@ COMPLETION = re.compile(r"(install|uninstall|query)=(bash|zsh|fish)")
 
 def ask_hydra(argv: list[str]) -> int:
     """Let Hydra answer about the configuration; no trial is run. Raises InputError for what it would not understand."""
+    import_from_here()
     options = _parser().parse_args(argv)
     asked = [options.cfg is not None, options.info is not None, options.shell_completion, options.hydra_help]
     if sum(asked) != 1 or ((options.resolve or options.package) and options.cfg is None):
@@ -30,7 +28,8 @@ def ask_hydra(argv: list[str]) -> int:
             raise InputError("-sc takes install=bash or uninstall=bash, and zsh and fish likewise")
     else:
         _check(options.overrides, options.config_dir, options.package)
-    return _call_hydra(argv)
+    answer(argv)
+    return 0
 
 
 def _check(overrides: list[str], config_dir: Path | None, package: str | None) -> None:
@@ -38,24 +37,8 @@ def _check(overrides: list[str], config_dir: Path | None, package: str | None) -
     if swept := [word for word in overrides if is_sweep(word)]:
         raise InputError(f"{swept[0]} lists several values: choose one whose configuration is shown")
     config = compose_values([*search_path([config_dir] if config_dir else [], overrides), *overrides])
-    if package is not None and OmegaConf.select(config, package) is None:
+    if package is not None and not has_part(config, package):
         raise InputError(f"--package {package}: there is no such part of the configuration")
-
-
-def _call_hydra(argv: list[str]) -> int:
-    import hydra
-
-    def task(config: Any) -> None:
-        raise AssertionError("Hydra was asked a question, and ran the task instead")
-
-    register_schemas()
-    saved = sys.argv
-    sys.argv = ["gsbench", *argv]
-    try:
-        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(task)()
-    finally:
-        sys.argv = saved
-    return 0
 
 
 def _parser() -> ArgumentParser:

@@ -15,13 +15,13 @@ import numpy as np
 import torch
 
 from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS
-from gsbench.densify import External, Lineage
+from gsbench.densify import Lineage
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.inputs import write_test_cameras, write_training_views
 from gsbench.external.outputs import take_model, take_renders
 from gsbench.external.placeholders import fill, words_of
 from gsbench.external.program import run_program
-from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS
+from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS, External
 from gsbench.files import write_json
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER

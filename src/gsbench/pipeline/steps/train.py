@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsbench.config.schema import TrainConfig
 from gsbench.densify import Densifier
 from gsbench.files import write_json
 from gsbench.gaussians.initial import gaussians_from_cloud
@@ -28,6 +27,7 @@ from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
 from gsbench.system.machine import describe_machine
 from gsbench.system.memory import peak_memory_mb, reset_peak_memory
+from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Status, Trainer
 
 TRAINING_FILE = "training.json"
