@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from gsbench import old_names
 from gsbench.app.hydra_app import compose_trials
+from gsbench.config import old_names
 from gsbench.config.command_words import options
 from gsbench.config.compose import compose_one
-from gsbench.config.schema import conf_dir
 from gsbench.errors import InputError
+from gsbench.system.install import conf_dir
 
 GIVEN = ["densify.version='1'", "allow_targets=[opensplat,mine]"]
 

@@ -9,10 +9,10 @@ import torch
 from gsbench.densify import FastGS
 from gsbench.densify.scores import draw
 from gsbench.errors import InputError
-from gsbench.eval.ssim import torch_photometric_loss
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.reference import ReferenceRasterizer
+from gsbench.train.loss import torch_photometric_loss
 from tests.densify.test_absgs import growth
 from tests.densify.test_rounds import EXTENT, assert_same, to_rows
 from tests.densify.test_scores import BLACK, COUNT, Room, alphas, at, started

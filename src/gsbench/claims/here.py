@@ -52,7 +52,7 @@ class Here:
         return ""
 
     def _missing_metrics(self, options: str) -> dict[str, str]:
-        from gsbench.config.schema import EvalConfig
+        from gsbench.eval.options import EvalConfig
         from gsbench.pipeline.components import make_evaluator
 
         values = _thawed(options)

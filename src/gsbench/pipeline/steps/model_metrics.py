@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsbench.config.schema import SceneConfig
 from gsbench.errors import InputError
 from gsbench.eval.facts import FLICKER, GEOMETRY, OF_MODELS
 from gsbench.eval.flicker import camera_path, flicker
@@ -32,6 +31,7 @@ from gsbench.raster import Rasterizer
 from gsbench.scene.camera import Camera
 from gsbench.scene.courtyard.depth import courtyard_depth
 from gsbench.scene.courtyard.render import courtyard_cameras, surface_distance
+from gsbench.scene.options import SceneConfig
 from gsbench.scene.types import Scene
 
 if TYPE_CHECKING:
