@@ -18,7 +18,6 @@ NAMES = ("name", "kind", "protocol", "path", "sink", "enabled")  # they say whic
 # group/file: the keys whose values differ from the class's own; a file that is built on another has the other's too
 DELIBERATE = {
     "densify/absgrad": {"gradient", "gradient_threshold"},
-    "densify/edgeaware": {"gradient", "gradient_threshold"},
     "densify/longaxis": {"gradient", "gradient_threshold"},
     "densify/revised": {"revised_opacity"},
     "densify/volumetric_once": {"split_isotropic"},
@@ -31,10 +30,13 @@ DELIBERATE = {
     "train/late2024": {"opacity"},
     "train/none": {"iterations"},
 }
-# A shortened schedule, and what starts another program, differ in most of what they have.
+# Built on another file, and yet of a class whose defaults are its values.
+OWN_CLASS = {"densify/edgeaware", "densify/gns"}
+# A shortened schedule, those of other authors (held to their code in tests/densify), and what starts another program
+# differ in most of what they have.
 WHOLE = {
     "train/quick",
-    *(f"densify/{name}" for name in ("3dgs", "brush", "external", "gsplat", "nerfstudio", "opensplat")),
+    *(f"train/{name}" for name in ("fastgs", "improved_gs", "mrnf", "resgs", "taming")),
 }
 
 
@@ -83,6 +85,8 @@ def stated(path: str) -> dict[str, Any]:
 
 
 def allowed(path: str) -> set[str]:
+    if path in OWN_CLASS:
+        return DELIBERATE.get(path, set())
     return set().union(*(DELIBERATE.get(file, set()) for file in (path, *bases(path))))
 
 

@@ -185,10 +185,14 @@ def check(config: DictConfig) -> None:
 
 
 def require_values(values: Mapping[str, Any], group: str) -> None:
-    """Raise InputError for the first setting of ``group`` that must be given and is not."""
-    for key, value in values.items():
+    """Raise InputError for the first setting of ``group`` that must be given and is not, or of its ``options``."""
+    name = values.get("name")
+    whose = f" ({group}={name})" if name not in (None, MISSING) else ""
+    options = values.get("options")
+    nested = options if isinstance(options, Mapping) else {}
+    for key, value in [*values.items(), *((f"options.{key}", value) for key, value in nested.items())]:
         if value == MISSING:
-            raise InputError(f"{group}.{key} is not set: give it a value")
+            raise InputError(f"{group}.{key} is not set: give it a value{whose}")
 
 
 def _settings_of(config: DictConfig, group: str) -> dict[str, Any]:

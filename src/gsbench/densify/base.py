@@ -83,6 +83,11 @@ class Densifier:
         """Check the hyper-parameters against their annotations; a subclass adds the rules between them."""
         check_settings(self, "densify")
 
+    @property
+    def most_gaussians(self) -> int | None:
+        """How many Gaussians there may be at any time, by ``max_gaussians`` where a class has that; None: no limit."""
+        return getattr(self, "max_gaussians", None)
+
     def prepare(self, gaussians: Gaussians) -> Gaussians:
         """The Gaussians that the training starts with, from those of the initial cloud."""
         return gaussians

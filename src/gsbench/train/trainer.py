@@ -102,7 +102,7 @@ class Trainer:
         self.step = 0
         self.seconds = 0.0
         self.losses = LossLog()
-        cap = getattr(densifier, "max_gaussians", None)
+        cap = densifier.most_gaussians
         pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
         room = room_for_images(free_bytes(self.device), len(initial), cap, pixels)
         self.targets = Targets(scene.train, self.device, room)
