@@ -3,7 +3,9 @@
     python scripts/findings.py collect RUNS   copy what the page needs out of a runs folder
     python scripts/findings.py                write the tables into the page and draw the curves
 
-The page's own test makes the tables anew and compares.
+A table of differences is one family of tests (Holm). It stands in the page as ``differences of EXPERIMENT`` (every arm
+minus the baseline) or as ``differences of EXPERIMENT: ARM, ARM against ARM``. The page's own test makes the tables anew
+and compares.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from PIL import Image
 from gsbench.analysis.frame import to_frame
 from gsbench.analysis.pairing import Paired
 from gsbench.analysis.results import Experiment, list_experiments, read_experiment, read_views
-from gsbench.analysis.statistics import compare_family
+from gsbench.analysis.statistics import Comparison, compare_family
 from gsbench.eval.facts import MetricFacts, find
 
 PAGE = Path(__file__).parents[1] / "docs" / "findings.md"
@@ -31,7 +33,11 @@ BASELINES = ("adc", "sfm")  # what the others are held against: among densifiers
 METRICS = {"lpips_squeeze": ("LPIPS (squeeze)", 3), "psnr": ("PSNR, dB", 2), "ssim": ("SSIM", 3), "flip": ("FLIP", 3)}
 WHICH = ["scene", "init", "densify", "seed", "iterations", "width", "height"]
 CAUSES = ["cloned", "split_gradient", "split_volume", "isotropic_resplit", "blocked_by_cap", "pruned_opacity"]
-SECTION = re.compile(r"(<!-- (\w+) of (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+SECTION = re.compile(
+    r"(<!-- (?P<table>\w+) of (?P<experiment>\w+)(?:: (?P<arms>[\w., -]+) against (?P<against>[\w.-]+))? -->\n)"
+    r".*?<!-- end -->",
+    re.DOTALL,
+)
 
 
 def collect(runs: Path) -> None:
@@ -112,28 +118,40 @@ def _by_scene(frame: pd.DataFrame, title: str, cell: Callable[[pd.DataFrame], st
     return lines
 
 
-def differences_table(frame: pd.DataFrame) -> list[str]:
-    """Each arm minus the baseline in each metric: mean, 95 % interval, p adjusted over the arms (Holm), verdict."""
+def differences_table(frame: pd.DataFrame, against: str | None = None, arms: Sequence[str] | None = None) -> list[str]:
+    """Each arm minus ``against`` in each metric: mean, 95 % interval, p adjusted over the whole table (Holm).
+
+    Bold is what the program would decide. Nothing is called better or worse, since no metric was declared.
+    """
+    against = against or _baseline(frame)
+    found = compared(frame, against, arms)
     lines = [
-        _row([f"minus {_baseline(frame)}", *(title for title, _ in METRICS.values())]),
+        _row([f"minus {against}", *(title for title, _ in METRICS.values())]),
         _row(["---"] * (1 + len(METRICS))),
     ]
-    others = _arms(frame)[1:]
-    found = {
-        metric: compare_family([(pair(frame, arm, metric), _facts(metric).direction) for arm in others])
-        for metric in METRICS
-    }
-    for index, arm in enumerate(others):
-        cells = []
-        for metric, (_, digits) in METRICS.items():
-            c = found[metric][index]
-            word = "" if c.verdict == "no evidence" else f": **{c.verdict}**"
-            interval = f" [{c.interval.low:+.{digits}f}, {c.interval.high:+.{digits}f}]" if c.interval else ""
-            p = c.p_family
-            chance = "" if p is None else f", p {p:.3f}" if p >= 0.001 else ", p < .001"
-            cells.append(f"{c.mean:+.{digits}f}{interval}{chance}{word}")
-        lines.append(_row([arm, *cells]))
+    for arm in dict.fromkeys(arm for arm, _ in found):
+        lines.append(_row([arm, *(_difference(found[arm, metric]) for metric in METRICS)]))
     return lines
+
+
+def _difference(c: Comparison) -> str:
+    _, digits = METRICS[c.metric]
+    interval = f" [{c.interval.low:+.{digits}f}, {c.interval.high:+.{digits}f}]" if c.interval else ""
+    p = c.p_family
+    chance = "" if p is None else f"p {p:.3f}" if p >= 0.001 else "p < .001"
+    if c.verdict != "no evidence":
+        chance = f"**{chance}**"
+    return ", ".join(filter(None, [f"{c.mean:+.{digits}f}{interval}", chance]))
+
+
+def compared(
+    frame: pd.DataFrame, against: str | None = None, arms: Sequence[str] | None = None
+) -> dict[tuple[str, str], Comparison]:
+    """By (arm, metric), each of ``arms`` (default: all others) minus ``against``, as one family of tests."""
+    against = against or _baseline(frame)
+    keys = [(arm, metric) for arm in arms or _arms(frame) if arm != against for metric in METRICS]
+    members = [(pair(frame, arm, metric, against), _facts(metric).direction) for arm, metric in keys]
+    return dict(zip(keys, compare_family(members), strict=True))
 
 
 def events_table(frame: pd.DataFrame) -> list[str]:
@@ -147,11 +165,9 @@ def events_table(frame: pd.DataFrame) -> list[str]:
     return lines
 
 
-def pair(frame: pd.DataFrame, arm: str, metric: str) -> Paired:
-    """An arm and the baseline as the program pairs them, a trial's mean standing for its views."""
-    one, other = (
-        frame[frame.arm == name].set_index(["scene", "seed"])[metric].sort_index() for name in (_baseline(frame), arm)
-    )
+def pair(frame: pd.DataFrame, arm: str, metric: str, against: str) -> Paired:
+    """Two arms as the program pairs them, but for the views: a trial's mean stands for them, so none is drawn anew."""
+    one, other = (frame[frame.arm == name].set_index(["scene", "seed"])[metric].sort_index() for name in (against, arm))
     both = one.index.intersection(other.index)
     difference = (other[both] - one[both]).dropna()
     scenes = tuple(dict.fromkeys(difference.index.get_level_values("scene")))
@@ -199,7 +215,14 @@ TABLES = {
 
 def with_tables(page: str) -> str:
     """The page with every table made anew."""
-    return SECTION.sub(lambda m: m[1] + "\n".join(TABLES[m[2]](read(m[3]))) + "\n" + m[4], page)
+    return SECTION.sub(lambda found: found[1] + "\n".join(_table(found)) + "\n<!-- end -->", page)
+
+
+def _table(found: re.Match[str]) -> list[str]:
+    frame = read(found["experiment"])
+    if found["against"] is None:
+        return TABLES[found["table"]](frame)
+    return differences_table(frame, found["against"], found["arms"].split(", "))
 
 
 def draw() -> None:

@@ -12,7 +12,7 @@ import yaml
 
 from gsbench import cli
 from gsbench.errors import InputError
-from gsbench.own_modules import import_only
+from gsbench.system.own_modules import import_only
 
 BOMB = "from pathlib import Path\nPath('exploded').touch()\nclass Bomb:\n    pass\n"
 MINE = """

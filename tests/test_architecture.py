@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -12,27 +12,34 @@ import pytest
 import gsbench
 
 PACKAGE = Path(gsbench.__file__).parent
-LIBRARY = ("scene", "gaussians", "raster", "densify", "init", "eval")  # usable without configuration files or pipeline
-UPSTAIRS = (
-    "cli",
-    "compose",
-    "hydra_guard",
-    "hydra_job",
-    "tracking",
-    "bench",
-)  # modules beside the rooms that are not ground floor
-GROUND_FLOOR = {path.stem for path in PACKAGE.glob("*.py")} - {*UPSTAIRS}
-# What each room may import of gsbench beside itself and the ground floor.
-MAY_IMPORT = {
-    "datasets": set(),
-    "scene": {"datasets"},
-    "gaussians": set(),
-    "raster": {"gaussians", "scene"},
-    "densify": {"gaussians", "raster"},
-    "init": {"gaussians", "scene"},
-    "eval": {"scene"},  # names of photographs, to match renders with
-    "analysis": {"eval.facts", "eval.protocol"},  # tables of facts, which load no torch
+# The house from the top floor down. A room may import those on floors below its own, and the ground floor.
+FLOORS = (
+    {"cli"},
+    {"verbs"},
+    {"app"},
+    {"launch", "bench", "renders", "claims"},
+    {"pipeline", "view"},
+    {"config"},
+    {"train", "external", "analysis"},
+    {"densify", "eval"},
+    {"raster", "init", "tracking"},
+    {"scene"},
+    {"gaussians", "datasets", "runs"},
+    {"system"},
+)
+GROUND_FLOOR = {"errors", "events", "files", "logs", "settings", "weights", "words"}
+LIBRARY = ("train", "densify", "raster", "eval", "scene", "gaussians", "init", "external")  # usable without the program
+WITHOUT_TORCH = ("analysis", "runs", "datasets", "system", "config", "claims", "cli")
+KNOW_HYDRA = {"app", "config"}
+HYDRA = {"hydra", "omegaconf"}
+# What a room may import of a room below it, where that is less than all.
+ONLY = {
+    ("analysis", "eval"): {"gsbench.eval.facts", "gsbench.eval.protocol"},  # tables of facts, which load no torch
+    ("config", "train"): {"gsbench.train.options"},
+    ("config", "external"): {"gsbench.external.placeholders"},
 }
+
+Graph = Mapping[str, set[str]]
 
 
 def modules() -> dict[str, Path]:
@@ -44,13 +51,15 @@ def modules() -> dict[str, Path]:
     return found
 
 
-def imports_of(path: Path) -> Iterator[str]:
+def imports_of(path: Path, inside_functions: bool = True) -> Iterator[str]:
     """The dotted names that a file imports anywhere but for type checkers: modules, or names in them."""
     pending: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
     while pending:
         node = pending.pop()
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             pending += node.orelse
+            continue
+        if not inside_functions and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             continue
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -60,24 +69,45 @@ def imports_of(path: Path) -> Iterator[str]:
 
 
 @functools.cache
-def arrows() -> dict[str, set[str]]:
-    """For each module of gsbench, the modules of gsbench that it imports."""
+def arrows(inside_functions: bool = True) -> dict[str, set[str]]:
+    """For each module of gsbench, the modules of gsbench that it imports, and the names of foreign packages."""
     known = modules()
     graph: dict[str, set[str]] = {}
     for name, path in known.items():
-        named = (target if target in known else target.rpartition(".")[0] for target in imports_of(path))
-        graph[name] = {target for target in named if target in known and target != name}
+        graph[name] = set()
+        for target in imports_of(path, inside_functions):
+            if not f"{target}.".startswith("gsbench."):
+                graph[name].add(target.split(".")[0])
+            else:
+                module = target if target in known else target.rpartition(".")[0]
+                assert module in known, f"{name} imports {target}, which is not there"
+                graph[name] |= {module} - {name}
     return graph
 
 
-def circle(graph: dict[str, set[str]]) -> list[str]:
-    """The modules of a circle of imports in order, the first named again at the end; empty where there is none."""
+def room(module: str) -> str:
+    """The folder below ``gsbench`` in which a module stands; a file beside the folders is a room of its own."""
+    parts = module.split(".")
+    return parts[1] if parts[0] == "gsbench" and len(parts) > 1 else ""
+
+
+def by_room(graph: Graph) -> dict[str, set[str]]:
+    """The arrows between rooms."""
+    rooms: dict[str, set[str]] = {room(module): set() for module in graph if room(module)}
+    for module, targets in graph.items():
+        if room(module):
+            rooms[room(module)] |= {room(target) for target in targets if room(target)} - {room(module)}
+    return rooms
+
+
+def circle(graph: Graph) -> list[str]:
+    """The members of a circle of arrows in order, the first named again at the end; empty where there is none."""
     done: set[str] = set()
 
     def visit(name: str, way: list[str]) -> list[str]:
         if name in way:
             return [*way[way.index(name) :], name]
-        if name in done:
+        if name in done or name not in graph:
             return []
         for target in sorted(graph[name]):
             if found := visit(target, [*way, name]):
@@ -88,48 +118,106 @@ def circle(graph: dict[str, set[str]]) -> list[str]:
     return next((found for name in sorted(graph) if (found := visit(name, []))), [])
 
 
-def room(module: str) -> str:
-    return module.split(".")[1] if "." in module else ""
+def upward(graph: Graph) -> list[str]:
+    """Each arrow between rooms that does not run down, in words."""
+    level = {name: number for number, names in enumerate(reversed(FLOORS), 1) for name in names}
+    level |= dict.fromkeys(GROUND_FLOOR, 0)
+    found = []
+    for module, targets in sorted(graph.items()):
+        for target in sorted(targets):
+            here, there = room(module), room(target)
+            if here and there and here != there and level[there] >= max(level[here], 1):
+                found.append(f"{module} imports {target}, which stands no lower")
+    return found
 
 
-def test_no_circle_of_imports() -> None:
+def way_to(graph: Graph, start: str, goals: Iterable[str]) -> list[str]:
+    """A shortest chain of imports from a module to one of ``goals``; importing a module runs the packages it is in."""
+    goals, ways = set(goals), {start: [start]}
+    pending = [start]
+    while pending:
+        name = pending.pop(0)
+        if name in goals:
+            return ways[name]
+        parts = name.split(".")
+        packages = {".".join(parts[:i]) for i in range(1, len(parts))} & set(graph)
+        for target in sorted(graph.get(name, set()) | packages):
+            if target not in ways:
+                ways[target] = [*ways[name], target]
+                pending.append(target)
+    return []
+
+
+def test_no_circle_of_modules() -> None:
     found = circle(arrows())
     assert not found, f"{' imports '.join(found)}: the last of these imports closes a circle"
 
 
-def test_a_circle_is_found() -> None:
-    assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
-    assert circle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
+def test_no_circle_of_folders() -> None:
+    found = circle(by_room(arrows()))
+    assert not found, f"{' knows '.join(found)}: the last of these closes a circle"
 
 
-@pytest.mark.parametrize("name", sorted(MAY_IMPORT))
-def test_a_room_knows_only_those_below_it(name: str) -> None:
+def test_every_room_has_a_floor_and_arrows_run_down() -> None:
+    assert set(by_room(arrows())) <= set().union(*FLOORS) | GROUND_FLOOR
+    assert not upward(arrows())
+
+
+def test_the_ground_floor_is_small() -> None:
+    loose = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"}
+    assert loose == GROUND_FLOOR | {"cli"}
+
+
+@pytest.mark.parametrize(("above", "below"), sorted(ONLY))
+def test_a_room_that_may_see_a_part_of_another(above: str, below: str) -> None:
     for module, targets in arrows().items():
-        if room(module) == name:
-            for target in targets:
-                allowed = {name, *GROUND_FLOOR, *MAY_IMPORT[name], ""}
-                known = room(target) in allowed or target.removeprefix("gsbench.") in allowed
-                assert known, f"{module} imports {target}: {name} may not know {room(target)}"
+        if room(module) == above:
+            seen = {target for target in targets if room(target) == below}
+            assert seen <= ONLY[above, below], f"{module} imports {seen - ONLY[above, below]}"
 
 
 @pytest.mark.parametrize("name", LIBRARY)
-def test_the_library_knows_neither_hydra_nor_mlflow(name: str) -> None:
-    for module, path in modules().items():
+def test_the_library_reaches_neither_hydra_nor_mlflow_nor_the_pipeline(name: str) -> None:
+    program = {module for module in arrows() if room(module) in {"pipeline", "config", "app", "launch", "tracking"}}
+    for module in arrows():
         if room(module) == name:
-            foreign = {target.split(".")[0] for target in imports_of(path)} & {"hydra", "omegaconf", "mlflow"}
-            assert not foreign, f"{module} imports {foreign}"
+            way = way_to(arrows(), module, HYDRA | {"mlflow"} | program)
+            assert not way, " imports ".join(way)
 
 
-def test_the_way_down_from_the_command_line() -> None:
-    """cli knows launch, launch knows the pipeline; none of them is known below, and verbs know neither cli nor each
-    other."""
-    above = {"cli": 0, "verbs": 1, "launch": 2, "pipeline": 3}
+@pytest.mark.parametrize("name", WITHOUT_TORCH)
+def test_what_answers_at_once_loads_no_torch(name: str) -> None:
+    graph = arrows(inside_functions=False)
+    for module in graph:
+        if room(module) == name and not module.startswith(MAY_LOAD_TORCH):
+            way = way_to(graph, module, {"torch"})
+            assert not way, " imports ".join(way)
+
+
+MAY_LOAD_TORCH = ("gsbench.system.resources",)
+
+
+def test_hydra_is_known_in_two_rooms() -> None:
     for module, targets in arrows().items():
-        for target in targets:
-            here, there = room(module), room(target)
-            if there in above and here != there:
-                assert here in above or here in ("view", "tracking", "bench"), (
-                    f"{module} imports {target}, which is above it"
-                )
-                assert above.get(here, 3) <= above[there], f"{module} imports {target}, which is above it"
-            assert not (here == there == "verbs"), f"{module} imports {target}: verbs do not know each other"
+        assert not targets & HYDRA or room(module) in KNOW_HYDRA, f"{module} imports {targets & HYDRA}"
+
+
+def test_verbs_do_not_know_each_other() -> None:
+    shared = {"gsbench.verbs.arguments", "gsbench.verbs.table"}  # how all of them read their words; which there are
+    for module, targets in arrows().items():
+        if room(module) == "verbs":
+            others = {target for target in targets if room(target) == "verbs"} - shared
+            assert not others, f"{module} imports {others}"
+
+
+def test_the_checks_can_fail() -> None:
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
+    assert circle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
+    modules_apart = {"gsbench.train.x": {"gsbench.eval.x"}, "gsbench.eval.y": {"gsbench.train.y"}}
+    assert not circle(modules_apart)  # no circle of modules, and yet
+    assert circle(by_room(modules_apart)) == ["eval", "train", "eval"]
+    assert upward(modules_apart) == ["gsbench.eval.y imports gsbench.train.y, which stands no lower"]
+    assert upward({"gsbench.words": {"gsbench.runs.x"}})
+    assert not upward({"gsbench.settings": {"gsbench.words"}, "gsbench.runs.x": {"gsbench.words"}})
+    chain = {"gsbench.train.x": {"gsbench.runs.x"}, "gsbench.runs": {"mlflow"}, "gsbench.runs.x": set()}
+    assert way_to(chain, "gsbench.train.x", {"mlflow"})[-2:] == ["gsbench.runs", "mlflow"]

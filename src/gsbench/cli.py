@@ -15,7 +15,7 @@ from gsbench import __version__
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder
 from gsbench.logs import printable_output, set_up_logging
-from gsbench.own_modules import SAFE_PATH
+from gsbench.system.own_modules import SAFE_PATH
 from gsbench.verbs.table import VERBS
 from gsbench.words import closest
 
@@ -81,6 +81,10 @@ def _verb(name: str, argv: list[str]) -> int:
 
 
 def _trials(argv: list[str]) -> int:
+    from gsbench.verbs.queries import QUERIES, ask_hydra
+
+    if any(word.split("=")[0] in QUERIES for word in argv):
+        return ask_hydra(argv)
     from gsbench.app.command import launch
 
     return launch(argv)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import re
@@ -168,3 +169,9 @@ def _free(folder: Path) -> int:
     except OSError:
         return NEARLY_NOTHING
     return usage.free if usage.total else NEARLY_NOTHING  # a file system without a size, such as /proc, is never full
+
+
+def file_sha256(path: Path) -> str:
+    """The sha256 of a file's content, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 import reprlib
 import sys
 import types
@@ -25,6 +26,28 @@ from gsbench.words import closest, is_path
 
 PathName = Annotated[str, Predicate(is_path), doc("a path")]
 AnyPath = Annotated[str | Path, Predicate(lambda path: is_path(str(path))), doc("a path")]
+MAX_NAME_BYTES = 100  # of a name: folders are made of two, and file systems end at 255
+
+
+def is_folder_name(value: str) -> bool:
+    """Whether a text can name a folder, on any system and in the address of a trial (``x:scene:arm:0``)."""
+    is_plain = value.isprintable() and not set(value) & set('/\\:*?"<>|') and value == value.strip()
+    return is_plain and value[:1] not in ("", ".", "-") and len(value.encode()) <= MAX_NAME_BYTES
+
+
+def is_address(value: str) -> bool:
+    """Whether a text can be the address of a tracker."""
+    return re.fullmatch(r"[a-z][a-z0-9+.-]*://\S*", value) is not None and value.isprintable()
+
+
+FolderName = Annotated[str, Predicate(is_folder_name), doc("a plain folder name")]
+Address = Annotated[str, Predicate(is_address), doc("an address such as http://HOST:PORT")]
+TargetName = Annotated[
+    str,
+    Predicate(lambda name: "." in name and all(part.isidentifier() for part in name.split("."))),
+    doc("the import path of a class, such as mine.MyClass"),
+]
+MISSING: Any = "???"  # a value that must be given, as Hydra writes it in YAML
 Fraction = Annotated[float, Interval(ge=0, le=1)]
 OpenFraction = Annotated[float, Interval(gt=0, lt=1)]
 

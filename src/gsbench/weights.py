@@ -6,7 +6,6 @@ in the torch hub cache; if it lies nowhere it is downloaded into that cache. Not
 
 from __future__ import annotations
 
-import hashlib
 import os
 import urllib.request
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsbench.errors import InputError
-from gsbench.files import CHUNK, atomic
+from gsbench.files import CHUNK, atomic, file_sha256
 from gsbench.logs import progress
 from gsbench.words import readable_bytes
 
@@ -135,12 +134,6 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
     if not all(isinstance(value, torch.Tensor) for value in state.values()):
         raise _unreadable(path, "it holds something other than tensors")
     return dict(state)
-
-
-def file_sha256(path: Path) -> str:
-    """The sha256 of a file's content, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def hub_cache() -> Path:

@@ -8,9 +8,9 @@ import pytest
 
 from gsbench.analysis.published import load_published, published_names, published_table
 from gsbench.analysis.results import load_experiment
-from gsbench.config.schema import conf_dir
 from gsbench.errors import InputError
 from gsbench.eval.facts import find
+from gsbench.system.install import conf_dir
 from gsbench.verbs import tables
 from tests.analysis.test_tables import one_trial, texts
 

@@ -16,9 +16,9 @@ import pytest
 
 import gsbench.datasets.fetch as fetching
 from gsbench.cli import run
-from gsbench.config.schema import conf_dir
 from gsbench.datasets.catalog import Archive, Dataset, read_catalog
 from gsbench.datasets.plan import wanted_files
+from gsbench.system.install import conf_dir
 from tests.datasets.conftest import archive_content, write_archive
 from tests.datasets.server import Manners, Server
 

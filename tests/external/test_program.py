@@ -13,11 +13,11 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from gsbench.densify import External
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.inputs import write_test_cameras, write_training_views
 from gsbench.external.placeholders import fill, words_of
 from gsbench.external.program import run_program
+from gsbench.external.settings import External
 from gsbench.init.base import PointCloud
 from gsbench.runs.hashing import config_hash
 from gsbench.scene.camera import Camera
@@ -94,14 +94,14 @@ def test_placeholders() -> None:
 
 
 def test_yaml_of_the_original_code_hands_our_schedule_on() -> None:
-    words = ["densify=3dgs", "densify.options.code=/code", "densify.version='1'", "allow_targets=[python,git]"]
+    words = ["densify=external/3dgs", "densify.options.code=/code", "densify.version='1'", "allow_targets=[python,git]"]
     command = composed(*words, "train=paper", "train.densify_stop=9000")["densify"]["command"]
     assert str(command[command.index("--densify_until_iter") + 1]) == "9000"
     assert str(command[command.index("--opacity_lr") + 1]) == "0.05"
 
 
 def test_a_limit_of_time_makes_no_other_trial_but_an_option_does() -> None:
-    words = ["densify=opensplat", "densify.version='1'", "allow_targets=[opensplat]"]
+    words = ["densify=external/opensplat", "densify.version='1'", "allow_targets=[opensplat]"]
     base = config_hash(composed(*words))
     assert config_hash(composed(*words, "densify.time_limit_minutes=5")) == base
     assert config_hash(composed(*words, "densify.options.num_downscales=0")) != base

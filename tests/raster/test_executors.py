@@ -12,14 +12,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.config.schema import conf_dir
 from gsbench.errors import InputError
 from gsbench.pipeline.components import locate
 from gsbench.raster import create_rasterizer, executors, resolve_name
 from gsbench.raster.contract import CASES, departures
 from gsbench.raster.executors import EXECUTORS, Executor, find, resolve
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.system.install import install_command
+from gsbench.system.install import conf_dir, install_command
 
 CPU = torch.device("cpu")
 

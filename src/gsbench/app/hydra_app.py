@@ -19,9 +19,9 @@ from gsbench.app.grids import grids_aside
 from gsbench.app.task import OWN, StopAfterListing, Task
 from gsbench.config.command_words import check_words, is_sweep
 from gsbench.config.compose import Composed, compose_master, composing, explained, ready_trial
+from gsbench.config.hydra_guard import load_callbacks
 from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, start, words_of
 from gsbench.errors import InputError
-from gsbench.hydra_guard import load_callbacks
 from gsbench.launch.outcome import Outcome
 from gsbench.logs import show_details
 

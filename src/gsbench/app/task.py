@@ -23,8 +23,8 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.batch import begin_for_another_launcher
 from gsbench.launch.outcome import Outcome, objective, outcome_of_error
 from gsbench.logs import set_up_logging
-from gsbench.own_modules import import_only
 from gsbench.runs.trial_files import TrialPaths
+from gsbench.system.own_modules import import_only
 
 OWN = "gsbench"  # the names of gsbench's own launcher and sweeper
 

@@ -13,13 +13,13 @@ import torch
 from gsbench.bench.peer import PEER, TorchPeer
 from gsbench.bench.scenes import SEED, make_scene
 from gsbench.bench.waits import counting_waits
-from gsbench.config.schema import TrainConfig
 from gsbench.densify import ADC
 from gsbench.errors import InputError
 from gsbench.pipeline.components import build_rasterizer, keep_float32
 from gsbench.raster.base import Rasterizer
 from gsbench.raster.executors import find
 from gsbench.system.memory import peak_memory_mb, reset_peak_memory
+from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer
 
 WARM_UP_STEPS = 2  # compile, and let memory pools grow

@@ -12,188 +12,36 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache, partial
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from annotated_types import Ge, Interval, Predicate, doc
+from annotated_types import Interval, Predicate, doc
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
+from gsbench.config.trust import check_permissions, is_external
 from gsbench.errors import InputError
-from gsbench.eval.facts import LPIPS, find, known_keys, lpips_variants
-from gsbench.eval.protocol import PROTOCOLS
-from gsbench.raster import executors
+from gsbench.eval.options import EvalConfig
+from gsbench.raster.options import RasterConfig
 from gsbench.runs.layout import IN_RUNS
-from gsbench.scene.sizes import MIN_SIZE, check_final_size
-from gsbench.settings import Fraction, PathName, check_settings, checked
-from gsbench.trust import check_permissions, is_external
-from gsbench.words import closest
+from gsbench.scene.options import SceneConfig
+from gsbench.settings import MISSING, Address, FolderName, PathName, TargetName, check_settings, checked, is_folder_name
+from gsbench.train.options import TrainConfig
 
 NO_DENSIFIER = "gsbench.densify.NoDensifier"
-MAX_SIZE = 16_384  # px, of a picture of the courtyard
 MAX_SEED = 2**63 - 1  # torch's generators take no larger one
-MAX_NAME_BYTES = 100  # of a name: folders are made of two, and file systems end at 255
-METRIC_NAME = re.compile(r"[a-z][a-z0-9_]*")
-TAKEN_NAMES = (*known_keys(), "view", "lpips")  # of metrics, and what else a table of views or a list of metrics means
 
 
-def is_folder_name(value: str) -> bool:
-    """Whether a text can name a folder, on any system and in the address of a trial (``x:scene:arm:0``)."""
-    is_plain = value.isprintable() and not set(value) & set('/\\:*?"<>|') and value == value.strip()
-    return is_plain and value[:1] not in ("", ".", "-") and len(value.encode()) <= MAX_NAME_BYTES
-
-
-def is_address(value: str) -> bool:
-    """Whether a text can be the address of a tracker."""
-    return re.fullmatch(r"[a-z][a-z0-9+.-]*://\S*", value) is not None and value.isprintable()
-
-
-def are_different(values: list[Any]) -> bool:
-    """Whether no value stands twice in a list."""
-    return len(set(values)) == len(values)
-
-
-FolderName = Annotated[str, Predicate(is_folder_name), doc("a plain folder name")]
 ExperimentName = Annotated[
     str,
     Predicate(lambda name: is_folder_name(name) and name not in IN_RUNS),
     doc(f"a plain folder name, and none of {', '.join(IN_RUNS)}"),
 ]
-Address = Annotated[str, Predicate(is_address), doc("an address such as http://HOST:PORT")]
-TargetName = Annotated[
-    str,
-    Predicate(lambda name: "." in name and all(part.isidentifier() for part in name.split("."))),
-    doc("the import path of a class, such as mine.MyClass"),
-]
-ProtocolName = Annotated[
-    str, Predicate(lambda name: name in PROTOCOLS), doc(" or ".join(f"'{name}'" for name in PROTOCOLS))
-]
-AT_RULE = "a list of different iterations, at which the test views are measured beside the last"
-LPIPS_RULE = f"a list of {', '.join(lpips_variants())}, each at most once"
-LpipsVariant = Annotated[str, Predicate(lambda name: name in lpips_variants())]
 DeviceName = Annotated[
     str,
     Predicate(lambda name: re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", name) is not None),
     doc("auto, cpu, cuda or cuda:1"),
 ]
-
-
-@dataclass
-class SceneConfig:
-    name: FolderName = MISSING
-    kind: Literal["colmap", "photos", "courtyard"] = MISSING
-    path: PathName | None = None  # folder of the capture
-    images: PathName | None = None  # image folder below path; null: images
-    sparse: PathName | None = None  # model folder below path; null: sparse/0 or sparse
-    downscale: PositiveInt = 1  # divide both sides by it
-    max_size: Annotated[int, Ge(MIN_SIZE)] | None = None  # longest side, px; never enlarges
-    resample: Literal["lanczos", "area"] = "lanczos"
-    max_images: Annotated[int, Ge(3)] = 200  # evenly spaced over the sorted names
-    test_every: Annotated[int, Ge(2)] = 8  # every 8th sorted name is held out
-    train_list: PathName | None = None  # file of names, one a line
-    test_list: PathName | None = None
-    principal_point: Literal["used", "centred"] = "used"  # 3DGS ignores it
-    views: Annotated[int, Interval(ge=3, le=9999)] = 48  # courtyard only, as are the next three
-    width: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 400
-    height: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 300
-    seed: Annotated[int, Interval(ge=0, le=2**31 - 1)] = 0
-
-    def __post_init__(self) -> None:
-        check_settings(self, "scene")
-        if self.kind != "courtyard" and not self.path:
-            raise InputError("scene.path is not set: say where the capture lies, for example scene.path=/my/photos")
-        if self.kind == "courtyard":
-            check_final_size((self.width, self.height), self.downscale, self.max_size, "the courtyard")
-
-
-@dataclass
-class RasterConfig:
-    name: str = MISSING  # auto, or an executor of gsbench.raster.executors
-    _target_: TargetName | None = None  # a class of your own, instead; its options are further keys
-
-    def __post_init__(self) -> None:
-        check_settings(self, "raster")
-        if self._target_ is None and self.name not in executors.names():
-            choices = ", ".join(executors.names())
-            raise InputError(
-                f"raster must be one of {choices}, got {self.name!r}{closest(self.name, executors.names())}"
-            )
-
-
-@dataclass
-class TrainConfig:
-    name: str = MISSING
-    iterations: NonNegativeInt = 30_000  # 0: what the initialiser gives is evaluated as it is
-    sh_interval: PositiveInt = 1000  # spherical harmonics gain a degree so often
-    ssim_weight: Fraction = 0.2  # loss = 0.8 L1 + 0.2 (1 - SSIM)
-    background: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
-    position_initial: PositiveFloat = 1.6e-4  # learning rates; positions times the scene extent
-    position_final: PositiveFloat = 1.6e-6
-    position_steps: PositiveInt = 30_000
-    sh_dc: PositiveFloat = 2.5e-3
-    sh_rest: PositiveFloat = 1.25e-4
-    opacity: PositiveFloat = 0.05  # 2023 code; 0.025 in late-2024 code
-    scale: PositiveFloat = 5e-3
-    rotation: PositiveFloat = 1e-3
-    densify_start: NonNegativeInt = 500  # the window of the densifiers, which read it from here
-    densify_stop: NonNegativeInt = 15_000
-    densify_interval: PositiveInt = 100
-    opacity_reset_interval: PositiveInt = 3000
-    mcmc_stop: NonNegativeInt = 25_000  # 3DGS-MCMC refines for longer
-    step_after_refine: bool = False  # True: gsplat's order, the optimiser steps before a refinement and loses no step
-    visible_adam: bool = False  # update visible Gaussians only; a departure from the baseline
-    max_seconds: PositiveFloat | None = None  # a budget of training time; the run ends at the first iteration past it
-    volume_histogram: list[NonNegativeInt] = field(default_factory=lambda: [4000, 8000, 12_000])  # iterations (Fig. 5)
-    log_every: PositiveInt = 10
-    checkpoint_every: PositiveInt = 1000  # iterations; a killed trial goes on from the last one
-    checkpoint_minutes: PositiveFloat = 10.0  # and after so many minutes, whichever is first
-
-    def __post_init__(self) -> None:
-        check_settings(self, "train")
-
-
-@dataclass
-class EvalConfig:
-    name: str = MISSING
-    protocol: ProtocolName = MISSING
-    lpips: Annotated[list[LpipsVariant], Predicate(are_different), doc(LPIPS_RULE)] = field(
-        default_factory=lambda: list(lpips_variants())
-    )
-    flip: bool = True
-    extra: dict[str, Any] = field(default_factory=dict)  # metrics of your own: {name: {_target_: mine.MyMetric}}
-    at: Annotated[list[PositiveInt], Predicate(are_different), doc(AT_RULE)] = field(default_factory=list)
-    primary: str | None = None  # the metric of the verdict, declared before results are seen; null: none was
-    maps: bool = False  # keep maps of depth, volume and distance to the initial cloud: where an arm helps
-    weights: PathName | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
-    download: bool = True  # fetch missing weights, checked by checksum
-
-    def __post_init__(self) -> None:
-        check_settings(self, "eval")
-        for name, options in self.extra.items():
-            if not METRIC_NAME.fullmatch(name) or name in TAKEN_NAMES:
-                raise InputError(
-                    f"eval.extra.{name}: name your metric in small letters, digits and underscores, and none of "
-                    f"{', '.join(TAKEN_NAMES)}"
-                )
-            if not isinstance(options, Mapping) or "_target_" not in options:
-                raise InputError(f"eval.extra.{name} must name a class, as eval.extra.{name}._target_=mine.MyMetric")
-        if self.primary is not None and self.primary not in self.extra:
-            self._check_primary(self.primary)
-
-    def _check_primary(self, key: str) -> None:
-        """Raise InputError unless one of gsbench's own metrics, which these settings ask for, has this key."""
-        facts = find(key)
-        if facts is None:
-            known = [*known_keys(), *self.extra]
-            raise InputError(
-                f"eval.primary={key} is no metric{closest(key, known)} (known are {', '.join(known)}; a metric of your "
-                "own by the name that it has under eval.extra)"
-            )
-        if facts.setting == "eval.flip" and not self.flip:
-            raise InputError("eval.primary=flip is not measured with eval.flip=false")
-        if facts.setting == "eval.lpips" and key.removeprefix(LPIPS) not in self.lpips:
-            raise InputError(f"eval.primary={key} is not measured: add {key.removeprefix(LPIPS)} to eval.lpips")
 
 
 @dataclass
@@ -208,11 +56,12 @@ class ComponentConfig:
 class TrackingConfig:
     name: str = MISSING
     enabled: bool = True
-    uri: Address | None = None  # null: $MLFLOW_TRACKING_URI, else sqlite in the runs folder
+    sink: Literal["mlflow", "tensorboard", "wandb"] = "mlflow"
+    uri: Address | None = None  # null: $MLFLOW_TRACKING_URI, else sqlite in the runs folder; W&B: $WANDB_BASE_URL
     flush_seconds: PositiveFloat = 10.0
     patience_seconds: NonNegativeFloat = 30.0  # with a slow tracker, at the end of a trial; `gsbench sync` mends it
     images: NonNegativeInt = 4  # test renders mirrored per trial
-    model: bool = False  # keep the PLY as an artifact
+    model: bool = False  # keep the PLY as an artifact (MLflow, W&B)
     system_metrics: bool = False  # MLflow's own: processors, memory, disk, network, GPUs
 
     def __post_init__(self) -> None:
@@ -300,15 +149,6 @@ def _names_and_defaults(schema: type) -> type:
     return dataclasses.make_dataclass(schema.__name__, fields)
 
 
-def conf_dir() -> Path:
-    """The folder ``conf``: inside an installed wheel, else beside ``src`` of a checkout."""
-    here = Path(__file__).resolve().parent
-    for candidate in (here / "conf", here.parents[1] / "conf"):
-        if (candidate / "config.yaml").is_file():
-            return candidate
-    raise FileNotFoundError("gsbench's conf folder was not found; reinstall gsbench")
-
-
 def check_values(config: DictConfig) -> None:
     """Hold the values of a composed configuration against their schemas, and convert them (``1e3`` to 1000).
 
@@ -339,10 +179,14 @@ def check(config: DictConfig) -> None:
 
 
 def require_values(values: Mapping[str, Any], group: str) -> None:
-    """Raise InputError for the first setting of ``group`` that must be given and is not."""
-    for key, value in values.items():
+    """Raise InputError for the first setting of ``group`` that must be given and is not, or of its ``options``."""
+    name = values.get("name")
+    whose = f" ({group}={name})" if name not in (None, MISSING) else ""
+    options = values.get("options")
+    nested = options if isinstance(options, Mapping) else {}
+    for key, value in [*values.items(), *((f"options.{key}", value) for key, value in nested.items())]:
         if value == MISSING:
-            raise InputError(f"{group}.{key} is not set: give it a value")
+            raise InputError(f"{group}.{key} is not set: give it a value{whose}")
 
 
 def _settings_of(config: DictConfig, group: str) -> dict[str, Any]:

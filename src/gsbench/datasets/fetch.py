@@ -16,8 +16,7 @@ from gsbench.datasets.plan import SceneFiles, ScenePlan, check_unchanged, descri
 from gsbench.datasets.records import RECORDS, FileRecord, SceneRecord, add_record, read_records, today
 from gsbench.datasets.remote import FetchError, Patience, RangesRefusedError, RemoteFile, download, size_of
 from gsbench.errors import InputError
-from gsbench.files import atomic
-from gsbench.weights import file_sha256
+from gsbench.files import atomic, file_sha256
 from gsbench.words import readable_bytes, some_of
 
 log = logging.getLogger(__name__)

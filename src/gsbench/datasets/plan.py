@@ -9,11 +9,11 @@ from pathlib import Path
 
 import yaml
 
-from gsbench.config.schema import conf_dir
 from gsbench.datasets.archive import Member, holds
 from gsbench.datasets.catalog import DATA_VARIABLE
 from gsbench.datasets.records import SceneRecord, record_key
 from gsbench.errors import InputError
+from gsbench.system.install import conf_dir
 from gsbench.words import counted, readable_bytes, some_of
 
 SCENE_PATH = re.compile(r"\$\{oc\.env:GSBENCH_DATA,data\}/(?P<folder>.+)")

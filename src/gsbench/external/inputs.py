@@ -11,9 +11,9 @@ from PIL import Image
 
 from gsbench.files import write_json
 from gsbench.init.base import MODEL_FOLDER, PointCloud
-from gsbench.pipeline.steps.ground_truth import png_name
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import write_model
+from gsbench.scene.names import png_name
 from gsbench.scene.types import View
 
 IMAGES = "images"

@@ -12,8 +12,8 @@ from gsbench.errors import InputError, TrainingError
 from gsbench.eval.matching import match_by_order, match_pictures
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
-from gsbench.pipeline.steps.ground_truth import png_name
 from gsbench.scene.images import read_image
+from gsbench.scene.names import png_name
 from gsbench.scene.types import View
 from gsbench.words import counted, some_of
 

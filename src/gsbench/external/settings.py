@@ -1,7 +1,6 @@
 """Another program as an arm: the settings of what trains in place of gsbench.
 
-It stands in this group because an arm of a table is an initialiser and a densifier; `gsbench.external` runs
-it.
+It is chosen in the group ``densify``, because an arm of a table is an initialiser and a densifier.
 """
 
 from __future__ import annotations
@@ -18,17 +17,16 @@ from pydantic import PositiveFloat
 
 from gsbench.errors import InputError
 from gsbench.external.placeholders import fill, names_in, program_of, words_of
-from gsbench.settings import check_settings
+from gsbench.settings import MISSING, check_settings
 
 # What a command may ask for beside the options of its YAML.
 DATA = "data"  # folder of the training views: images/ and the COLMAP model sparse/0
 TEST_CAMERAS = "test_cameras"  # folder of the test views' cameras: transforms.json and the COLMAP model sparse/0
 OUTPUT = "output"  # empty folder, in which the program also starts
 KNOWN = (DATA, TEST_CAMERAS, OUTPUT, "iterations", "seed", "device", "threads")
-NOT_GIVEN = "???"  # Hydra's: a value that must be given
 MODEL_SUFFIX = ".ply"
 
-Text = Annotated[str, MinLen(1), Predicate(lambda text: text != NOT_GIVEN and bool(text.strip())), doc("a text")]
+Text = Annotated[str, MinLen(1), Predicate(lambda text: text != MISSING and bool(text.strip())), doc("a text")]
 CommandLine = Annotated[list[str] | str, doc("a list of words, or a text that is split as a shell would")]
 
 
@@ -55,7 +53,7 @@ class External:
     def __post_init__(self) -> None:
         check_settings(self, "densify")
         for name, value in self.options.items():
-            if value == NOT_GIVEN:
+            if value == MISSING:
                 raise InputError(f"densify.options.{name} is not set: give it a value")
             if not str(name).isidentifier() or name in KNOWN or isinstance(value, Mapping | list):
                 raise InputError(

@@ -10,19 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.config.compose import Composed
+from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.declare import declare, declared_metrics
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
-from gsbench.launch.preflight import check_components, missing_folders, missing_weights
+from gsbench.launch.preflight import check_components, check_trackers, missing_folders, missing_weights
 from gsbench.launch.serial import run_serial
 from gsbench.runs.layout import STORE
 from gsbench.runs.stages import STAGES
 from gsbench.runs.store import Store
 from gsbench.runs.trial_files import TrialPaths, find_finished
 from gsbench.system.stopping import stop_on_signals
-from gsbench.trust import check_permissions
 
 log = logging.getLogger(__name__)
 
@@ -69,6 +69,8 @@ def _begin(trials: Sequence[Composed], unfinished: Sequence[Composed]) -> None:
     if launcher != "slurm" and (missing := missing_folders(unfinished)):
         raise InputError("; ".join(missing))
     check_components(unfinished, here=launcher != "slurm")
+    if launcher != "slurm":
+        check_trackers(unfinished)
     make_runs_folder(runs)
     Store(runs / STORE).sweep(STAGES)
     add_to_plan(trials)
@@ -100,7 +102,7 @@ def _unavailable_metrics(options: dict[str, Any]) -> frozenset[str]:
 @cache
 def _unavailable(options: str) -> frozenset[str]:
     """The metrics that cannot be computed here and now; weights are looked for, and fetched, once for a sweep."""
-    from gsbench.config.schema import EvalConfig
+    from gsbench.eval.options import EvalConfig
     from gsbench.pipeline.components import make_evaluator
 
     return frozenset(make_evaluator(EvalConfig(**json.loads(options))).awaited)

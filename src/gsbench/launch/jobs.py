@@ -24,9 +24,9 @@ from gsbench.config.hydra_job import HydraJob
 from gsbench.errors import InputError
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.queue import forget_submission
-from gsbench.own_modules import import_only, importable
 from gsbench.runs.trial_files import TrialPaths, find_finished
 from gsbench.system.install import install_command
+from gsbench.system.own_modules import import_only, importable
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
 from gsbench.system.stopping import Stopped, stop_on_signals
 

@@ -12,21 +12,23 @@ from typing import Any
 
 import torch
 
-from gsbench.config.schema import EvalConfig, require_values
-from gsbench.densify import External
+from gsbench.config.schema import require_values
+from gsbench.config.trust import EXTERNAL, check_program, check_target, homes_of, load_class, targets_in
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import facts_of
 from gsbench.eval.metric import Metric
+from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import get_protocol
+from gsbench.external.settings import External
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
-from gsbench.runs.hashing import WITHOUT_EFFECT, without_later
+from gsbench.runs.hashing import WITHOUT_EFFECT
 from gsbench.runs.source import OWN, has_changed_since_import, source_of
 from gsbench.settings import checked, unknown_setting
-from gsbench.trust import check_program, check_target, homes_of, load_class, targets_in
 
 log = logging.getLogger(__name__)
 
+MOVED = {EXTERNAL: "gsbench.external.settings.External"}  # how configurations name a class, and where it stands
 RESERVED = ("_target_", "name")  # keys of a group that are not options of its class
 METHODS = {
     "init": ("needs_reference", "content", "run"),
@@ -134,7 +136,7 @@ def _check_names(cls: Any, options: dict[str, Any], group: str) -> None:
 
 def locate(target: str, group: str, allow_targets: list[str]) -> type:
     """The class at the import path ``package.module.Class``, which must be one that ``group`` can use."""
-    found = load_class(target, group, allow_targets)
+    found = load_class(MOVED.get(target, target), group, allow_targets)
     methods = () if found is External else METHODS[group.partition(".")[0]]
     lacking = [method for method in methods if not callable(getattr(found, method, None))]
     if not isinstance(found, type) or lacking:
@@ -154,7 +156,7 @@ def options_of(group: str, component: Any) -> dict[str, Any]:
         fields = [
             field.name for field in dataclasses.fields(component) if field.init and field.name not in WITHOUT_EFFECT
         ]
-        values |= without_later(group, {name: _plain(getattr(component, name)) for name in fields})
+        values |= {name: _plain(getattr(component, name)) for name in fields}
     return values
 
 
@@ -172,7 +174,8 @@ def make_evaluator(
     """The evaluator that the settings ``eval`` describe, with the user's own metrics; looks for networks' weights."""
     weights = None if options.weights is None else Path(options.weights).expanduser()
     protocol = get_protocol(options.protocol)
-    return Evaluator(protocol, device, tuple(options.lpips), options.flip, weights, options.download, extra)
+    lpips, more = tuple(options.lpips), tuple(options.more)
+    return Evaluator(protocol, device, lpips, options.flip, weights, options.download, extra, more)
 
 
 def select_device(name: str) -> torch.device:

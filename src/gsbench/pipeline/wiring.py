@@ -14,10 +14,12 @@ from typing import Any
 
 import torch
 
-from gsbench.config.schema import EvalConfig, SceneConfig, TrainConfig
-from gsbench.densify import Densifier, External
+from gsbench.config.trust import check_permissions
+from gsbench.densify import Densifier
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.metric import Metric
+from gsbench.eval.options import EvalConfig
+from gsbench.external.settings import External
 from gsbench.init import Sfm
 from gsbench.init.base import Initializer
 from gsbench.pipeline.components import (
@@ -38,9 +40,10 @@ from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
+from gsbench.scene.options import SceneConfig
 from gsbench.scene.types import Capture
 from gsbench.system.resources import available_threads
-from gsbench.trust import check_permissions
+from gsbench.train.options import TrainConfig
 
 CaptureReader = Callable[[SceneConfig, Path | None], Capture]
 
@@ -140,7 +143,7 @@ class Trial:
         parts = self.parts
         program = parts.densifier if isinstance(parts.densifier, External) else None
         if program is not None and not program.leaves_model:
-            return measure_step(self.views, trained, self.evaluator)
+            return measure_step(self.views, trained, self.evaluator, parts.eval.geometry, parts.eval.flicker)
         return evaluate_step(
             self.views,
             trained,
@@ -151,6 +154,8 @@ class Trial:
             parts.device,
             parts.measured_earlier,
             made_by_program=program is not None,
+            geometry=parts.eval.geometry,
+            flicker=parts.eval.flicker,
         )
 
 

@@ -15,20 +15,19 @@ import yaml
 from PIL import Image
 
 from gsbench.analysis.results import FROM_RENDERS, MADE_ELSEWHERE, Trial, read_experiment
-from gsbench.config.schema import is_folder_name
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.pictures import Pair
-from gsbench.files import atomic, write_json, write_text
+from gsbench.files import atomic, file_sha256, write_json, write_text
 from gsbench.pipeline.results import EVALUATED, versions
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
-from gsbench.pipeline.steps.ground_truth import png_name
 from gsbench.renders.reference_images import Truth
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import CONFIG, GROUND_TRUTH, PER_VIEW, RENDERS, RESULTS
 from gsbench.runs.stages import EVALUATE
 from gsbench.scene.images import read_image
-from gsbench.weights import file_sha256
+from gsbench.scene.names import png_name
+from gsbench.settings import is_folder_name
 
 UNKNOWN = f"{MADE_ELSEWHERE}, of which only the renders are known"
 KEPT_GROUPS = ("scene", "eval", "tracking", "launch")  # of the configuration: what is true of renders too

@@ -12,20 +12,20 @@ import torch
 
 from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import compose_one
-from gsbench.config.schema import EvalConfig
+from gsbench.config.hydra_guard import PERMISSIONS, typed_permissions
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize
 from gsbench.eval.facts import METRICS
 from gsbench.eval.matching import Matching, match_by_order, match_pictures
+from gsbench.eval.options import EvalConfig
 from gsbench.eval.pictures import Pair, measure
 from gsbench.files import storage_errors
-from gsbench.hydra_guard import PERMISSIONS, typed_permissions
 from gsbench.logs import progress
-from gsbench.own_modules import import_only
 from gsbench.pipeline.components import build_metrics, make_evaluator, select_device
 from gsbench.renders.import_renders import check_place, enter, find_place
 from gsbench.renders.reference_images import Truth, find_truth, truth_of_trial
 from gsbench.scene.readers import list_images
+from gsbench.system.own_modules import import_only
 from gsbench.system.resources import available_threads
 from gsbench.words import counted, some_of
 

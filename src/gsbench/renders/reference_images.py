@@ -10,7 +10,6 @@ from typing import Any
 from gsbench.analysis.results import Trial, read_views
 from gsbench.config.compose import compose_one, options
 from gsbench.errors import InputError
-from gsbench.pipeline.steps.ground_truth import png_name
 from gsbench.pipeline.wiring import Parts
 from gsbench.pipeline.wiring import Trial as TrialSteps
 from gsbench.runs import stages
@@ -18,6 +17,7 @@ from gsbench.runs.layout import GROUND_TRUTH, RENDERS, RESULTS, STORE
 from gsbench.runs.store import Store
 from gsbench.runs.trial_files import read_config
 from gsbench.scene.images import image_size
+from gsbench.scene.names import png_name
 from gsbench.scene.readers import fingerprint, list_images
 from gsbench.view.trials import find_trial
 from gsbench.words import closest

@@ -19,11 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from gsbench import __version__
-from gsbench.files import remove_temporaries, storage_errors, sync_to_disk, write_json
+from gsbench.files import file_sha256, remove_temporaries, storage_errors, sync_to_disk, write_json
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.step import Stage, Step
 from gsbench.system.locks import BusyError, hold
-from gsbench.weights import file_sha256
 
 log = logging.getLogger(__name__)
 

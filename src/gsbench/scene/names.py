@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 from gsbench.errors import InputError
 from gsbench.scene.images import IMAGE_SUFFIXES
@@ -94,3 +94,8 @@ def split_names(
 def _stem(name: str) -> str:
     path = PurePosixPath(name)
     return (path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path).as_posix()
+
+
+def png_name(view_name: str) -> str:
+    """File name for the picture of a view; sub-folders become part of the name."""
+    return Path(view_name).with_suffix(".png").as_posix().replace("/", "__")

@@ -18,5 +18,14 @@ def install_command(extra: str = "") -> str:
 
 def checkout() -> Path | None:
     """The folder of the source checkout from which gsbench runs; None where it was installed from a wheel."""
-    root = Path(__file__).resolve().parents[2]
+    root = Path(__file__).resolve().parents[3]
     return root if (root / "pyproject.toml").is_file() and (root / "src" / "gsbench").is_dir() else None
+
+
+def conf_dir() -> Path:
+    """The folder ``conf``: inside an installed wheel, else beside ``src`` of a checkout."""
+    here = Path(__file__).resolve().parents[1]
+    for candidate in (here / "conf", here.parents[1] / "conf"):
+        if (candidate / "config.yaml").is_file():
+            return candidate
+    raise FileNotFoundError("gsbench's conf folder was not found; reinstall gsbench")

@@ -4,7 +4,7 @@ The child is a fresh interpreter (never a fork, so no threads or locks are inher
 function needs: the parent's ``__main__`` is not imported again, so it works alike from a console script, a notebook,
 pytest and Hydra. The child, and every program that it started, ends when the parent does, even when the parent is
 killed; no such program outlives the function. On Linux that holds for daemons too; on other systems a program that
-begins a session of its own gets away (`gsbench.supervise`).
+begins a session of its own gets away (`gsbench.system.supervise`).
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from pathlib import Path
 from typing import Any, BinaryIO, ParamSpec, TypeVar
 
 from gsbench.errors import GsbenchError
-from gsbench.own_modules import importable
-from gsbench.supervise import go_on_as_child
+from gsbench.system.own_modules import importable
+from gsbench.system.supervise import go_on_as_child
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 _BOOTSTRAP = (
     "import json, sys; path, own = json.loads(sys.argv[1]); sys.path[:] = path; "
-    "from gsbench.own_modules import import_only; import_only(*own); from {module} import {name}; {name}()"
+    "from gsbench.system.own_modules import import_only; import_only(*own); from {module} import {name}; {name}()"
 )
 _SECONDS_TO_END = 10.0  # patience with a child that ends what it started, before it is killed
 _TAIL_LINES = 3

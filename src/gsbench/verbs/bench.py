@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.errors import InputError
-from gsbench.own_modules import import_only
 from gsbench.raster.executors import AUTO, EXECUTORS
 from gsbench.scene.sizes import MIN_SIZE
+from gsbench.system.own_modules import import_only
 from gsbench.verbs.arguments import ArgumentParser, path
 
 COLUMNS = (  # of the table

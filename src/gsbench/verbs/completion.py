@@ -1,7 +1,7 @@
 """``gsbench completion``: what the Tab key offers, as folders tell of experiments and trials, and Hydra of settings.
 
-A shell's script (`gsbench.verbs.completion`) asks ``gsbench completion query LINE``, which prints a line for each word that
-the last one of ``LINE`` may become. Loads no torch, and Hydra for settings only.
+A shell's script asks ``gsbench completion query LINE``, which prints a line for each word that the last one of ``LINE``
+may become. Loads no torch, and Hydra for settings only.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from pathlib import Path
 
 from gsbench.analysis.results import list_experiments
 from gsbench.datasets.catalog import read_catalog
-from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys
 from gsbench.runs.layout import TRIAL_GLOB
 from gsbench.verbs.arguments import ArgumentParser
@@ -24,7 +23,6 @@ from gsbench.verbs.table import VERBS
 QUERY = "query"
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 CHOICES = r"(?<![\w-]){option}[ =]\{{([^}}]*)\}}"  # as argparse shows them: --format {{md,csv}}
-NOT_TYPED = ("experiment", "experiment=", "hydra", "hydra.", "schema/")  # Hydra offers them, and gsbench refuses them
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -158,36 +156,10 @@ def _trials(runs: Path, name: str) -> list[Path]:
 
 
 def _settings(words: Sequence[str], word: str) -> list[str]:
-    """Groups, their choices and keys, as Hydra completes them after ``words``; of a list, the last value."""
-    from hydra.core.global_hydra import GlobalHydra
-    from hydra.plugins.completion_plugin import DefaultCompletionPlugin
+    """Groups, their choices and keys that may follow ``words``; of a list, the last value."""
+    from gsbench.config.questions import settings_like
 
-    from gsbench.config.command_words import parse
-    from gsbench.config.compose import composing
-
-    head, comma, last = word.rpartition(",")
-    key = head.partition("=")[0] + "=" if comma else ""
-    try:
-        overrides, _, _ = parse(words)
-    except InputError:
-        return []
-    first_values = [re.sub(r"^(\w+=[\w-]+),.*", r"\1", override) for override in overrides]  # Hydra: one at a time
-    with composing():
-        plugin = DefaultCompletionPlugin(GlobalHydra.instance().config_loader())
-        try:
-            found = plugin._query("config", " ".join([*first_values, key + last]))
-        except Exception:  # noqa: BLE001 - a line that is half typed may be wrong in any way
-            return []
-    if comma:
-        return [head + comma + candidate.removeprefix(key) for candidate in found]
-    if not words or "+experiment=".startswith(word):
-        found.append("+experiment=")
-    return [_closed(candidate) for candidate in found if candidate not in NOT_TYPED]
-
-
-def _closed(candidate: str) -> str:
-    """A group that has folders below it is chosen as any other."""
-    return candidate if re.search(r"[=./]", candidate) else f"{candidate}="
+    return settings_like(words, word)
 
 
 BASH = r"""

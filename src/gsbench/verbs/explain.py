@@ -7,8 +7,8 @@ from pathlib import Path
 
 from gsbench.analysis.explain import ADDRESS, explain_cell
 from gsbench.errors import InputError
-from gsbench.own_modules import import_only
 from gsbench.runs.layout import CONFIG, STORE
+from gsbench.system.own_modules import import_only
 from gsbench.verbs.arguments import ArgumentParser
 
 
@@ -41,7 +41,7 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
     )
     words = parser.parse_args(argv).trial
     from gsbench.app.hydra_app import compose_trials
-    from gsbench.hydra_guard import PERMISSIONS, typed_permissions
+    from gsbench.config.hydra_guard import PERMISSIONS, typed_permissions
     from gsbench.pipeline.wiring import Parts, Trial
     from gsbench.renders.import_renders import is_entered
     from gsbench.runs.explain_cache import explain_steps

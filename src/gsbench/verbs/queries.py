@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import os
 import re
-import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
-
-from omegaconf import OmegaConf
 
 from gsbench.config.command_words import check_words, is_sweep, parse_word, search_path
 from gsbench.config.compose import compose_values
-from gsbench.config.schema import conf_dir, register_schemas
+from gsbench.config.hydra_guard import check_search_path, typed_permissions
+from gsbench.config.questions import answer, has_part
 from gsbench.errors import InputError
-from gsbench.hydra_guard import check_search_path, typed_permissions
 from gsbench.verbs.arguments import ArgumentParser
 
 QUERIES = ("--cfg", "-c", "--info", "-i", "--hydra-help", "--shell-completion", "-sc", "--resolve", "--package", "-p")
@@ -34,7 +30,8 @@ def ask_hydra(argv: list[str]) -> int:
         _check_typed(os.environ.get("COMP_LINE", ""))
     else:
         _check(options.overrides, options.config_dir, options.package)
-    return _call_hydra(argv)
+    answer(argv)
+    return 0
 
 
 def _check(overrides: list[str], config_dir: Path | None, package: str | None) -> None:
@@ -42,7 +39,7 @@ def _check(overrides: list[str], config_dir: Path | None, package: str | None) -
     if swept := [word for word in overrides if is_sweep(word)]:
         raise InputError(f"{swept[0]} lists several values: choose one whose configuration is shown")
     config = compose_values([*search_path([config_dir] if config_dir else [], overrides), *overrides])
-    if package is not None and OmegaConf.select(config, package) is None:
+    if package is not None and not has_part(config, package):
         raise InputError(f"--package {package}: there is no such part of the configuration")
 
 
@@ -54,22 +51,6 @@ def _check_typed(line: str) -> None:
             parse_word(word)
             words.append(word)
     check_search_path(words, typed_permissions(words))
-
-
-def _call_hydra(argv: list[str]) -> int:
-    import hydra
-
-    def task(config: Any) -> None:
-        raise AssertionError("Hydra was asked a question, and ran the task instead")
-
-    register_schemas()
-    saved = sys.argv
-    sys.argv = ["gsbench", *argv]
-    try:
-        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(task)()
-    finally:
-        sys.argv = saved
-    return 0
 
 
 def _parser() -> ArgumentParser:

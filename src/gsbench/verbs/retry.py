@@ -11,13 +11,13 @@ import yaml
 
 from gsbench.analysis.results import experiment_home
 from gsbench.config.compose import Composed, compose_one
+from gsbench.config.hydra_guard import PERMISSIONS, typed_permissions
+from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
-from gsbench.hydra_guard import PERMISSIONS, typed_permissions
 from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
-from gsbench.own_modules import import_only
 from gsbench.runs.trial_files import TrialPaths, label_of, read_config
-from gsbench.trust import check_permissions
+from gsbench.system.own_modules import import_only
 from gsbench.verbs.arguments import ArgumentParser
 
 log = logging.getLogger(__name__)

@@ -15,13 +15,13 @@ from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER, PointCloud
-from gsbench.pipeline.steps.ground_truth import png_name
 from gsbench.runs.layout import GROUND_TRUTH, LINEAGE, POINT_CLOUD, STORE
 from gsbench.runs.stages import INIT
 from gsbench.runs.store import Store
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import PINHOLE_MODELS, pinhole_camera, points_of, read_model
 from gsbench.scene.images import read_image
+from gsbench.scene.names import png_name
 from gsbench.scene.types import View
 from gsbench.view import ADDRESS
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from gsbench.errors import InputError
+from gsbench.files import file_sha256
 from gsbench.init.base import Preparation, Progress, Timer
 from gsbench.init.colmap.options import ColmapOptions
 from gsbench.init.colmap.reconstruct import load_reference, select_pairs
@@ -19,7 +20,6 @@ from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.init.networks.matching import build_matcher, match_within_memory
 from gsbench.init.preview import STRONGEST, proposed_pairs
 from gsbench.scene.types import Capture
-from gsbench.weights import file_sha256
 
 CACHE_BYTES = 1 << 30  # of descriptors held in memory while pairs are matched
 NAMES_IN_WARNING = 5

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from gsbench.config.schema import SceneConfig
 from gsbench.logs import progress
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.stages import CAPTURE
 from gsbench.runs.step import Step
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.images import image_size
+from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.sizes import check_final_size
 from gsbench.scene.types import Capture

@@ -16,17 +16,16 @@ import numpy as np
 import torch
 
 from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS
-from gsbench.densify import External, Lineage
+from gsbench.densify import Lineage
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.inputs import write_test_cameras, write_training_views
 from gsbench.external.outputs import take_model, take_renders
 from gsbench.external.placeholders import fill, words_of
 from gsbench.external.program import run_program
-from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS
+from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS, External
 from gsbench.files import write_json
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.own_modules import SAFE_PATH
 from gsbench.pipeline.components import options_of
 from gsbench.pipeline.steps.train import TRAINING_FILE
 from gsbench.pipeline.steps.views import Views
@@ -34,6 +33,7 @@ from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_L
 from gsbench.runs.stages import EXTERNAL
 from gsbench.runs.step import Step
 from gsbench.system.machine import describe_machine
+from gsbench.system.own_modules import SAFE_PATH
 from gsbench.words import readable_time
 
 CONTRACT = 1  # raise when programs are given, or asked for, something else

@@ -9,6 +9,7 @@ from PIL import Image
 from gsbench.pipeline.steps.views import Views
 from gsbench.runs.stages import GROUND_TRUTH
 from gsbench.runs.step import Step
+from gsbench.scene.names import png_name
 
 
 def ground_truth_step(views: Views) -> Step:
@@ -19,8 +20,3 @@ def ground_truth_step(views: Views) -> Step:
             Image.fromarray(view.image).save(folder / png_name(view.name))
 
     return Step(GROUND_TRUTH, {"scene": views.inputs, "init": views.init.key}, build)
-
-
-def png_name(view_name: str) -> str:
-    """File name for the picture of a view; sub-folders become part of the name."""
-    return Path(view_name).with_suffix(".png").as_posix().replace("/", "__")

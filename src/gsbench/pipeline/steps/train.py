@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsbench.config.schema import TrainConfig
 from gsbench.densify import Densifier
 from gsbench.files import write_json
 from gsbench.gaussians.initial import gaussians_from_cloud
@@ -22,12 +21,12 @@ from gsbench.logs import progress
 from gsbench.pipeline.components import options_of, rasterizer_inputs
 from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
-from gsbench.runs.hashing import without_later
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
 from gsbench.system.machine import describe_machine
 from gsbench.system.memory import peak_memory_mb, reset_peak_memory
+from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Status, Trainer
 
 TRAINING_FILE = "training.json"
@@ -50,9 +49,7 @@ def train_step(
         "init": views.init.key,
         "densify": options_of("densify", densifier),
         "raster": rasterizer_inputs(rasterizer),
-        "train": without_later(
-            "train", {key: value for key, value in dataclasses.asdict(options).items() if key not in WITHOUT_EFFECT}
-        ),
+        "train": {key: value for key, value in dataclasses.asdict(options).items() if key not in WITHOUT_EFFECT},
         "seed": seed,
     }
     if snapshot_at:

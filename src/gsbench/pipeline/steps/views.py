@@ -5,13 +5,13 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
-from gsbench.config.schema import SceneConfig
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.logs import progress
 from gsbench.pipeline.steps.capture import split_of
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
 from gsbench.scene.load import load_scene
+from gsbench.scene.options import SceneConfig
 from gsbench.scene.types import Capture, Scene
 
 

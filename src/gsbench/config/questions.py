@@ -1,0 +1,69 @@
+"""What Hydra itself is asked about the configuration: to show it, and what the Tab key may offer."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.plugins.completion_plugin import DefaultCompletionPlugin
+from omegaconf import DictConfig, OmegaConf
+
+from gsbench.config.command_words import parse
+from gsbench.config.compose import composing
+from gsbench.config.hydra_job import CONFIG_NAME
+from gsbench.config.schema import register_schemas
+from gsbench.errors import InputError
+from gsbench.system.install import conf_dir
+
+NOT_TYPED = ("experiment", "experiment=", "hydra", "hydra.", "schema/")  # Hydra offers them, and gsbench refuses them
+
+
+def answer(argv: Sequence[str]) -> None:
+    """Let Hydra answer a question such as ``--cfg job`` on the standard output; no trial is run."""
+
+    def task(config: Any) -> None:
+        raise AssertionError("Hydra was asked a question, and ran the task instead")
+
+    register_schemas()
+    saved = sys.argv
+    sys.argv = ["gsbench", *argv]
+    try:
+        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=CONFIG_NAME)(task)()
+    finally:
+        sys.argv = saved
+
+
+def has_part(config: DictConfig, key: str) -> bool:
+    """Whether there is a part ``key``, with dots, of a configuration."""
+    return OmegaConf.select(config, key) is not None
+
+
+def settings_like(words: Sequence[str], word: str) -> list[str]:
+    """Groups, their choices and keys, as Hydra completes ``word`` after ``words``; of a list, the last value."""
+    head, comma, last = word.rpartition(",")
+    key = head.partition("=")[0] + "=" if comma else ""
+    try:
+        overrides, _, _ = parse(words)
+    except InputError:
+        return []
+    first_values = [re.sub(r"^(\w+=[\w-]+),.*", r"\1", override) for override in overrides]  # Hydra: one at a time
+    with composing():
+        plugin = DefaultCompletionPlugin(GlobalHydra.instance().config_loader())
+        try:
+            found = plugin._query(CONFIG_NAME, " ".join([*first_values, key + last]))
+        except Exception:  # noqa: BLE001 - a line that is half typed may be wrong in any way
+            return []
+    if comma:
+        return [head + comma + candidate.removeprefix(key) for candidate in found]
+    if not words or "+experiment=".startswith(word):
+        found.append("+experiment=")
+    return [_closed(candidate) for candidate in found if candidate not in NOT_TYPED]
+
+
+def _closed(candidate: str) -> str:
+    """A group that has folders below it is chosen as any other."""
+    return candidate if re.search(r"[=./]", candidate) else f"{candidate}="

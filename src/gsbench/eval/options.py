@@ -1,0 +1,86 @@
+"""The settings of an evaluation: protocol, metrics, and the one that a verdict is declared to be about."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+from annotated_types import Predicate, doc
+from pydantic import PositiveInt
+
+from gsbench.errors import InputError
+from gsbench.eval.facts import FLICKER, GEOMETRY, LPIPS, MORE, find, further_keys, known_keys, lpips_variants
+from gsbench.eval.protocol import PROTOCOLS
+from gsbench.settings import MISSING, PathName, check_settings
+from gsbench.words import closest
+
+METRIC_NAME = re.compile(r"[a-z][a-z0-9_]*")
+TAKEN_NAMES = (*known_keys(), "view", "lpips")  # of metrics, and what else a table of views or a list of metrics means
+
+
+def are_different(values: list[Any]) -> bool:
+    """Whether no value stands twice in a list."""
+    return len(set(values)) == len(values)
+
+
+ProtocolName = Annotated[
+    str, Predicate(lambda name: name in PROTOCOLS), doc(" or ".join(f"'{name}'" for name in PROTOCOLS))
+]
+AT_RULE = "a list of different iterations, at which the test views are measured beside the last"
+LPIPS_RULE = f"a list of {', '.join(lpips_variants())}, each at most once"
+LpipsVariant = Annotated[str, Predicate(lambda name: name in lpips_variants())]
+MORE_RULE = f"a list of {', '.join(further_keys())}, each at most once"
+FurtherMetric = Annotated[str, Predicate(lambda name: name in further_keys())]
+
+
+@dataclass
+class EvalConfig:
+    name: str = MISSING
+    protocol: ProtocolName = MISSING
+    lpips: Annotated[list[LpipsVariant], Predicate(are_different), doc(LPIPS_RULE)] = field(
+        default_factory=lambda: list(lpips_variants())
+    )
+    flip: bool = True
+    more: Annotated[list[FurtherMetric], Predicate(are_different), doc(MORE_RULE)] = field(default_factory=list)
+    extra: dict[str, Any] = field(default_factory=dict)  # metrics of your own: {name: {_target_: mine.MyMetric}}
+    at: Annotated[list[PositiveInt], Predicate(are_different), doc(AT_RULE)] = field(default_factory=list)
+    primary: str | None = None  # the metric of the verdict, declared before results are seen; null: none was
+    maps: bool = False  # keep maps of depth, volume and distance to the initial cloud: where an arm helps
+    geometry: bool = False  # measure depths and surfaces of the model, and what floats in front of them
+    flicker: bool = False  # measure how neighbouring renders of a camera path differ
+    weights: PathName | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
+    download: bool = True  # fetch missing weights, checked by checksum
+
+    def __post_init__(self) -> None:
+        check_settings(self, "eval")
+        for name, options in self.extra.items():
+            if not METRIC_NAME.fullmatch(name) or name in TAKEN_NAMES:
+                raise InputError(
+                    f"eval.extra.{name}: name your metric in small letters, digits and underscores, and none of "
+                    f"{', '.join(TAKEN_NAMES)}"
+                )
+            if not isinstance(options, Mapping) or "_target_" not in options:
+                raise InputError(f"eval.extra.{name} must name a class, as eval.extra.{name}._target_=mine.MyMetric")
+        if self.primary is not None and self.primary not in self.extra:
+            self._check_primary(self.primary)
+
+    def _check_primary(self, key: str) -> None:
+        """Raise InputError unless one of gsbench's own metrics, which these settings ask for, has this key."""
+        facts = find(key)
+        if facts is None:
+            known = [*known_keys(), *self.extra]
+            raise InputError(
+                f"eval.primary={key} is no metric{closest(key, known)} (known are {', '.join(known)}; a metric of your "
+                "own by the name that it has under eval.extra)"
+            )
+        if facts.setting == "eval.flip" and not self.flip:
+            raise InputError("eval.primary=flip is not measured with eval.flip=false")
+        for setting, asked in ((GEOMETRY, self.geometry), (FLICKER, self.flicker)):
+            if facts.setting == setting and not asked:
+                raise InputError(f"eval.primary={key} is not measured: add {setting}=true")
+        if facts.setting == MORE and key not in self.more:
+            raise InputError(f"eval.primary={key} is not measured: add {key} to eval.more")
+        if facts.setting == "eval.lpips" and key.removeprefix(LPIPS) not in self.lpips:
+            raise InputError(f"eval.primary={key} is not measured: add {key.removeprefix(LPIPS)} to eval.lpips")

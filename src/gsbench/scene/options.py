@@ -1,0 +1,43 @@
+"""The settings of a scene: where its photographs lie, how many are read and how large, which are held out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Interval
+from pydantic import PositiveInt
+
+from gsbench.errors import InputError
+from gsbench.scene.sizes import MIN_SIZE, check_final_size
+from gsbench.settings import MISSING, FolderName, PathName, check_settings
+
+MAX_SIZE = 16_384  # px, of a picture of the courtyard
+
+
+@dataclass
+class SceneConfig:
+    name: FolderName = MISSING
+    kind: Literal["colmap", "photos", "courtyard"] = MISSING
+    path: PathName | None = None  # folder of the capture
+    images: PathName | None = None  # image folder below path; null: images
+    sparse: PathName | None = None  # model folder below path; null: sparse/0 or sparse
+    downscale: PositiveInt = 1  # divide both sides by it
+    max_size: Annotated[int, Ge(MIN_SIZE)] | None = None  # longest side, px; never enlarges
+    resample: Literal["lanczos", "area"] = "lanczos"
+    max_images: Annotated[int, Ge(3)] = 200  # evenly spaced over the sorted names
+    test_every: Annotated[int, Ge(2)] = 8  # every 8th sorted name is held out
+    train_list: PathName | None = None  # file of names, one a line
+    test_list: PathName | None = None
+    principal_point: Literal["used", "centred"] = "used"  # 3DGS ignores it
+    views: Annotated[int, Interval(ge=3, le=9999)] = 48  # courtyard only, as are the next three
+    width: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 400
+    height: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 300
+    seed: Annotated[int, Interval(ge=0, le=2**31 - 1)] = 0
+
+    def __post_init__(self) -> None:
+        check_settings(self, "scene")
+        if self.kind != "courtyard" and not self.path:
+            raise InputError("scene.path is not set: say where the capture lies, for example scene.path=/my/photos")
+        if self.kind == "courtyard":
+            check_final_size((self.width, self.height), self.downscale, self.max_size, "the courtyard")

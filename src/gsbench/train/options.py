@@ -1,0 +1,41 @@
+"""The settings of a training: iterations, learning rates, the window of the densifiers, checkpoints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+
+from gsbench.settings import MISSING, Fraction, check_settings
+
+
+@dataclass
+class TrainConfig:
+    name: str = MISSING
+    iterations: NonNegativeInt = 30_000  # 0: what the initialiser gives is evaluated as it is
+    sh_interval: PositiveInt = 1000  # spherical harmonics gain a degree so often
+    ssim_weight: Fraction = 0.2  # loss = 0.8 L1 + 0.2 (1 - SSIM)
+    background: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
+    position_initial: PositiveFloat = 1.6e-4  # learning rates; positions times the scene extent
+    position_final: PositiveFloat = 1.6e-6
+    position_steps: PositiveInt = 30_000
+    sh_dc: PositiveFloat = 2.5e-3
+    sh_rest: PositiveFloat = 1.25e-4
+    opacity: PositiveFloat = 0.05  # 2023 code; 0.025 in late-2024 code
+    scale: PositiveFloat = 5e-3
+    rotation: PositiveFloat = 1e-3
+    densify_start: NonNegativeInt = 500  # the window of the densifiers, which read it from here
+    densify_stop: NonNegativeInt = 15_000
+    densify_interval: PositiveInt = 100
+    opacity_reset_interval: PositiveInt = 3000
+    mcmc_stop: NonNegativeInt = 25_000  # 3DGS-MCMC refines for longer
+    step_after_refine: bool = False  # True: gsplat's order, the optimiser steps before a refinement and loses no step
+    visible_adam: bool = False  # update visible Gaussians only; a departure from the baseline
+    max_seconds: PositiveFloat | None = None  # a budget of training time; the run ends at the first iteration past it
+    volume_histogram: list[NonNegativeInt] = field(default_factory=lambda: [4000, 8000, 12_000])  # iterations (Fig. 5)
+    log_every: PositiveInt = 10
+    checkpoint_every: PositiveInt = 1000  # iterations; a killed trial goes on from the last one
+    checkpoint_minutes: PositiveFloat = 10.0  # and after so many minutes, whichever is first
+
+    def __post_init__(self) -> None:
+        check_settings(self, "train")
