@@ -174,7 +174,7 @@ def test_a_file_of_claims_allows_no_code(tmp_path: Path, key: str, monkeypatch: 
         parse_claims(content() | {"settings": {key: ["stranger"]}})
     arms = {"adc": None, "volumetric": {"densify": "adc", "densify._target_": "stranger.Mine", "densify.name": "mine"}}
     file = parse_claims(content() | {"arms": arms})
-    with pytest.raises(InputError, match="stranger.Mine is not gsbench's own"):
+    with pytest.raises(InputError, match=r"stranger\.Mine is not gsbench's own"):
         prepare(file, tmp_path, lambda trial, metric: "")
     check = prepare(file, tmp_path, lambda trial, metric: "", ["allow_targets=[stranger]"])
     assert check.trials(check.questions, 1)[1].values["densify"]["_target_"] == "stranger.Mine"

@@ -62,7 +62,8 @@ def test_no_module_of_the_current_folder_is_imported(capture: Path) -> None:
 
 
 def test_nor_by_a_process_of_its_own(capture: Path) -> None:
-    code = "import posixpath; from gsbench.system.isolate import run_isolated as run; print(run(posixpath.basename, 'a/b'))"
+    imports = "import posixpath; from gsbench.system.isolate import run_isolated"
+    code = f"{imports}; print(run_isolated(posixpath.basename, 'a/b'))"
     done = gsbench(capture, start=("-P", "-c", code))
     assert (done.stdout, done.stderr) == ("b\n", "")
     assert not (capture.parent / "exploded").exists(), (capture.parent / "exploded").read_text()

@@ -134,7 +134,8 @@ def targets_in(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple
 def homes_of(place: Sequence[str]) -> tuple[str, ...]:
     """The packages of gsbench whose classes may stand at a place of the configuration without the user's permission."""
     if len(place) == 1 and place[0] in COMPONENTS:
-        return (f"{PACKAGE}.{place[0]}",)
+        own = f"{PACKAGE}.{place[0]}"
+        return (own, f"{PACKAGE}.external") if place[0] == "densify" else (own,)
     if len(place) == 3 and tuple(place[:2]) == ("eval", "extra"):
         return (f"{PACKAGE}.eval",)
     return ()
