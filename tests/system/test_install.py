@@ -54,4 +54,6 @@ def test_the_image_is_built_by_commands_that_there_are() -> None:
         done = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
     ignored = (ROOT / ".dockerignore").read_text().split()  # whose names without a wildcard are of the root alone
-    assert {name.lstrip("/") for name in (ROOT / ".gitignore").read_text().split()} < set(ignored)  # nothing of this machine gets in
+    assert {name.lstrip("/") for name in (ROOT / ".gitignore").read_text().split()} < set(
+        ignored
+    )  # nothing of this machine gets in
