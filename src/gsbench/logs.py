@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 LOGGER = logging.getLogger("gsbench")
 
 
-class _People(logging.StreamHandler):
+class _People(logging.StreamHandler[TextIO]):
     """Shows lines from INFO on, and all of the loggers that are ``watched``."""
 
     watched: tuple[str, ...] = ()
