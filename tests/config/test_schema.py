@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -176,6 +177,32 @@ def test_hash_ignores_what_cannot_change_a_result() -> None:
     assert config_hash(composed("eval.primary=psnr")) == base  # how a result will be read does not change it
     assert config_hash(composed("densify.volume_threshold=0.04")) != base
     assert config_hash(composed("scene.max_size=200")) != base
+
+
+def test_settings_that_came_later_change_no_hash_where_they_are_not_used() -> None:
+    values = composed()
+    later = ("more", "geometry", "flicker")
+    before = {key: value for key, value in values["eval"].items() if key not in later}  # as settings were without them
+    assert config_hash(values | {"eval": before}) == config_hash(values)
+    used = [config_hash(composed(word)) for word in ("eval.more=[gmsd]", "eval.geometry=true", "eval.flicker=true")]
+    assert len({*used, config_hash(values)}) == 4
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["eval.more=[psnr]"], "eval.more"),
+        (["eval.more=[gmsd,gmsd]"], "at most once"),
+        (["eval.primary=gmsd"], "add gmsd to eval.more"),
+        (["eval.primary=floaters", "eval.flicker=true"], "add eval.geometry=true"),
+        (["eval.primary=flicker"], "add eval.flicker=true"),
+        (["eval.extra.floaters._target_=mine.Mine", "allow_targets=[mine]"], "none of"),
+    ],
+)
+def test_metrics_that_are_not_measured_or_known_are_refused(words: list[str], said: str) -> None:
+    with pytest.raises(InputError, match=re.escape(said)):
+        composed(*words)
+    assert composed("eval.primary=floaters", "eval.geometry=true")["eval"]["primary"] == "floaters"
 
 
 def test_hash_follows_the_source_of_a_users_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,13 +11,13 @@ from gsbench.densify import DensifyContext, EdgeAware, Refinement, Taming
 from gsbench.densify.adc import ADC
 from gsbench.densify.scores import blended_sums, by_median, draw, edge_map
 from gsbench.errors import InputError
-from gsbench.eval.ssim import torch_photometric_loss
 from gsbench.events import RefineEvent
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.reference import ReferenceRasterizer, bin_gaussians, blending_weights, project, tile_rectangles
 from gsbench.scene.camera import Camera
+from gsbench.train.loss import torch_photometric_loss
 from tests.densify import restatement
 from tests.densify.test_long_axis import halves
 from tests.densify.test_rounds import EXTENT, assert_same, to_rows

@@ -174,7 +174,8 @@ def make_evaluator(
     """The evaluator that the settings ``eval`` describe, with the user's own metrics; looks for networks' weights."""
     weights = None if options.weights is None else Path(options.weights).expanduser()
     protocol = get_protocol(options.protocol)
-    return Evaluator(protocol, device, tuple(options.lpips), options.flip, weights, options.download, extra)
+    lpips, more = tuple(options.lpips), tuple(options.more)
+    return Evaluator(protocol, device, lpips, options.flip, weights, options.download, extra, more)
 
 
 def select_device(name: str) -> torch.device:

@@ -141,7 +141,7 @@ class Trial:
         parts = self.parts
         program = parts.densifier if isinstance(parts.densifier, External) else None
         if program is not None and not program.leaves_model:
-            return measure_step(self.views, trained, self.evaluator)
+            return measure_step(self.views, trained, self.evaluator, parts.eval.geometry, parts.eval.flicker)
         return evaluate_step(
             self.views,
             trained,
@@ -152,6 +152,8 @@ class Trial:
             parts.device,
             parts.measured_earlier,
             made_by_program=program is not None,
+            geometry=parts.eval.geometry,
+            flicker=parts.eval.flicker,
         )
 
 

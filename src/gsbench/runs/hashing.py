@@ -17,7 +17,7 @@ NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tra
 ADDED_LATER: dict[str, dict[str, Any]] = {
     "init": {"min_inlier_ratio": 0.0},
     "raster": {"_target_": None},
-    "eval": {"at": [], "extra": {}},
+    "eval": {"at": [], "extra": {}, "more": [], "geometry": False, "flicker": False},
 }
 
 
