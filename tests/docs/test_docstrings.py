@@ -12,6 +12,7 @@ from gsbench.densify import Densifier
 from gsbench.eval.metric import Metric
 from gsbench.init.base import Initializer
 from gsbench.raster import Rasterizer
+from gsbench.tracking.sink import Sink
 from tests.conftest import ROOT
 
 PROMPT = re.compile(r"^\s*>>> ", re.MULTILINE)
@@ -31,7 +32,7 @@ def test_examples(name: str, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    "extended", [Densifier, Initializer, Metric, Rasterizer], ids=lambda extended: extended.__name__
+    "extended", [Densifier, Initializer, Metric, Rasterizer, Sink], ids=lambda extended: extended.__name__
 )
 def test_what_users_extend_has_an_example(extended: type) -> None:
     assert extended.__module__ in SOURCES

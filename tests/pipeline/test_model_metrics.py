@@ -13,7 +13,6 @@ import pytest
 import torch
 from PIL import Image
 
-from gsbench.config.schema import SceneConfig
 from gsbench.errors import InputError
 from gsbench.eval.facts import FLICKER, GEOMETRY, OF_MODELS
 from gsbench.gaussians.model import Gaussians
@@ -32,6 +31,7 @@ from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.camera import Camera
 from gsbench.scene.courtyard.depth import courtyard_depth
 from gsbench.scene.courtyard.render import courtyard_cameras
+from gsbench.scene.options import SceneConfig
 from gsbench.scene.types import Scene, View
 
 SIZE = (48, 36)

@@ -15,10 +15,11 @@ pytest.importorskip("triton")
 ROOT = Path(__file__).resolve().parents[2]
 CONTRACT = "tests/raster/test_contract.py"
 INTERPRETED = "tests/raster/test_triton_interpreted.py"
+EVERY = "match_the_reference"
 ONE_SCENE = "33x49"  # more than one tile each way, the last of one pixel, harmonics of every degree
 PARTS = {  # those that are asked for run side by side
-    "contract": [CONTRACT, INTERPRETED, "-m", "not slow", "-k", f"triton and (not match or {ONE_SCENE})"],
-    "every scene": [CONTRACT, "-k", f"triton and match and not {ONE_SCENE}"],
+    "contract": [CONTRACT, INTERPRETED, "-m", "not slow", "-k", f"triton and (not {EVERY} or {ONE_SCENE})"],
+    "every scene": [CONTRACT, "-k", f"triton and {EVERY} and not {ONE_SCENE}"],
     "training": [INTERPRETED, "-m", "slow"],
 }
 SLOW = ("every scene", "training")

@@ -15,7 +15,7 @@ from gsbench.files import checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.declare import declare, declared_metrics
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
-from gsbench.launch.preflight import check_components, missing_folders, missing_weights
+from gsbench.launch.preflight import check_components, check_trackers, missing_folders, missing_weights
 from gsbench.launch.serial import run_serial
 from gsbench.runs.layout import STORE
 from gsbench.runs.stages import STAGES
@@ -66,6 +66,8 @@ def _begin(trials: Sequence[Composed], unfinished: Sequence[Composed]) -> None:
     if launcher != "slurm" and (missing := missing_folders(unfinished)):
         raise InputError("; ".join(missing))
     check_components(unfinished, here=launcher != "slurm")
+    if launcher != "slurm":
+        check_trackers(unfinished)
     make_runs_folder(runs)
     Store(runs / STORE).sweep(STAGES)
     add_to_plan(trials)

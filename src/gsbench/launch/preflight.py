@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 from collections.abc import Iterable, Sequence
@@ -11,6 +12,8 @@ from typing import Any
 from gsbench.config.command_words import options
 from gsbench.config.compose import Composed
 from gsbench.config.schema import COMPONENTS
+from gsbench.errors import InputError
+from gsbench.system.install import install_command
 
 READ = ("colmap", "photos")  # the kinds of scenes that are read from scene.path
 
@@ -65,6 +68,13 @@ def check_components(trials: Sequence[Composed], here: bool) -> None:
             device = select_device(values["device"])
             if not own_raster and values["raster"]["name"] != AUTO:
                 resolve(values["raster"]["name"], device.type)
+
+
+def check_trackers(trials: Sequence[Composed]) -> None:
+    """Raise InputError where a trial's tracker needs a package that is not installed."""
+    for sink in sorted({t.values["tracking"]["sink"] for t in trials if t.values["tracking"]["enabled"]}):
+        if importlib.util.find_spec(sink) is None:
+            raise InputError(f"tracking.sink={sink} needs a package: {install_command(sink)} (or pip install {sink})")
 
 
 def need_no_check(trials: Sequence[Composed]) -> bool:

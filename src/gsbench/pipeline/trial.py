@@ -82,12 +82,10 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
     with _recorded_failures(values, paths):
         parts = Parts.of(values)
         torch.set_num_threads(parts.threads)
-        mirror = Mirror(values["tracking"], paths.runs, paths.folder, values)
+        mirror = Mirror(values["tracking"], paths.runs, paths.folder)
 
         def announce(stage: Stage, folder: Path) -> None:
             write_json(paths.folder / BUILDING, {"stage": stage.name, "folder": str(folder)})
-            if stage is TRAIN:
-                mirror.follow(folder)
 
         store = Store(paths.runs / layout.STORE, announce)
         write_text(paths.folder / CONFIG, config_yaml)

@@ -8,7 +8,8 @@ from __future__ import annotations
 # in the runs folder, beside the experiments
 STORE = "store"  # results of stages by content
 ARTIFACTS, DATABASE = "mlartifacts", "mlflow.db"  # MLflow's mirror
-IN_RUNS = (STORE, ARTIFACTS, DATABASE)
+TENSORBOARD, WANDB = "tensorboard", "wandb"  # the mirrors of others
+IN_RUNS = (STORE, ARTIFACTS, DATABASE, TENSORBOARD, WANDB)
 
 # in an experiment's folder
 PLAN = "plan.json"  # the trials that were asked for

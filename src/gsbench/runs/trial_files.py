@@ -22,9 +22,6 @@ from gsbench.system.locks import is_held
 
 TAIL_BYTES = 4096
 INPUTS_VERSION = 1
-# Results made before they had ``awaited`` tell by the reason whether an unavailable metric may still come: not where it
-# starts so.
-FOR_GOOD = ("not asked for", "a view is ")
 
 State = Literal["done", "running", "failed", "partial", "missing"]
 
@@ -145,7 +142,7 @@ def find_finished(
     try:
         if results["status"] != "complete" or results["hashes"]["config"] != config_hash(values):
             return None
-        lacking = _awaited(results)
+        lacking = set(results["awaited"])  # metrics that may still come, once their weights or packages are there
         same = (
             record["version"] == INPUTS_VERSION
             and record["config"] == config_hash(values)
@@ -163,13 +160,6 @@ def find_finished(
     except (KeyError, TypeError, AttributeError, ValueError, OSError):
         return None
     return results if same else None
-
-
-def _awaited(results: Mapping[str, Any]) -> set[str]:
-    """The metrics that a trial lacks and that may still come, once their weights or packages are there."""
-    if "awaited" in results:
-        return set(results["awaited"])
-    return {key for key, reason in results["unavailable"].items() if not str(reason).startswith(FOR_GOOD)}
 
 
 def _stamp(path: Path) -> list[int]:

@@ -20,11 +20,16 @@ SSIM_WEIGHT = 0.2
 Loss = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
 
+def as_unit_range(image: Tensor, dtype: torch.dtype) -> Tensor:
+    """``image`` as ``dtype``; 8-bit values are divided by 255."""
+    return image.to(dtype) / 255 if image.dtype == torch.uint8 else image.to(dtype)
+
+
 def torch_photometric_loss(
     image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT
 ) -> tuple[Tensor, Tensor, Tensor]:
     """``photometric_loss`` in plain torch, for any device and floating dtype: the definition."""
-    target = target.to(image.dtype) / 255 if target.dtype == torch.uint8 else target.to(image.dtype)
+    target = as_unit_range(target, image.dtype)
     l1 = (image - target).abs().mean()
     similarity = ssim_map(image, target).mean()
     loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - similarity)
