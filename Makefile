@@ -9,16 +9,15 @@ PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c co
 # for each processor, so the ordinary ones stay.
 GENERIC := NUMBA_CPU_NAME=generic OPENBLAS_CORETYPE=Prescott ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 \
 	DNNL_MAX_CPU_ISA=SSE41 NPY_DISABLE_CPU_FEATURES='X86_V3 X86_V4 AVX512_ICL'
-GENERIC_TESTS := tests/system/test_machine.py tests/raster/test_cpu.py tests/raster/test_contract.py tests/gaussians tests/densify \
-	tests/train/test_loss.py tests/train/test_trainer.py tests/train/test_resume.py tests/eval/test_metrics.py \
-	tests/init/colmap/test_alignment.py tests/init/test_sfm.py
+# What computes: the paths in tests/core.txt, which the workflows run on other systems too.
+CORE_TESTS := @tests/core.txt
 
 # The next version of Hydra, as far as it is released, laid over .venv for the tests of what Hydra does.
 NEXT_HYDRA := 'hydra-core>=1.4.0rc1,<1.5' 'omegaconf>=2.4.1rc1,<2.5'
 NEXT_HYDRA_TESTS := tests/app/test_joined_sweeps.py tests/config/test_schema.py
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-generic test-next-hydra lint
+.PHONY: help install demo test test-slow test-generic test-next-hydra lint docs lock
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -30,11 +29,14 @@ demo: $(VENV)/.stamp-run ## baseline against volumetric densification on the cou
 	$(BIN)/gsbench tables demo
 	$(BIN)/gsbench report demo
 
-test: $(VENV)/.stamp-dev ## run the tests
-	$(PYTEST)
+test: $(VENV)/.stamp-dev ## run the tests, but for the slow ones
+	$(PYTEST) -m 'not slow'
+
+test-slow: $(VENV)/.stamp-dev ## run the tests that take long and rarely tell anything new
+	$(PYTEST) -m slow
 
 test-generic: $(VENV)/.stamp-dev ## run core tests as on the plainest processor of this architecture
-	$(GENERIC) $(PYTEST) $(GENERIC_TESTS)
+	$(GENERIC) $(PYTEST) $(CORE_TESTS)
 
 test-next-hydra: $(VENV)/.stamp-dev ## run the tests of configurations and sweeps on the next version of Hydra
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --pre --no-deps --upgrade --target $(VENV)/next-hydra $(NEXT_HYDRA)
@@ -45,6 +47,13 @@ lint: $(VENV)/.stamp-dev ## check style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+docs: $(VENV)/.stamp-docs ## write the documentation as a site to site/; fails where a link leads nowhere
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs --quiet build
+
+lock: $(VENV)/.stamp-run ## bring uv.lock to the versions of constraints.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(BIN)/uv lock --no-config --default-index https://pypi.org/simple $$(sed 's/^/--upgrade-package /' constraints.txt)
+
 # What running needs, and no more; development tools come on top.
 $(VENV)/.stamp-run: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "gsbench needs Python 3.11 or newer: make PYTHON=python3.12 ...")'
@@ -54,4 +63,8 @@ $(VENV)/.stamp-run: pyproject.toml constraints.txt
 
 $(VENV)/.stamp-dev: $(VENV)/.stamp-run
 	$(PIP) -e '.[dev]'
+	@touch $@
+
+$(VENV)/.stamp-docs: $(VENV)/.stamp-run
+	$(PIP) -e '.[docs]'
 	@touch $@

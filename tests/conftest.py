@@ -38,6 +38,6 @@ def shared_weights(shared: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def _own_search_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The program, called within a test, tells its children where not to import from; the next test's must not hear it."""
+    """Forget what the program, called within a test, tells its children of where not to import from."""
     monkeypatch.setenv("PYTHONSAFEPATH", "")  # so that it is known here, and put back at the end
     monkeypatch.delenv("PYTHONSAFEPATH")

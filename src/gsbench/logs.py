@@ -55,7 +55,7 @@ def printable_output() -> Iterator[None]:
         sys.stdout, sys.stderr = out, err
 
 
-class _People(logging.StreamHandler):
+class _People(logging.StreamHandler[TextIO]):
     """Shows lines from INFO on, and all of the loggers that are ``watched``."""
 
     watched: tuple[str, ...] = ()

@@ -96,10 +96,12 @@ def option_fields(cls: type) -> list[dataclasses.Field[Any]]:
 def describe(hint: Any) -> str:
     """An annotation in words, as they stand after "must be".
 
-    >>> describe(Annotated[int, Gt(0)] | None)
-    'a whole number above 0 or null'
-    >>> describe(Literal["soft", "hard", "curve"])
-    "'soft', 'hard' or 'curve'"
+    Examples:
+        >>> from annotated_types import Gt
+        >>> describe(Annotated[int, Gt(0)] | None)
+        'a whole number above 0 or null'
+        >>> describe(Literal["soft", "hard", "curve"])
+        "'soft', 'hard' or 'curve'"
     """
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:

@@ -67,7 +67,7 @@ def results_below(folder: Path) -> list[dict[str, float]]:
     return [json.loads(path.read_text()) for path in sorted(folder.rglob("results.json"))]
 
 
-@pytest.mark.parametrize("launch", ["serial", "local"])
+@pytest.mark.parametrize("launch", ["serial", pytest.param("local", marks=pytest.mark.slow)])
 def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path, launch: str) -> None:
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     (tmp_path / "conf" / "experiment" / "own.yaml").write_text(EXPERIMENT)
@@ -93,7 +93,10 @@ def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path, launc
     assert (tmp_path / "notes.txt").read_text().splitlines()[len(notes) :] == ["sweep begins", "sweep ends"]
 
 
-@pytest.mark.parametrize("launcher", ["basic", "joblib", "submitit_local"])
+@pytest.mark.parametrize(
+    "launcher",
+    ["basic", *(pytest.param(name, marks=pytest.mark.slow) for name in ("joblib", "submitit_local"))],
+)
 def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, launcher: str) -> None:
     package = f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher"
     if launcher != "basic" and find_spec(package) is None:

@@ -73,6 +73,7 @@ def training_log_size(runs: Path) -> int:
     return sum(path.stat().st_size for path in runs.glob("store/train/.*.partial/metrics.jsonl"))
 
 
+@pytest.mark.slow
 def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
     environment: dict[str, str], undisturbed: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -118,6 +119,7 @@ def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
     assert results_of(runs) == undisturbed
 
 
+@pytest.mark.slow
 def test_two_sweeps_at_once_share_the_work(
     environment: dict[str, str], undisturbed: dict[str, Any], tmp_path: Path
 ) -> None:

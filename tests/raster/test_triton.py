@@ -14,17 +14,23 @@ pytest.importorskip("triton")
 
 ROOT = Path(__file__).resolve().parents[2]
 CONTRACT = "tests/raster/test_contract.py"
-# About equally long; they run side by side.
-PARTS = {
-    "contract": [CONTRACT, "-k", "triton and match"],
-    "rest": [CONTRACT, "tests/raster/test_triton_interpreted.py", "-k", "triton and not match"],
+INTERPRETED = "tests/raster/test_triton_interpreted.py"
+EVERY = "match_the_reference"
+ONE_SCENE = "33x49"  # more than one tile each way, the last of one pixel, harmonics of every degree
+PARTS = {  # those that are asked for run side by side
+    "contract": [CONTRACT, INTERPRETED, "-m", "not slow", "-k", f"triton and (not {EVERY} or {ONE_SCENE})"],
+    "every scene": [CONTRACT, "-k", f"triton and {EVERY} and not {ONE_SCENE}"],
+    "training": [INTERPRETED, "-m", "slow"],
 }
+SLOW = ("every scene", "training")
 LIMIT = 3600  # s, for one that hangs; minutes on a quiet machine, and 15 were too few on two cores with a load of 20
 
 
 @pytest.fixture(scope="module")
-def interpreted() -> Iterator[dict[str, subprocess.Popen[str]]]:
-    """All parts, started together."""
+def interpreted(request: pytest.FixtureRequest) -> Iterator[dict[str, subprocess.Popen[str]]]:
+    """The parts that this session runs, started together."""
+    here = [item for item in request.session.items if item.path == request.path]
+    chosen = [item.callspec.params["part"] for item in here if hasattr(item, "callspec")]
     environment = os.environ | {
         "TRITON_INTERPRET": "1",
         "OMP_NUM_THREADS": "1",
@@ -40,6 +46,7 @@ def interpreted() -> Iterator[dict[str, subprocess.Popen[str]]]:
             text=True,
         )
         for part, arguments in PARTS.items()
+        if part in chosen
     }
     yield processes
     for process in processes.values():
@@ -47,9 +54,22 @@ def interpreted() -> Iterator[dict[str, subprocess.Popen[str]]]:
         process.wait()
 
 
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("part", [pytest.param(p, marks=[pytest.mark.slow] if p in SLOW else []) for p in PARTS])
 def test_in_the_interpreter(interpreted: dict[str, subprocess.Popen[str]], part: str) -> None:
     output, _ = interpreted[part].communicate(timeout=LIMIT)
     print(output)
     assert interpreted[part].returncode == 0, output
     assert " passed" in output
+
+
+def test_no_test_is_in_two_parts_or_in_none() -> None:
+    environment = os.environ | {"TRITON_INTERPRET": "1"}
+
+    def collected(arguments: list[str]) -> list[str]:
+        words = [sys.executable, "-m", "pytest", "-q", "--collect-only", "-p", "no:cacheprovider", *arguments]
+        done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+        return [line for line in done.stdout.splitlines() if "::" in line]
+
+    everything = [name for name in collected([CONTRACT, INTERPRETED]) if "triton" in name]
+    parts = [name for arguments in PARTS.values() for name in collected(arguments)]
+    assert sorted(parts) == sorted(everything)

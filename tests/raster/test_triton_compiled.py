@@ -67,7 +67,10 @@ def step(
     return gaussians, output
 
 
-@pytest.mark.parametrize("target", TARGETS, ids=lambda number: f"sm_{number}")
+@pytest.mark.parametrize(
+    "target",
+    [pytest.param(number, id=f"sm_{number}", marks=[] if number == 90 else [pytest.mark.slow]) for number in TARGETS],
+)
 def test_kernels_compile_without_spills(launches: list[Launch], target: int, monkeypatch: pytest.MonkeyPatch) -> None:
     step(CASE)
     step(CASE, absolute=True, footprint=True)

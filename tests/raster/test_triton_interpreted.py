@@ -236,6 +236,7 @@ def tiny_scene(truth: Gaussians) -> Scene:
     return Scene("tiny", tuple(views), tuple(views[:1]))
 
 
+@pytest.mark.slow
 def test_a_training_equals_the_references(tmp_path: Path) -> None:
     """Thirty iterations, of which the twentieth refines.
 

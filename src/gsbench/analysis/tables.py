@@ -338,7 +338,7 @@ def _left_out(experiment: Experiment) -> list[str]:
     return [f"Left out ({len(experiment.warnings)}): {'; '.join(shown)}{rest}."]
 
 
-def _natural(key: tuple[str, ...]) -> tuple:
+def _natural(key: tuple[str, ...]) -> tuple[tuple[int, float, str], ...]:
     """Sort numbers by value and other text by itself."""
     parts = []
     for text in key:

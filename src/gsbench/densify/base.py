@@ -62,6 +62,32 @@ class Densifier:
 
     State: ``context``; ``lineage``; and ``statistics``, one tensor [N] for each name in ``STATISTICS``, zero at the
     start. They follow every ``edit`` (the new have zero), are saved, and are on the device of the Gaussians.
+
+    Examples:
+        A rule that clones, every ``interval`` iterations, what is nearly opaque:
+
+        >>> @dataclass
+        ... class CloneOpaque(Densifier):
+        ...     interval: int = 100
+        ...     opacity: float = 0.9
+        ...
+        ...     def rules(self, refinement):
+        ...         return [self.grow] if refinement.step % self.interval == 0 else []
+        ...
+        ...     def grow(self, refinement):
+        ...         opaque = refinement.gaussians.values.opacity_logits.sigmoid() > self.opacity  # [N]
+        ...         refinement.event.cloned += self.clone(refinement, opaque)
+
+        >>> from gsbench.gaussians.trainable import LearningRates
+        >>> from gsbench.raster.contract import Case
+        >>> initial = Case(16, 12, 20, sh_degree=0).gaussians().map(Tensor.float)
+        >>> gaussians = TrainableGaussians(initial, LearningRates(), 1.0)
+        >>> densifier = CloneOpaque(interval=50, opacity=0.5)
+        >>> densifier.begin(gaussians.values, DensifyContext(extent=1.0))
+        >>> densifier.refine(49, gaussians, torch.Generator())
+        >>> event = densifier.refine(50, gaussians, torch.Generator())
+        >>> event.before, event.cloned, event.after
+        (20, 9, 29)
     """
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {}

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import torch
@@ -70,7 +71,7 @@ class Evaluator:
                 self._leave_out(facts.key, error)
         self._metrics |= extra
 
-    def evaluate_view(self, render: NDArray | Tensor, ground_truth: NDArray | Tensor) -> dict[str, float]:
+    def evaluate_view(self, render: NDArray[Any] | Tensor, ground_truth: NDArray[Any] | Tensor) -> dict[str, float]:
         """The metrics of one view; images are [H, W, 3], uint8 or floating point in [0, 1].
 
         A metric that cannot be computed is absent and stands in ``unavailable``. Raises ``TrainingError`` where the
@@ -95,7 +96,7 @@ class Evaluator:
         if error.awaited and key not in self.own:
             self.awaited.add(key)
 
-    def _prepare(self, image: NDArray | Tensor) -> Tensor:
+    def _prepare(self, image: NDArray[Any] | Tensor) -> Tensor:
         tensor = torch.as_tensor(image, device=self.device)  # [H, W, 3]
         if tensor.dtype != torch.uint8:
             if not bool(tensor.isfinite().all()):

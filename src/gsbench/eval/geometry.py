@@ -81,5 +81,5 @@ def project(points: Array, camera: Camera) -> tuple[NDArray[np.int64], NDArray[n
     return index[inside], row[inside].astype(np.int64), column[inside].astype(np.int64), z[inside]
 
 
-def _mean(values: NDArray) -> float:
+def _mean(values: NDArray[np.float64] | NDArray[np.bool_]) -> float:
     return float(values.mean()) if values.size else np.nan

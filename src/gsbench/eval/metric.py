@@ -12,6 +12,20 @@ class Metric(Protocol):
 
     A class of the user's own says as class attributes how its values are to be read: ``direction`` (1, -1 or 0),
     ``label``, ``unit``, ``decimals`` and ``worthwhile``, as `gsbench.eval.facts.MetricFacts` explains them.
+
+    Examples:
+        The largest error of any pixel, in 8-bit levels; less is better:
+
+        >>> import torch
+        >>> class LargestError:
+        ...     label, unit, direction, decimals, worthwhile = "largest error", "levels", -1, 0, 1.0
+        ...
+        ...     def measure(self, image, truth):
+        ...         return 255 * (image - truth).abs().max().item()
+
+        >>> metric: Metric = LargestError()
+        >>> metric.measure(torch.zeros(4, 5, 3), torch.ones(4, 5, 3))
+        255.0
     """
 
     def measure(self, image: Tensor, truth: Tensor) -> float:

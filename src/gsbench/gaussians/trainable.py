@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -160,7 +161,7 @@ class TrainableGaussians:
         setattr(self.values, name, parameter)
         return state
 
-    def _group(self, name: str) -> dict:
+    def _group(self, name: str) -> dict[str, Any]:
         return next(group for group in self.optimizer.param_groups if group["name"] == name)
 
     def state_dict(self) -> dict[str, object]:
@@ -172,7 +173,7 @@ class TrainableGaussians:
 
     @classmethod
     def load(
-        cls, state: dict, rates: LearningRates, spatial_scale: float, device: torch.device | None = None
+        cls, state: dict[str, Any], rates: LearningRates, spatial_scale: float, device: torch.device | None = None
     ) -> TrainableGaussians:
         """The inverse of ``state_dict``, on ``device`` (None: where the state is); copies."""
         gaussians = Gaussians(**state["gaussians"]).map(lambda tensor: tensor.to(device))

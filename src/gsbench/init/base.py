@@ -161,7 +161,28 @@ class Preparation:
 
 
 class Initializer(ABC):
-    """Makes cameras and a first cloud of points for a capture. A dataclass: its fields are the options."""
+    """Makes cameras and a first cloud of points for a capture. A dataclass: its fields are the options.
+
+    Examples:
+        Where only the points are new, `PlacedCloud` brings ``run``: cameras, report and picture.
+
+        >>> from gsbench.init.placed import PlacedCloud
+        >>> @dataclass(frozen=True, kw_only=True)
+        ... class Grid(PlacedCloud):
+        ...     name: ClassVar[str] = "grid"
+        ...     side: int = 3  # points along each edge of a cube of 2 units
+        ...
+        ...     def cloud(self, capture, model):
+        ...         axis = np.linspace(-1, 1, self.side)
+        ...         points = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)  # [P, 3]
+        ...         return PointCloud(points, np.full(points.shape, 128, dtype=np.uint8))
+
+        >>> len(Grid(side=4).cloud(None, None))
+        64
+        >>> Grid(side="four")
+        Traceback (most recent call last):
+        gsbench.errors.InputError: init.side must be a whole number, got 'four'
+    """
 
     name: ClassVar[str]  # as reports call it
 

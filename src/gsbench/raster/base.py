@@ -76,6 +76,24 @@ class Rasterizer(Protocol):
 
     One of a user's that gives ``RenderOutput.footprint``, which is optional, has a class attribute ``has_footprint =
     True``.
+
+    Examples:
+        The reference without colours; `departures` says what is not as the contract wants it.
+
+        >>> from gsbench.raster.contract import Case, departures
+        >>> from gsbench.raster.reference import ReferenceRasterizer
+        >>> class Grey:
+        ...     name = "grey"
+        ...
+        ...     def render(self, gaussians, camera, sh_degree, background, absolute_gradient=False):
+        ...         output = ReferenceRasterizer().render(gaussians, camera, sh_degree, background, absolute_gradient)
+        ...         output.image = output.image.mean(-1, keepdim=True).expand(-1, -1, 3)
+        ...         return output
+
+        >>> rasterizer: Rasterizer = Grey()
+        >>> tiny = Case(7, 5, 20, sh_degree=3)  # width, height, Gaussians
+        >>> departures(rasterizer, cases=(tiny,))[0].partition(" by")[0]
+        '7x5-n20-sh3: image is off'
     """
 
     name: str

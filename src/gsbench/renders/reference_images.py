@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.results import Trial, read_views
-from gsbench.config.compose import compose_one, options
+from gsbench.config.command_words import options
+from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.pipeline.wiring import Parts
 from gsbench.pipeline.wiring import Trial as TrialSteps

@@ -41,8 +41,9 @@ def sha256_of(values: Any) -> str:
 def flatten(mapping: Mapping[str, Any], keep_empty: bool = False) -> dict[str, Any]:
     """Nested mappings as one with dotted keys; an empty one within is dropped, unless ``keep_empty``.
 
-    >>> flatten({"a": {"b": 1, "c": {}}, "d": [2]})
-    {'a.b': 1, 'd': [2]}
+    Examples:
+        >>> flatten({"a": {"b": 1, "c": {}}, "d": [2]})
+        {'a.b': 1, 'd': [2]}
     """
     flat: dict[str, Any] = {}
     for key, value in mapping.items():

@@ -42,8 +42,9 @@ def select_images(names: Sequence[str], max_images: int) -> list[str]:
 
     The first is always kept, and a closed ring of views stays evenly spaced. This comes before the split.
 
-    >>> select_images(["a", "b", "c", "d", "e"], 3)
-    ['a', 'b', 'd']
+    Examples:
+        >>> select_images(["a", "b", "c", "d", "e"], 3)
+        ['a', 'b', 'd']
     """
     if max_images < MIN_IMAGES:
         raise InputError(f"scene.max_images must be at least {MIN_IMAGES}, got {max_images}")

@@ -14,10 +14,11 @@ def downscaled_size(width: int, height: int, downscale: int = 1, max_size: int |
 
     Sides are rounded half up, and never below 1; the size never grows.
 
-    >>> downscaled_size(4946, 3286, downscale=4)
-    (1237, 822)
-    >>> downscaled_size(4946, 3286, max_size=1600)
-    (1600, 1063)
+    Examples:
+        >>> downscaled_size(4946, 3286, downscale=4)
+        (1237, 822)
+        >>> downscaled_size(4946, 3286, max_size=1600)
+        (1600, 1063)
     """
     if downscale < 1:
         raise InputError(f"scene.downscale must be at least 1, got {downscale}")

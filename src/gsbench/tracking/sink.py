@@ -39,6 +39,32 @@ class Sink(Protocol):
     """One trial in a tracker. Each method may raise whatever the tracker's client raises.
 
     It is closed by no one: its process ends without tearing anything down, so each method sends what it is given.
+
+    Examples:
+        One that prints:
+
+        >>> class Printed:
+        ...     state_file = "printed.json"
+        ...
+        ...     def open(self, state, results):
+        ...         return state
+        ...
+        ...     def log(self, points):
+        ...         for point in points:
+        ...             print(f"{point.step}: {point.key} {point.value}")
+        ...
+        ...     def complete(self, summary):
+        ...         self.log(summary.points)
+        ...
+        ...     def stop(self, status, reason):
+        ...         print(status, reason)
+        ...
+        ...     def remove(self):
+        ...         pass
+
+        >>> sink: Sink = Printed()
+        >>> sink.log([Point("loss", 0.5, step=100, seconds=1.0)])
+        100: loss 0.5
     """
 
     state_file: str  # in the trial's folder: what `open` returned, "complete" and "logged" kept by `TrackedTrial`

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsbench.analysis.results import RESULTS, Trial, load_experiment
+from gsbench.analysis.results import Trial, load_experiment
 from gsbench.densify.volume import log_volume
 from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER, PointCloud
-from gsbench.runs.layout import GROUND_TRUTH, LINEAGE, POINT_CLOUD, STORE
+from gsbench.runs.layout import GROUND_TRUTH, LINEAGE, POINT_CLOUD, RESULTS, STORE
 from gsbench.runs.stages import INIT
 from gsbench.runs.store import Store
 from gsbench.scene.camera import Camera

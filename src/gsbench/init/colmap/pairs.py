@@ -19,8 +19,9 @@ _GPS_LATITUDE_REF, _GPS_LATITUDE, _GPS_LONGITUDE_REF, _GPS_LONGITUDE, _GPS_ALTIT
 def exhaustive_pairs(count: int) -> list[Pair]:
     """Every pair of ``count`` images.
 
-    >>> exhaustive_pairs(3)
-    [(0, 1), (0, 2), (1, 2)]
+    Examples:
+        >>> exhaustive_pairs(3)
+        [(0, 1), (0, 2), (1, 2)]
     """
     return [(i, j) for i in range(count) for j in range(i + 1, count)]
 
@@ -28,8 +29,9 @@ def exhaustive_pairs(count: int) -> list[Pair]:
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
     """Each image with the next ``overlap`` ones, and with those 1, 2, 4, … 2^(overlap - 1) further on, as COLMAP does.
 
-    >>> sequential_pairs(6, 3)
-    [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (1, 3), (1, 4), (1, 5), (2, 3), (2, 4), (2, 5), (3, 4), (3, 5), (4, 5)]
+    Examples:
+        >>> sequential_pairs(6, 3)
+        [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (1, 3), (1, 4), (1, 5), (2, 3), (2, 4), (2, 5), (3, 4), (3, 5), (4, 5)]
     """
     steps = {*range(1, overlap + 1), *(2**power for power in range(overlap))}
     return sorted((i, i + step) for i in range(count) for step in steps if i + step < count)

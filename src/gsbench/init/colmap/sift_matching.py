@@ -119,8 +119,9 @@ def divide(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
 
     Parts that come out thin, as those of few pairs do, are put together up to the size of a full one.
 
-    >>> divide([(1, 2), (1, 3), (1, 4), (2, 3), (2, 4), (3, 4)], 2)
-    [[(1, 2)], [(1, 3), (1, 4), (2, 3), (2, 4)], [(3, 4)]]
+    Examples:
+        >>> divide([(1, 2), (1, 3), (1, 4), (2, 3), (2, 4), (3, 4)], 2)
+        [[(1, 2)], [(1, 3), (1, 4), (2, 3), (2, 4)], [(3, 4)]]
     """
     blocks: dict[tuple[int, int], list[IdPair]] = {}
     for first, second in sorted(pairs):

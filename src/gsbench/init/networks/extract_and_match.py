@@ -70,7 +70,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
         raise InputError(
             f"{options.name}: no keypoint in any image: lower init.keypoint_threshold, or check the photos"
         )
-    if options.pairs == "lowres":
+    if options.pairs == "lowres":  # type: ignore[comparison-overlap]  # `Dim` has one way more than SIFT
         with timer.phase("preselect"):
             small = at_low_resolution(job)
             _extract_all(small, open_store(small), names, device, progress)
@@ -108,7 +108,7 @@ def choose_pairs(job: NetworkJob, names: Sequence[str], pairs: list[tuple[str, s
     if job.options.pairs == "auto":
         store = open_store(job)
         return proposed_pairs(names, lambda name: store.require_features(name).strongest(STRONGEST).descriptors)
-    if job.options.pairs == "lowres":
+    if job.options.pairs == "lowres":  # type: ignore[comparison-overlap]
         small = open_store(at_low_resolution(job))
         matches = {pair: small.read_matches(*pair) for pair in pairs}  # none where memory did not suffice for all
         return [pair for pair, found in matches.items() if found is None or len(found) > LOWRES_MATCHES]

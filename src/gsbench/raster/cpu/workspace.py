@@ -7,6 +7,7 @@ import weakref
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from math import prod
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,7 +31,7 @@ class Arena:
     def __init__(self) -> None:
         self._blocks: dict[str, NDArray[np.uint8]] = {}
 
-    def take(self, name: str, shape: tuple[int, ...], dtype: DTypeLike, zero: bool = False) -> NDArray:
+    def take(self, name: str, shape: tuple[int, ...], dtype: DTypeLike, zero: bool = False) -> NDArray[Any]:
         """An array of ``shape``; ``zero`` clears it whenever it had to be allocated anew."""
         size = prod(shape) * np.dtype(dtype).itemsize
         block = self._blocks.get(name)

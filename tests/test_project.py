@@ -1,0 +1,161 @@
+"""Facts about the project that stand in more than one file of its root agree."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+import yaml
+
+import gsbench
+from tests.conftest import ROOT
+
+PUBLIC = {"pypi.org", "files.pythonhosted.org"}
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+
+
+def normal(name: str) -> str:
+    """A distribution's name as the package index compares it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def constraints() -> dict[str, str]:
+    lines = (ROOT / "constraints.txt").read_text().split()
+    return {normal(name): version for name, version in (line.split("==") for line in lines)}
+
+
+def locked() -> list[dict[str, Any]]:
+    return tomllib.loads((ROOT / "uv.lock").read_text())["package"]
+
+
+def steps(workflow: Path) -> list[dict[str, Any]]:
+    return [step for job in yaml.safe_load(workflow.read_text())["jobs"].values() for step in job["steps"]]
+
+
+def test_the_lock_has_the_versions_of_the_constraints() -> None:
+    pinned = constraints()
+    different = {
+        package["name"]: (package["version"], pinned[package["name"]])
+        for package in locked()
+        if package["name"] in pinned and package["version"] != pinned[package["name"]]
+    }
+    assert different == {}, "make lock"
+
+
+def test_the_lock_locks_what_the_project_file_asks_for() -> None:
+    (own,) = (package for package in locked() if "editable" in package["source"])
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = [*project["dependencies"], *(line for extra in project["optional-dependencies"].values() for line in extra)]
+    names = {normal(re.match(r"[\w.-]+", line).group()) for line in asked}  # type: ignore[union-attr]
+    assert own["name"] == project["name"]
+    assert {entry["name"] for entry in own["metadata"]["requires-dist"]} == names - {own["name"]}, "make lock"
+    assert tomllib.loads((ROOT / "uv.lock").read_text())["requires-python"] == project["requires-python"], "make lock"
+
+
+def test_the_lock_names_public_places_only() -> None:
+    text = (ROOT / "uv.lock").read_text()
+    assert {urlsplit(address).hostname for address in re.findall(r'"([a-z+]+://[^"]*)"', text)} == PUBLIC
+    sources = [package["source"] for package in locked()]
+    assert {*map(tuple, sources)} == {("registry",), ("editable",)}
+    assert [source["editable"] for source in sources if "editable" in source] == ["."]
+
+
+def test_one_version() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == gsbench.__version__
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert newest is not None
+    assert newest.group(1) == gsbench.__version__.removesuffix(".dev0")
+
+
+def test_the_check_before_a_commit_formats_as_ours_does() -> None:
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    (ruff,) = (entry for entry in hooks if entry["repo"].endswith("/ruff-pre-commit"))
+    assert ruff["rev"] == f"v{constraints()['ruff']}"
+
+
+@pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
+def test_workflows_call_targets_and_files_that_there_are(workflow: Path) -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    called = {name for step in steps(workflow) for name in re.findall(r"\bmake ([a-z-]+)", step.get("run", ""))}
+    assert called
+    assert called <= targets
+    for step in steps(workflow):
+        for name in re.findall(r"@(\S+)", step.get("run", "")):
+            assert (ROOT / name).exists()
+
+
+def test_every_target_for_tests_is_called_by_a_workflow_and_by_ci() -> None:
+    makefile = (ROOT / "Makefile").read_text()
+    wanted = {name for name in re.findall(r"^([a-z-]+):.*##", makefile, re.MULTILINE) if name.startswith("test")}
+    wanted |= {"lint", "docs"}
+    text = "".join(step.get("run", "") + "\n" for workflow in WORKFLOWS for step in steps(workflow))
+    assert wanted <= set(re.findall(r"\bmake ([a-z-]+)", text))
+    assert wanted <= set(re.findall(r"^make ([a-z-]+)", (ROOT / ".ci" / "run").read_text(), re.MULTILINE))
+
+
+def test_linux_is_tested_from_the_oldest_python_that_is_promised() -> None:
+    (tests,) = (path for path in WORKFLOWS if path.stem == "tests")
+    tested = yaml.safe_load(tests.read_text())["jobs"]["linux"]["strategy"]["matrix"]["python"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["requires-python"] == f">={tested[0]}"
+    assert tested == sorted(tested, key=lambda version: int(version.split(".")[1]))
+
+
+def test_the_core_of_the_tests_is_there() -> None:
+    for name in (ROOT / "tests" / "core.txt").read_text().split():
+        assert (ROOT / name).exists(), name
+
+
+def test_the_site_has_every_document() -> None:
+    """Quickly, without building it: `make docs` finds links that lead nowhere."""
+
+    class Loader(yaml.SafeLoader):
+        """Reads MkDocs' tag for environment variables as a list."""
+
+    Loader.add_constructor("!ENV", lambda loader, node: loader.construct_sequence(node))
+    config = yaml.load((ROOT / "mkdocs.yml").read_text(), Loader)
+    pages = re.findall(r"'([\w./-]+\.md)'", str(config["nav"]))
+    generated = {"changelog.md", "contributing.md"}
+    assert len(pages) == len(set(pages))
+    assert set(pages) - generated == {path.name for path in (ROOT / "docs").glob("*.md")}
+    index = (ROOT / "docs" / "index.md").read_text()
+    assert [name for name in set(pages) - generated - {"index.md"} if f"]({name}" not in index] == []
+
+
+REPOSITORY = "https://example.org/owner/gsbench/"
+
+
+@pytest.mark.parametrize(
+    ("link", "folder", "repository", "wanted"),
+    [
+        ("[a](search.md#here)", "docs", None, "[a](search.md#here)"),
+        ("[a](#here)", "docs", None, "[a](#here)"),
+        ("[a](docs/search.md#here)", "", None, "[a](search.md#here)"),
+        ("[a](../CONTRIBUTING.md)", "docs", None, "[a](contributing.md)"),
+        ("[a](../README.md#verbs)", "docs", None, "[a](index.md)"),
+        ("[a](../src/gsbench/eval/facts.py)", "docs", None, "[a](reference/gsbench/eval/facts.md)"),
+        ("[a](../src/gsbench/raster/__init__.py)", "docs", None, "[a](reference/gsbench/raster/index.md)"),
+        ("[a](../conf/densify/)", "docs", None, "a (`conf/densify`)"),
+        ("[conf/densify](../conf/densify/)", "docs", None, "conf/densify"),
+        ("[a](../conf/densify/)", "docs", REPOSITORY, "[a](https://example.org/owner/gsbench/tree/main/conf/densify)"),
+        ("[a](LICENSE)", "", REPOSITORY, "[a](https://example.org/owner/gsbench/blob/main/LICENSE)"),
+        ("[a](https://example.org)", "docs", None, "[a](https://example.org)"),
+        ("![a](demo.jpg)", "docs", None, "![a](demo.jpg)"),
+        ("[a](nowhere.md)", "docs", REPOSITORY, "[a](nowhere.md)"),  # is left to MkDocs, which refuses it
+        ("[a](../../../../../../etc/passwd)", "docs", REPOSITORY, "[a](../../../../../../etc/passwd)"),
+        ("```\n[a](../conf/densify/)\n```", "docs", None, "```\n[a](../conf/densify/)\n```"),
+    ],
+)
+def test_links_lead_on_from_the_site(link: str, folder: str, repository: str | None, wanted: str) -> None:
+    specification = importlib.util.spec_from_file_location("site_links", ROOT / "scripts" / "site_links.py")
+    assert specification is not None
+    assert specification.loader is not None
+    site_links = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(site_links)
+    assert site_links.led_on(link, ROOT / folder, repository) == wanted
