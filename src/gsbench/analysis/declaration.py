@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.results import Trial, read_json_lines
+from gsbench.analysis.results import TrialResult, read_json_lines
 from gsbench.runs.layout import DECLARED
 from gsbench.words import counted
 
@@ -44,7 +44,7 @@ class ActiveDeclaration:
     """
 
     declaration: Declaration
-    seen: tuple[Trial, ...]
+    seen: tuple[TrialResult, ...]
     trials: int
     earlier: tuple[Declaration, ...]
 
@@ -77,14 +77,14 @@ class ActiveDeclaration:
         return counted(self.trials, "trial")
 
 
-def read_declarations(folder: Path, trials: Sequence[Trial] = ()) -> list[Declaration]:
+def read_declarations(folder: Path, trials: Sequence[TrialResult] = ()) -> list[Declaration]:
     """Every declaration for the experiment in ``folder``, the oldest first; also those that only its trials record."""
     records = [*read_json_lines(folder / DECLARED), *(trial.data.get("declared") for trial in trials)]
     found = [declaration for declaration in map(_from_record, records) if declaration is not None]
     return sorted(dict.fromkeys(found), key=lambda declaration: declaration.time)
 
 
-def standing(folder: Path, trials: Sequence[Trial]) -> ActiveDeclaration | None:
+def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration | None:
     """The declaration that holds for the experiment in ``folder`` with these trials: the latest; None without any."""
     declared = read_declarations(folder, trials)
     if not declared:
@@ -94,7 +94,7 @@ def standing(folder: Path, trials: Sequence[Trial]) -> ActiveDeclaration | None:
     return ActiveDeclaration(latest, seen, len(trials), tuple(declared[:-1]))
 
 
-def measured(trial: Trial) -> float:
+def measured(trial: TrialResult) -> float:
     """When the trial's metrics were there, Unix time; of results that do not say it, when they were written."""
     moment = _unix(trial.data.get("measured"))
     return trial.finished if moment is None else moment

@@ -6,21 +6,21 @@ import time
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 
-from gsbench.analysis.results import Trial, canonical
+from gsbench.analysis.results import TrialResult, canonical
 from gsbench.runs.source import OWN, SHOWN
 
-Versions = dict[str, list[Trial]]  # version -> the trials that it made
+Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 
 # Settings in which trials of one cell may differ: they name the trial or say where it runs, not what is computed.
 IGNORED_SETTINGS = (
     *("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path"),
     "eval.primary",
 )
-CODE = "code of "  # how the keys of ``Trial.code`` start that are a user's own classes
+CODE = "code of "  # how the keys of ``TrialResult.code`` start that are a user's own classes
 CLASSES = ("init._target_", "densify._target_")
 
 
-def differing_conditions(trials: Sequence[Trial]) -> dict[str, list[str]]:
+def differing_conditions(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
     """The conditions in which trials differ, with their values; the code that made them is one.
 
     Unlike budgets of which none acted are no difference: all of the trials grew as they liked.
@@ -36,7 +36,7 @@ def differing_conditions(trials: Sequence[Trial]) -> dict[str, list[str]]:
     return {key: sorted(values) for key, values in seen.items() if len(values) > 1}
 
 
-def differing_settings(trials: Sequence[Trial]) -> dict[str, list[str]]:
+def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
     """The settings in which trials with different configuration hashes differ, those that may differ left out."""
     if len({trial.config_hash for trial in trials}) == 1:
         return {}
@@ -45,7 +45,7 @@ def differing_settings(trials: Sequence[Trial]) -> dict[str, list[str]]:
     return {key: found for key, found in values.items() if len(found) > 1}
 
 
-def differing_code(trials: Iterable[Trial]) -> dict[str, Versions]:
+def differing_code(trials: Iterable[TrialResult]) -> dict[str, Versions]:
     """The classes and stages of which the trials used several versions, as far as versions were recorded."""
     found: dict[str, Versions] = defaultdict(lambda: defaultdict(list))
     for trial in trials:
@@ -54,7 +54,7 @@ def differing_code(trials: Iterable[Trial]) -> dict[str, Versions]:
     return {part: dict(versions) for part, versions in found.items() if len(versions) > 1}
 
 
-def differing_unrecorded_code(trials: Sequence[Trial]) -> dict[str, Versions]:
+def differing_unrecorded_code(trials: Sequence[TrialResult]) -> dict[str, Versions]:
     """The same for trials with equal settings, made before versions were recorded.
 
     The hash in a folder's name is of the settings and of the file of a user's own class. Where the settings are equal
@@ -71,7 +71,7 @@ def differing_unrecorded_code(trials: Sequence[Trial]) -> dict[str, Versions]:
     return {CODE + " or ".join(own): dict(versions)} if own and len(paths) == 1 else {}
 
 
-def describe_code(part: str, versions: Mapping[str, Sequence[Trial]]) -> str:
+def describe_code(part: str, versions: Mapping[str, Sequence[TrialResult]]) -> str:
     """``mine.Patient: 3fa9c1d2 (garden seeds 0, 1; 2026-11-21 18:40) | …``, the oldest version first."""
     ordered = sorted(versions.items(), key=lambda item: max(trial.finished for trial in item[1]))
     texts = [f"{short_version(version)} ({_places(own)}; {_when(own)})" for version, own in ordered]
@@ -83,7 +83,7 @@ def short_version(version: str) -> str:
     return version if " " in version else version[:SHOWN]
 
 
-def _places(trials: Sequence[Trial]) -> str:
+def _places(trials: Sequence[TrialResult]) -> str:
     """``garden seeds 0, 1; room seed 0``"""
     seeds: dict[str, list[int]] = defaultdict(list)
     for trial in trials:
@@ -94,7 +94,7 @@ def _places(trials: Sequence[Trial]) -> str:
     )
 
 
-def _when(trials: Sequence[Trial]) -> str:
+def _when(trials: Sequence[TrialResult]) -> str:
     """When the trials were finished: a minute, or the first and the last."""
     times = sorted(trial.finished for trial in trials)
     minutes = [time.strftime("%Y-%m-%d %H:%M", time.localtime(finished)) for finished in times]

@@ -37,7 +37,7 @@ MADE_ELSEWHERE = "made by another program"  # how the reason of a quantity start
 
 
 @dataclass(frozen=True)
-class Trial:
+class TrialResult:
     """One complete trial; ``data`` is the whole of its ``results.json``, ``config_hash`` that in its folder's name."""
 
     path: Path
@@ -139,7 +139,7 @@ class Experiment:
 
     name: str
     folder: Path
-    trials: tuple[Trial, ...]
+    trials: tuple[TrialResult, ...]
     warnings: tuple[str, ...]
 
     @property
@@ -162,7 +162,7 @@ def load_experiment(runs_dir: Path, name: str) -> Experiment:
 def read_experiment(folder: Path) -> Experiment:
     """Every trial of the experiment in ``folder``, which may have none yet."""
     runs_dir = folder.parent
-    trials: list[Trial] = []
+    trials: list[TrialResult] = []
     warnings: list[str] = []
     for place in _trial_folders(folder):
         try:
@@ -193,7 +193,7 @@ class _UnusableError(Exception):
     """Why a folder is not a usable trial."""
 
 
-def read_trial(path: Path, runs_dir: Path) -> Trial:
+def read_trial(path: Path, runs_dir: Path) -> TrialResult:
     """Read and check one trial folder."""
     try:
         text = (path / RESULTS).read_text(encoding="utf-8")
@@ -216,7 +216,7 @@ def read_trial(path: Path, runs_dir: Path) -> Trial:
             raise _UnusableError(f"foreign, its {RESULTS} is of {key} {value!r}")
     if data["seed"] != int(match["seed"]):
         raise _UnusableError(f"foreign, its {RESULTS} is of seed {data['seed']}")
-    return Trial(
+    return TrialResult(
         path=path,
         experiment=data["experiment"],
         scene=data["scene"],
@@ -230,7 +230,7 @@ def read_trial(path: Path, runs_dir: Path) -> Trial:
     )
 
 
-def read_views(trial: Trial) -> dict[str, dict[str, float]]:
+def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
     """The metrics of every test view, ``{view: {metric: value}}``; raises ``InputError`` where the file is damaged.
 
     The file must average to the trial's own metrics, so that a truncated one cannot pass.

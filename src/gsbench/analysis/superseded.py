@@ -7,11 +7,11 @@ from pathlib import Path
 
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import CODE, IGNORED_SETTINGS, differing_unrecorded_code, short_version
-from gsbench.analysis.results import Trial, canonical
+from gsbench.analysis.results import TrialResult, canonical
 
 
 def find_superseded(
-    trials: Sequence[Trial], present: Callable[[str, Trial], str | None] = lambda target, trial: None
+    trials: Sequence[TrialResult], present: Callable[[str, TrialResult], str | None] = lambda target, trial: None
 ) -> dict[Path, str]:
     """Folders of trials whose code is no longer the present one, each with the reason.
 
@@ -31,7 +31,7 @@ def find_superseded(
     return reasons
 
 
-def _superseded_unrecorded(trials: Sequence[Trial]) -> dict[Path, str]:
+def _superseded_unrecorded(trials: Sequence[TrialResult]) -> dict[Path, str]:
     """Trials without recorded versions where a later one of the same arm and settings was made by another version."""
     reasons: dict[Path, str] = {}
     for arm in by_key(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values():
@@ -45,10 +45,10 @@ def _superseded_unrecorded(trials: Sequence[Trial]) -> dict[Path, str]:
     return reasons
 
 
-def _settings(trial: Trial) -> str:
+def _settings(trial: TrialResult) -> str:
     """The settings that trials of one cell share, as comparable text."""
     return canonical({key: value for key, value in trial.config.items() if not key.startswith(IGNORED_SETTINGS)})
 
 
-def _finished(trial: Trial) -> float:
+def _finished(trial: TrialResult) -> float:
     return trial.finished

@@ -18,7 +18,7 @@ from gsbench.files import link_or_copy, read_object, remove_temporaries, storage
 from gsbench.init.base import PICTURE_FILE, REPORT_FILE
 from gsbench.logs import log_to
 from gsbench.pipeline.results import results_of
-from gsbench.pipeline.wiring import Parts, Trial
+from gsbench.pipeline.wiring import Parts, TrialSteps
 from gsbench.runs import layout
 from gsbench.runs.layout import BUILDING, CONFIG, FAILED, LOG, RESULTS
 from gsbench.runs.stages import EVALUATE, GROUND_TRUTH, INIT, TRAIN
@@ -92,7 +92,7 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
         store = Store(paths.runs / layout.STORE, announce)
         write_text(paths.folder / CONFIG, config_yaml)
         (paths.folder / FAILED).unlink(missing_ok=True)
-        trial = Trial(parts, store)
+        trial = TrialSteps(parts, store)
     entries: dict[str, Entry] = {}
     with mirror, _recorded_failures(values, paths):
         for step in trial.steps():

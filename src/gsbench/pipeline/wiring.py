@@ -89,7 +89,7 @@ class Parts:
         return sorted({step for step in self.eval.at if step < self.train.iterations})
 
 
-class Trial:
+class TrialSteps:
     """A trial before, while and after its steps are built; each step's result is found in ``store`` under its key."""
 
     capture: Capture  # known once `steps` is past the making of photographs
@@ -166,7 +166,7 @@ class StepFinder:
         """The stages of the trial with the configuration ``values`` whose results are there, up to the first that is
         not."""
         built = []
-        for step in Trial(Parts.of(values), self.store, self._read_once).steps():
+        for step in TrialSteps(Parts.of(values), self.store, self._read_once).steps():
             if self.store.find(step) is None:
                 break
             built.append(step.stage.name)

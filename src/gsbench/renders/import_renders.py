@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 from PIL import Image
 
-from gsbench.analysis.results import FROM_RENDERS, MADE_ELSEWHERE, Trial, read_experiment
+from gsbench.analysis.results import FROM_RENDERS, MADE_ELSEWHERE, TrialResult, read_experiment
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.pictures import Pair
@@ -170,6 +170,6 @@ def _config(place: Place, truth: Truth, runs: Path) -> dict[str, Any]:
     return names | groups | {"init": own, "densify": {"name": place.densify, "evaluated_from": FROM_RENDERS}}
 
 
-def _trials(home: Path, scene: str) -> list[Trial]:
+def _trials(home: Path, scene: str) -> list[TrialResult]:
     """The experiment's trials of a scene; none where there is no such experiment yet."""
     return [trial for trial in read_experiment(home).trials if trial.scene == scene] if home.is_dir() else []

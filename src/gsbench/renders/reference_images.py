@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.results import Trial, read_views
+from gsbench.analysis.results import TrialResult, read_views
 from gsbench.config.compose import compose_one, options
 from gsbench.errors import InputError
-from gsbench.pipeline.wiring import Parts
-from gsbench.pipeline.wiring import Trial as TrialSteps
+from gsbench.pipeline.wiring import Parts, TrialSteps
 from gsbench.runs import stages
 from gsbench.runs.layout import GROUND_TRUTH, RENDERS, RESULTS, STORE
 from gsbench.runs.store import Store
@@ -63,7 +62,7 @@ def find_truth(place: str, settings: Sequence[str], runs: Path) -> Truth:
     return _scene(place, settings)
 
 
-def truth_of_trial(trial: Trial) -> Truth:
+def truth_of_trial(trial: TrialResult) -> Truth:
     """What a finished trial was tested on, under the names and in the order of its own evaluation."""
     photographs = {view: trial.path / GROUND_TRUTH / png_name(view) for view in read_views(trial)}
     width, height = trial.data["resolution"]
