@@ -29,6 +29,7 @@ from gsbench.launch.plan import (
     same_trial_elsewhere,
 )
 from gsbench.launch.states import states_of_experiment
+from gsbench.launch.trial import Trial
 from gsbench.runs.hashing import config_hash
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
@@ -93,7 +94,7 @@ def finish(
 
 
 @cache
-def experiment(name: str) -> list[Composed]:
+def experiment(name: str) -> list[Trial]:
     """Composed once: the paper's tables take seconds."""
     return compose_trials([f"+experiment={name}"])
 
@@ -393,12 +394,12 @@ def fake_trial(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
     return behaviour, order
 
 
-def sweep() -> list[Composed]:
+def sweep() -> list[Trial]:
     return [replace(trial, values=trial.values | {"runs": os.environ["GSBENCH_RUNS"]}) for trial in _composed_sweep()]
 
 
 @cache
-def _composed_sweep() -> list[Composed]:
+def _composed_sweep() -> list[Trial]:
     return compose_trials(["name=x", "densify=adc", "seed=0,1,2"], multirun=True)
 
 

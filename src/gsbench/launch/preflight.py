@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from gsbench.config.command_words import options
-from gsbench.config.compose import Composed
 from gsbench.config.schema import COMPONENTS
+from gsbench.launch.trial import Trial
 
 READ = ("colmap", "photos")  # the kinds of scenes that are read from scene.path
 
 
-def missing_folders(trials: Sequence[Composed]) -> list[str]:
+def missing_folders(trials: Sequence[Trial]) -> list[str]:
     """A line for each folder of photographs or weights that the trials name and that is not there, and the mend."""
     from gsbench.datasets.catalog import how_to_get
     from gsbench.scene.readers import missing_folder
@@ -27,7 +25,7 @@ def missing_folders(trials: Sequence[Composed]) -> list[str]:
     return lines + ([how_to_get(missing)] if missing else []) + missing_weights(trials)
 
 
-def missing_weights(trials: Sequence[Composed]) -> list[str]:
+def missing_weights(trials: Sequence[Trial]) -> list[str]:
     """A line for each folder of weights that the trials name and that is not there."""
     named = {
         (group, str(folder))
@@ -42,32 +40,16 @@ def missing_weights(trials: Sequence[Composed]) -> list[str]:
     ]
 
 
-def check_components(trials: Sequence[Composed], here: bool) -> None:
-    """Make what the trials' init, densify and raster describe, so that their classes refuse what they do not take.
+def check_parts(trials: Sequence[Trial], here: bool) -> None:
+    """Refuse what the parts of the trials, which stay with them, do not take.
 
     With ``here``, the trials will run on this machine, whose devices are known. Raises InputError naming the key.
     """
-    from gsbench.external.settings import External
-    from gsbench.pipeline.components import build, check_footprint, select_device
-    from gsbench.raster.executors import AUTO, resolve
-
-    for values in _distinct(trials, (*COMPONENTS, "raster", "device", "allow_targets")):
-        own_raster = values["raster"]["_target_"] is not None
-        groups = (*COMPONENTS, *(["raster"] if own_raster else []))
-        made = {group: build(group, values[group], values["allow_targets"]) for group in groups}
-        if here and isinstance(made["densify"], External):
-            made["densify"].executable()
-        if own_raster or values["raster"]["name"] != AUTO:
-            own = made.get("raster")
-            raster = getattr(own, "name", values["raster"]["name"])
-            check_footprint(made["densify"], values["densify"]["name"], raster, own)
-        if here:
-            device = select_device(values["device"])
-            if not own_raster and values["raster"]["name"] != AUTO:
-                resolve(values["raster"]["name"], device.type)
+    for trial in trials:
+        trial.parts.check(here)
 
 
-def need_no_check(trials: Sequence[Composed]) -> bool:
+def need_no_check(trials: Sequence[Trial]) -> bool:
     """Whether the trials take their components as they ship, whose options gsbench's own tests have checked.
 
     A dry run then answers without loading torch.
@@ -78,8 +60,3 @@ def need_no_check(trials: Sequence[Composed]) -> bool:
         if group == "hydra" or (group in (*COMPONENTS, "raster", "train") and value not in options(key)):
             return False
     return True
-
-
-def _distinct(trials: Iterable[Composed], keys: Sequence[str]) -> list[dict[str, Any]]:
-    """The different values that trials have under ``keys``, in the order of their first appearance."""
-    return list({json.dumps([t.values[k] for k in keys], default=str): t.values for t in trials}.values())

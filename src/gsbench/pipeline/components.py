@@ -41,23 +41,25 @@ METHODS = {
 def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     """The object that ``values`` of ``group`` (init, densify, raster, eval.extra.NAME) describes.
 
-    ``_target_`` names a class by its import path; the other keys are its arguments. For dataclasses, values are checked
-    against the annotations. Raises InputError naming the key that is unknown or wrong.
+    ``_target_`` names a class by its import path; the other keys are its arguments. gsbench's own classes hold them
+    against their annotations themselves; for a user's dataclass this is done here, before its code sees them. Raises
+    InputError naming the key that is unknown or wrong.
     """
     target = values["_target_"]
     check_target(target, group, allow_targets)
     cls = locate(target, group)
     require_values(values, group)
     options = {key: value for key, value in values.items() if key not in RESERVED}
-    if dataclasses.is_dataclass(cls):
+    own = target.startswith(ALLOWED_TARGETS)
+    if dataclasses.is_dataclass(cls) and not own:
         options = checked(cls, options, group)
     else:
         _check_names(cls, options, group)
-    if options and not dataclasses.is_dataclass(cls) and not target.startswith(ALLOWED_TARGETS):
-        raise InputError(
-            f"{group}._target_={target} has options but is no dataclass: make it one, so that results are stored under "
-            "their values"
-        )
+        if options and not own:
+            raise InputError(
+                f"{group}._target_={target} has options but is no dataclass: make it one, so that results are stored "
+                "under their values"
+            )
     try:
         return cls(**options)
     except InputError:
@@ -65,7 +67,7 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     except (TypeError, ValueError) as error:
         raise InputError(f"{group}: {error}") from error
     except Exception as error:  # a user's class may raise anything
-        if target.startswith(ALLOWED_TARGETS):
+        if own:
             raise
         raise InputError(f"{group}: {target} cannot be made ({type(error).__name__}: {error})") from error
 
@@ -77,8 +79,14 @@ def build_rasterizer(
 
     Raises InputError where it cannot run on ``device``.
     """
+    own = build_own_rasterizer(values, allow_targets)
+    return create_rasterizer(values["name"], device, threads) if own is None else own
+
+
+def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Rasterizer | None:
+    """The user's own rasterizer; None where ``values`` of the group raster name one of gsbench's."""
     if values.get("_target_") is None:
-        return create_rasterizer(values["name"], device, threads)
+        return None
     rasterizer: Rasterizer = build("raster", values, allow_targets)
     target, name = values["_target_"], getattr(rasterizer, "name", None)
     if not isinstance(name, str) or any(name == executor.name for executor in EXECUTORS):

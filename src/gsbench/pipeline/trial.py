@@ -17,8 +17,9 @@ from gsbench.errors import GsbenchError
 from gsbench.files import link_or_copy, read_object, remove_temporaries, storage_errors, write_json, write_text
 from gsbench.init.base import PICTURE_FILE, REPORT_FILE
 from gsbench.logs import log_to
+from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.results import results_of
-from gsbench.pipeline.wiring import Parts, TrialSteps
+from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs import layout
 from gsbench.runs.layout import BUILDING, CONFIG, FAILED, LOG, RESULTS
 from gsbench.runs.stages import EVALUATE, GROUND_TRUTH, INIT, TRAIN
@@ -38,23 +39,23 @@ PUBLISHED_TRAINING = (
 )  # fmt: skip
 
 
-def run_trial(values: dict[str, Any], config_yaml: str, wait: bool = True) -> dict[str, Any]:
-    """Run the trial with the resolved configuration ``values``, or find it done; returns what ``results.json`` holds.
+def run_trial(parts: Parts, config_yaml: str, wait: bool = True) -> dict[str, Any]:
+    """Run the trial with these parts, or find it done; returns what ``results.json`` holds.
 
     On failure ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again. Where
     another process runs this trial, waits for it, or raises BusyError if ``wait`` is False.
     """
     take_signals_back()
-    paths = TrialPaths.of(values)
+    paths = TrialPaths.of(parts.values)
     with storage_errors(paths.runs):
         paths.folder.mkdir(parents=True, exist_ok=True)
         with hold(paths.lock, paths.label, wait), log_to(paths.folder / LOG):
-            finished = find_finished(values)
+            finished = find_finished(parts.values)
             if finished is not None:
                 log.info("%s: was done", paths.label)
                 return finished
             remove_temporaries(paths.folder)
-            return _run(values, config_yaml, paths)
+            return _run(parts, config_yaml, paths)
 
 
 @contextmanager
@@ -77,10 +78,11 @@ def _record_failure(error: Exception, values: dict[str, Any], paths: TrialPaths)
         write_json(paths.folder / FAILED, record | {"time": time.time(), "seed": values["seed"]})
 
 
-def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[str, Any]:
+def _run(parts: Parts, config_yaml: str, paths: TrialPaths) -> dict[str, Any]:
     """Build every step, show its files in the trial's folder, write the results."""
+    values = parts.values
     with _recorded_failures(values, paths):
-        parts = Parts.of(values)
+        parts.complete()
         torch.set_num_threads(parts.threads)
         mirror = Mirror(values["tracking"], paths.runs, paths.folder, values)
 

@@ -10,7 +10,8 @@ from typing import Any
 from gsbench.analysis.results import TrialResult, read_views
 from gsbench.config.compose import compose_one, options
 from gsbench.errors import InputError
-from gsbench.pipeline.wiring import Parts, TrialSteps
+from gsbench.pipeline.parts import Parts
+from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs import stages
 from gsbench.runs.layout import GROUND_TRUTH, RENDERS, RESULTS, STORE
 from gsbench.runs.store import Store
@@ -80,7 +81,7 @@ def _scene(name: str, settings: Sequence[str]) -> Truth:
     if not any(word.startswith("init=") for word in settings) and config["scene"]["kind"] != "photos":
         config = compose_one([f"scene={name}", *CAMERAS_ONLY, *settings]).values
     store = Store(Path(config["runs"]).expanduser().resolve() / STORE)
-    trial = TrialSteps(Parts.of(config), store)
+    trial = TrialSteps(Parts(config), store)
     for step in trial.steps():
         if step.stage in (stages.CAPTURE, stages.INIT, stages.GROUND_TRUTH):
             entry = store.get(step)

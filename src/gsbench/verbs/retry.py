@@ -14,6 +14,7 @@ from gsbench.config.compose import Composed, compose_one
 from gsbench.errors import InputError
 from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
+from gsbench.launch.trial import Trial
 from gsbench.runs.source import import_from_here
 from gsbench.runs.trial_files import TrialPaths, label_of, read_config
 from gsbench.verbs.arguments import ArgumentParser
@@ -46,7 +47,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
-    replaced = [old for old, trial in zip(unfinished, trials, strict=True) if TrialPaths.of(trial.values).folder != old]
+    replaced = [old for old, trial in zip(unfinished, trials, strict=True) if trial.folder != old]
     for old in replaced:
         log.info("%s: its configuration has changed since; the new one is run", label_of(old))
     code = run_trials(trials)
@@ -54,7 +55,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return code
 
 
-def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[str]) -> Composed:
+def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[str]) -> Trial:
     """The trial in ``folder``: from its planned overrides, else from the configuration that it wrote."""
     if planned is not None and Path(planned.cwd).is_dir():
         os.chdir(planned.cwd)  # relative paths were meant from there, and the trials are run from there
@@ -69,13 +70,13 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
             raise InputError(
                 f"{' '.join(changes)} would make other trials than those of the plan: give the sweep's own command"
             )
-        return Composed(trial.values | {"runs": str(runs)}, trial.yaml, trial.overrides)
+        return Trial(trial.values | {"runs": str(runs)}, trial.yaml, trial.overrides)
     if changes:
         raise InputError(
             f"{label_of(folder)} is in no plan, so no setting of it can be changed: run it by its own command"
         )
     values = read_config(folder) | {"runs": str(runs)}
-    return Composed(values, yaml.safe_dump(values, sort_keys=False), ())
+    return Trial(values, yaml.safe_dump(values, sort_keys=False), ())
 
 
 def _identity(trial: Composed) -> Path:
