@@ -167,7 +167,7 @@ def test_wrong_type_in_a_component_names_the_key() -> None:
 
 def test_every_component_of_gsbench_checks_its_own_options() -> None:
     """`build` leaves it to them; what is wrong in every kind of option is a list of lists."""
-    for group, option in [(group, option) for group in ("init", "densify") for option in options(group)]:
+    for group, option in [(name, option) for name in ("init", "densify") for option in options(name)]:
         values = composed(f"{group}={option}", *needs(option), *PLACES.get(option, []))[group]
         for key in values.keys() - {"_target_", "name"}:
             with pytest.raises(InputError, match=rf"{group}\.{key}"):
