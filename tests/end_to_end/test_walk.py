@@ -1,4 +1,4 @@
-"""How a setting travels: a trial is composed, built and checked once, and V_th takes few doors from its YAML to its rule.
+"""How a setting travels: a trial is composed, built and checked once, and V_th takes few doors from YAML to rule.
 
 The way is what the call stacks say at the moments when the value is composed, checked and used: from one to the next,
 up to the frame that they share and down again. A crossing is a step from one folder of gsbench to another.

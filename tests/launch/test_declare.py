@@ -9,13 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.analysis.declaration import measured, read_declarations, standing
+from gsbench.analysis.declaration import measured, standing
 from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.declare import declare, declared_metrics
 from gsbench.launch.trial import Trial
+from gsbench.runs.declaration import read_declarations
 from tests.end_to_end.conftest import SMALL
 
 # later words win: a trial of seconds

@@ -23,6 +23,7 @@ from gsbench.errors import InputError
 from gsbench.files import read_object
 from gsbench.runs.hashing import flatten
 from gsbench.runs.layout import CONFIG, FAILED, IN_RUNS, INPUTS, PER_VIEW, RESULTS
+from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 
 TRIAL_FOLDER = re.compile(r"(?P<hash>[0-9a-f]{8})-seed(?P<seed>\d+)")
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
@@ -31,9 +32,6 @@ Arm = tuple[str, str]  # initialiser, densifier
 
 TEXT_KEYS = ("experiment", "scene", "init", "densify", "raster", "protocol")
 COUNT_KEYS = ("seed", "iterations", "num_gaussians")
-# What ``evaluated_from`` says of a trial that gsbench did not train: its model was rendered here, or renders are all.
-FROM_MODEL, FROM_RENDERS = "model", "renders"
-MADE_ELSEWHERE = "made by another program"  # how the reason of a quantity starts that nobody can know of such a trial
 
 
 @dataclass(frozen=True)
@@ -255,20 +253,6 @@ def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
                 f"{path} does not average to the {key} of its trial ({mean:.6g}, not {expected:.6g}): damaged"
             )
     return views
-
-
-def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """The objects of a JSON-lines file up to the first damaged line, as a killed writer leaves it; [] if absent."""
-    rows: list[dict[str, Any]] = []
-    try:
-        with path.open(encoding="utf-8") as file:
-            for line in file:
-                row = json.loads(line)
-                if isinstance(row, dict):
-                    rows.append(row)
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError):
-        pass
-    return rows
 
 
 def canonical(value: object) -> str:

@@ -26,7 +26,8 @@ from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.origins import cloud_notes, machine_notes
 from gsbench.analysis.pairing import BASELINE, ViewCache, choose_pairs
 from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS, Experiment, TrialResult
+from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 from gsbench.words import counted, signed
 
 DEFAULT_ROWS = ("scene", "init", "densify")

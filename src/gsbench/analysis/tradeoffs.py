@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.quantities import Quantity
-from gsbench.analysis.results import Arm, TrialResult, read_json_lines
+from gsbench.analysis.results import Arm, TrialResult
+from gsbench.files import read_json_lines
 from gsbench.runs.layout import CURVES
 
 GRID = 200  # points at which two curves are compared

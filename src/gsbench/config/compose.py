@@ -17,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from gsbench.config.command_words import GROUPS, check_words, is_sweep, options
+from gsbench.config.command_words import GROUPS, check_single, options
 from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, number_job, words_of
 from gsbench.config.schema import Config, check, check_values, plain, register_schemas
 from gsbench.errors import InputError
@@ -100,9 +100,7 @@ def compose_jobs(
 
 def compose_one(overrides: Sequence[str]) -> Composed:
     """The configuration of the single trial that ``overrides`` describe, as ``Composed.overrides`` has them."""
-    check_words(overrides)
-    if swept := [word for word in overrides if is_sweep(word)]:
-        raise InputError(f"{swept[0]} lists several values: choose one")
+    check_single(overrides, "choose one")
     with composing() as hydra:
         return ready_trial(compose_master(hydra, overrides), overrides)
 

@@ -21,6 +21,7 @@ from gsbench.densify.budget import admit
 from gsbench.densify.volume import ConditionOf, child_log_scales, log_volume
 from gsbench.errors import InputError
 from gsbench.events import Cause
+from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.settings import OpenFraction
 
 ThresholdMode = Literal["absolute", "extent_relative", "quantile", "auto"]
@@ -39,7 +40,7 @@ class Volumetric(ADC):
     where no volume stands out. ``volume_start``, ``volume_stop`` and ``volume_interval`` default to those of ADC.
     """
 
-    volume_threshold: PositiveFloat = 0.03
+    volume_threshold: PositiveFloat = VOLUME_THRESHOLD
     threshold_mode: ThresholdMode = "absolute"
     volume_quantile: OpenFraction = 0.9978  # 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03
     condition_of: ConditionOf = "eigenvalues"  # what kappa divides: eigenvalues (eq. 7) or scales

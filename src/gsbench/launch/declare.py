@@ -8,10 +8,10 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gsbench.analysis.declaration import Declaration, read_declarations
 from gsbench.errors import InputError
 from gsbench.files import write_text
 from gsbench.launch.trial import Trial
+from gsbench.runs.declaration import Declaration, read_declarations
 from gsbench.runs.layout import DECLARED
 from gsbench.system.locks import hold
 

@@ -24,6 +24,7 @@ from gsbench.errors import InputError
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.queue import forget_submission
 from gsbench.launch.trial import Trial
+from gsbench.runs.layout import JOBS
 from gsbench.runs.trial_files import TrialPaths, find_finished
 from gsbench.system.install import install_command
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
@@ -100,7 +101,7 @@ def need_submitit(launcher: str) -> None:
 
 def job_folder(values: dict[str, Any]) -> Path:
     """Where the jobs of an experiment write what they print; made if it is not there."""
-    folder = TrialPaths.of(values).runs / ".jobs" / values["name"]
+    folder = TrialPaths.of(values).runs / JOBS / values["name"]
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 

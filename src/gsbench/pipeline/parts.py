@@ -20,12 +20,12 @@ from gsbench.pipeline.components import (
     build_own_rasterizer,
     check_footprint,
     make_evaluator,
-    select_device,
 )
 from gsbench.raster import Rasterizer, create_rasterizer
 from gsbench.raster.executors import AUTO, resolve
 from gsbench.scene.options import SceneConfig
 from gsbench.system.resources import available_threads
+from gsbench.train.device import select_device
 from gsbench.train.options import TrainConfig
 
 

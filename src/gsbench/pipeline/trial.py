@@ -135,7 +135,7 @@ def _publish(folder: Path, entries: Mapping[str, Entry]) -> list[Path]:
         files = sorted([*source.glob("*.png"), *source.glob("*.npz")])
         links |= {folder / name / file.name: file for file in files}
     if (init / PICTURE_FILE).exists():
-        links[folder / layout.FIGURES / "initial_cloud.png"] = init / PICTURE_FILE
+        links[folder / layout.FIGURES / layout.INITIAL_CLOUD] = init / PICTURE_FILE
     for link, file in links.items():
         link.parent.mkdir(exist_ok=True)
         link_or_copy(file, link)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from gsbench.config.command_words import check_words, is_sweep, search_path
+from gsbench.config.command_words import check_single, search_path
 from gsbench.config.compose import compose_values
 from gsbench.config.questions import answer, has_part
 from gsbench.errors import InputError
@@ -33,9 +33,7 @@ def ask_hydra(argv: list[str]) -> int:
 
 
 def _check(overrides: list[str], config_dir: Path | None, package: str | None) -> None:
-    check_words(overrides)
-    if swept := [word for word in overrides if is_sweep(word)]:
-        raise InputError(f"{swept[0]} lists several values: choose one whose configuration is shown")
+    check_single(overrides, "choose one whose configuration is shown")
     config = compose_values([*search_path([config_dir] if config_dir else [], overrides), *overrides])
     if package is not None and not has_part(config, package):
         raise InputError(f"--package {package}: there is no such part of the configuration")

@@ -15,13 +15,14 @@ from gsbench.analysis.pairing import ViewCache, arm_name, pair_trials
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart, short_number
 from gsbench.analysis.report.crops import Crop, choose_crops
 from gsbench.analysis.report.volumes import share_above, volume_histogram
-from gsbench.analysis.results import Arm, TrialResult, read_json_lines
+from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import ALPHA
 from gsbench.analysis.tables import change_words, cost_change
 from gsbench.analysis.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve
 from gsbench.analysis.verdicts import ArmVerdicts, Verdict, judge
 from gsbench.errors import InputError
 from gsbench.events import Cause, RefineEvent
+from gsbench.files import read_json_lines
 from gsbench.runs import layout
 from gsbench.words import signed
 

@@ -152,7 +152,7 @@ def _match_in_processes(jobs: Sequence[MatchingJob], count: int, progress: Progr
     matched = [0] * len(jobs)
 
     def run(index: int) -> None:
-        def all_together(phase: str, done: int, total: int) -> None:
+        def all_together(phase: str, done: int, total: int | None, note: str = "") -> None:
             matched[index] = done
             progress(phase, sum(matched), count)
 
