@@ -24,8 +24,9 @@ from gsbench.errors import InputError
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.queue import forget_submission
 from gsbench.launch.trial import Trial
+from gsbench.runs.finished import Done, find_finished
 from gsbench.runs.layout import JOBS
-from gsbench.runs.trial_files import TrialPaths, find_finished
+from gsbench.runs.trial_files import TrialPaths
 from gsbench.system.install import install_command
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
 from gsbench.system.stopping import Stopped, stop_on_signals
@@ -135,8 +136,8 @@ def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome
     """The outcome of an ended job: the trial's files first, then what the job returned, then its log's last words."""
     values = next(trial.values for trial in trials if trial.folder == folder)
     finished = find_finished(values)
-    if finished is not None:
-        return outcome_of_results(folder, finished)
+    if isinstance(finished, Done):
+        return outcome_of_results(folder, finished.results)
     if job.paths.result_pickle.exists():
         kind, value = pickle.loads(job.paths.result_pickle.read_bytes())  # submitit's own reader would ask sacct first
         if isinstance(value, Outcome):

@@ -19,8 +19,9 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.files import read_object, write_json
 from gsbench.launch.queue import ask_queue, state_in_queue
 from gsbench.launch.trial import Trial
+from gsbench.runs.finished import NotDone, find_finished
 from gsbench.runs.layout import PLAN, RESULTS, STORE, TRIAL_GLOB
-from gsbench.runs.trial_files import TrialPaths, find_finished, stage_and_step, state_of
+from gsbench.runs.trial_files import TrialPaths, stage_and_step, state_of
 from gsbench.system.locks import hold
 from gsbench.words import counted, readable_time
 
@@ -170,9 +171,10 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
         if state not in ("done", "running"):
             state = state_in_queue(paths.folder, queue) or state
         note = ""
-        if state == "done" and find_finished(trial.values) is None:
-            note = "  will be checked: something that it was made of has changed, or a metric is missing"
-        elif state != "done":
+        if state == "done":
+            if isinstance(found := find_finished(trial.values), NotDone):
+                note = f"  will be checked: {found.reason}"
+        else:
             shared = same_trial_elsewhere(paths)
             if shared is not None:
                 note = f"  as in {shared}: nothing to compute"

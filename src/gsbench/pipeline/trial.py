@@ -21,11 +21,12 @@ from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.results import results_of
 from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs import layout
+from gsbench.runs.finished import Done, find_finished, record_inputs
 from gsbench.runs.layout import BUILDING, CONFIG, FAILED, LOG, RESULTS
 from gsbench.runs.stages import EVALUATE, GROUND_TRUTH, INIT, TRAIN
 from gsbench.runs.step import Stage
 from gsbench.runs.store import Entry, Store
-from gsbench.runs.trial_files import TrialPaths, find_finished, record_inputs
+from gsbench.runs.trial_files import TrialPaths
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture
 from gsbench.system.locks import hold
@@ -51,9 +52,9 @@ def run_trial(parts: Parts, config_yaml: str, wait: bool = True) -> dict[str, An
         paths.folder.mkdir(parents=True, exist_ok=True)
         with hold(paths.lock, paths.label, wait), log_to(paths.folder / LOG):
             finished = find_finished(parts.values)
-            if finished is not None:
+            if isinstance(finished, Done):
                 log.info("%s: was done", paths.label)
-                return finished
+                return finished.results
             remove_temporaries(paths.folder)
             return _run(parts, config_yaml, paths)
 
