@@ -250,6 +250,27 @@ def test_spz_is_read_by_another_library(gaussians: Gaussians, tmp_path: Path) ->
     assert (ours - mirrored).abs().mean() > 0.2  # the test would see wrong axes
 
 
+def test_spz_says_when_one_far_gaussian_coarsens_all(gaussians: Gaussians, caplog: pytest.LogCaptureFixture) -> None:
+    """A step of half a unit against Gaussians of a thirtieth; not where all are far, nor where the step is fine."""
+    from gsbench.gaussians.spz import spz_bytes
+
+    many = Gaussians.concatenate([gaussians] * (2000 // len(gaussians) + 1))
+    spz_bytes(many)
+    assert not caplog.records
+    many.means[7] = torch.tensor([3e6, 0.0, 0.0])
+    spz_bytes(many)
+    (record,) = caplog.records
+    assert f"1 of {len(many)} Gaussians lie beyond" in record.getMessage()
+    assert "positions are kept to 0.5 units" in record.getMessage()
+    caplog.clear()
+    many.means[:] = 3e6  # nobody is to blame
+    spz_bytes(many)
+    many.means[:] = 0.0
+    many.means[7] = 100.0  # a step of 2^-16
+    spz_bytes(many)
+    assert not caplog.records
+
+
 def test_sog_names_the_program_that_writes_it(
     runs: Path, gaussians: Gaussians, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -181,7 +181,14 @@ def own_trials(
             "scene__images": "images_4",
             "scene__downscale": 1,
             "scene__resample": "lanczos",
+            "scene__test_every": 8,
+            "scene__max_images": 200,
+            "densify__name": densify,
         }
+        if densify == "volumetric":
+            rule = {"children": 2, "order": "after_adc", "start": None, "stop": 12_000, "interval": None}
+            settings |= {f"densify__volume_{key}": value for key, value in rule.items()}
+            settings |= {"densify__placement": "sampled", "densify__start": 500, "densify__interval": 100}
         if init == "sfm":
             settings["init__max_num_features"] = 8192
         else:
@@ -207,7 +214,14 @@ def test_below_the_differences_stand_our_choices_as_they_were_recorded(tmp_path:
     assert "rate of opacity: 0.05;" in line_about(difference, "Learning rate of opacity")
     assert "the files of images_4 (lanczos where shrunk), 400×300 px" in line_about(difference, "Images")
     assert "net vgg, fed [0, 1]" in line_about(difference, "LPIPS weights")
-    assert "2000; the paper keeps the 30,000" in line_about(difference, "Iterations")
+    assert "2000; the paper does not say" in line_about(difference, "Iterations")
+    assert "every 8th image; the paper does not say" in line_about(difference, "Held out")
+    assert "at most 200, evenly spaced" in line_about(difference, "Images of a large scene")
+    assert "volume split: 2; the paper does not say" in line_about(difference, "Children of a volume split")
+    assert "from the parent's density; the paper does not say" in line_about(difference, "Their places")
+    assert "after clone and split, before pruning; the paper" in line_about(difference, "Order of the volume rule")
+    assert "every 100 iterations, after 500 and before 12,000;" in line_about(difference, "Window of the volume rule")
+    assert "RTX 2080" in line_about(difference, "Hardware")
     for written in (to_markdown(difference), to_html(difference), to_latex(difference)):
         assert "4,096 an image; the paper does not say" in written
 
@@ -222,7 +236,7 @@ def test_a_choice_that_differs_between_arms_names_them_and_one_that_agrees_is_no
         "Keypoints: 4,096 an image for dim_paper, 8,192 an image for sfm;"
     )
     assert "opacity: 0.025;" in line_about(difference, "Learning rate of opacity")
-    assert not any(note.startswith("Iterations") for note in difference.notes)
+    assert not any(note.startswith("Matching networks") for note in difference.notes)  # both take the same
 
 
 def test_choices_that_were_not_recorded_are_said_to_be_so(make_experiment: Callable[..., Experiment]) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 Row = dict[str, Any]
+DIFFERENCES: list[float] = []  # what comparisons with it found, for scripts/fidelity.py
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
 
 

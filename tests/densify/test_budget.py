@@ -134,8 +134,26 @@ def test_a_governed_round_ends_at_its_target(kind: type[ADC]) -> None:
     assert event.cloned == cloned.sum()
     assert event.pruned_opacity >= (opacities < 0.005).sum()
     if kind is Volumetric:
-        assert event.volume_threshold == pytest.approx(0.03 * event.strictness)
+        assert event.volume_threshold == pytest.approx(0.03 * event.strictness**3)
     json.loads(json.dumps(event.as_dict(), allow_nan=False))
+
+
+@pytest.mark.parametrize("dimension", [1, 3])
+def test_the_governor_moves_a_volume_or_the_size_that_it_is_of(dimension: int) -> None:
+    """Counted by hand: who is over the two thresholds that one factor gives."""
+    densifier = Volumetric(max_gaussians=450, cap="governor", stop=1200, governor_dimension=dimension)  # type: ignore[arg-type]
+    trainable, gradient = prepared(densifier, 2, count=300)
+    sizes = np.exp(np.array([row["log_scales"] for row in to_rows(trainable)]))  # [N, 3]
+    event = densifier.refine(900, trainable, generator(0))
+    factor = event.strictness
+    assert factor != 1
+    over, large = gradient >= 2e-4 * factor, sizes.max(-1) > 0.01 * EXTENT
+    assert (event.cloned, event.split_gradient) == ((over & ~large).sum(), (over & large).sum())
+    size = np.cbrt(0.03 / (4 / 3 * np.pi)) * (factor if dimension == 3 else np.cbrt(factor))  # of a sphere of V_th
+    geometric_mean = np.cbrt((sizes / np.where(over & large, 1.6, 1)[:, None]).prod(-1))
+    copies = np.where(over, 2, 1)  # clones and children of a split have the same volume as one another
+    assert event.split_volume == copies[geometric_mean > size].sum() > 0
+    assert abs(event.after - event.target) <= 2
 
 
 def test_far_over_its_target_a_round_prunes_more_of_the_faint() -> None:

@@ -142,3 +142,40 @@ def test_threshold_strictness() -> None:
         densifier.gradient_threshold = float(densifier.statistics["gradient_sum"][0])  # as float32 holds it
         counts[inclusive] = densifier.refine(600, trainable, torch.Generator()).cloned
     assert counts == {True: 1, False: 0}
+
+
+@pytest.mark.parametrize("rule", ["relocate", "add"])
+def test_mcmc_begins_the_moments_of_all_six_tensors_anew_at_the_sources(rule: str) -> None:
+    densifier, trainable = mcmc_state(max_gaussians=60, growth=0.5)
+    for tensor in trainable.values.tensors().values():
+        tensor.grad = torch.ones_like(tensor)
+    trainable.optimizer_step()
+    if rule == "add":
+        trainable.values.opacity_logits.data[:10] = -1.0  # nobody is dead
+    before = trainable.values.opacity_logits.detach().clone()
+    densifier.refine(600, trainable, torch.Generator().manual_seed(0))
+    after = trainable.values.opacity_logits.detach()
+    count = 30 if rule == "relocate" else 40  # who lived stands first, in order
+    sources = (after[:count] != before[40 - count :]).numpy()
+    assert 0 < sources.sum() < count
+    for name, tensor in trainable.values.tensors().items():
+        state = trainable.optimizer.state[tensor]
+        for moment in ("exp_avg", "exp_avg_sq"):
+            rows = state[moment].flatten(1) if state[moment].dim() > 1 else state[moment][:, None]
+            is_zero = (rows == 0).all(-1).numpy()
+            assert is_zero[:count].tolist() == sources.tolist(), name
+            assert is_zero[count:].all(), name
+
+
+def test_mcmc_shares_an_opacity_among_fifty_at_most() -> None:
+    """The authors clamp the number of copies to 50, though their table of binomials has 51 rows."""
+    densifier, trainable = mcmc_state(2, max_gaussians=200, growth=50.0)
+    trainable.values.opacity_logits.data[:] = torch.tensor([-4.0, 8.0])
+    opacity = float(trainable.values.opacities[1].detach())
+    event = densifier.refine(600, trainable, torch.Generator().manual_seed(0))
+    assert event.added == 100
+    expected = max(1 - (1 - opacity) ** (1 / 50), densifier.min_opacity)
+    assert float(trainable.values.opacities[1].detach()) == pytest.approx(expected, rel=1e-9)
+    assert MCMC(max_copies=3).max_copies == 3
+    with pytest.raises(InputError, match=r"densify\.max_copies"):
+        MCMC(max_copies=52)

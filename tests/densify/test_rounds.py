@@ -75,6 +75,8 @@ def assert_same(trainable: TrainableGaussians, rows: list[restatement.Row]) -> N
         assert real.keys() == expected.keys()
         for name in real:
             np.testing.assert_allclose(real[name], expected[name], rtol=1e-5, atol=1e-7, err_msg=name)
+            apart = np.abs(real[name] - expected[name]) / np.maximum(1, np.abs(expected[name]))
+            restatement.DIFFERENCES.append(float(apart.max(initial=0)))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -92,6 +94,59 @@ def test_adc_round(seed: int, step: int) -> None:
     assert event.cloned > 0
     assert event.split_gradient > 0
     assert event.after == len(rows) == len(densifier.lineage.ids)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_absgrad_round(seed: int) -> None:
+    """As ADC, of another gradient at four times the threshold."""
+    densifier = ADC(gradient="absolute", gradient_threshold=0.0008)
+    trainable, gradient = prepared(densifier, seed)
+    densifier.statistics["gradient_sum"] *= 4
+    rows, expected = to_rows(trainable), {}
+    event = densifier.refine(600, trainable, torch.Generator().manual_seed(seed))
+    noise = iter(noise_of(seed, [event.split_gradient]))
+    rows = restatement.prune(restatement.adc_growth(rows, gradient, EXTENT, noise, expected), 600, EXTENT, expected)
+    assert_same(trainable, rows)
+    assert expected == {name: getattr(event, name) for name in expected}
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_revised_round(seed: int) -> None:
+    """As ADC, but clone, original and children of a split each have 1 - sqrt(1 - o)."""
+    densifier = ADC(revised_opacity=True)
+    trainable, gradient = prepared(densifier, seed)
+    rows, expected = to_rows(trainable), {}
+    event = densifier.refine(600, trainable, torch.Generator().manual_seed(seed))
+    noise = iter(noise_of(seed, [event.split_gradient]))
+    for i, row in enumerate(rows):
+        if gradient[i] >= 0.0002:
+            opacity = 1 - np.sqrt(1 - 1 / (1 + np.exp(-row["opacity_logits"])))
+            row["opacity_logits"] = np.log(opacity / (1 - opacity))
+            row["first opacity_logits"], row["second opacity_logits"] = np.zeros(()), np.zeros(())
+    rows = restatement.prune(restatement.adc_growth(rows, gradient, EXTENT, noise, expected), 600, EXTENT, expected)
+    assert_same(trainable, rows)
+    assert expected == {name: getattr(event, name) for name in expected}
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_volumetric_once_round(seed: int) -> None:
+    """Who would be over the threshold again is left alone."""
+    densifier = Volumetric(volume_threshold=0.03, split_isotropic=False)
+    trainable, gradient = prepared(densifier, seed, count=200)
+    rows, expected = to_rows(trainable), {}
+    event = densifier.refine(600, trainable, torch.Generator().manual_seed(seed))
+    noise = iter(noise_of(seed, [event.split_gradient, event.split_volume]))
+    rows = restatement.adc_growth(rows, gradient, EXTENT, noise, expected)
+    chosen, scales = [], {}
+    for i, row in enumerate(rows):
+        s = np.exp(row["log_scales"])
+        child = s / (s.max() / s.min())
+        if 4 / 3 * np.pi * s.prod() > 0.03 >= 4 / 3 * np.pi * child.prod():
+            chosen.append(i)
+            scales[i] = np.log(child)
+    rows = restatement.prune(restatement.split_all(rows, chosen, scales, noise), 600, EXTENT, expected)
+    assert_same(trainable, rows)
+    assert event.split_volume == len(chosen) > 0
 
 
 @pytest.mark.parametrize("seed", range(6))

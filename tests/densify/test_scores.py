@@ -9,9 +9,9 @@ from PIL import Image, ImageFilter
 
 from gsbench.densify import DensifyContext, EdgeAware, Refinement, Taming
 from gsbench.densify.adc import ADC
-from gsbench.densify.scores import blended_sums, by_median, draw, edge_map
+from gsbench.densify.scores import blended_sums, by_mean, by_median, draw, edge_map
 from gsbench.errors import InputError
-from gsbench.eval.ssim import torch_photometric_loss
+from gsbench.eval.ssim import ssim_map
 from gsbench.events import RefineEvent
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.paper_values import LearningRates
@@ -19,8 +19,8 @@ from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.reference import ReferenceRasterizer, bin_gaussians, blending_weights, project, tile_rectangles
 from gsbench.scene.camera import Camera
+from gsbench.train.loss import torch_photometric_loss
 from tests.densify import restatement
-from tests.densify.test_long_axis import halves
 from tests.densify.test_rounds import EXTENT, assert_same, to_rows
 from tests.gaussians.helpers import front_camera, random_gaussians
 
@@ -45,6 +45,9 @@ class Room:
 
     def render(self, index: int, gaussians: Gaussians, step: int) -> RenderOutput:
         return ReferenceRasterizer().render(gaussians, self.cameras[index], 0, BLACK)
+
+    def dissimilarity(self, index: int, image: torch.Tensor) -> torch.Tensor:
+        return (1 - ssim_map(image, self.images[index].to(image) / 255).mean(0)).clamp_min(0)
 
     def loss(self, index: int, image: torch.Tensor) -> torch.Tensor:
         return torch_photometric_loss(image, self.images[index])[0]
@@ -71,6 +74,10 @@ def find_edges(image: torch.Tensor) -> np.ndarray:
     edges = np.array(Image.fromarray(image.numpy()).convert("L").filter(ImageFilter.FIND_EDGES), np.float64)
     edges[[0, -1]], edges[:, [0, -1]] = 0, 0
     return (edges - edges.min()) / (edges.max() - edges.min())
+
+
+def over_mean(values: np.ndarray) -> np.ndarray:
+    return np.where(values > 0, values / values[values > 0].mean(), 0)
 
 
 def over_median(values: np.ndarray) -> np.ndarray:
@@ -101,7 +108,9 @@ def test_blended_sums_are_sums_of_alpha_and_transmittance() -> None:
 def test_by_median_leaves_out_what_is_not_positive() -> None:
     values = torch.tensor([0.0, -3.0, float("nan"), 4.0, 2.0, 8.0, 6.0])
     assert by_median(values).tolist() == [0, 0, 0, 1, 0.5, 2, 1.5]
+    assert by_mean(values).tolist() == pytest.approx([0, 0, 0, 0.8, 0.4, 1.6, 1.2])
     assert not by_median(torch.zeros(3)).any()
+    assert not by_mean(torch.zeros(3)).any()
 
 
 def test_draws_are_in_proportion_and_without_replacement() -> None:
@@ -140,56 +149,6 @@ def started(densifier: ADC, seed: int) -> tuple[TrainableGaussians, np.ndarray]:
 
 def at(step: int, trainable: TrainableGaussians, rng: torch.Generator) -> Refinement:
     return Refinement(step, trainable, rng, RefineEvent(step, len(trainable)))
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_edge_aware_score_of_each_gaussian(seed: int) -> None:
-    densifier, room = EdgeAware(score_views=2), Room()
-    trainable, _ = started(densifier, seed)
-    with torch.no_grad():
-        scores = densifier.edge_scores(trainable.values, 700, torch.Generator().manual_seed(seed))
-    drawn = torch.randperm(3, generator=torch.Generator().manual_seed(seed))[:2].tolist()
-    expected = np.zeros(COUNT)
-    for view in drawn:
-        weights = alphas(trainable.values.detach(), room.cameras[view])
-        expected += over_median((weights * find_edges(room.images[view])).sum((1, 2))) / 2
-    np.testing.assert_allclose(scores, expected, rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize("step", [600, 3100])
-@pytest.mark.parametrize("seed", range(2))
-def test_edge_aware_round(seed: int, step: int) -> None:
-    """Who is drawn becomes two halves along the longest axis; nobody else changes."""
-    densifier = EdgeAware(gradient_threshold=3e-4, max_gaussians=COUNT + 9, cap="hard")
-    trainable, gradient = started(densifier, seed)
-    rows, expected = to_rows(trainable), {}
-    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
-    over = gradient >= 3e-4
-    assert event.split_gradient == 9
-    assert event.blocked_by_cap == over.sum() - 9
-    rng = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        twin, _ = started(densifier, seed)
-        scores = densifier.edge_scores(twin.values, step, rng)
-    drawn = draw(torch.from_numpy(over), scores, 9, rng).numpy()
-    assert not (drawn & ~over).any()
-    rows = restatement.prune(halves(rows, np.where(drawn, 1.0, 0.0)), step, EXTENT, expected)
-    assert_same(trainable, rows)
-    assert expected == {name: getattr(event, name) for name in expected}
-    assert event.balances()
-
-
-def test_the_growth_control_is_a_root() -> None:
-    densifier = EdgeAware(max_gaussians=10_000, start=500, stop=15_000)
-    trainable, _ = started(densifier, 0)
-    rng = torch.Generator()
-    allowed = [densifier.allowance(at(step, trainable, rng)) for step in (600, 7500, 14_500, 14_900)]
-    assert allowed == [round(10_000 * np.sqrt(x)) - COUNT for x in (100 / 14_000, 0.5, 1, 1)]
-    densifier.max_gaussians = COUNT
-    assert densifier.allowance(at(7500, trainable, rng)) == 0
-    event = densifier.refine(7500, trainable, rng)
-    assert event.split_gradient == 0
-    assert event.blocked_by_cap > 0
 
 
 def taming_scores(trainable: TrainableGaussians, gradient: np.ndarray) -> np.ndarray:

@@ -11,7 +11,6 @@ import torch
 
 from gsbench.densify import ADC, Cause, Densifier, DensifyContext, Lineage, RefineEvent, Refinement, Volumetric
 from gsbench.densify.operations import standard_normal
-from gsbench.errors import InputError
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from tests.gaussians.helpers import random_gaussians
@@ -69,21 +68,6 @@ def test_statistics_are_saved_and_reset() -> None:
     assert saved["statistics"]["sum"].tolist() == [3.0] * 5  # a copy
 
 
-def test_a_checkpoint_of_the_older_layout_is_read() -> None:
-    """It held each statistic beside the lineage, and ADC's count of the initial cloud."""
-    old = {
-        "lineage": Lineage(3).state_dict(),
-        "initial_count": 3,
-        "gradient_sum": torch.tensor([1.0, 2.0, 3.0]),
-        "visible_count": torch.tensor([1, 1, 2], dtype=torch.int32),
-        "max_radii": torch.zeros(3, dtype=torch.int32),
-    }
-    densifier = Volumetric()
-    densifier.load_state_dict(old, DensifyContext(1.0))
-    assert densifier.mean_gradient().tolist() == [1.0, 2.0, 1.5]
-    assert densifier.lineage.initial_count == 3
-
-
 def test_the_count_of_the_initial_cloud_survives_growth_and_saving() -> None:
     densifier = Gathering()
     refinement = started(densifier, 4)
@@ -99,12 +83,6 @@ def test_a_subclass_adds_to_the_statistics_of_its_base() -> None:
 
     assert list(Own.STATISTICS) == [*ADC.STATISTICS, "hits"]
     assert Volumetric.STATISTICS == ADC.STATISTICS
-
-
-@pytest.mark.parametrize("old", ["_grow_by_gradient", "_grow_and_prune", "_prune", "_carry_statistics"])
-def test_a_class_written_for_the_old_names_is_refused(old: str) -> None:
-    with pytest.raises(InputError, match=rf"Mine\.{old} is never called; it became .*docs/densifier\.md"):
-        type("Mine", (ADC,), {old: lambda self, *_: None})
 
 
 @pytest.mark.parametrize(

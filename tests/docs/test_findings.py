@@ -10,6 +10,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from gsbench.analysis.statistics import compare
+from gsbench.claims.sequential import Design, decide
 from tests.conftest import ROOT
 from tests.docs import findings_said as said
 
@@ -126,3 +128,19 @@ def test_the_experiments_of_the_page_are_configurations() -> None:
     named = set(re.findall(r"\+experiment=(\w+)", page))
     assert named >= {"bonsai_growth", "fair_governor", "fair_hard", "initialisers"}
     assert all((ROOT / "conf" / "experiment" / f"{name}.yaml").is_file() for name in named)
+
+
+@pytest.mark.parametrize("name", ["bonsai_growth", "fair_governor", "fair_hard"])
+def test_stopping_when_decided_contradicts_no_finding_about_lpips(name: str) -> None:
+    """Looks at two and three seeds of the same trials: what a plain comparison calls better is so, and nothing else.
+
+    Where five arms share the 5 %, some of it is undecided.
+    """
+    frame = findings.read(name)
+    for arm in sorted(set(frame.arm) - {"adc"}):
+        paired = findings.pair(frame, arm, "lpips_squeeze")
+        rows = [matrix[:, 0] for matrix in paired.differences]
+        alone, shared = (decide(rows, Design(len(rows), (2, 3), alpha), 0.005, -1) for alpha in (0.05, 0.01))
+        better = compare(paired, -1).verdict == "better"
+        assert alone.outcome == "for" if better else alone.outcome in ("undecided", "equivalent")
+        assert shared.outcome in (alone.outcome, "undecided")

@@ -33,7 +33,7 @@ pytestmark = pytest.mark.end_to_end
 
 TRAINER = Path(__file__).with_name("trainer.py")
 CLOUD = f"""
-defaults: [external, _self_]
+defaults: [/densify/external/program@_here_, _self_]
 name: cloud
 command: ["{{python}}", {TRAINER}, --data, "{{data}}", --output, "{{output}}", --iterations, "{{iterations}}",
   --seed, "{{seed}}", --mode, "{{mode}}"]

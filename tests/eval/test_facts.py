@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,18 @@ import torch
 
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
-from gsbench.eval.facts import METRICS, MetricFacts, facts_of, find, from_record, known_keys, lpips_variants, to_record
+from gsbench.eval.facts import (
+    METRICS,
+    OF_MODELS,
+    MetricFacts,
+    facts_of,
+    find,
+    from_record,
+    further_keys,
+    known_keys,
+    lpips_variants,
+    to_record,
+)
 from gsbench.eval.metric import UnavailableError
 from gsbench.eval.protocol import PAPER, PROTOCOLS
 
@@ -30,13 +42,17 @@ def test_every_metric_can_be_imported_and_is_described(facts: MetricFacts) -> No
     assert callable(getattr(importlib.import_module(module), name).measure)
     assert facts.direction in (-1, 1)
     assert facts.worthwhile is not None
+    assert facts.words
+    assert facts.lowest is not None
     assert find(facts.key) is facts
 
 
 def test_the_evaluator_knows_exactly_the_metrics_of_the_table() -> None:
-    evaluator = Evaluator(PAPER, lpips=[])
+    evaluator = Evaluator(PAPER, lpips=[], more=further_keys())
     values = evaluator.evaluate_view(IMAGE, IMAGE)
-    assert values.keys() | evaluator.unavailable.keys() == set(known_keys())
+    of_images = {facts.key for facts in METRICS}
+    assert values.keys() | evaluator.unavailable.keys() == of_images
+    assert set(known_keys()) == of_images | {facts.key for facts in OF_MODELS}
     assert all(f"lpips_{protocol.lpips}" in known_keys() for protocol in PROTOCOLS.values())
     assert set(lpips_variants()) == {"vgg_raw", "vgg", "alex", "squeeze"}
 
@@ -107,3 +123,12 @@ def test_a_metric_that_says_nothing_has_no_direction() -> None:
     facts = facts_of("plain", object())
     assert (facts.label, facts.direction, facts.decimals, facts.worthwhile) == ("plain", 0, 3, None)
     assert from_record("plain", None) == facts
+
+
+def test_the_page_on_metrics_shows_the_table() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "metric.md").read_text(encoding="utf-8")
+    for facts in (*METRICS, *OF_MODELS):
+        better = "more" if facts.direction > 0 else "less"
+        low, high = ("" if bound is None else f"{bound:g}" for bound in (facts.lowest, facts.highest))
+        cells = (f"`{facts.key}`", facts.name, better, low, high, facts.words)
+        assert f"| {' | '.join(cells)} |".replace("|  |", "| |") in page, facts.key

@@ -9,7 +9,8 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from gsbench.eval.metrics import flip, psnr, ssim
+from gsbench.eval.metrics import flip, psnr
+from gsbench.eval.ssim import ssim
 
 
 def distorted_pair(height: int = 40, width: int = 53, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -17,8 +17,8 @@ from gsbench.eval import facts
 from gsbench.eval.evaluator import Evaluator, quantize, summarize
 from gsbench.eval.facts import find
 from gsbench.eval.lpips import load_lpips
-from gsbench.eval.metrics import ssim
 from gsbench.eval.protocol import PAPER, STANDARD, get_protocol
+from gsbench.eval.ssim import ssim
 
 
 @pytest.fixture(autouse=True)

@@ -94,14 +94,14 @@ def test_placeholders() -> None:
 
 
 def test_yaml_of_the_original_code_hands_our_schedule_on() -> None:
-    words = ["densify=3dgs", "densify.options.code=/code", "densify.version='1'", "allow_targets=[python]"]
+    words = ["densify=external/3dgs", "densify.options.code=/code", "densify.version='1'", "allow_targets=[python]"]
     command = composed(*words, "train=paper", "train.densify_stop=9000")["densify"]["command"]
     assert str(command[command.index("--densify_until_iter") + 1]) == "9000"
     assert str(command[command.index("--opacity_lr") + 1]) == "0.05"
 
 
 def test_a_limit_of_time_makes_no_other_trial_but_an_option_does() -> None:
-    words = ["densify=opensplat", "densify.version='1'", "allow_targets=[opensplat]"]
+    words = ["densify=external/opensplat", "densify.version='1'", "allow_targets=[opensplat]"]
     base = config_hash(composed(*words))
     assert config_hash(composed(*words, "densify.time_limit_minutes=5")) == base
     assert config_hash(composed(*words, "densify.options.num_downscales=0")) != base

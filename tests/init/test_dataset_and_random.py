@@ -12,7 +12,8 @@ import torch
 
 from gsbench.errors import InputError
 from gsbench.gaussians.ply import read_ply, write_ply
-from gsbench.init import GAUSSIANS_FILE, MODEL_FOLDER, Dataset, Ply, Random, read_cloud
+from gsbench.init import GAUSSIANS_FILE, MODEL_FOLDER, Carved, Dataset, Ply, Random, read_cloud
+from gsbench.init.jittered import shifted_copies
 from gsbench.scene.types import Capture
 from tests.gaussians.helpers import random_gaussians
 
@@ -70,6 +71,47 @@ def test_random_fills_the_box_around_the_training_cameras(courtyard: Capture, tm
     np.testing.assert_array_equal(read_cloud(tmp_path / "b" / MODEL_FOLDER).points, cloud.points)
     Random(count=5000, size=2.0, seed=4).run(courtyard, tmp_path / "c")
     assert not np.allclose(read_cloud(tmp_path / "c" / MODEL_FOLDER).points, cloud.points)
+
+
+@pytest.mark.parametrize("seen_by", [1, 3])
+def test_carved_keeps_what_training_cameras_have_in_view(courtyard: Capture, tmp_path: Path, seen_by: int) -> None:
+    """COLMAP's own projection, one point and one image at a time."""
+    options = {"count": 300, "size": 2.0, "seed": 3}
+    Random(**options).run(courtyard, tmp_path / "random")
+    report = Carved(**options, seen_by=seen_by).run(courtyard, tmp_path / "carved")
+    model = pycolmap.Reconstruction(courtyard.model)
+    images = [image for image in model.images.values() if image.name in courtyard.train_names]
+    whole, expected = read_cloud(tmp_path / "random" / MODEL_FOLDER).points, []
+    for point in whole:
+        pixels = [(image.project_point(point), model.cameras[image.camera_id]) for image in images]
+        views = sum(
+            pixel is not None and 0 <= pixel[0] < camera.width and 0 <= pixel[1] < camera.height
+            for pixel, camera in pixels
+        )
+        if views >= seen_by:
+            expected.append(point)
+    found = read_cloud(tmp_path / "carved" / MODEL_FOLDER).points
+    np.testing.assert_array_equal(found, expected)
+    assert 0 < len(expected) == report.num_points < 300
+
+
+def test_carved_says_when_nobody_sees_anything(courtyard: Capture, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none is in view of 9999 training cameras"):
+        Carved(count=10, seen_by=9999).run(courtyard, tmp_path)
+
+
+def test_copies_lie_about_their_points(tmp_path: Path) -> None:
+    """A grid of two spacings: shifts are normal and in proportion to the distance to the neighbour."""
+    grid = np.stack(np.meshgrid(*[np.arange(12.0)] * 3), -1).reshape(-1, 3)
+    points = np.concatenate([grid, 100 + 10 * grid])
+    copies = shifted_copies(points, 3, 0.5, seed=1)
+    assert copies.shape == (3 * len(points), 3)
+    shifts = (copies.reshape(3, -1, 3) - points).reshape(3, 2, -1)
+    assert shifts[:, 0].std() == pytest.approx(0.5, rel=0.03)
+    assert shifts[:, 1].std() == pytest.approx(5.0, rel=0.03)
+    assert abs(shifts[:, 0].mean()) < 0.02
+    np.testing.assert_array_equal(copies, shifted_copies(points, 3, 0.5, seed=1))
+    assert not np.allclose(copies, shifted_copies(points, 3, 0.5, seed=2))
 
 
 def test_random_needs_cameras(bare_photos: Capture, courtyard: Capture, tmp_path: Path):

@@ -20,7 +20,8 @@ from gsbench.init.colmap.database import (
     write_keypoints,
     write_matches,
 )
-from gsbench.init.colmap.reconstruct import MappingSettings, Verification, map_images
+from gsbench.init.colmap.mapping import map_images
+from gsbench.init.colmap.reconstruct import MappingSettings, Verification
 from gsbench.init.colmap.sift import extract_sift
 from gsbench.init.colmap.sift_matching import match_sift
 from gsbench.init.networks.extractors import build_extractor, extract_features
@@ -61,8 +62,11 @@ def test_sift_through_the_external_path_gives_the_same_model(
     verify_pairs(external, pairs, Verification(0, 15).options(), no_progress)
     assert database_counts(external) == database_counts(own)
 
-    first, _ = map_images(own, bare_photos.images, tmp_path / "first", MAPPING, no_progress)
-    second, _ = map_images(external, bare_photos.images, tmp_path / "second", MAPPING, no_progress)
+    verification = Verification(0, 15)
+    first, second = (
+        map_images(path, bare_photos.images, tmp_path / path.stem, MAPPING, verification, "auto", no_progress).model
+        for path in (own, external)
+    )
     assert first.num_points3D() == second.num_points3D() > 100
     for point_id, point in first.points3D.items():
         np.testing.assert_array_equal(point.xyz, second.points3D[point_id].xyz)

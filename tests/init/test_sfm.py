@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.init import MODEL_FOLDER, OWN_GAUGE_FOLDER, PICTURE_FILE, REPORT_FILE, Sfm, SfmDense, read_cloud
+from gsbench.init import MODEL_FOLDER, OWN_GAUGE_FOLDER, PICTURE_FILE, REPORT_FILE, Jittered, Sfm, SfmDense, read_cloud
 from gsbench.init.base import InitReport
 from gsbench.init.colmap.initializer import WORK_FOLDER
 from gsbench.scene.courtyard.render import surface_distance
@@ -57,6 +57,24 @@ def test_own_poses_agree_with_the_exact_ones(own: tuple[InitReport, Path]):
     assert report.focal_lengths[0] == pytest.approx(300.9, rel=0.01)  # 320 / (2 tan 28 degrees)
     assert report.mean_reprojection_error < 0.5
     assert report.warnings == ()
+
+
+def test_jittered_is_sfm_with_copies_nearby(
+    shared: tuple[InitReport, Path], courtyard: Capture, tmp_path: Path
+) -> None:
+    """The points themselves first, to the bit, then twice as many of their colours."""
+    plain, folder = shared
+    report = Jittered(copies=2, shift=0.1).run(courtyard, tmp_path)
+    before, after = read_cloud(folder / MODEL_FOLDER), read_cloud(tmp_path / MODEL_FOLDER)
+    count = len(before.points)
+    assert report.num_points == len(after.points) == 3 * count
+    assert report.counts["shifted_copies"] == 2 * count
+    assert report.mean_reprojection_error == plain.mean_reprojection_error
+    assert json.loads((tmp_path / REPORT_FILE).read_text())["num_points"] == 3 * count
+    np.testing.assert_array_equal(after.points[:count], before.points)
+    np.testing.assert_array_equal(after.colors, np.tile(before.colors, (3, 1)))
+    for copies in np.split(after.points[count:], 2):
+        assert 0 < np.median(np.linalg.norm(copies - before.points, axis=1)) < 1.0
 
 
 def test_own_model_is_written_in_both_gauges(own: tuple[InitReport, Path], courtyard: Capture):

@@ -14,9 +14,9 @@ from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
-from gsbench.launch.declare import declare, declared_metrics
+from gsbench.launch.declare import declare, declare_plan, declared_metrics
 from gsbench.launch.trial import Trial
-from gsbench.runs.declaration import read_declarations
+from gsbench.runs.declaration import read_declarations, read_plans
 from tests.end_to_end.conftest import SMALL
 
 # later words win: a trial of seconds
@@ -53,6 +53,20 @@ def test_one_command_cannot_declare_two(tmp_path: Path, capsys: pytest.CaptureFi
         declared_metrics(trials)
     assert run(["-m", *TINY, "eval.primary=psnr,ssim", f"runs={tmp_path}"]) == 2
     assert "eval.primary makes no other trial" in capsys.readouterr().err
+
+
+def test_a_plan_of_claims_is_kept_beside_declared_metrics(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    home = tmp_path / "exp"
+    first = declare_plan(home, {"claims": []}, "aaaa")
+    assert declare_plan(home, {"claims": []}, "aaaa") == first  # said again: it stands, with its time
+    declare(declared_metrics([composed(tmp_path, "eval.primary=psnr")]))
+    assert not caplog.text
+    with caplog.at_level(logging.WARNING):
+        declare_plan(home, {"claims": [1]}, "bbbb")
+    assert "another plan of claims was declared before" in caplog.text
+    assert {plan.hash for plan in read_plans(home)} == {"aaaa", "bbbb"}
+    assert [one.metric for one in read_declarations(home)] == ["psnr"]
+    assert next(plan for plan in read_plans(home) if plan.hash == "bbbb").plan == {"claims": [1]}
 
 
 @pytest.mark.end_to_end

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -63,7 +64,7 @@ def finish(
     values: dict[str, Any],
     seconds: float = 100.0,
     unavailable: dict[str, str] | None = None,
-    awaited: list[str] | None = None,
+    awaited: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Make the files of a finished trial, with one stage result in the store and one source file."""
     paths = TrialPaths.of(values)
@@ -87,7 +88,7 @@ def finish(
         "unavailable": unavailable or {},
         "seconds": {"init": 1.0, "train": seconds, "evaluate": 0.0},
         "hashes": {"config": config_hash(values)},
-        **({} if awaited is None else {"awaited": awaited}),
+        "awaited": list(awaited),
     }
     record_inputs(paths.folder, values, results, [source], {"train": entry.path}, [paths.folder / "table.csv"])
     (paths.folder / "results.json").write_text(json.dumps(results))
@@ -284,7 +285,7 @@ def test_changes_are_noticed_and_named(
     change: str, cause: str, names: str, runs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     values = trial_values()
-    finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"} if change == "weights" else None)
+    finish(values, awaited=["lpips_vgg"] if change == "weights" else ())
     folder = TrialPaths.of(values).folder
     record = json.loads((folder / "inputs.json").read_text())
     if change == "photo":
@@ -343,7 +344,7 @@ def test_metric_that_cannot_come_later_does_not_hinder() -> None:
 
 def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do() -> None:
     values = trial_values()
-    finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"})
+    finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"}, awaited=["lpips_vgg"])
     assert isinstance(find_finished(values, lambda options: {"lpips_vgg", "flip"}), Done)
     assert isinstance(find_finished(values, lambda options: {"flip"}), NotDone)
 
@@ -351,7 +352,7 @@ def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do() -> None:
 # ---- plan and states
 
 
-def test_results_that_say_what_is_awaited_are_not_read_by_their_prose() -> None:
+def test_what_is_awaited_is_not_read_from_the_prose_of_reasons() -> None:
     values = trial_values("seed=3")
     finish(values, unavailable={"lpips_vgg": "weights not found", "own": "no reason that anyone knows"}, awaited=[])
     assert isinstance(find_finished(values), Done)

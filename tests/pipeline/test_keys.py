@@ -20,12 +20,12 @@ WORDS = [
 ]  # fmt: skip
 BARE = Capture("garden", Path("photos"), ("a.jpg", "b.jpg", "c.jpg"), ("a.jpg",), None, False, "0" * 64)
 KEYS = [
-    ("config", "6006ce2d5a24f06065a7ec3e0acce9d6afbbd0b8b2242059686c41e77927766d"),
-    ("init", "b7ca2c34f15e6982b1cfe176048e01e1fa86b6b9acfd45ce66bb1443118d7fe8"),  # of the cameras
-    ("init", "ac52126886c9371912391c051d2566f1598bbc65f7748aec1e579818c6fa9bf4"),
-    ("train", "6dcae2ad1476c5e69fbc7d7ff24e581cdb9f9b66b3ed076e46c006a972d50d12"),
-    ("ground_truth", "44b8d46ce327228f2d0da693aff1ca7d511b53713ed00bdd0d59ee20273c8e30"),
-    ("evaluate", "381b3a2dbc8630c807f85b6a5141d317f8c087635dd0f4665edae7a022b45e75"),
+    ("config", "829d41d8682f8e0ab480d40763b896e350b8d976d9e067920f049be019c6b979"),
+    ("init", "974e9139210e7e6ef41a8ec7b4f58645d4493ac8e8a413880403cad374ed9df4"),  # of the cameras
+    ("init", "c37f77392d25080252dd1ef80d5eb8cf9e7441e0778f5fb3a9eb1e0285416a16"),
+    ("train", "aa6038a98a2ff7183f53d10888f73b82b5585a9135988124200c3fb32436918f"),
+    ("ground_truth", "ffebc31a202d233f2dd1c9af264a7e3e5cef988a8f4a5914c840336f97149d37"),
+    ("evaluate", "73dfdb288b4ddf8d4e3019e32fe31fb763cd68c9501deb160bf0ad61fab31de3"),
 ]
 
 

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from gsbench.densify import ADC
-from gsbench.eval.ssim import torch_photometric_loss
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import Rasterizer, RenderOutput
@@ -23,6 +22,7 @@ from gsbench.raster.triton import executor
 from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import Scene, View
+from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.loss_triton import TritonLoss
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer

@@ -19,7 +19,7 @@ def test_the_name_is_that_of_the_project_file() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["name"] == DISTRIBUTION
     assert list(project["scripts"]) == ["gsbench"]
-    assert f"{DISTRIBUTION}[dim,search,slurm,view]" in project["optional-dependencies"]["dev"]
+    assert f"{DISTRIBUTION}[dim,search,slurm,tensorboard,view]" in project["optional-dependencies"]["dev"]
 
 
 def test_from_a_checkout_the_hint_installs_the_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -54,4 +54,6 @@ def test_the_image_is_built_by_commands_that_there_are() -> None:
         done = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
     ignored = (ROOT / ".dockerignore").read_text().split()  # whose names without a wildcard are of the root alone
-    assert {name.lstrip("/") for name in (ROOT / ".gitignore").read_text().split()} < set(ignored)  # nothing of this machine gets in
+    assert {name.lstrip("/") for name in (ROOT / ".gitignore").read_text().split()} < set(
+        ignored
+    )  # nothing of this machine gets in

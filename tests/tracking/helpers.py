@@ -8,6 +8,8 @@ import socket
 from pathlib import Path
 from typing import Any
 
+from gsbench.runs.trial_files import TrialPaths
+
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = 150
 
@@ -21,13 +23,22 @@ def trial_values(runs: Path, seed: int = 0, name: str = "tracked") -> dict[str, 
     return {"name": name, "seed": seed, "runs": str(runs), "train": {"iterations": RECORDS}, **named}
 
 
+def begin_trial(values: dict[str, Any], uri: str | None = None, patience: float = 30.0, **more: Any) -> Path:
+    """The folder of a trial that has written its configuration, as the mirror finds it."""
+    folder = TrialPaths.of(values).folder
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "config.yaml").write_text(json.dumps(values | {"tracking": options(uri, patience) | more}))
+    return folder
+
+
 def write_trial(folder: Path, values: dict[str, Any], records: int = RECORDS, psnr: float = 20.0) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     seed = values["seed"]
     lines = [{"step": i, "loss": 1 / i, "seed": seed, "seconds": 0.01 * i} for i in range(1, records + 1)]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     (folder / "events.jsonl").write_text("".join(json.dumps({"step": i, "cloned": i}) + "\n" for i in (50, 100)))
-    (folder / "config.yaml").write_text("a: 1\n")
+    if not (folder / "config.yaml").exists():
+        begin_trial(values)
     results = {
         "metrics": {"psnr": psnr},
         "num_gaussians": 10 + seed,

@@ -21,6 +21,7 @@ class Listener:
         self._socket = socket.create_server(("127.0.0.1", 0), backlog=BACKLOG)
         self.port: int = self._socket.getsockname()[1]
         self.connections: list[socket.socket] = []
+        self.threads = 1  # that were ever started here
         threading.Thread(target=self._accept, daemon=True).start()
 
     def __enter__(self) -> Listener:
@@ -37,6 +38,7 @@ class Listener:
             while True:
                 connection, _ = self._socket.accept()
                 self.connections.append(connection)
+                self.threads += 1
                 threading.Thread(target=self.serve, args=(connection,), daemon=True).start()
 
     def serve(self, connection: socket.socket) -> None:

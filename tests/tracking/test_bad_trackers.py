@@ -23,6 +23,7 @@ from tests.end_to_end.conftest import SMALL
 from tests.processes import heed_interrupts
 from tests.tracking.helpers import (
     RECORDS,
+    begin_trial,
     child_environment,
     found_runs,
     free_port,
@@ -41,13 +42,12 @@ TINY = [*SMALL, "train.iterations=20", "scene.views=8", "init.count=500", "eval.
 MIRROR = """
 import sys
 from pathlib import Path
-from gsbench.runs.trial_files import TrialPaths
 from gsbench.tracking import Mirror
-from tests.tracking.helpers import options, trial_values, write_trial
+from tests.tracking.helpers import begin_trial, options, trial_values, write_trial
 runs, uri, seed, patience = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), float(sys.argv[4])
 values = trial_values(runs, seed)
-folder = TrialPaths.of(values).folder
-with Mirror(options(uri, patience), runs, folder, values):
+folder = begin_trial(values, uri, patience)
+with Mirror(options(uri, patience), runs, folder):
     write_trial(folder, values)
 """
 
@@ -114,11 +114,9 @@ def test_nothing_is_left_of_a_trial_that_is_ended_while_its_tracker_hangs(signum
 
 def test_sync_can_be_stopped_while_the_tracker_hangs(runs: Path) -> None:
     values = trial_values(runs, name="synced")
-    folder = TrialPaths.of(values).folder
-    write_trial(folder, values)
     with Listener() as tracker:
-        config = values | {"tracking": options(f"postgresql+psycopg2://x@127.0.0.1:{tracker.port}/x")}
-        (folder / "config.yaml").write_text(json.dumps(config))
+        folder = begin_trial(values, f"postgresql+psycopg2://x@127.0.0.1:{tracker.port}/x")
+        write_trial(folder, values)
         results = json.loads((folder / "results.json").read_text()) | {"status": "complete"}
         (folder / "results.json").write_text(json.dumps(results))
         program = subprocess.Popen(
@@ -146,7 +144,7 @@ def mirrors_of(program: subprocess.Popen[str]) -> list[psutil.Process]:
         with suppress(psutil.NoSuchProcess):
             children = psutil.Process(program.pid).children(recursive=True)
             found[:] = [
-                child for child in children if any("gsbench.tracking.child" in word for word in child.cmdline())
+                child for child in children if any("gsbench.tracking.follower" in word for word in child.cmdline())
             ]
         return bool(found)
 

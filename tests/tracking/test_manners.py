@@ -16,10 +16,9 @@ import pytest
 from gsbench.errors import InputError
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.tracking import Mirror, connect, default_uri, mirror_trial, prepare, tracker_uri
-from gsbench.tracking.process import MirrorProcesses
 from gsbench.tracking.source import source_tags
 from gsbench.verbs.ui import address_of
-from tests.tracking.helpers import RECORDS, found_runs, history, options, trial_values, write_trial
+from tests.tracking.helpers import RECORDS, begin_trial, found_runs, history, options, trial_values, write_trial
 
 SECONDS = 240  # within which what never comes is told from a slow machine
 
@@ -61,9 +60,8 @@ def test_the_address_is_the_configured_one_then_the_environments_then_ours(
 def test_a_trial_goes_where_the_environment_says(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MLFLOW_TRACKING_URI", default_uri(runs))
     values = trial_values(tmp_path, seed=20)
-    folder = TrialPaths.of(values).folder
-    folder.mkdir(parents=True)
-    with Mirror(options(), tmp_path, folder, values):
+    folder = begin_trial(values)
+    with Mirror(options(), tmp_path, folder):
         write_trial(folder, values)
     assert not (tmp_path / "mlflow.db").exists()
     (run,) = [run for run in found_runs(connect(None, runs), "tracked") if run.data.tags["seed"] == "20"]
@@ -110,19 +108,18 @@ def test_the_photographs_are_the_dataset_of_a_run(runs: Path) -> None:
 
 def test_a_failed_run_holds_its_reason_until_it_is_mended(runs: Path) -> None:
     values = trial_values(runs, seed=22)
-    folder = TrialPaths.of(values).folder
-    folder.mkdir(parents=True)
+    folder = begin_trial(values)
     (folder / "log.txt").write_text("what happened\n")
-    with pytest.raises(RuntimeError), Mirror(options(), runs, folder, values):  # noqa: PT012
+    with pytest.raises(RuntimeError), Mirror(options(), runs, folder):  # noqa: PT012
         (folder / "failed.json").write_text(json.dumps({"message": "the loss became nan", "traceback": "…"}))
         raise RuntimeError
     client = connect(None, runs)
     (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "22"]
     assert run.info.status == "FAILED"
     assert run.data.tags["error"] == "the loss became nan"
-    assert artifacts(client, run) == {"failed.json", "log.txt"}
+    assert artifacts(client, run) == {"config.yaml", "failed.json", "log.txt"}
     (folder / "failed.json").unlink()
-    with Mirror(options(), runs, folder, values):
+    with Mirror(options(), runs, folder):
         write_trial(folder, values)
     run = client.get_run(run.info.run_id)
     assert run.info.status == "FINISHED"
@@ -138,13 +135,11 @@ def test_the_model_is_an_artifact_if_asked_for(runs: Path) -> None:
 
 def test_system_metrics_are_logged_if_asked_for(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MLFLOW_SYSTEM_METRICS_SAMPLING_INTERVAL", "0.2")
-    monkeypatch.setattr("gsbench.tracking.mirror.processes", MirrorProcesses())  # one that has this environment
     client = connect(None, runs)
     values = trial_values(runs, seed=25)
-    folder = TrialPaths.of(values).folder
-    folder.mkdir(parents=True)
+    folder = begin_trial(values, system_metrics=True)
     seen: set[str] = set()
-    with Mirror(options() | {"system_metrics": True}, runs, folder, values):
+    with Mirror(options(), runs, folder):
         deadline = time.monotonic() + SECONDS
         while not seen and time.monotonic() < deadline:
             time.sleep(0.2)

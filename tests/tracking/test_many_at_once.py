@@ -16,14 +16,13 @@ from tests.tracking.helpers import RECORDS, child_environment, found_runs, histo
 JOBS = 8
 CHILD = """
 import json, sys
-from tests.tracking.helpers import options, trial_values, write_trial
-from gsbench.runs.trial_files import TrialPaths
+from tests.tracking.helpers import begin_trial, options, trial_values, write_trial
 from gsbench.tracking import Mirror
 from pathlib import Path
 runs, uri, seed = Path(sys.argv[1]), sys.argv[2] or None, int(sys.argv[3])
 values = trial_values(runs, seed)
-folder = TrialPaths.of(values).folder
-with Mirror(options(uri), runs, folder, values):
+folder = begin_trial(values, uri)
+with Mirror(options(uri), runs, folder):
     write_trial(folder, values)
 """
 

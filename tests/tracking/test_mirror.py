@@ -9,17 +9,17 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
 
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.tracking import Mirror, connect, ensure_experiment, mirror_trial, prepare
-from gsbench.tracking.process import SECONDS_IN_VAIN, MirrorProcesses
-from gsbench.tracking.trial_run import STATE
+from gsbench.tracking.mirror import SECONDS_IN_VAIN
+from gsbench.tracking.mlflow_sink import STATE
 from tests.tracking.helpers import (
     RECORDS,
+    begin_trial,
     child_environment,
     found_runs,
     free_port,
@@ -30,6 +30,8 @@ from tests.tracking.helpers import (
 )
 from tests.tracking.servers import Listener
 
+SECONDS = 240  # within which what never comes is told from a slow machine
+
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -39,19 +41,16 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def processes(monkeypatch: pytest.MonkeyPatch) -> MirrorProcesses:
-    """None kept from other tests."""
-    processes = MirrorProcesses()
-    monkeypatch.setattr("gsbench.tracking.mirror.processes", processes)
-    return processes
+@pytest.fixture(autouse=True)
+def _fresh_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is remembered of the trackers of other tests."""
+    monkeypatch.setattr(Mirror, "in_vain", False)
 
 
 def test_all_that_the_files_say_is_mirrored_once(runs: Path) -> None:
     values = trial_values(runs, seed=1)
-    folder = TrialPaths.of(values).folder
-    folder.mkdir(parents=True)
-    with Mirror(options(), runs, folder, values):
+    folder = begin_trial(values)
+    with Mirror(options(), runs, folder):
         write_trial(folder, values)
     assert not mirror_trial(options(), runs, folder, values)
     client = connect(None, runs)
@@ -95,18 +94,28 @@ def test_results_that_changed_replace_the_run(runs: Path) -> None:
     assert run.data.metrics["psnr"] == 33.0
 
 
+def wait_for_run(folder: Path) -> None:
+    """Wait until the trial's run is there and noted."""
+    deadline = time.monotonic() + SECONDS
+    while "run_id" not in (json.loads((folder / STATE).read_text()) if (folder / STATE).exists() else {}):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
 def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs: Path) -> None:
     values = trial_values(runs, seed=4)
-    folder = TrialPaths.of(values).folder
-    folder.mkdir(parents=True)
+    folder = begin_trial(values)
     client = connect(None, runs)
     for error, status in ((KeyboardInterrupt(), "KILLED"), (RuntimeError("x"), "FAILED")):
-        with pytest.raises(type(error)), Mirror(options(), runs, folder, values):  # noqa: PT012
-            time.sleep(1)
+        with pytest.raises(type(error)), Mirror(options(), runs, folder):  # noqa: PT012
+            wait_for_run(folder)
+            if status == "FAILED":  # as a trial does before anyone beside it is told
+                (folder / "failed.json").write_text(json.dumps({"message": "x"}))
             raise error
         (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "4"]
         assert run.info.status == status
-    with Mirror(options(), runs, folder, values):
+    (folder / "failed.json").unlink()
+    with Mirror(options(), runs, folder):
         write_trial(folder, values)
     (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "4"]
     assert run.info.status == "FINISHED"
@@ -114,20 +123,17 @@ def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs: Path) ->
 
 def test_curves_of_a_training_in_progress_are_followed(runs: Path, tmp_path: Path) -> None:
     values = trial_values(runs, seed=5)
-    folder = TrialPaths.of(values).folder
-    folder.mkdir(parents=True)
+    folder = begin_trial(values)
     client = connect(None, runs)
     seen = 0
-    with Mirror(options(), runs, folder, values) as mirror:
-        mirror.follow(tmp_path)
+    with Mirror(options(), runs, folder):
+        (folder / "building.json").write_text(json.dumps({"stage": "train", "folder": str(tmp_path)}))
         (tmp_path / "metrics.jsonl").write_text('{"step": 10, "loss": 0.5}\n{"step": 20, "lo')
-        for _ in range(100):
+        wait_for_run(folder)
+        deadline = time.monotonic() + SECONDS
+        while not seen and time.monotonic() < deadline:
             time.sleep(0.1)
-            state = folder / STATE
-            run_id = json.loads(state.read_text()).get("run_id") if state.exists() else None
-            seen = 0 if run_id is None else len(history(client, run_id, "train/loss"))
-            if seen:
-                break
+            seen = len(history(client, json.loads((folder / STATE).read_text())["run_id"], "train/loss"))
     assert seen == 1
 
 
@@ -141,10 +147,9 @@ def test_a_broken_tracker_harms_no_trial(uri: str, tmp_path: Path, caplog: pytes
         "nonsense": "gopher://x",
     }[uri]
     values = trial_values(tmp_path)
-    folder = TrialPaths.of(values).folder
-    folder.mkdir(parents=True)
+    folder = begin_trial(values, address)
     prepare(options(address), tmp_path, "tracked")
-    with Mirror(options(address), tmp_path, folder, values):
+    with Mirror(options(address), tmp_path, folder):
         write_trial(folder, values)
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert any(text.startswith("tracking: ") and "gsbench sync" in text for text in warnings)
@@ -152,58 +157,57 @@ def test_a_broken_tracker_harms_no_trial(uri: str, tmp_path: Path, caplog: pytes
     assert (folder / "results.json").exists()
 
 
-def mirror_threads() -> list[threading.Thread]:
-    return [thread for thread in threading.enumerate() if thread.name == "mlflow-mirror"]
-
-
-@pytest.mark.usefixtures("processes")
 def test_a_slow_tracker_is_not_waited_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    others = psutil.Process().children()
+    others, threads = psutil.Process().children(), threading.active_count()
     values = trial_values(tmp_path)
-    folder = TrialPaths.of(values).folder
-    folder.mkdir(parents=True)
-    threads = mirror_threads()
     with Listener() as tracker:
         slow = options(f"http://127.0.0.1:{tracker.port}", patience=0.2)
+        folder = begin_trial(values, slow["uri"], patience=0.2)
         prepare(slow, tmp_path, "tracked")
-        with Mirror(slow, tmp_path, folder, values):
+        with Mirror(slow, tmp_path, folder):
             write_trial(folder, values)
+            mine = threading.active_count() - threads - tracker.threads
     assert [record.getMessage().split(";")[0] for record in caplog.records] == ["tracking: MLflow is slow"] * 2
-    assert mirror_threads() == threads  # none that the end of the interpreter could hit
+    assert mine == 0  # no thread that the end of the interpreter could hit
     assert psutil.Process().children() == others
 
 
-def test_patience_is_short_after_it_was_in_vain(processes: MirrorProcesses) -> None:
+def test_patience_is_short_after_it_was_in_vain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    waited: list[float | None] = []
+
     class Fake:
-        is_alive = True
+        is_slow = True
 
-        def kill(self) -> None:
-            self.is_alive = False
-
-        def close(self) -> None:
+        def __init__(self, *words: str) -> None:
             pass
 
-    process: Any = Fake()
-    assert processes.patience(30) == 30
-    processes.give_up(process)
-    assert not process.is_alive
-    assert processes.patience(30) == SECONDS_IN_VAIN
-    assert processes.patience(1) == 1
-    other: Any = Fake()
-    processes.give_back(other)
-    assert processes.patience(30) == 30
-    assert processes.take() is other
+        def finish(self, seconds: float | None) -> None:
+            waited.append(seconds)
+            if self.is_slow:
+                raise TimeoutError
+
+    monkeypatch.setattr("gsbench.tracking.mirror.MirrorProcess", Fake)
+
+    def trial(patience: float) -> None:
+        with Mirror(options(patience=patience), tmp_path, tmp_path):
+            pass
+
+    trial(30)
+    trial(30)
+    trial(1)
+    Fake.is_slow = False
+    trial(30)
+    trial(30)
+    assert waited == [30, SECONDS_IN_VAIN, 1, SECONDS_IN_VAIN, 30]
 
 
-@pytest.mark.usefixtures("processes")
 def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(
     runs: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     for seed in (6, 7):
         values = trial_values(runs, seed)
-        folder = TrialPaths.of(values).folder
-        folder.mkdir(parents=True)
-        with Mirror(options(), runs, folder, values):
+        folder = begin_trial(values)
+        with Mirror(options(), runs, folder):
             write_trial(folder, values)
             if seed == 6:
                 for child in psutil.Process().children():
@@ -218,14 +222,13 @@ def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(
 def test_the_trials_process_loads_no_mlflow(runs: Path) -> None:
     """No part of it can then take the process down, and it takes no memory beside a training."""
     values = trial_values(runs, seed=8)
-    folder = TrialPaths.of(values).folder
-    folder.mkdir(parents=True)
+    folder = begin_trial(values)
     code = (
         "import json, sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror\n"
-        "options, runs, folder, values = json.loads(sys.argv[1])\n"
-        "with Mirror(options, Path(runs), Path(folder), values): pass\nsys.exit('mlflow' in sys.modules)"
+        "options, runs, folder = json.loads(sys.argv[1])\n"
+        "with Mirror(options, Path(runs), Path(folder)): pass\nsys.exit('mlflow' in sys.modules)"
     )
-    words = json.dumps([options(), str(runs), str(folder), values])
+    words = json.dumps([options(), str(runs), str(folder)])
     done = subprocess.run(
         [sys.executable, "-c", code, words], env=child_environment(), capture_output=True, text=True, check=False
     )
@@ -252,7 +255,7 @@ def test_switched_off_means_no_mlflow(tmp_path: Path) -> None:
     code = (
         "import sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror, prepare\n"
         "o = {'enabled': False, 'uri': None, 'flush_seconds': 1, 'images': 0}\n"
-        "prepare(o, Path('.'), 'x')\nwith Mirror(o, Path('.'), Path('.'), {}): pass\nsys.exit('mlflow' in sys.modules)"
+        "prepare(o, Path('.'), 'x')\nwith Mirror(o, Path('.'), Path('.')): pass\nsys.exit('mlflow' in sys.modules)"
     )
     assert (
         subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=child_environment(), check=False).returncode == 0

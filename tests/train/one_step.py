@@ -18,9 +18,9 @@ from gsbench.bench.scenes import make_scene
 from gsbench.bench.stepper import NEVER, standing_still
 from gsbench.bench.waits import counting_waits
 from gsbench.densify import ADC, MCMC
-from gsbench.eval.ssim import torch_photometric_loss
 from gsbench.raster import create_rasterizer, validate
 from gsbench.raster.readback import Readback
+from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.trainer import Trainer
 
 DENSIFIERS = {

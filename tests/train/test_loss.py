@@ -7,8 +7,8 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from gsbench.eval.ssim import ssim_map, torch_photometric_loss, window
-from gsbench.train.loss import PhotometricLoss, photometric_loss
+from gsbench.eval.ssim import ssim_map, window
+from gsbench.train.loss import PhotometricLoss, photometric_loss, torch_photometric_loss
 
 SIZES = [(3, 4), (11, 16), (37, 53), (64, 65), (100, 21)]
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import random
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +18,7 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.raster import create_rasterizer
 from gsbench.scene.types import Scene
 from gsbench.system.stopping import Stopped, stop_on_signals
-from gsbench.train.trainer import Status, Trainer
+from gsbench.train.trainer import Status, Trainer, drop_after
 from tests.train.test_trainer import cloud, options, records, same
 
 ITERATIONS = 120
@@ -115,3 +118,35 @@ def test_a_stop_in_the_last_iteration_loses_nothing(tiny_scene: Scene, truth: Ga
     with pytest.raises(Stopped), stop_on_signals():
         run(tiny_scene, truth, tmp_path / "broken", "adc", stop)
     assert same(whole, run(tiny_scene, truth, tmp_path / "broken", "adc"))
+
+
+def test_records_later_than_the_checkpoint_and_a_torn_line_are_dropped(tmp_path: Path) -> None:
+    file = tmp_path / "metrics.jsonl"
+    lines = [json.dumps({"step": step}) + "\n" for step in range(1, 8)]
+    for torn in ("", '{"step": 3, "lo', '{"loss": 1}\n', "5\n"):
+        file.write_text("".join([*lines, torn]))
+        drop_after(file, 5)
+        assert file.read_text() == "".join(lines[:5])
+    drop_after(tmp_path / "absent.jsonl", 5)
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.jsonl"]
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="needs a signal that comes in the middle of a write")
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+def test_a_kill_while_a_resumed_training_tidies_its_records_loses_none(share: float, tmp_path: Path) -> None:
+    """The system ends the process as soon as it has written ``share`` of the file."""
+    file = tmp_path / "events.jsonl"
+    lines = [json.dumps({"step": step, "cloned": step}) + "\n" for step in range(1, 5001)]
+    file.write_text("".join(lines))
+    kept = len("".join(lines[:4000]))
+    code = (
+        "import resource, signal, sys\nfrom pathlib import Path\nfrom gsbench.train.trainer import drop_after\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_DFL)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)\n"
+        "resource.setrlimit(resource.RLIMIT_CORE, (0, 0))\ndrop_after(Path(sys.argv[1]), 4000)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(file), str(int(share * kept))], check=False)
+    assert done.returncode == -signal.SIGXFSZ
+    assert file.read_text() == "".join(lines)
+    drop_after(file, 4000)  # the next attempt
+    assert file.read_text() == "".join(lines[:4000])

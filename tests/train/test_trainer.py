@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.densify import ADC, MCMC, Densifier, NoDensifier, Volumetric
+from gsbench.densify import ADC, GNS, MCMC, MRNF, Densifier, FastGS, NoDensifier, ResGS, Volumetric
 from gsbench.errors import TrainingError
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
@@ -95,8 +95,16 @@ def test_same_seed_same_bits_other_seed_not(
 
 @pytest.mark.parametrize(
     "make",
-    [small, lambda: small(Volumetric, volume_threshold=0.01), lambda: MCMC(start=20, stop=110, interval=20)],
-    ids=["adc", "volumetric", "mcmc"],
+    [
+        small,
+        lambda: small(Volumetric, volume_threshold=0.01),
+        lambda: MCMC(start=20, stop=110, interval=20),
+        lambda: MRNF(start=0, stop=110, interval=20, decay_until=120),
+        lambda: GNS(start=20, stop=60, interval=20, max_gaussians=90, pressure_length=1.0, overgrowth=2.0),
+        lambda: small(ResGS, phase_ends=[0.3, 0.6], fade_interval=15, fade_stop=100),
+        lambda: small(FastGS, error_threshold=0.05, least_count=0.0, max_gaussians=200),
+    ],
+    ids=["adc", "volumetric", "mcmc", "mrnf", "gns", "resgs", "fastgs"],
 )
 def test_interrupted_training_ends_in_the_same_bits(
     make, tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path

@@ -12,7 +12,6 @@ from gsbench.analysis.differences import (
     differing_code,
     differing_conditions,
     differing_settings,
-    differing_unrecorded_code,
 )
 from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.results import TrialResult
@@ -73,8 +72,6 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
         keys = differing_conditions(group) or differing_settings(group)
         if keys:
             raise _refusal(f"{where}, scene {scene}" if "scene=" not in where else where, keys, group)
-        if code := differing_unrecorded_code(group):
-            raise _code_refusal(where, code, trials[0].experiment)
         seeds = [trial.seed for trial in group]
         twice = sorted({seed for seed in seeds if seeds.count(seed) > 1})
         if twice:

@@ -11,11 +11,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from gsbench.analysis.origins import machine_of
 from gsbench.analysis.results import TrialResult
 from gsbench.eval.facts import LPIPS, find
 from gsbench.eval.protocol import PAPER, PROTOCOLS
 
 NOT_RECORDED = "not recorded"
+PLACES = {"sampled": "drawn from the parent's density", "parent_mean": "the parent's mean"}
+ORDERS = {
+    "after_adc": "after clone and split, before pruning",
+    "before_adc": "before clone and split",
+    "after_prune": "after pruning",
+}
 
 
 @dataclass(frozen=True)
@@ -117,6 +124,39 @@ def _cap(trial: TrialResult) -> str:
     return "none" if count is None else f"{count:,} (densify.cap={cap})"
 
 
+def _hold_out(trial: TrialResult) -> str:
+    config = trial.config
+    return "by lists" if config.get("scene.test_list") else f"every {config['scene.test_every']}th image"
+
+
+def _selection(trial: TrialResult) -> str:
+    return f"at most {trial.config['scene.max_images']}, evenly spaced over the sorted names"
+
+
+def _volume(key: str, say: Callable[[Any], str]) -> Callable[[TrialResult], str | None]:
+    """Reads a setting of the volume rule; None for arms without the rule."""
+
+    def read(trial: TrialResult) -> str | None:
+        trial.config["densify.name"]  # raises where nothing was recorded
+        value = trial.config.get(f"densify.{key}")
+        return None if value is None else say(value)
+
+    return read
+
+
+def _window(trial: TrialResult) -> str | None:
+    config = trial.config
+    if config.get("densify.volume_order") is None:
+        config["densify.name"]  # raises where nothing was recorded
+        return None
+    start, stop = (
+        config[f"densify.{key}"] if config.get(f"densify.volume_{key}") is None else config[f"densify.volume_{key}"]
+        for key in ("start", "stop")
+    )
+    interval = config.get("densify.volume_interval") or config["densify.interval"]
+    return f"every {interval} iterations, after {start:,} and before {stop:,}"
+
+
 def _images(trial: TrialResult) -> str:
     config = trial.config
     text = f"the files of {config['scene.images']}" if config.get("scene.images") else "the photographs"
@@ -150,5 +190,12 @@ TOPICS = (
     Topic("opacity", "Learning rate of opacity", lambda trial: str(trial.config["train.opacity"])),
     Topic("iterations", "Iterations", lambda trial: str(trial.data["iterations"])),
     Topic("images", "Images", _images, _sizes),
+    Topic("hold_out", "Held out", _hold_out),
+    Topic("selection", "Images of a large scene", _selection),
+    Topic("children", "Children of a volume split", _volume("volume_children", str)),
+    Topic("placement", "Their places", _volume("placement", PLACES.__getitem__)),
+    Topic("order", "Order of the volume rule", _volume("volume_order", ORDERS.__getitem__)),
+    Topic("window", "Window of the volume rule", _window),
+    Topic("hardware", "Hardware", lambda trial: machine_of(trial) or NOT_RECORDED),
     Topic("lpips", "LPIPS weights", _lpips),
 )

@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 
 from gsbench.analysis.results import TrialResult, canonical
-from gsbench.runs.source import OWN, SHOWN
+from gsbench.runs.source import SHOWN
 
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 
@@ -17,7 +17,6 @@ IGNORED_SETTINGS = (
     "eval.primary",
 )
 CODE = "code of "  # how the keys of ``TrialResult.code`` start that are a user's own classes
-CLASSES = ("init._target_", "densify._target_")
 
 
 def differing_conditions(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
@@ -46,29 +45,12 @@ def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
 
 
 def differing_code(trials: Iterable[TrialResult]) -> dict[str, Versions]:
-    """The classes and stages of which the trials used several versions, as far as versions were recorded."""
+    """The classes and stages of which the trials used several versions."""
     found: dict[str, Versions] = defaultdict(lambda: defaultdict(list))
     for trial in trials:
         for part, version in trial.code.items():
             found[part][version].append(trial)
     return {part: dict(versions) for part, versions in found.items() if len(versions) > 1}
-
-
-def differing_unrecorded_code(trials: Sequence[TrialResult]) -> dict[str, Versions]:
-    """The same for trials with equal settings, made before versions were recorded.
-
-    The hash in a folder's name is of the settings and of the file of a user's own class. Where the settings are equal
-    and the hashes are not, it was the file that changed.
-    """
-    versions: Versions = defaultdict(list)
-    for trial in trials:
-        versions[f"configuration {trial.config_hash}"].append(trial)
-    if len(versions) < 2 or all("code" in trial.data for trial in trials):
-        return {}
-    classes = {str(trial.config.get(key)) for trial in trials for key in CLASSES if key in trial.config}
-    own = sorted(name for name in classes if not name.startswith(OWN))
-    paths = {trial.config.get("scene.path") for trial in trials}  # the one setting that is hashed and yet ignored
-    return {CODE + " or ".join(own): dict(versions)} if own and len(paths) == 1 else {}
 
 
 def describe_code(part: str, versions: Mapping[str, Sequence[TrialResult]]) -> str:
@@ -79,8 +61,8 @@ def describe_code(part: str, versions: Mapping[str, Sequence[TrialResult]]) -> s
 
 
 def short_version(version: str) -> str:
-    """A version as people see it: the start of a hash, or the whole of what is no hash."""
-    return version if " " in version else version[:SHOWN]
+    """A version as people see it: the start of a hash."""
+    return version[:SHOWN]
 
 
 def _places(trials: Sequence[TrialResult]) -> str:

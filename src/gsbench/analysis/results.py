@@ -20,9 +20,8 @@ from typing import Any
 import yaml
 
 from gsbench.errors import InputError
-from gsbench.files import read_object
 from gsbench.runs.hashing import flatten
-from gsbench.runs.layout import CONFIG, FAILED, IN_RUNS, INPUTS, PER_VIEW, RESULTS
+from gsbench.runs.layout import CONFIG, FAILED, IN_RUNS, PER_VIEW, RESULTS
 from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 
 TRIAL_FOLDER = re.compile(r"(?P<hash>[0-9a-f]{8})-seed(?P<seed>\d+)")
@@ -71,15 +70,14 @@ class TrialResult:
 
     @cached_property
     def code(self) -> dict[str, str]:
-        """The versions of the code that made the trial, as far as they were recorded.
+        """The versions of the code that made the trial; empty for what another program made.
 
         ``code of <class>`` is the hash of the file that defines a user's own class, ``stage <name>`` the version of
-        one of gsbench's stages. Trials made before these stood in ``results.json`` have the stages in another file.
+        one of gsbench's stages.
         """
         recorded = self.data.get("code", {})
-        stages = recorded.get("stages") or read_object(self.path / INPUTS).get("stages") or {}
         return {f"code of {target}": str(digest) for target, digest in recorded.get("sources", {}).items()} | {
-            f"stage {name}": str(version) for name, version in stages.items()
+            f"stage {name}": str(version) for name, version in recorded.get("stages", {}).items()
         }
 
     @property

@@ -25,6 +25,7 @@ RANDOM_FLIPS = 100_000
 BOOTSTRAP_SAMPLES = 4000
 POWER = 0.8
 MAX_SEEDS = 1000
+LARGEST_SHIFT = 30.0  # in standard errors; beyond it scipy's noncentral t gives nan, and all is seen
 
 TOO_FEW = " (too few for an exact test)"
 NOT_REPEATED = "none, since no trial was repeated with another seed"
@@ -277,12 +278,20 @@ def seeds_needed(deviation: float, scenes: int, difference: float, power: float 
     gives the power; more seeds do not tell more about other scenes.
     """
     for seeds in range(2, MAX_SEEDS + 1):
-        degrees = scenes * (seeds - 1)
-        critical = special.stdtrit(degrees, 1 - ALPHA / 2)
-        shift = difference / (deviation / math.sqrt(scenes * seeds)) if deviation > 0 else math.inf
-        if not math.isfinite(shift) or 1 - special.nctdtr(degrees, min(shift, 30.0), critical) >= power:
+        if t_power(difference, deviation / math.sqrt(scenes * seeds), scenes * (seeds - 1)) >= power:
             return seeds
     return None
+
+
+def t_power(difference: float, error: float, degrees: int, alpha: float = ALPHA) -> float:
+    """The chance that a two-sided t test sees ``difference``, with this standard error and these degrees of freedom.
+
+    By the noncentral t distribution; the far tail of the wrong sign is left out.
+    """
+    if error == 0:
+        return 1.0 if difference else 0.0
+    shift = min(difference / error, LARGEST_SHIFT)
+    return float(1 - special.nctdtr(degrees, shift, special.stdtrit(degrees, 1 - alpha / 2)))
 
 
 def _scene_comparisons(paired: Paired, per_trial: Sequence[Array], direction: int) -> tuple[SceneComparison, ...]:
@@ -295,7 +304,7 @@ def _scene_comparisons(paired: Paired, per_trial: Sequence[Array], direction: in
             deviation=float(values.std(ddof=1)) if len(values) > 1 else None,
             trials=len(values),
             views=matrix.shape[1],
-            interval=_t_interval(values),
+            interval=t_interval(values),
             p=p,
             p_holm=adjusted,
             better_views=float(np.mean(direction * matrix.mean(axis=0) > 0)),
@@ -308,7 +317,8 @@ def _scene_p(values: Array) -> float | None:
     return sign_flip_p(values, np.ones(len(values))) if len(values) >= units_needed() else stratified_t_p([values])
 
 
-def _t_interval(values: Array) -> Interval | None:
+def t_interval(values: Array) -> Interval | None:
+    """Student's 95 % interval of the mean of ``values`` [n]; None of a single one."""
     if len(values) < 2:
         return None
     half = float(special.stdtrit(len(values) - 1, 1 - ALPHA / 2) * values.std(ddof=1) / math.sqrt(len(values)))

@@ -18,6 +18,7 @@ from gsbench.system.install import conf_dir
 from gsbench.words import closest
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")
+EXTERNAL_FOLDER = "external"  # below a group: choices that are no arms of gsbench's own, which glob(*) leaves out
 NAMED_APART = ("name", "seed")  # not hashed, and yet each of their values has a trial of its own
 OPTIONS = ("-m", "--multirun", "--dry-run", "--config-dir", "--cfg", "--info", "--help", "--version")
 KEY = re.compile(r"[+~]*\w+([./]\w+)*")
@@ -136,8 +137,10 @@ def check_makes_trials(override: Override) -> None:
 
 
 def options(group: str) -> list[str]:
-    """The YAML files of a group that come with gsbench."""
-    return sorted(path.stem for path in Path(conf_dir(), group).glob("*.yaml"))
+    """The YAML files of a group that come with gsbench; those of other programs by their folder, ``external/NAME``."""
+    folder = Path(conf_dir(), group)
+    own = sorted(path.stem for path in folder.glob("*.yaml"))
+    return own + sorted(f"{EXTERNAL_FOLDER}/{path.stem}" for path in Path(folder, EXTERNAL_FOLDER).glob("*.yaml"))
 
 
 def _check_experiment_word(word: str, override: Override) -> None:

@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gsbench.config.command_words import GROUPS, check_single, options
 from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, number_job, words_of
+from gsbench.config.old_names import know_old_names
 from gsbench.config.schema import Config, check, check_values, plain, register_schemas
 from gsbench.errors import InputError
 from gsbench.settings import checked
@@ -55,6 +56,7 @@ def composing() -> Iterator[Hydra]:
         with initialize_config_dir(str(conf_dir()), version_base="1.3", job_name="gsbench"):
             hydra = GlobalHydra.instance().hydra
             assert hydra is not None
+            know_old_names(hydra.config_loader)
             yield hydra
     finally:
         HydraConfig.instance().cfg = None
@@ -217,7 +219,7 @@ def _chain(error: BaseException | None) -> list[str]:
 
 def _keys_below(parent: str, overrides: Sequence[str]) -> list[str]:
     """The settings below ``parent`` with the group choices among ``overrides``, as far as these compose."""
-    choices = [word for word in overrides if re.fullmatch(r"\w+=[\w-]+", word) and word.split("=")[0] in GROUPS]
+    choices = [word for word in overrides if re.fullmatch(r"\w+=[\w/-]+", word) and word.split("=")[0] in GROUPS]
     with composing() as hydra:
         try:
             config = hydra.compose_config(CONFIG_NAME, choices, RunMode.RUN)

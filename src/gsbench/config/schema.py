@@ -59,11 +59,12 @@ class ComponentConfig:
 class TrackingConfig:
     name: str = MISSING
     enabled: bool = True
-    uri: Address | None = None  # null: $MLFLOW_TRACKING_URI, else sqlite in the runs folder
+    sink: Literal["mlflow", "tensorboard", "wandb"] = "mlflow"
+    uri: Address | None = None  # null: $MLFLOW_TRACKING_URI, else sqlite in the runs folder; W&B: $WANDB_BASE_URL
     flush_seconds: PositiveFloat = 10.0
     patience_seconds: NonNegativeFloat = 30.0  # with a slow tracker, at the end of a trial; `gsbench sync` mends it
     images: NonNegativeInt = 4  # test renders mirrored per trial
-    model: bool = False  # keep the PLY as an artifact
+    model: bool = False  # keep the PLY as an artifact (MLflow, W&B)
     system_metrics: bool = False  # MLflow's own: processors, memory, disk, network, GPUs
 
     def __post_init__(self) -> None:
@@ -184,10 +185,14 @@ def check(config: DictConfig) -> None:
 
 
 def require_values(values: Mapping[str, Any], group: str) -> None:
-    """Raise InputError for the first setting of ``group`` that must be given and is not."""
-    for key, value in values.items():
+    """Raise InputError for the first setting of ``group`` that must be given and is not, or of its ``options``."""
+    name = values.get("name")
+    whose = f" ({group}={name})" if name not in (None, MISSING) else ""
+    options = values.get("options")
+    nested = options if isinstance(options, Mapping) else {}
+    for key, value in [*values.items(), *((f"options.{key}", value) for key, value in nested.items())]:
         if value == MISSING:
-            raise InputError(f"{group}.{key} is not set: give it a value")
+            raise InputError(f"{group}.{key} is not set: give it a value{whose}")
 
 
 def _settings_of(config: DictConfig, group: str) -> dict[str, Any]:

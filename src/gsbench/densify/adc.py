@@ -97,10 +97,14 @@ class ADC(Budgeted):
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         """Two masks [N]: those whose mean gradient reaches the threshold, and those to split rather than clone."""
-        mean, threshold = self.mean_gradient(), self.gradient_threshold * self.strictness
         log_scales = refinement.gaussians.values.log_scales
         large = log_scales.amax(-1) > math.log(self.split_size * self.context.extent)
-        return mean >= threshold if self.threshold_inclusive else mean > threshold, large
+        return self.reaches(self.mean_gradient(), self.gradient_threshold), large
+
+    def reaches(self, mean: Tensor, threshold: float) -> Tensor:
+        """Mask [N] of those whose ``mean`` [N] reaches a threshold of growth."""
+        limit = threshold * self.strictness
+        return mean >= limit if self.threshold_inclusive else mean > limit
 
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
         """Those of the ``candidates`` [N] that the budget admits, and how many it refuses: the largest mean gradients.
@@ -171,7 +175,11 @@ class ADC(Budgeted):
 
     def reset_opacity(self, refinement: Refinement) -> None:
         """Make everything faint, so that what is not needed stays so and is pruned."""
-        limit = math.log(self.opacity_reset_value / (1 - self.opacity_reset_value))
+        self.limit_opacity(refinement, self.opacity_reset_value)
+        refinement.event.opacity_reset = True
+
+    def limit_opacity(self, refinement: Refinement, ceiling: float) -> None:
+        """Lower all opacities above ``ceiling`` to it; the moments of all opacities become zero, as in 3DGS."""
+        limit = math.log(ceiling / (1 - ceiling))
         logits = refinement.gaussians.values.opacity_logits.detach().clamp_max(limit)
         refinement.gaussians.overwrite("opacity_logits", logits)
-        refinement.event.opacity_reset = True

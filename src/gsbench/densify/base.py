@@ -13,7 +13,6 @@ from torch import Tensor
 from gsbench.densify.lineage import Lineage
 from gsbench.densify.operations import revised_logits, split
 from gsbench.densify.scores import TrainingViews
-from gsbench.errors import InputError
 from gsbench.events import Cause, RefineEvent
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
@@ -53,14 +52,6 @@ class Refinement:
 Rule = Callable[[Refinement], None]
 
 
-RENAMED = {  # a class that still has the old name would never be asked
-    "_grow_by_gradient": "grow_by_gradient(refinement)",
-    "_grow_and_prune": "rules(refinement)",
-    "_prune": "prune(refinement)",
-    "_carry_statistics": "STATISTICS",
-}
-
-
 class Densifier:
     """Base of all densifiers, and the one that never changes the Gaussians (``densify=none``).
 
@@ -87,13 +78,15 @@ class Densifier:
         super().__init_subclass__(**keywords)
         own = [vars(parent).get("STATISTICS", {}) for parent in reversed(cls.__mro__)]
         cls.STATISTICS = {name: dtype for table in own for name, dtype in table.items()}
-        for old, new in RENAMED.items():
-            if old in cls.__dict__:
-                raise InputError(f"{cls.__name__}.{old} is never called; it became {new}: see docs/densifier.md")
 
     def __post_init__(self) -> None:
         """Check the hyper-parameters against their annotations; a subclass adds the rules between them."""
         check_settings(self, "densify")
+
+    @property
+    def most_gaussians(self) -> int | None:
+        """How many Gaussians there may be at any time, by ``max_gaussians`` where a class has that; None: no limit."""
+        return getattr(self, "max_gaussians", None)
 
     def prepare(self, gaussians: Gaussians) -> Gaussians:
         """The Gaussians that the training starts with, from those of the initial cloud."""
@@ -202,7 +195,7 @@ class Densifier:
     def load_state_dict(self, state: dict[str, Any], context: DensifyContext) -> None:
         self.context = context
         self.lineage = Lineage.from_state(state["lineage"])
-        saved = state.get("statistics", state)  # older checkpoints hold each beside the lineage
+        saved = state["statistics"]
         self.statistics = {name: saved[name].to(context.device, copy=True) for name in self.STATISTICS}
 
     def _zeros(self, count: int, device: torch.device) -> dict[str, Tensor]:

@@ -15,11 +15,11 @@ CapKind = Literal["soft", "freeze", "hard", "curve", "governor"]
 SETTLE_STEPS = 40  # halvings of a range of the logarithm: far below the distance of neighbouring float32 scores
 
 
-def check_room(max_gaussians: int, num_initial: int) -> None:
+def check_room(most: int, num_initial: int) -> None:
     """Raise InputError where the initial cloud has more Gaussians than an arm may ever have."""
-    if max_gaussians < num_initial:
+    if most < num_initial:
         raise InputError(
-            f"densify.max_gaussians must be at least the size of the initial cloud ({num_initial}), got {max_gaussians}"
+            f"densify.max_gaussians must be at least the size of the initial cloud ({num_initial}), got {most}"
         )
 
 

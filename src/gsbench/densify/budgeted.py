@@ -50,8 +50,8 @@ class Budgeted(Densifier):
             raise InputError(f"densify.cap={self.cap} needs the method forecast, which {type(self).__name__} lacks")
 
     def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
-        if self.max_gaussians is not None:
-            check_room(self.max_gaussians, len(gaussians))
+        if self.most_gaussians is not None:
+            check_room(self.most_gaussians, len(gaussians))
         super().begin(gaussians, context)
 
     def due(self, step: int) -> bool:

@@ -7,16 +7,25 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from pydantic import PositiveInt
+from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import Refinement
+from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.budget import allowance
 from gsbench.densify.long_axis import LongAxis
-from gsbench.densify.scores import blended_sums, by_median, draw, draw_views, edge_map
+from gsbench.densify.operations import quantile
+from gsbench.densify.scores import by_mean, draw, draw_views, edge_scores
 from gsbench.gaussians.model import Gaussians
+from gsbench.raster.base import RenderOutput
+from gsbench.settings import Fraction, OpenFraction
 
-RAMP_ROUNDS = 5  # before the end of the window the budget of cap=root is reached: 500 iterations in the authors' code
+# The authors' code has iterations, rounds being 100 apart and opacity resets 3,000; here these are rounds and resets.
+CLOSING_ROUNDS = 5  # before the end of the window cap=root has reached its budget, and the score is the gradient
+CLOSING_FACTOR = 1.5  # the threshold is divided by it in the closing rounds, while there is room
+EARLY_PRUNE = 3  # rounds from the start of training: a first pruning of the faint
+RECOVERY = 3  # rounds after an opacity reset: what has recovered least is pruned
+ALL_VIEWS = 4  # rounds after an opacity reset: all views give scores
+RESETS = 3  # so many resets count for the two above, the last one not
 
 
 @dataclass
@@ -24,36 +33,96 @@ class EdgeAware(LongAxis):
     """The long-axis split of candidates drawn by the edge-aware score of Deng et al. (arXiv 2508.12313).
 
     Of ``score_views`` training views, drawn in each round, the score of a Gaussian is the mean of sum over pixels of
-    (edge strength of the photograph) alpha T, each view's over its median. Who is over the gradient threshold is drawn
-    without replacement in proportion to it, as many as the budget admits. ``cap=root`` is their growth control:
-    ``max_gaussians`` sqrt(x), x the progress of the window up to five rounds before its end.
+    (edge strength of the photograph) alpha T, each view's over its mean; in the closing rounds, the mean gradient. Who
+    is over the gradient threshold and has a score is drawn without replacement in proportion to it, as many as the
+    budget admits. ``cap=root`` is their growth control: ``max_gaussians`` sqrt(x), x the progress of the window up to
+    the closing rounds. Pruned are the faint (nobody for size, none in the last round), once early those below
+    ``early_prune_opacity``, and three rounds after an opacity reset the faintest ``recovery_share``. Gradients are
+    gathered within the window only.
     """
 
+    gradient: Literal["signed", "absolute"] = "absolute"
+    gradient_threshold: PositiveFloat = 3e-4
     score_views: PositiveInt = 10
     cap: Literal["root", "curve", "hard"] = "root"  # type: ignore[assignment]
     max_gaussians: PositiveInt = 1_000_000
+    opacity_reset_value: OpenFraction = 0.05
+    early_prune_opacity: Fraction = 0.02
+    recovery_share: Fraction = 0.2
+
+    def observe(self, step: int, render: RenderOutput) -> None:
+        if step > self.start:
+            super().observe(step, render)
+
+    def rules(self, refinement: Refinement) -> list[Rule]:
+        """Those of ADC, and the prunings around them."""
+        step, rules = refinement.step, super().rules(refinement)
+        if self.prune in rules and step >= self.stop - self.interval:
+            rules.remove(self.prune)
+        if step == EARLY_PRUNE * self.interval:
+            rules.append(self.prune_early)
+        if self.start < step < self.stop and self.rounds_after_reset(step) == RECOVERY:
+            rules += [self.prune_unrecovered, self.reset_statistics]
+        return rules
+
+    def rounds_after_reset(self, step: int) -> float:
+        """How many rounds ago opacities were reset (or training began), while that counts; else infinity."""
+        counts = step < RESETS * self.opacity_reset_interval
+        return step % self.opacity_reset_interval / self.interval if counts else math.inf
+
+    def closing(self, step: int) -> bool:
+        """Whether ``step`` is in the closing rounds."""
+        return step > self.stop - CLOSING_ROUNDS * self.interval
 
     def allowance(self, refinement: Refinement) -> int | None:
         if self.cap != "root":
             return super().allowance(refinement)
-        ramp = max(self.stop - RAMP_ROUNDS * self.interval - self.start, self.interval)
+        ramp = max(self.stop - CLOSING_ROUNDS * self.interval - self.start, self.interval)
         progress = min((refinement.step - self.start) / ramp, 1.0)
-        return allowance(len(refinement.gaussians), round(self.max_gaussians * math.sqrt(progress)), "hard")
+        return allowance(len(refinement.gaussians), int(self.most_gaussians * math.sqrt(progress)), "hard")
+
+    @property
+    def most_gaussians(self) -> int:
+        return self.max_gaussians
+
+    def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
+        over, large = super().candidates(refinement)
+        if self.closing(refinement.step) and self.allowance(refinement) != 0:
+            over = self.reaches(self.mean_gradient(), self.gradient_threshold / CLOSING_FACTOR)
+        return over, large
 
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
         count, allowed = int(candidates.sum()), self.allowance(refinement)
         assert allowed is not None  # no cap of this class is without a limit
-        if count <= allowed or allowed == 0:
-            return candidates & (allowed > 0), max(0, count - allowed)
-        scores = self.edge_scores(refinement.gaussians.values, refinement.step, refinement.rng)
-        return draw(candidates, scores, allowed, refinement.rng), count - allowed
+        if count == 0 or allowed == 0:
+            return torch.zeros_like(candidates), count
+        scores = self.scores(refinement.gaussians.values, refinement.step, refinement.rng)
+        chosen = draw(candidates & (scores > 0), scores, allowed, refinement.rng)
+        return chosen, count - int(chosen.sum())
 
-    def edge_scores(self, gaussians: Gaussians, step: int, rng: torch.Generator) -> Tensor:
-        """The edge-aware score, [N]."""
-        views, total = self.context.training_views, torch.zeros_like(gaussians.opacity_logits)
-        chosen = draw_views(views, self.score_views, rng)
-        for index in chosen:
-            edges = edge_map(views.image(index)).to(total.dtype).unsqueeze(-1)  # [H, W, 1]
-            sums, _ = blended_sums(views, index, gaussians, step, edges.expand(-1, -1, 3).contiguous())
-            total += by_median(sums[:, 0])
-        return total / len(chosen)
+    def scores(self, gaussians: Gaussians, step: int, rng: torch.Generator) -> Tensor:
+        """By which candidates are drawn, [N]."""
+        if self.closing(step):
+            return self.mean_gradient()
+        views = self.context.training_views
+        count = len(views) if self.rounds_after_reset(step) == ALL_VIEWS else self.score_views
+        return edge_scores(views, draw_views(views, count, rng), gaussians, step, by_mean)
+
+    def huge(self, step: int, log_scales: Tensor) -> Tensor:
+        """Nobody, [N]: these authors do not prune by size."""
+        return torch.zeros_like(log_scales[:, 0], dtype=torch.bool)
+
+    def prune_early(self, refinement: Refinement) -> None:
+        """Remove what has become faint before the first round."""
+        self.prune_below(refinement, self.early_prune_opacity)
+
+    def prune_unrecovered(self, refinement: Refinement) -> None:
+        """Remove the faintest ``recovery_share``: what did not become opaque again after the reset."""
+        opacities = refinement.gaussians.values.opacities.detach()
+        if len(opacities):
+            self.prune_below(refinement, quantile(opacities.sort().values, self.recovery_share))
+
+    def prune_below(self, refinement: Refinement, opacity: float) -> None:
+        faint = refinement.gaussians.values.opacities < opacity  # [N]
+        refinement.event.pruned_opacity += int(faint.sum())
+        self.edit(refinement, keep=~faint)

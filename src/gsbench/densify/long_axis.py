@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsbench.densify.adc import ADC, Grown
 from gsbench.densify.base import Refinement
+from gsbench.densify.operations import faded
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.settings import OpenFraction
@@ -35,7 +36,8 @@ class LongAxis(ADC):
     def grown(self, refinement: Refinement) -> Grown:
         values = refinement.gaussians.values
         over, _ = self.candidates(refinement)
-        log_scales, logits = self._shrunk(values.log_scales), self._faded(values.opacity_logits)
+        log_scales = shrunk(values.log_scales, *self._factors)
+        logits = faded(values.opacity_logits, self.opacity_factor)
         return Grown(
             torch.where(over, 2, 1),
             torch.where(over.unsqueeze(-1), log_scales, values.log_scales),
@@ -47,22 +49,37 @@ class LongAxis(ADC):
         over, _ = self.candidates(refinement)
         selected, blocked = self.choose(refinement, over, 1)
         parents = selected.nonzero().squeeze(-1)  # [S]
-        half = refinement.gaussians.values.detach().select(parents)
-        longest = half.log_scales.argmax(-1)  # [S]
-        directions = half.rotations[torch.arange(len(parents), device=longest.device), :, longest]  # [S, 3]
-        offsets = REACH * self.split_distance * half.scales.amax(-1, keepdim=True) * directions
-        half.log_scales, half.opacity_logits = self._shrunk(half.log_scales), self._faded(half.opacity_logits)
-        children = Gaussians.concatenate([half, half])
-        children.means = torch.cat([half.means + offsets, half.means - offsets])
+        chosen = refinement.gaussians.values.detach().select(parents)
+        children = halves(chosen, REACH * self.split_distance, *self._factors, self.opacity_factor)
         self.edit(refinement, ~selected, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
         refinement.event.split_gradient += len(parents)
         refinement.event.blocked_by_cap += blocked
 
-    def _shrunk(self, log_scales: Tensor) -> Tensor:
-        """Log scales of the children, [N, 3]."""
-        longest = torch.zeros_like(log_scales, dtype=torch.bool).scatter(-1, log_scales.argmax(-1, keepdim=True), True)
-        across = math.log(math.sqrt(1 - self.split_distance**2))
-        return log_scales + torch.where(longest, math.log(1 - self.split_distance), across)
+    @property
+    def _factors(self) -> tuple[float, float]:
+        """On the longest axis, and on the others."""
+        return 1 - self.split_distance, math.sqrt(1 - self.split_distance**2)
 
-    def _faded(self, opacity_logits: Tensor) -> Tensor:
-        return torch.logit(self.opacity_factor * opacity_logits.sigmoid())
+
+def halves(parents: Gaussians, offset: float, longest: float, across: float, opacity: float) -> Gaussians:
+    """Two children of each of ``parents`` [S], first all on the one side, then all on the other, [2 S].
+
+    They stand ``offset`` standard deviations away along the longest axis, which is multiplied by ``longest``, the
+    others by ``across``, the opacity by ``opacity``.
+    """
+    axis = parents.log_scales.argmax(-1)  # [S]
+    directions = parents.rotations[torch.arange(len(axis), device=axis.device), :, axis]  # [S, 3]
+    offsets = offset * parents.scales.amax(-1, keepdim=True) * directions
+    children = Gaussians.concatenate([parents, parents])
+    children.means = torch.cat([parents.means + offsets, parents.means - offsets])
+    children.log_scales = shrunk(children.log_scales, longest, across)
+    children.opacity_logits = faded(children.opacity_logits, opacity)
+    return children
+
+
+def shrunk(log_scales: Tensor, longest: float, across: float) -> Tensor:
+    """``log_scales`` [N, 3] with a factor on the longest axis and one on the others."""
+    index = log_scales.argmax(-1, keepdim=True)
+    is_longest = torch.zeros_like(log_scales, dtype=torch.bool).scatter(-1, index, True)
+    factors = log_scales.new_tensor([math.log(across), math.log(longest)])  # two plain numbers would become float32
+    return log_scales + factors[is_longest.long()]

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Interval
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor
 
@@ -19,7 +20,7 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.settings import OpenFraction
 
-MAX_COPIES = 51  # of one Gaussian in a relocation (the authors' table of binomials ends there)
+BINOMIALS = 51  # rows in the authors' table; they let a Gaussian and its copies be one fewer
 GATE_STEEPNESS = 100.0  # of the sigmoid that keeps noise off opaque Gaussians
 
 
@@ -40,13 +41,12 @@ class MCMC(Budgeted):
     scale_weight: NonNegativeFloat = 0.01  # of the mean scale, in the loss
     initial_opacity: OpenFraction = 0.5
     initial_scale: PositiveFloat = 0.1  # of the distance to the neighbours
+    max_copies: Annotated[int, Interval(ge=1, le=BINOMIALS)] = (
+        50  # of one Gaussian, itself included, that share opacity
+    )
 
     def prepare(self, gaussians: Gaussians) -> Gaussians:
-        changed = {
-            "opacity_logits": torch.full_like(gaussians.opacity_logits, _logit(self.initial_opacity)),
-            "log_scales": gaussians.log_scales + math.log(self.initial_scale),
-        }
-        return Gaussians(**(gaussians.tensors() | changed))
+        return spread_out(gaussians, self.initial_opacity, self.initial_scale)
 
     def regularizer(self, gaussians: Gaussians) -> Tensor:
         return self.opacity_weight * gaussians.opacities.mean() + self.scale_weight * gaussians.scales.mean()
@@ -105,14 +105,16 @@ class MCMC(Budgeted):
         """Give the ``sources`` [D] the opacity and scale that they and their copies will have."""
         copies = torch.bincount(sources, minlength=len(gaussians)) + 1  # [N] each and its copies
         touched = copies > 1
-        opacity, shrink = shared_opacity(gaussians.values.opacities.detach()[touched], copies[touched])
+        shared = copies[touched].clamp_max(self.max_copies)
+        opacity, shrink = shared_opacity(gaussians.values.opacities.detach()[touched], shared)
         opacity = opacity.clamp(self.min_opacity, 1 - 1e-6)
         logits = gaussians.values.opacity_logits.detach().clone()
         logits[touched] = torch.logit(opacity)
         log_scales = gaussians.values.log_scales.detach().clone()
         log_scales[touched] += shrink.log().unsqueeze(-1)
-        gaussians.overwrite("opacity_logits", logits, where=touched)
-        gaussians.overwrite("log_scales", log_scales, where=touched)
+        changed = {"opacity_logits": logits, "log_scales": log_scales}
+        for name, tensor in gaussians.values.tensors().items():  # the moments of all six begin anew
+            gaussians.overwrite(name, changed.get(name, tensor), where=touched)
 
 
 def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
@@ -121,8 +123,7 @@ def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     o' = 1 - (1 - o)^(1/n) and s'/s = o / sum_{i=1..n} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1), eq. 9;
     [M] each.
     """
-    copies = copies.clamp_max(MAX_COPIES)
-    new = 1 - (1 - opacities.double()).pow(1 / copies)  # [M]
+    new = 1 - (1 - opacities.double()).pow(1 / copies.double())  # [M]
     total = torch.zeros_like(new)
     for i in range(1, int(copies.max()) + 1 if len(copies) else 1):
         inner = torch.zeros_like(new)
@@ -140,5 +141,10 @@ def _draw(weights: Tensor, count: int, rng: torch.Generator) -> Tensor:
     return torch.searchsorted(cumulative, draws, right=True).clamp_max(len(weights) - 1).to(weights.device)
 
 
-def _logit(p: float) -> float:
-    return math.log(p / (1 - p))
+def spread_out(gaussians: Gaussians, opacity: float, scale: float) -> Gaussians:
+    """``gaussians`` with one ``opacity``, and ``scale`` times their scales."""
+    changed = {
+        "opacity_logits": torch.full_like(gaussians.opacity_logits, math.log(opacity / (1 - opacity))),
+        "log_scales": gaussians.log_scales + math.log(scale),
+    }
+    return Gaussians(**(gaussians.tensors() | changed))

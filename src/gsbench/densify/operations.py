@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -49,3 +51,16 @@ def revised_logits(opacity_logits: Tensor) -> Tensor:
     2404.06109)."""
     transmittance = (-opacity_logits).sigmoid().sqrt()  # sqrt(1 - o)
     return torch.logit((1 - transmittance).clamp_min(MIN_REVISED_OPACITY))
+
+
+def quantile(ordered: Tensor, q: float) -> float:
+    """The ``q``-quantile of sorted values [N], interpolated linearly (torch.quantile refuses more than 16 M values)."""
+    position = q * (len(ordered) - 1)
+    low = math.floor(position)
+    high = min(low + 1, len(ordered) - 1)
+    return float(ordered[low] + (position - low) * (ordered[high] - ordered[low]))
+
+
+def faded(opacity_logits: Tensor, factor: float) -> Tensor:
+    """Logits of ``factor`` (at most 1) times the opacity."""
+    return torch.logit(factor * opacity_logits.sigmoid())

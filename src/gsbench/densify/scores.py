@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import torch
@@ -26,6 +27,11 @@ class TrainingViews(Protocol):
 
     def render(self, index: int, gaussians: Gaussians, step: int) -> RenderOutput:
         """A view as the training renders it at iteration ``step``."""
+        ...
+
+    def dissimilarity(self, index: int, image: Tensor) -> Tensor:
+        """At each pixel of a rendered ``image`` [H, W, 3] of a view max(0, 1 - SSIM), SSIM's mean over channels: [H,
+        W]."""
         ...
 
     def loss(self, index: int, image: Tensor) -> Tensor:
@@ -80,10 +86,36 @@ def to_unit_range(values: Tensor) -> Tensor:
 
 def by_median(values: Tensor) -> Tensor:
     """``values`` [N] over the median of the positive ones (the lower of two); what is not positive becomes 0."""
+    return _over(values, torch.median)
+
+
+def by_mean(values: Tensor) -> Tensor:
+    """``values`` [N] over the mean of the positive ones; what is not positive becomes 0."""
+    return _over(values, torch.mean)
+
+
+def _over(values: Tensor, middle: Callable[[Tensor], Tensor]) -> Tensor:
     positive = values > 0  # NaN is not
     if not positive.any():
         return torch.zeros_like(values)
-    return torch.where(positive, values / values[positive].median(), 0.0)
+    return torch.where(positive, values / middle(values[positive]), 0.0)
+
+
+def edge_scores(
+    views: TrainingViews,
+    chosen: Sequence[int],
+    gaussians: Gaussians,
+    step: int,
+    normalize: Callable[[Tensor], Tensor],
+) -> Tensor:
+    """How much of the photographs' edges each Gaussian covers, [N]: the mean over the ``chosen`` views of sum over
+    pixels of (edge strength) alpha T, each view's after ``normalize``."""
+    total = torch.zeros_like(gaussians.opacity_logits)
+    for index in chosen:
+        edges = edge_map(views.image(index)).to(total.dtype).unsqueeze(-1)  # [H, W, 1]
+        sums, _ = blended_sums(views, index, gaussians, step, edges.expand(-1, -1, 3).contiguous())
+        total += normalize(sums[:, 0])
+    return total / len(chosen)
 
 
 def draw(candidates: Tensor, scores: Tensor, count: int, rng: torch.Generator) -> Tensor:

@@ -18,6 +18,7 @@ from torch import Tensor
 from gsbench.densify.adc import ADC, Grown
 from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.budget import admit
+from gsbench.densify.operations import quantile
 from gsbench.densify.volume import ConditionOf, child_log_scales, log_volume
 from gsbench.errors import InputError
 from gsbench.events import Cause
@@ -38,6 +39,9 @@ class Volumetric(ADC):
     above the ``volume_quantile`` of all volumes; ``auto`` ignores both and takes the upper Tukey fence of log V (third
     quartile plus 1.5 interquartile ranges), which follows the scene's own histogram in any gauge and selects little
     where no volume stands out. ``volume_start``, ``volume_stop`` and ``volume_interval`` default to those of ADC.
+
+    Under ``cap=governor`` one factor moves the gradient's threshold and V_th. ``governor_dimension`` says what of V_th
+    it multiplies: 3, the size of which V_th is the cube; 1, V_th itself, so that sizes move by the factor's cube root.
     """
 
     volume_threshold: PositiveFloat = VOLUME_THRESHOLD
@@ -53,6 +57,7 @@ class Volumetric(ADC):
     volume_start: NonNegativeInt | None = None
     volume_stop: NonNegativeInt | None = None
     volume_interval: PositiveInt | None = None
+    governor_dimension: Literal[1, 3] = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -137,8 +142,8 @@ class Volumetric(ADC):
         )
 
     def log_threshold(self, volumes: Tensor) -> float:
-        """log V_th for Gaussians with log volumes [N], by ``threshold_mode``, times ``strictness``."""
-        return self._own_log_threshold(volumes) + math.log(self.strictness)
+        """log V_th for Gaussians with log volumes [N], by ``threshold_mode``, times a power of ``strictness``."""
+        return self._own_log_threshold(volumes) + self.governor_dimension * math.log(self.strictness)
 
     def _own_log_threshold(self, volumes: Tensor) -> float:
         if self.threshold_mode == "absolute":
@@ -149,14 +154,6 @@ class Volumetric(ADC):
             return math.inf
         ordered = volumes.sort().values
         if self.threshold_mode == "quantile":
-            return _quantile(ordered, self.volume_quantile)
-        first, third = _quantile(ordered, 0.25), _quantile(ordered, 0.75)
+            return quantile(ordered, self.volume_quantile)
+        first, third = quantile(ordered, 0.25), quantile(ordered, 0.75)
         return third + TUKEY_FENCE * (third - first)
-
-
-def _quantile(ordered: Tensor, q: float) -> float:
-    """Linear interpolation between order statistics (torch.quantile refuses more than 16 M values)."""
-    position = q * (len(ordered) - 1)
-    low = math.floor(position)
-    high = min(low + 1, len(ordered) - 1)
-    return float(ordered[low] + (position - low) * (ordered[high] - ordered[low]))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.eval.facts import LPIPS, METRICS, MetricFacts, facts_of, lpips_variants
+from gsbench.eval.facts import LPIPS, METRICS, MORE, MetricFacts, facts_of, further_keys, lpips_variants
 from gsbench.eval.measures import Conditions
 from gsbench.eval.metric import Metric, UnavailableError
 from gsbench.eval.protocol import Protocol
@@ -24,7 +24,8 @@ class Evaluator:
     """Computes the metrics of one protocol; loads every network once.
 
     ``lpips`` names the variants to compute (see `gsbench.eval.facts.lpips_variants`); ``weights`` is a folder to look
-    in first; ``extra`` are the user's own metrics by name. ``unavailable`` maps each metric that cannot be computed to
+    in first; ``more`` names those of gsbench's metrics that are computed only if asked for (`further_keys`); ``extra``
+    are the user's own metrics by name. ``unavailable`` maps each metric that cannot be computed to
     its reason in one line, and ``awaited`` holds those of them that could be once their weights or packages are there;
     both can grow while views are evaluated, and such a metric is then left out of ``summarize`` for every view.
     ``own`` are the facts of the user's metrics.
@@ -39,22 +40,28 @@ class Evaluator:
         weights: Path | None = None,
         download: bool = True,
         extra: Mapping[str, Metric] = MappingProxyType({}),
+        more: Sequence[str] = (),
     ) -> None:
         variants = lpips_variants()
         unknown = [variant for variant in lpips or () if variant not in variants]
         if unknown:
             raise InputError(f"unknown LPIPS variant {unknown[0]!r}; choose among {', '.join(variants)}")
+        if unknown := [key for key in more if key not in further_keys()]:
+            raise InputError(f"unknown metric {unknown[0]!r}; choose among {', '.join(further_keys())}")
         self.protocol = protocol
         self.device = torch.device(device)
         self.unavailable: dict[str, str] = {}
         self.awaited: set[str] = set()
         self.extra = dict(extra)
+        self.more = tuple(sorted(more))
         self.own = {name: facts_of(name, metric) for name, metric in extra.items()}
         wanted = {f"{LPIPS}{variant}" for variant in (variants if lpips is None else lpips)}
-        wanted |= {facts.key for facts in METRICS if not facts.setting} | ({"flip"} if flip else set())
+        wanted |= {facts.key for facts in METRICS if not facts.setting} | ({"flip"} if flip else set()) | set(more)
         conditions = Conditions(protocol, self.device, weights, download)
         self._metrics: dict[str, Metric] = {}
         for facts in METRICS:
+            if facts.setting == MORE and facts.key not in wanted:
+                continue  # left unsaid: such a metric may be younger than the results of others
             try:
                 if facts.key not in wanted:
                     raise UnavailableError(f"not asked for ({facts.setting})")

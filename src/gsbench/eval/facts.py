@@ -12,6 +12,8 @@ from typing import Any
 
 from gsbench.errors import InputError
 
+MORE = "eval.more"  # lists metrics that are computed only if named there
+GEOMETRY, FLICKER = "eval.geometry", "eval.flicker"  # ask for what is measured of a model
 LPIPS = "lpips_"  # how the keys of LPIPS start; what follows names the variant, as in ``eval.lpips``
 DECIMALS = 3  # of a metric that does not say
 
@@ -30,6 +32,9 @@ class MetricFacts:
     setting: str = ""  # the setting that asks for it; empty: it is always computed
     target: str = field(default="", repr=False)  # import path of what computes it
     options: Mapping[str, Any] = field(default_factory=dict, repr=False)  # of that class
+    lowest: float | None = None  # possible value; None: there is no bound, or it is not known
+    highest: float | None = None
+    words: str = ""  # what it measures
 
     @property
     def name(self) -> str:
@@ -37,29 +42,111 @@ class MetricFacts:
         return f"{self.label} ({self.unit})" if self.unit else self.label
 
 
+MEASURES = "gsbench.eval.measures"  # where what computes them stands
+
+
 def _lpips(variant: str, label: str, net: str, raw: bool = False) -> MetricFacts:
     """LPIPS by the network ``net``, fed [-1, 1] as it is defined; ``raw``: fed [0, 1], as the evaluation of 3DGS is."""
-    options = {"net": net, "raw": raw}
-    target = "gsbench.eval.measures.LpipsMetric"
     return MetricFacts(
-        f"{LPIPS}{variant}", label, -1, 3, "", 0.005, True, setting="eval.lpips", target=target, options=options
+        f"{LPIPS}{variant}",
+        label,
+        -1,
+        3,
+        "",
+        0.005,
+        True,
+        setting="eval.lpips",
+        target=f"{MEASURES}.LpipsMetric",
+        options={"net": net, "raw": raw},
+        lowest=0.0,
+        words=f"distance of what {net} sees{', fed [0, 1]' if raw else ''}",
+    )
+
+
+def _structural(key: str, label: str, direction: int, class_name: str, highest: float, words: str) -> MetricFacts:
+    """A metric of structure without weights, computed where ``eval.more`` names it."""
+    return MetricFacts(
+        key,
+        label,
+        direction,
+        4,
+        "",
+        0.002,
+        True,
+        setting=MORE,
+        target=f"{MEASURES}.{class_name}",
+        lowest=0.0,
+        highest=highest,
+        words=words,
     )
 
 
 METRICS = (
-    MetricFacts("psnr", "PSNR", 1, 2, "dB", 0.1, target="gsbench.eval.measures.Psnr"),
-    MetricFacts("ssim", "SSIM", 1, 3, "", 0.005, target="gsbench.eval.measures.Ssim"),
+    MetricFacts(
+        "psnr", "PSNR", 1, 2, "dB", 0.1, target=f"{MEASURES}.Psnr", lowest=0.0, words="mean squared error, logarithmic"
+    ),
+    MetricFacts(
+        "ssim",
+        "SSIM",
+        1,
+        3,
+        "",
+        0.005,
+        target=f"{MEASURES}.Ssim",
+        lowest=-1.0,
+        highest=1.0,
+        words="means, contrast and structure in windows of 11 px",
+    ),
     _lpips("vgg_raw", "LPIPS VGG raw", "vgg", raw=True),
     _lpips("vgg", "LPIPS VGG", "vgg"),
     _lpips("alex", "LPIPS Alex", "alex"),
     _lpips("squeeze", "LPIPS Squeeze", "squeeze"),
-    MetricFacts("flip", "FLIP", -1, 3, "", 0.005, True, setting="eval.flip", target="gsbench.eval.measures.Flip"),
+    MetricFacts(
+        "flip",
+        "FLIP",
+        -1,
+        3,
+        "",
+        0.005,
+        True,
+        setting="eval.flip",
+        target=f"{MEASURES}.Flip",
+        lowest=0.0,
+        highest=1.0,
+        words="difference that one sees when two images alternate",
+    ),
+    _structural("ms_ssim", "MS-SSIM", 1, "MsSsim", 1.0, "SSIM's structure at five scales"),
+    _structural("iw_ssim", "IW-SSIM", 1, "IwSsim", 1.0, "the same, weighted by the information that a place carries"),
+    _structural("fsim", "FSIMc", 1, "Fsim", 1.0, "edges and lines: phase congruency, contrast and colour there"),
+    _structural("gmsd", "GMSD", -1, "Gmsd", 0.5, "how unevenly the gradients agree"),
+)
+
+
+def _of_model(
+    key: str, label: str, direction: int, worthwhile: float, words: str, unit: str = "%", setting: str = GEOMETRY
+) -> MetricFacts:
+    """A metric that needs the model and its cameras, not a pair of images; `gsbench.pipeline` computes it."""
+    highest = 100.0 if unit == "%" and not label.startswith("depth") else None
+    return MetricFacts(
+        key, label, direction, 2, unit, worthwhile, setting=setting, lowest=0.0, highest=highest, words=words
+    )
+
+
+OF_MODELS = (
+    _of_model("depth_error", "depth error", -1, 0.2, "mean error of the render's depth, of the true depth"),
+    _of_model("off_surface", "off surface", -1, 1.0, "pixels whose surface lies over 5 cm from a true one"),
+    _of_model("completeness", "completeness", 1, 1.0, "true surface with a rendered one within 5 cm"),
+    _of_model("point_depth_error", "depth error at points", -1, 0.2, "median, at points that only test views see"),
+    _of_model("floaters", "floaters", -1, 0.5, "opacity in front of the first surface"),
+    _of_model(
+        "flicker", "flicker", -1, 0.1, "change of a point's colour between frames of a path", "levels", setting=FLICKER
+    ),
 )
 
 
 def known_keys() -> tuple[str, ...]:
     """The keys of gsbench's own metrics, in the order of tables."""
-    return tuple(facts.key for facts in METRICS)
+    return tuple(facts.key for facts in (*METRICS, *OF_MODELS))
 
 
 def lpips_variants() -> tuple[str, ...]:
@@ -67,9 +154,14 @@ def lpips_variants() -> tuple[str, ...]:
     return tuple(facts.key.removeprefix(LPIPS) for facts in METRICS if facts.key.startswith(LPIPS))
 
 
+def further_keys() -> tuple[str, ...]:
+    """What ``eval.more`` may list."""
+    return tuple(facts.key for facts in METRICS if facts.setting == MORE)
+
+
 def find(key: str) -> MetricFacts | None:
     """The facts of gsbench's own metric ``key``, or None."""
-    return next((facts for facts in METRICS if facts.key == key), None)
+    return next((facts for facts in (*METRICS, *OF_MODELS) if facts.key == key), None)
 
 
 def facts_of(key: str, metric: object) -> MetricFacts:

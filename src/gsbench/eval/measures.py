@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import importlib.util
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from gsbench.eval import fsim, gmsd, multiscale
 from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import UnavailableError
-from gsbench.eval.metrics import flip, psnr, ssim
+from gsbench.eval.metrics import flip, psnr
 from gsbench.eval.protocol import Protocol
+from gsbench.eval.ssim import ssim
 from gsbench.weights import MissingWeights
 
 
@@ -66,10 +70,7 @@ class LpipsMetric:
         self._network, self._raw = conditions.network(net), raw
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
-        height, width = image.shape[:2]
-        smallest = self._network.backbone.min_size
-        if min(height, width) < smallest:
-            raise UnavailableError(f"a view is {width}x{height} px, below {smallest} px a side")
+        _need_size(image, self._network.backbone.min_size)
         first, second = (x.permute(2, 0, 1).unsqueeze(0) for x in (image, truth))  # [1, 3, H, W] each
         if self._raw:
             return float(self._network(first, second))
@@ -87,6 +88,46 @@ class Flip:
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
         return float(flip(image, truth, self._ppd))
+
+
+class Structural:
+    """A metric without weights that looks at structure; of each, its function of two images and its smallest side."""
+
+    function: Callable[[Tensor, Tensor], Tensor]
+    smallest: int  # px
+
+    def __init__(self, conditions: Conditions) -> None:
+        pass  # no protocol says anything of these: their authors' definitions hold
+
+    def measure(self, image: Tensor, truth: Tensor) -> float:
+        _need_size(image, self.smallest)
+        value = float(type(self).function(_exact(image), _exact(truth)))
+        if not math.isfinite(value):
+            raise UnavailableError("a view is flat: it has no structure to compare")
+        return value
+
+
+class MsSsim(Structural):
+    function, smallest = staticmethod(multiscale.ms_ssim), multiscale.MIN_SIZE
+
+
+class IwSsim(Structural):
+    function, smallest = staticmethod(multiscale.iw_ssim), multiscale.MIN_SIZE
+
+
+class Fsim(Structural):
+    function, smallest = staticmethod(fsim.fsim), fsim.MIN_SIZE
+
+
+class Gmsd(Structural):
+    function, smallest = staticmethod(gmsd.gmsd), gmsd.MIN_SIZE
+
+
+def _need_size(image: Tensor, smallest: int) -> None:
+    """Raise UnavailableError for a view [H, W, 3] with a side below ``smallest`` px."""
+    height, width = image.shape[:2]
+    if min(height, width) < smallest:
+        raise UnavailableError(f"a view is {width}x{height} px, below {smallest} px a side")
 
 
 def _exact(image: Tensor) -> Tensor:

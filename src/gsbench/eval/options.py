@@ -11,7 +11,7 @@ from annotated_types import Predicate, doc
 from pydantic import PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.eval.facts import LPIPS, find, known_keys, lpips_variants
+from gsbench.eval.facts import FLICKER, GEOMETRY, LPIPS, MORE, find, further_keys, known_keys, lpips_variants
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.settings import MISSING, PathName, check_settings
 from gsbench.words import closest
@@ -31,6 +31,8 @@ ProtocolName = Annotated[
 AT_RULE = "a list of different iterations, at which the test views are measured beside the last"
 LPIPS_RULE = f"a list of {', '.join(lpips_variants())}, each at most once"
 LpipsVariant = Annotated[str, Predicate(lambda name: name in lpips_variants())]
+MORE_RULE = f"a list of {', '.join(further_keys())}, each at most once"
+FurtherMetric = Annotated[str, Predicate(lambda name: name in further_keys())]
 
 
 @dataclass
@@ -41,10 +43,13 @@ class EvalConfig:
         default_factory=lambda: list(lpips_variants())
     )
     flip: bool = True
+    more: Annotated[list[FurtherMetric], Predicate(are_different), doc(MORE_RULE)] = field(default_factory=list)
     extra: dict[str, Any] = field(default_factory=dict)  # metrics of your own: {name: {_target_: mine.MyMetric}}
     at: Annotated[list[PositiveInt], Predicate(are_different), doc(AT_RULE)] = field(default_factory=list)
     primary: str | None = None  # the metric of the verdict, declared before results are seen; null: none was
     maps: bool = False  # keep maps of depth, volume and distance to the initial cloud: where an arm helps
+    geometry: bool = False  # measure depths and surfaces of the model, and what floats in front of them
+    flicker: bool = False  # measure how neighbouring renders of a camera path differ
     weights: PathName | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
     download: bool = True  # fetch missing weights, checked by checksum
 
@@ -72,5 +77,10 @@ class EvalConfig:
             )
         if facts.setting == "eval.flip" and not self.flip:
             raise InputError("eval.primary=flip is not measured with eval.flip=false")
+        for setting, asked in ((GEOMETRY, self.geometry), (FLICKER, self.flicker)):
+            if facts.setting == setting and not asked:
+                raise InputError(f"eval.primary={key} is not measured: add {setting}=true")
+        if facts.setting == MORE and key not in self.more:
+            raise InputError(f"eval.primary={key} is not measured: add {key} to eval.more")
         if facts.setting == "eval.lpips" and key.removeprefix(LPIPS) not in self.lpips:
             raise InputError(f"eval.primary={key} is not measured: add {key.removeprefix(LPIPS)} to eval.lpips")

@@ -22,7 +22,7 @@ class Protocol:
     """The conventions under which metrics are computed; means over views are plain means of the per-view values.
 
     ``eight_bit``: renders are rounded to 8 bits (``floor(clamp(255 x + 0.5))``) before they are compared, as a PNG
-    would store them. ``ssim_padding``: see ``gsbench.eval.metrics.ssim``. ``lpips``: the variant that tables show as
+    would store them. ``ssim_padding``: see ``gsbench.eval.ssim.ssim``. ``lpips``: the variant that tables show as
     *the* LPIPS of this protocol. ``flip_ppd``: pixels per degree of FLIP's viewer. ``psnr_cap``: dB, reported for pairs
     of higher PSNR; identical images, whose PSNR is infinite and has no number in JSON, get it.
     """

@@ -1,57 +1,84 @@
-"""The definition of the photometric loss of 3DGS in plain torch, and its constants: ``(1 - w) L1 + w (1 - SSIM)``.
+"""SSIM with its window and constants, for the metric, for those made of it, and for the loss of a training.
 
-SSIM (Wang et al. 2004) with an 11x11 Gaussian window of sigma 1.5, zero padding, the mean of the full map, as in the
-reference implementation of 3DGS; w = 0.2.
+Wang, Bovik, Sheikh and Simoncelli 2004, "Image quality assessment: from error visibility to structural similarity": an
+11x11 Gaussian window of sigma 1.5, constants for a data range of 1, variances of the window as a population.
 """
 
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-SSIM_WEIGHT = 0.2
-WINDOW_RADIUS = 5  # px; 11 taps
+from gsbench.eval.images import as_batch, check_pair, check_size
+from gsbench.eval.protocol import SsimPadding
+
+WINDOW_RADIUS = 5  # px
+WINDOW_SIZE = 2 * WINDOW_RADIUS + 1  # px
 WINDOW_SIGMA = 1.5  # px
 C1 = 0.01**2
 C2 = 0.03**2
 
 
-def torch_photometric_loss(
-    image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT
-) -> tuple[Tensor, Tensor, Tensor]:
-    """``photometric_loss`` in plain torch, for any device and floating dtype: the definition."""
-    target = as_unit_range(target, image.dtype)
-    l1 = (image - target).abs().mean()
-    similarity = ssim_map(image, target).mean()
-    loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - similarity)
-    return loss, l1.detach(), similarity.detach()
-
-
-def as_unit_range(image: Tensor, dtype: torch.dtype) -> Tensor:
-    """``image`` as ``dtype``; 8-bit values are divided by 255."""
-    return image.to(dtype) / 255 if image.dtype == torch.uint8 else image.to(dtype)
-
-
-def window(dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> Tensor:
-    """The one-dimensional Gaussian window [11], of sum 1."""
-    # Made on the device: an upload would make the host wait.
-    offsets = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=torch.float64, device=device)
+def window() -> Tensor:
+    """The one-dimensional Gaussian window, [11] float64 of sum 1; its outer product with itself is the 2D window."""
+    offsets = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=torch.float64)
     weights = torch.exp(-0.5 * (offsets / WINDOW_SIGMA) ** 2)
-    return (weights / weights.sum()).to(dtype)
+    return weights / weights.sum()
+
+
+_WEIGHTS = window().tolist()  # plain numbers: a tensor would have to be brought to each device
+
+
+def ssim(image: Tensor, target: Tensor, padding: SsimPadding = "zero") -> Tensor:
+    """Structural similarity (their eq. 13), averaged over pixels and channels.
+
+    Images are [H, W, 3] in [0, 1] (the value is a 0-dimensional tensor) or a batch [B, 3, H, W] (the values are [B]).
+    ``padding`` says what happens at the border: "zero" pads the images with zeros and averages the full map, as the
+    evaluation of 3DGS does; "valid" averages over the pixels whose window lies inside the image, as scikit-image and
+    torchmetrics do. Raises ValueError for shapes and sizes that do not fit.
+    """
+    check_pair(image, target)
+    if padding not in ("zero", "valid"):
+        raise ValueError(f"ssim padding is {padding!r}; choose zero or valid")
+    x, y = as_batch(image), as_batch(target)  # [B, 3, H, W] each
+    if padding == "valid":
+        check_size(x, WINDOW_SIZE, "ssim without padding")
+    luminance, structure = ssim_parts(x, y, padding)
+    values = (luminance * structure).flatten(1).mean(dim=1)  # [B]
+    return values[0] if image.ndim == 3 else values
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """SSIM at every pixel and channel, [3, H, W], of two images [H, W, 3] in [0, 1]."""
-    x, y = (t.permute(2, 0, 1).unsqueeze(1) for t in (image, target))  # [3, 1, H, W]
-    taps = window(image.dtype, image.device)
+    """SSIM at every pixel and channel, [3, H, W], of two images [H, W, 3] in [0, 1], zeros outside."""
+    luminance, structure = ssim_parts(as_batch(image), as_batch(target), "zero")
+    return (luminance * structure)[0]
 
-    def blur(t: Tensor) -> Tensor:
-        t = torch.nn.functional.conv2d(t, taps.view(1, 1, 1, -1), padding=(0, WINDOW_RADIUS))
-        return torch.nn.functional.conv2d(t, taps.view(1, 1, -1, 1), padding=(WINDOW_RADIUS, 0))
 
-    mean_x, mean_y = blur(x), blur(y)
-    variance_x, variance_y = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2
-    covariance = blur(x * y) - mean_x * mean_y
-    luminance = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
-    structure = (2 * covariance + C2) / (variance_x + variance_y + C2)
-    return (luminance * structure).squeeze(1)
+def ssim_parts(x: Tensor, y: Tensor, padding: SsimPadding, data_range: float = 1.0) -> tuple[Tensor, Tensor]:
+    """The two factors of SSIM for images [B, C, H, W] of values from 0 to ``data_range``, [B, C, H', W'] each.
+
+    Luminance compares means (their eq. 6), the other contrast and structure in one (eq. 9 times eq. 10, C3 = C2 / 2).
+    """
+    moments = _blur(torch.cat([x, y, x * x, y * y, x * y]), padding)  # [5B, C, H', W']
+    mean_x, mean_y, mean_xx, mean_yy, mean_xy = moments.chunk(5)  # [B, C, H', W'] each
+    c1, c2 = C1 * data_range**2, C2 * data_range**2
+    covariance = mean_xy - mean_x * mean_y
+    variances = mean_xx - mean_x.square() + mean_yy - mean_y.square()
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x.square() + mean_y.square() + c1)
+    structure = (2 * covariance + c2) / (variances + c2)
+    return luminance, structure
+
+
+def _blur(images: Tensor, padding: SsimPadding) -> Tensor:
+    """Filter every channel of [B, C, H, W] with the window, one axis after the other."""
+    if padding == "zero":
+        images = F.pad(images, [WINDOW_RADIUS] * 4)
+    for axis in (2, 3):
+        size = images.shape[axis] - WINDOW_SIZE + 1
+        # Shifted sums: several times faster on a CPU than a depthwise convolution with one channel per group.
+        blurred = images.narrow(axis, 0, size) * _WEIGHTS[0]
+        for offset, weight in enumerate(_WEIGHTS[1:], start=1):
+            blurred.add_(images.narrow(axis, offset, size), alpha=weight)
+        images = blurred
+    return images

@@ -8,6 +8,7 @@ than most viewers.
 from __future__ import annotations
 
 import gzip
+import logging
 import math
 import struct
 
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 
+log = logging.getLogger(__name__)
+
 MAGIC, VERSION = 0x5053474E, 3  # "NGSP"
 POSITION_BITS = 24  # signed
 MAX_FRACTION_BITS = 20  # a millionth of a unit; the reference has always 12, and lets far positions wrap around
@@ -24,6 +27,8 @@ COLOR_SCALE = 0.15  # of the constant harmonic: bytes reach beyond [0, 1]
 SCALE_OFFSET, SCALE_STEPS = 10.0, 16.0  # a byte of a log scale: 16 (s + 10)
 SH_STEPS = 128.0
 SH_BUCKETS = (8,) * 3 + (16,) * 12  # of harmonics of degree 1, and above: the reference's 5 and 4 bits
+FAR_SHARE = 1e-3  # of the Gaussians; so few may be blamed for a coarse step; our choice
+COARSE = 0.1  # of a Gaussian's usual size, a step that can be seen; our choice
 ROTATION_BITS = 9  # and a sign, of the three smaller components
 # The files have y up and z backward where PLY files have y down and z forward: signs of (x, y, z), of a quaternion's
 # (x, y, z), and of the 15 harmonics above the constant one, each odd in y and z together or not.
@@ -32,11 +37,16 @@ HARMONICS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 
 
 def spz_bytes(gaussians: Gaussians) -> bytes:
-    """The file's content; positions beyond 2^23 units are moved there."""
+    """The file's content; positions beyond 2^23 units are moved there.
+
+    One position decides the step of all: a warning says so where a few far Gaussians make it coarse for the rest.
+    """
     raw = gaussians.detach().map(lambda tensor: tensor.float().cpu())
     axes = np.array(AXES)
     means = raw.means.double().numpy() * axes  # [N, 3]
-    fraction_bits = fraction_bits_for(float(np.abs(means).max()))
+    reach = np.abs(means).max(axis=1)  # [N] units
+    fraction_bits = fraction_bits_for(float(reach.max()))
+    warn_of_far_points(reach, float(np.exp(np.median(raw.log_scales.double().numpy()))), fraction_bits)
     header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(raw), MAX_SH_DEGREE, fraction_bits, 0, 0)
     limit = 1 << (POSITION_BITS - 1)
     fixed = np.clip(np.rint(means * (1 << fraction_bits)), -limit, limit - 1).astype("<i4")
@@ -53,6 +63,19 @@ def spz_bytes(gaussians: Gaussians) -> bytes:
         _to_bytes((steps + buckets // 2) // buckets * buckets),
     ]
     return gzip.compress(header + b"".join(section.tobytes() for section in sections), mtime=0)
+
+
+def warn_of_far_points(reach: NDArray[np.float64], size: float, fraction_bits: int) -> None:
+    """Say so where ``fraction_bits`` are coarse beside ``size``, the usual size of a Gaussian (world units), and all
+    but a thousandth of the Gaussians, whose largest coordinates are ``reach`` [N], could have more."""
+    usual = float(np.quantile(reach, 1 - FAR_SHARE))
+    step, possible = 2.0**-fraction_bits, 2.0 ** -fraction_bits_for(usual)
+    if step > COARSE * size and possible < step:
+        log.warning(
+            "positions are kept to %.2g units, a Gaussian's usual size is %.2g: %d of %d Gaussians lie beyond %.3g "
+            "units, as far as %.3g, and without them it would be %.2g; remove them before the export, or export a PLY",
+            step, size, int((reach > usual).sum()), len(reach), usual, reach.max(), possible,
+        )  # fmt: skip
 
 
 def fraction_bits_for(largest: float) -> int:

@@ -56,6 +56,10 @@ class TrainableGaussians:
         """Set the learning rate of the means for iteration ``step`` (1, 2, …)."""
         self._group("means")["lr"] = self.rates.position(step) * self.spatial_scale
 
+    def set_rate(self, name: str, rate: float) -> None:
+        """Set the learning rate of the parameter ``name``; that of the means is set anew in each iteration."""
+        self._group(name)["lr"] = rate
+
     def optimizer_step(self, sh_degree: int = MAX_SH_DEGREE, visible: Tensor | None = None) -> None:
         """Adam on every parameter that has a gradient, then forget the gradients.
 

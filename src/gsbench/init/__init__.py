@@ -16,9 +16,10 @@ from gsbench.init.base import (
 )
 from gsbench.init.dataset import Dataset
 from gsbench.init.dim import Dim, SiftKornia
+from gsbench.init.jittered import Jittered
 from gsbench.init.ply import Ply
 from gsbench.init.points import Points
-from gsbench.init.random import Random
+from gsbench.init.random import Carved, Random
 from gsbench.init.sfm import Sfm, SfmDense
 
 __all__ = [
@@ -27,11 +28,13 @@ __all__ = [
     "OWN_GAUGE_FOLDER",
     "PICTURE_FILE",
     "REPORT_FILE",
+    "Carved",
     "Dataset",
     "Dim",
     "Gauge",
     "InitReport",
     "Initializer",
+    "Jittered",
     "Ply",
     "PointCloud",
     "Points",

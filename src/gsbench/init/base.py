@@ -130,6 +130,7 @@ class InitReport:
     pose_errors: PoseErrors | None = None  # None without a reference, and where the reference's poses were taken over
     warnings: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)  # features, pairs, verified pairs, inlier matches
+    mapped_by: str | None = None  # the way that placed the cameras (init.mapper); None where they were given
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""

@@ -99,18 +99,28 @@ def seen_colors(points: Array, capture: Capture, model: pycolmap.Reconstruction)
     colors = np.full((len(points), 3), -1, dtype=np.int16)
     nearest = np.full(len(points), np.inf)
     for name in capture.train_names:
-        image = model.find_image_with_name(name)
-        if image is None or not image.has_pose:
-            continue
-        pose, camera = image.cam_from_world(), model.cameras[image.camera_id]
-        local = points @ pose.rotation.matrix().T + pose.translation  # [P, 3]
-        distance = np.linalg.norm(local, axis=1)
-        (ahead,) = np.nonzero((local[:, 2] > 0) & (distance < nearest))
-        pixels = np.asarray(camera.img_from_cam(local[ahead])).reshape(-1, 2)  # [A, 2]
-        with np.errstate(invalid="ignore"):
-            inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)  # NaN is outside
-        kept = ahead[inside]
-        column, row = pixels[inside].astype(np.int64).T
-        colors[kept] = read_image(capture.images / name)[row, column]
-        nearest[kept] = distance[kept]
+        seen, pixels, distance = in_view(points, name, model)
+        nearer = distance < nearest[seen]
+        kept, (column, row) = seen[nearer], pixels[nearer].astype(np.int64).T
+        if len(kept):
+            colors[kept] = read_image(capture.images / name)[row, column]
+        nearest[kept] = distance[nearer]
     return colors
+
+
+def in_view(points: Array, name: str, model: pycolmap.Reconstruction) -> tuple[NDArray[np.int64], Array, Array]:
+    """Which of ``points`` [P, 3] the image ``name`` has in view: their indices [V], pixels [V, 2] and distances [V].
+
+    Nobody for an image that the model does not place. What stands between is not looked for.
+    """
+    image = model.find_image_with_name(name)
+    if image is None or not image.has_pose:
+        return np.empty(0, np.int64), np.empty((0, 2)), np.empty(0)
+    pose, camera = image.cam_from_world(), model.cameras[image.camera_id]
+    local = points @ pose.rotation.matrix().T + pose.translation  # [P, 3]
+    (ahead,) = np.nonzero(local[:, 2] > 0)
+    pixels = np.asarray(camera.img_from_cam(local[ahead])).reshape(-1, 2)  # [A, 2]
+    with np.errstate(invalid="ignore"):
+        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)  # NaN is outside
+    seen = ahead[inside]
+    return seen, pixels[inside], np.linalg.norm(local[seen], axis=1)

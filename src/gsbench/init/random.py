@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from annotated_types import Interval
-from pydantic import PositiveFloat
+from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.init.base import PointCloud, Seed
@@ -41,6 +41,33 @@ class Random(PlacedCloud):
         if extent == 0:
             raise InputError(f"init=random: the training cameras of scene {capture.name} stand all at one place")
         return random_cloud(np.mean(centers, axis=0), self.size * extent, self.count, self.seed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Carved(Random):
+    """`Random` without the points that fewer than ``seen_by`` training cameras have in view.
+
+    ``count`` are drawn, so fewer remain. The idea is that of Faster-GS: what nobody sees costs, and trains nothing.
+    """
+
+    name: ClassVar[str] = "carved"
+
+    seen_by: PositiveInt = 1
+
+    def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
+        from gsbench.init.points import in_view
+
+        whole = super().cloud(capture, model)
+        cameras = np.zeros(self.count, dtype=np.int64)  # that see a point
+        for name in capture.train_names:
+            cameras[in_view(whole.points, name, model)[0]] += 1
+        kept = cameras >= self.seen_by
+        if not kept.any():
+            raise InputError(
+                f"init=carved: of {self.count} points none is in view of {self.seen_by} training cameras of scene "
+                f"{capture.name}; take more (init.count), a smaller box (init.size) or fewer cameras (init.seen_by)"
+            )
+        return PointCloud(whole.points[kept], whole.colors[kept])
 
 
 def random_cloud(center: np.ndarray, half_edge: float, count: int, seed: int) -> PointCloud:

@@ -87,6 +87,7 @@ def make_report(
     own_gauge: Gauge | None = None,
     pose_errors: PoseErrors | None = None,
     counts: Mapping[str, int] | None = None,
+    mapped_by: str | None = None,
     warnings: Sequence[str] = (),
 ) -> InitReport:
     """The report on ``model`` as it is written; ``packages`` are those whose installed versions it states."""
@@ -109,6 +110,7 @@ def make_report(
         own_gauge=own_gauge,
         pose_errors=pose_errors,
         counts=counts or {},
+        mapped_by=mapped_by,
     )
     return replace(report, warnings=(*warnings, *find_warnings(report, model)))
 

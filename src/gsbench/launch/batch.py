@@ -14,7 +14,7 @@ from gsbench.files import checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.declare import declare, declared_metrics
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
-from gsbench.launch.preflight import check_parts, missing_folders, missing_weights
+from gsbench.launch.preflight import check_parts, check_trackers, missing_folders, missing_weights
 from gsbench.launch.serial import run_serial
 from gsbench.launch.trial import Trial, drop_parts
 from gsbench.runs.finished import Done, NotDone, find_finished
@@ -69,6 +69,8 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
     check_parts(unfinished, here=launcher != "slurm")
     if launcher != "serial":  # the processes that run the trials make their own
         drop_parts(unfinished)
+    if launcher != "slurm":
+        check_trackers(unfinished)
     make_runs_folder(runs)
     Store(runs / STORE).sweep(STAGES)
     add_to_plan(trials)

@@ -1,4 +1,4 @@
-"""Writing down which metric a command declares its verdict to be about, before its trials run. Loads no torch."""
+"""Writing down which metric, or which plan of claims, a command declares before its trials run. Loads no torch."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from gsbench.errors import InputError
 from gsbench.files import write_text
 from gsbench.launch.trial import Trial
-from gsbench.runs.declaration import Declaration, read_declarations
+from gsbench.runs.declaration import Declaration, DeclaredPlan, read_declarations, read_plans
 from gsbench.runs.layout import DECLARED
 from gsbench.system.locks import hold
 
@@ -49,8 +50,7 @@ def declare(metrics: Mapping[Path, str | None]) -> None:
                 log.info("%s: %s stays declared, since %s", home.name, known[-1].metric, known[-1].when)
             if metric is None or (known and known[-1].metric == metric):
                 continue
-            entries = [*known, Declaration(int(time.time()), metric)]
-            write_text(home / DECLARED, "".join(json.dumps(entry.to_record()) + "\n" for entry in entries))
+            _write(home, [*known, Declaration(int(time.time()), metric)], read_plans(home))
         if known:
             log.warning(
                 "%s: the verdict is from now on about %s, and the report will say that %s was declared before",
@@ -58,3 +58,24 @@ def declare(metrics: Mapping[Path, str | None]) -> None:
                 metric,
                 known[-1].metric,
             )
+
+
+def declare_plan(home: Path, plan: Mapping[str, Any], plan_hash: str) -> DeclaredPlan:
+    """Add a plan of claims to the record of the experiment in ``home``, unless it is the latest there; what stands."""
+    home.mkdir(parents=True, exist_ok=True)
+    with hold(home / f".{DECLARED}.lock", "the declarations"):
+        known = read_plans(home)
+        if known and known[-1].hash == plan_hash:
+            return known[-1]
+        declared = DeclaredPlan(int(time.time()), plan_hash, dict(plan))
+        _write(home, read_declarations(home), [*known, declared])
+    if known:
+        log.warning("%s: another plan of claims was declared before, and the page will say so", home.name)
+    return declared
+
+
+def _write(home: Path, metrics: Sequence[Declaration], plans: Sequence[DeclaredPlan]) -> None:
+    """The whole record, in the order of time."""
+    both: list[Declaration | DeclaredPlan] = [*metrics, *plans]
+    entries = sorted(both, key=lambda entry: entry.time)
+    write_text(home / DECLARED, "".join(json.dumps(entry.to_record()) + "\n" for entry in entries))

@@ -20,6 +20,7 @@ from gsbench.files import read_object, write_json
 from gsbench.launch.queue import ask_queue, state_in_queue
 from gsbench.launch.trial import Trial
 from gsbench.runs.finished import NotDone, find_finished
+from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import PLAN, RESULTS, STORE, TRIAL_GLOB
 from gsbench.runs.trial_files import TrialPaths, stage_and_step, state_of
 from gsbench.system.locks import hold
@@ -46,6 +47,9 @@ def add_to_plan(trials: Sequence[Trial]) -> None:
         entry = {"overrides": list(trial.overrides), "cwd": os.getcwd(), "time": time.time()}
         by_plan.setdefault(paths.home, {})[paths.folder.relative_to(paths.home).as_posix()] = entry
     for home, entries in by_plan.items():
+        if len(entries) > 1:  # the same command is the same sweep, whenever it is given
+            sweep = {"id": sha256_of(sorted(entries))[:8], "count": len(entries)}
+            entries = {name: entry | {"sweep": sweep} for name, entry in entries.items()}
         home.mkdir(parents=True, exist_ok=True)
         with hold(home / f".{PLAN}.lock", "the plan"):
             known = _read(home)

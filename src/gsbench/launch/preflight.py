@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.config.command_words import options
+from gsbench.config.compose import Composed
 from gsbench.config.schema import COMPONENTS
+from gsbench.errors import InputError
 from gsbench.launch.trial import Trial
+from gsbench.system.install import install_command
 
 READ = ("colmap", "photos")  # the kinds of scenes that are read from scene.path
 
 
-def missing_folders(trials: Sequence[Trial]) -> list[str]:
+def missing_folders(trials: Sequence[Composed]) -> list[str]:
     """A line for each folder of photographs or weights that the trials name and that is not there, and the mend."""
     from gsbench.datasets.catalog import how_to_get
     from gsbench.scene.readers import missing_folder
@@ -25,7 +29,7 @@ def missing_folders(trials: Sequence[Trial]) -> list[str]:
     return lines + ([how_to_get(missing)] if missing else []) + missing_weights(trials)
 
 
-def missing_weights(trials: Sequence[Trial]) -> list[str]:
+def missing_weights(trials: Sequence[Composed]) -> list[str]:
     """A line for each folder of weights that the trials name and that is not there."""
     named = {
         (group, str(folder))
@@ -47,6 +51,13 @@ def check_parts(trials: Sequence[Trial], here: bool) -> None:
     """
     for trial in trials:
         trial.parts.check(here)
+
+
+def check_trackers(trials: Sequence[Trial]) -> None:
+    """Raise InputError where a trial's tracker needs a package that is not installed."""
+    for sink in sorted({t.values["tracking"]["sink"] for t in trials if t.values["tracking"]["enabled"]}):
+        if importlib.util.find_spec(sink) is None:
+            raise InputError(f"tracking.sink={sink} needs a package: {install_command(sink)} (or pip install {sink})")
 
 
 def need_no_check(trials: Sequence[Trial]) -> bool:

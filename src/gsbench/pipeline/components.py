@@ -22,7 +22,7 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import get_protocol
 from gsbench.external.settings import External
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
-from gsbench.runs.hashing import WITHOUT_EFFECT, without_later
+from gsbench.runs.hashing import WITHOUT_EFFECT
 from gsbench.runs.source import has_changed_since_import, source_of
 from gsbench.settings import checked, unknown_setting
 
@@ -164,7 +164,7 @@ def options_of(group: str, component: Any) -> dict[str, Any]:
         fields = [
             field.name for field in dataclasses.fields(component) if field.init and field.name not in WITHOUT_EFFECT
         ]
-        values |= without_later(group, {name: _plain(getattr(component, name)) for name in fields})
+        values |= {name: _plain(getattr(component, name)) for name in fields}
     return values
 
 
@@ -182,4 +182,5 @@ def make_evaluator(
     """The evaluator that the settings ``eval`` describe, with the user's own metrics; looks for networks' weights."""
     weights = None if options.weights is None else Path(options.weights).expanduser()
     protocol = get_protocol(options.protocol)
-    return Evaluator(protocol, device, tuple(options.lpips), options.flip, weights, options.download, extra)
+    lpips, more = tuple(options.lpips), tuple(options.more)
+    return Evaluator(protocol, device, lpips, options.flip, weights, options.download, extra, more)

@@ -80,7 +80,7 @@ def results_of(
             "evaluate": evaluated.key,
         },
         "code": {"sources": sources_of(values), "stages": {stage.name: stage.version for stage in STAGES}},
-        "machine": training.get("machine"),  # None of a training before it was recorded
+        "machine": training["machine"],
         "versions": versions(),
     }
     if "trained_by" in training:

@@ -85,12 +85,10 @@ def _run(parts: Parts, config_yaml: str, paths: TrialPaths) -> dict[str, Any]:
     with _recorded_failures(values, paths):
         parts.complete()
         torch.set_num_threads(parts.threads)
-        mirror = Mirror(values["tracking"], paths.runs, paths.folder, values)
+        mirror = Mirror(values["tracking"], paths.runs, paths.folder)
 
         def announce(stage: Stage, folder: Path) -> None:
             write_json(paths.folder / BUILDING, {"stage": stage.name, "folder": str(folder)})
-            if stage is TRAIN:
-                mirror.follow(folder)
 
         store = Store(paths.runs / layout.STORE, announce)
         write_text(paths.folder / CONFIG, config_yaml)

@@ -74,7 +74,7 @@ class TrialSteps:
     def _evaluate_step(self, trained: Step) -> Step:
         parts = self.parts
         if parts.program is not None and not parts.program.leaves_model:
-            return measure_step(self.views, trained, parts.evaluator)
+            return measure_step(self.views, trained, parts.evaluator, parts.eval.geometry, parts.eval.flicker)
         return evaluate_step(
             self.views,
             trained,
@@ -85,6 +85,8 @@ class TrialSteps:
             parts.device,
             parts.measured_earlier,
             made_by_program=parts.program is not None,
+            geometry=parts.eval.geometry,
+            flicker=parts.eval.flicker,
         )
 
 

@@ -18,9 +18,6 @@ from gsbench.runs.trial_files import TrialPaths
 
 INPUTS_VERSION = 1
 PYCOLMAP = "pycolmap"  # the package whose version has a part in every cloud
-# Results made before they had ``awaited`` tell by the reason whether an unavailable metric may still come: not where it
-# starts so.
-FOR_GOOD = ("not asked for", "a view is ")
 
 Cause = Literal["unfinished", "configuration", "record", "stage", "package", "file", "store", "metric"]
 
@@ -132,17 +129,10 @@ def _lacking(
     options: dict[str, Any],
 ) -> NotDone | None:
     """The metrics that a trial lacks and that could be computed now."""
-    lacking = _awaited(results)
+    lacking = set(results["awaited"])  # those that may still come, once their weights or packages are there
     if missing := sorted(lacking - set(unavailable_now(options))) if lacking else []:
         return NotDone("metric", f"it lacks {', '.join(missing)}, which may be computed now")
     return None
-
-
-def _awaited(results: Mapping[str, Any]) -> set[str]:
-    """The metrics that a trial lacks and that may still come, once their weights or packages are there."""
-    if "awaited" in results:
-        return set(results["awaited"])
-    return {key for key, reason in results["unavailable"].items() if not str(reason).startswith(FOR_GOOD)}
 
 
 def _stamp(path: Path) -> list[int]:

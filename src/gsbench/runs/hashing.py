@@ -12,13 +12,6 @@ from gsbench.runs.source import source_of
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")  # options that cannot change a result
 DECLARED = {"eval": ("primary",)}  # settings of a group that say how results will be read, whatever they are
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
-# Settings that are younger than the first results, with the default at which a result is what it was before them. There
-# they are left out of hashes and keys, so that nothing is computed anew for a setting that changes nothing.
-ADDED_LATER: dict[str, dict[str, Any]] = {
-    "init": {"min_inlier_ratio": 0.0},
-    "raster": {"_target_": None},
-    "eval": {"at": [], "extra": {}},
-}
 
 
 def config_hash(values: dict[str, Any]) -> str:
@@ -27,7 +20,7 @@ def config_hash(values: dict[str, Any]) -> str:
     for key, group in kept.items():
         if isinstance(group, dict):
             dropped = (*WITHOUT_EFFECT, *DECLARED.get(key, ()))
-            kept[key] = without_later(key, {name: value for name, value in group.items() if name not in dropped})
+            kept[key] = {name: value for name, value in group.items() if name not in dropped}
     return sha256_of(_with_sources(kept))
 
 
@@ -38,12 +31,6 @@ def _with_sources(values: Any) -> Any:
     target = values.get("_target_")
     sources = source_of(target) if isinstance(target, str) else {}
     return {key: _with_sources(value) for key, value in values.items()} | sources
-
-
-def without_later(group: str, values: dict[str, Any]) -> dict[str, Any]:
-    """``values`` of a group as they are hashed: without the settings of `ADDED_LATER` that stand at their defaults."""
-    later = ADDED_LATER.get(group, {})
-    return {name: value for name, value in values.items() if name not in later or value != later[name]}
 
 
 def sha256_of(values: Any) -> str:

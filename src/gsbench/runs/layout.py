@@ -8,7 +8,8 @@ from __future__ import annotations
 # in the runs folder, beside the experiments
 STORE = "store"  # results of stages by content
 ARTIFACTS, DATABASE = "mlartifacts", "mlflow.db"  # MLflow's mirror
-IN_RUNS = (STORE, ARTIFACTS, DATABASE)
+TENSORBOARD, WANDB = "tensorboard", "wandb"  # the mirrors of others
+IN_RUNS = (STORE, ARTIFACTS, DATABASE, TENSORBOARD, WANDB)
 JOBS = ".jobs"  # what the processes of launch=local and Slurm's jobs print, a folder for each experiment
 
 # in the store

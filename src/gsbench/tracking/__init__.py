@@ -1,11 +1,11 @@
-"""The MLflow mirror: what the files of a trial say, shown in a dashboard.
+"""The mirror: what the files of a trial say, shown in MLflow, TensorBoard or Weights & Biases.
 
-Files come first. A process beside the trial reads them and writes to MLflow in batches, so a tracker that is slow, down
-or read-only never harms a trial; what it missed, ``gsbench sync`` adds later from the same files.
+Files come first. A process beside the trial follows them and writes to the tracker in batches, so a tracker that is
+slow, down or read-only never harms a trial; what it missed, ``gsbench sync`` adds later from the same files.
 """
 
 from gsbench.tracking.client import connect, default_uri, ensure_experiment, tracker_uri
-from gsbench.tracking.mirror import Mirror, prepare
-from gsbench.tracking.trial_run import mirror_trial
+from gsbench.tracking.mirror import Mirror, prepare, sync
+from gsbench.tracking.tracked_trial import mirror_trial
 
-__all__ = ["Mirror", "connect", "default_uri", "ensure_experiment", "mirror_trial", "prepare", "tracker_uri"]
+__all__ = ["Mirror", "connect", "default_uri", "ensure_experiment", "mirror_trial", "prepare", "sync", "tracker_uri"]

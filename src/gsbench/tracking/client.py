@@ -8,17 +8,20 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
 
 from gsbench.files import atomic
 from gsbench.runs.layout import ARTIFACTS, DATABASE
+from gsbench.tracking.source import user_tags
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 ADVISORY_LOCK = 0x67736265_6E6368  # "gsbench": the number of our lock in a PostgreSQL database
+KIND = {"mlflow.experimentKind": "custom_model_development"}  # else its page opens as that of a chat program
+SWEEP_TAG = "gsbench.sweep"
 SECONDS_FOR_SQLITE = 20.0  # patience with a writer
 # What would print, phone home or hang for minutes.
 SETTINGS = {
@@ -68,13 +71,32 @@ def ensure_experiment(client: MlflowClient, name: str, runs: Path) -> str:
             served = str(client.tracking_uri).startswith(("http:", "https:"))  # then the server says where
             location = None if served else (runs / ARTIFACTS / name).as_uri()
             with suppress(MlflowException):  # a rival on another machine was first, or what follows says what is wrong
-                return str(client.create_experiment(name, artifact_location=location))
+                return str(client.create_experiment(name, artifact_location=location, tags=KIND))
             found = client.get_experiment_by_name(name)
         if found is None:
             raise RuntimeError(f"MLflow could not create the experiment {name}")
         if found.lifecycle_stage != "active":
             client.restore_experiment(found.experiment_id)
+        for key, value in KIND.items():
+            if key not in found.tags:  # somebody else's experiment of this name
+                client.set_experiment_tag(found.experiment_id, key, value)
         return str(found.experiment_id)
+
+
+def ensure_parent(client: MlflowClient, experiment_id: str, sweep: dict[str, Any], runs: Path) -> str:
+    """The id of the run under which the trials of a ``sweep`` (its ``id``, its ``count``) stand, created once.
+
+    It only groups: it is finished when it begins.
+    """
+    with _set_up_lock(str(client.tracking_uri), runs):
+        found = client.search_runs([experiment_id], f"tags.`{SWEEP_TAG}` = '{sweep['id']}'", max_results=1)
+        if found:
+            return str(found[0].info.run_id)
+        name = f"sweep of {sweep['count']} trials"
+        tags = {"kind": "sweep", SWEEP_TAG: sweep["id"], **user_tags()}
+        run_id = client.create_run(experiment_id, tags=tags, run_name=name).info.run_id
+        client.set_terminated(run_id, "FINISHED")
+        return str(run_id)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -19,6 +20,7 @@ SECTION = "Final metrics"
 BARS = ("psnr", "ssim", "lpips_vgg_raw", "lpips_vgg", "flip", "num_gaussians", "seconds_train")
 COLUMNS = ("arm", "scene.name", "seed")  # parameters, beside the runs
 MAX_RUNS = 100
+ONLY_TRIALS = "tags.kind = 'trial'"  # the runs of sweeps have no numbers
 
 
 def comparison_url(base: str, client: MlflowClient, experiment_id: str) -> str:
@@ -26,7 +28,9 @@ def comparison_url(base: str, client: MlflowClient, experiment_id: str) -> str:
     wanted = json.dumps(_view(), separators=(",", ":"))
     if client.get_experiment(experiment_id).tags.get(TAG) != wanted:
         client.set_experiment_tag(experiment_id, TAG, wanted)
-    words = f"viewStateShareKey={NAME}&compareRunsMode=CHART&workflowType=machine_learning"
+    # In an order of ours MLflow lists trials flat; in its own it hides them, charts included, under their sweep's run.
+    flat = f"orderByKey={quote('params.`arm`')}&orderByAsc=true&searchFilter={quote(ONLY_TRIALS)}"
+    words = f"viewStateShareKey={NAME}&compareRunsMode=CHART&workflowType=machine_learning&{flat}"
     return f"{base}/#/experiments/{experiment_id}/runs?{words}"
 
 

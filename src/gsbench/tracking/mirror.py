@@ -1,97 +1,94 @@
-"""A trial's side of the mirror: it tells a process beside it what to follow, and waits a bounded time at the end."""
+"""A trial's side of the mirror: a process beside it follows its files; at the end it is waited for, a bounded time."""
 
 from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from gsbench.tracking.client import tracker_uri
-from gsbench.tracking.process import MirrorError, MirrorProcess, processes
+from gsbench.tracking.process import MirrorError, MirrorProcess
+from gsbench.tracking.sink import name_of
 
 log = logging.getLogger(__name__)
 
 SECONDS_TO_STOP = 3.0  # patience where a signal asks to end
+SECONDS_IN_VAIN = 10.0  # patience with a tracker that the last trial waited for in vain
 
 
 class Mirror:
-    """Mirrors a trial while the ``with`` block runs; on leaving it, waits a bounded time for the tracker.
+    """Mirrors the trial in ``folder``, which has its ``config.yaml``, while the ``with`` block runs.
 
-    Whatever the tracker does, nothing is raised: one line in the log says what is missing.
+    On leaving it, the tracker is waited for a bounded time: a sweep does not lose all of it at each trial where it was
+    in vain before. Whatever the tracker does, nothing is raised: one line in the log says what is missing.
     """
 
-    def __init__(self, options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any]) -> None:
-        self._options, self._folder = options, folder
-        self._trial = {
-            "options": options | {"uri": tracker_uri(options["uri"], runs)},
-            "runs": str(runs),
-            "folder": str(folder),
-            "values": values,
-            "program": Path(sys.argv[0]).name or "python",
-        }
+    in_vain: ClassVar[bool] = False  # whether the last trial of this process waited for nothing
+
+    def __init__(self, options: dict[str, Any], runs: Path, folder: Path) -> None:
+        self._options, self._runs, self._folder = options, runs, folder
         self._process: MirrorProcess | None = None
 
     def __enter__(self) -> Mirror:
         if self._options["enabled"]:
+            program = Path(sys.argv[0]).name or "python"
             try:
-                self._process = processes.take()
+                self._process = MirrorProcess("follow", str(self._runs), str(self._folder), program)
             except OSError as error:
                 self._warn(error)
-            else:
-                self._process.tell("begin", **self._trial)
         return self
 
-    def follow(self, folder: Path) -> None:
-        """Read curves from ``folder`` as well: where a training in progress writes them."""
-        if self._process is not None:
-            self._process.tell("follow", folder=str(folder))
-
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
-        process, self._process = self._process, None
-        if process is None:
+        if self._process is None:
             return
         stopped = kind is not None and not issubclass(kind, Exception)
-        status = "KILLED" if stopped else "FINISHED" if kind is None else "FAILED"
-        patience = SECONDS_TO_STOP if stopped else processes.patience(self._options["patience_seconds"])
         try:
-            answer = process.ask("end", patience, status=status)
+            self._process.finish(SECONDS_TO_STOP if stopped else self._patience())
         except TimeoutError:
-            processes.give_up(process)
-            log.warning("tracking: MLflow is slow; `gsbench sync` mirrors the rest of %s later", self._folder)
+            Mirror.in_vain = True
+            log.warning("tracking: %s is slow; `gsbench sync` mirrors the rest of %s later", self._name, self._folder)
         except MirrorError as broken:
-            process.close()
             self._warn(broken)
-        except BaseException:
-            process.kill()
-            raise
         else:
-            processes.give_back(process)
-            self._report(answer)
+            Mirror.in_vain = False
 
-    def _report(self, answer: dict[str, Any]) -> None:
-        if answer["outcome"] == "failed":
-            log.debug("tracking failed:\n%s", answer["trace"])
-            self._warn(answer["error"])
-        elif answer["outcome"] == "busy":
-            log.debug("another process mirrors %s", self._folder)
+    def _patience(self) -> float:
+        seconds = float(self._options["patience_seconds"])
+        return min(seconds, SECONDS_IN_VAIN) if Mirror.in_vain else seconds
+
+    @property
+    def _name(self) -> str:
+        return name_of(self._options)
 
     def _warn(self, error: object) -> None:
         log.warning("tracking: %s; the files are complete, `gsbench sync` mirrors them later", error)
 
 
 def prepare(options: dict[str, Any], runs: Path, experiment: str) -> None:
-    """Create tables and ``experiment`` before many processes need them; a tracker that fails is only mentioned."""
-    if not options["enabled"]:
+    """Create what many processes will need at once; a tracker that fails is only mentioned."""
+    if not options["enabled"] or name_of(options) != "MLflow":
         return
-    request = {"uri": tracker_uri(options["uri"], runs), "runs": str(runs), "experiment": experiment}
     try:
-        with MirrorProcess() as process:
-            answer = process.ask("prepare", options["patience_seconds"], **request)
-        fault: object = answer.get("error")
+        patience = options["patience_seconds"]
+        MirrorProcess("prepare", str(runs), experiment, options["uri"] or "", str(patience)).finish(patience)
     except TimeoutError:
-        fault = "MLflow is slow"
+        fault: object = "MLflow is slow"
     except (MirrorError, OSError) as error:
         fault = error
-    if fault:
-        log.warning("tracking: %s; the files will be complete, `gsbench sync` mirrors them later", fault)
+    else:
+        return
+    log.warning("tracking: %s; the files will be complete, `gsbench sync` mirrors them later", fault)
+
+
+def sync(runs: Path, homes: Sequence[Path], uri: str | None, anew: bool) -> Iterator[str]:
+    """Mirror what the tracker missed of the experiments in ``homes``; yields a line for each trial and one for all.
+
+    With ``anew``, what the tracker shows is deleted first. Raises MirrorError where the tracker does not take it.
+    """
+    process = MirrorProcess("sync", str(runs), uri or "", "anew" if anew else "", *map(str, homes))
+    try:
+        yield from process.lines()
+        process.finish(None)
+    finally:
+        process.kill()  # Ctrl-C ends it, whatever the tracker does

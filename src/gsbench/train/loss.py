@@ -1,4 +1,8 @@
-"""The photometric loss of 3DGS, by the quickest executor for a device; `gsbench.eval.ssim` defines it."""
+"""The photometric loss of 3DGS, ``(1 - w) L1 + w (1 - SSIM)`` with w = 0.2: its definition in plain torch, and the
+quickest executor for a device.
+
+SSIM is that of `gsbench.eval.ssim`, padded with zeros, the mean of the full map, as in the reference code of 3DGS.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +12,28 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gsbench.eval.ssim import SSIM_WEIGHT, torch_photometric_loss
+from gsbench.eval.ssim import ssim_map
 from gsbench.raster.executors import find
 
+SSIM_WEIGHT = 0.2
+
 Loss = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+
+
+def as_unit_range(image: Tensor, dtype: torch.dtype) -> Tensor:
+    """``image`` as ``dtype``; 8-bit values are divided by 255."""
+    return image.to(dtype) / 255 if image.dtype == torch.uint8 else image.to(dtype)
+
+
+def torch_photometric_loss(
+    image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT
+) -> tuple[Tensor, Tensor, Tensor]:
+    """``photometric_loss`` in plain torch, for any device and floating dtype: the definition."""
+    target = as_unit_range(target, image.dtype)
+    l1 = (image - target).abs().mean()
+    similarity = ssim_map(image, target).mean()
+    loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - similarity)
+    return loss, l1.detach(), similarity.detach()
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT) -> tuple[Tensor, Tensor, Tensor]:

@@ -20,6 +20,7 @@ from gsbench.densify import Densifier, DensifyContext, NoDensifier
 from gsbench.densify.volume import log_volume
 from gsbench.errors import TrainingError
 from gsbench.events import RefineEvent
+from gsbench.files import write_text
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.ply import write_ply
@@ -102,7 +103,7 @@ class Trainer:
         self.step = 0
         self.seconds = 0.0
         self.losses = LossLog()
-        cap = getattr(densifier, "max_gaussians", None)
+        cap = densifier.most_gaussians
         pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
         room = room_for_images(free_bytes(self.device), len(initial), cap, pixels)
         self.targets = Targets(scene.train, self.device, room)
@@ -285,7 +286,10 @@ def generator(seed: int, stream: int) -> torch.Generator:
 
 
 def drop_after(path: Path, step: int) -> None:
-    """Remove the records later than ``step``, and a torn last line, from a JSON-lines file, if it is there."""
+    """Remove the records later than ``step``, and a torn last line, from a JSON-lines file, if it is there.
+
+    A kill meanwhile leaves the file as it was: what is lost here is in no checkpoint.
+    """
     if not path.exists():
         return
     kept = []
@@ -293,9 +297,9 @@ def drop_after(path: Path, step: int) -> None:
         try:
             if json.loads(line)["step"] <= step:
                 kept.append(line)
-        except (json.JSONDecodeError, KeyError):
+        except (json.JSONDecodeError, KeyError, TypeError):
             break
-    path.write_text("".join(line + "\n" for line in kept))
+    write_text(path, "".join(line + "\n" for line in kept))
 
 
 def _append(stream: Any, record: dict[str, Any]) -> None:

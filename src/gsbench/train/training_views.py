@@ -6,10 +6,11 @@ from collections.abc import Callable, Sequence
 
 from torch import Tensor
 
+from gsbench.eval.ssim import ssim_map
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster import Rasterizer, RenderOutput
 from gsbench.scene.types import View
-from gsbench.train.loss import PhotometricLoss
+from gsbench.train.loss import PhotometricLoss, as_unit_range
 from gsbench.train.targets import Targets
 
 
@@ -40,6 +41,10 @@ class SceneViews:
     def render(self, index: int, gaussians: Gaussians, step: int) -> RenderOutput:
         camera, degree = self._views[index].camera, self._sh_degree(step)
         return self._rasterizer.render(gaussians, camera, degree, self._background)
+
+    def dissimilarity(self, index: int, image: Tensor) -> Tensor:
+        target = as_unit_range(self._targets.get(index), image.dtype)
+        return (1 - ssim_map(image, target).mean(0)).clamp_min(0)
 
     def loss(self, index: int, image: Tensor) -> Tensor:
         return self._loss(image, self._targets.get(index))[0].detach()

@@ -7,6 +7,7 @@ from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
 
+from gsbench.analysis.agreement import agreements
 from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.errors_by_region import read_image
@@ -67,6 +68,8 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         sweeps=[] if search else sweep_charts(trials),
         tradeoffs=tradeoff_charts(trials),
         gaps=tradeoff_gaps(trials, baseline),
+        agreements=agreements(trials),
+        arm_name=arm_name,
         training=training_charts(trials, arms),
         events=event_charts(trials, arms),
         volumes=volumes,

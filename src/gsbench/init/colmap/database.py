@@ -155,6 +155,33 @@ def verify_pairs(
     list_file.unlink(missing_ok=True)
 
 
+def cameras_without_prior(path: Path) -> bool:
+    """Whether some camera's focal length is a guess, neither given nor in the EXIF data."""
+    with pycolmap.Database.open(path) as database:
+        return any(not camera.has_prior_focal_length for camera in database.read_all_cameras())
+
+
+def assume_focal_lengths(path: Path, factor: float) -> list[tuple[str, str]]:
+    """Set each guessed focal length to ``factor`` times the longest side, as one that is known.
+
+    Drops what was verified under the guess, and returns the pairs of names that have matches.
+    """
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for camera in database.read_all_cameras():
+            if not camera.has_prior_focal_length:
+                for index in camera.focal_length_idxs():
+                    camera.params[index] = factor * max(camera.width, camera.height)
+                camera.has_prior_focal_length = True
+                database.update_camera(camera)
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        pair_ids, matches = database.read_all_matches()
+        database.clear_two_view_geometries()
+        ids = [
+            pycolmap.pair_id_to_image_pair(pair) for pair, found in zip(pair_ids, matches, strict=True) if len(found)
+        ]
+    return sorted((names[first], names[second]) for first, second in ids)
+
+
 def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
     """COLMAP's list of image pairs, one pair of names on a line; they hold no spaces (`image_ids_as_names`)."""
     path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")

@@ -13,7 +13,7 @@ from gsbench.errors import InputError
 from gsbench.init import report
 from gsbench.init.base import OWN_GAUGE_FOLDER, InitReport, Preparation, Progress, Timer
 from gsbench.init.colmap import database as colmap_database
-from gsbench.init.colmap import reconstruct
+from gsbench.init.colmap import mapping, reconstruct
 from gsbench.init.colmap.alignment import Similarity
 from gsbench.init.colmap.options import ColmapOptions, DatabaseTask
 from gsbench.scene.types import Capture
@@ -68,9 +68,11 @@ def build_model(job: Job, progress: Progress) -> InitReport:
             model = reconstruct.triangulate(database, images, scratch, reference, settings, progress)
         return _finish(job, "shared", model, reference, None, timer, counts)
     with timer.phase("map"):
-        model, counts["models"] = reconstruct.map_images(database, images, scratch, settings, progress)
-    similarity = None if reference is None else reconstruct.similarity_to(model, reference)
-    return _finish(job, "own", model, reference, similarity, timer, counts)
+        verification = reconstruct.Verification(options.seed, options.min_inliers, options.min_inlier_ratio)
+        mapped = mapping.map_images(database, images, scratch, settings, verification, options.mapper, progress)
+    similarity = None if reference is None else reconstruct.similarity_to(mapped.model, reference)
+    counts["models"] = mapped.models
+    return _finish(job, "own", mapped.model, reference, similarity, timer, counts, mapped)
 
 
 def _finish(
@@ -81,10 +83,11 @@ def _finish(
     similarity: Similarity | None,
     timer: Timer,
     counts: Mapping[str, int],
+    mapped: mapping.Mapped | None = None,
 ) -> InitReport:
     """Align the model where it has poses of its own, write it, and report."""
     options, capture = job.options, job.capture
-    warnings = list(job.preparation.warnings)
+    warnings = [*job.preparation.warnings, *(() if mapped is None else mapped.warnings)]
     pose_errors, own_gauge, scale = None, None, 1.0 if poses == "shared" else None
     if poses == "own" and reference is not None and similarity is None:
         warnings.append("too few common cameras with the reference: poses are neither aligned nor compared")
@@ -110,6 +113,7 @@ def _finish(
         own_gauge=own_gauge,
         pose_errors=pose_errors,
         counts=counts,
+        mapped_by=None if mapped is None else mapped.way,
         warnings=warnings,
     )
     report.write_result(model, result, job.output_dir)

@@ -61,6 +61,7 @@ class ColmapOptions(ABC):
     neighbors: PositiveInt = 20
     min_inliers: Annotated[int, Ge(7)] = 15  # a fundamental matrix takes seven
     min_inlier_ratio: Fraction = 0.0
+    mapper: Literal["auto", "incremental", "global"] = "auto"
     min_model_size: Annotated[int, Ge(2)] = 3
     two_view_tracks: bool = False
     seed: Seed = 0

@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from gsbench.errors import InputError
-from gsbench.init.base import MIN_IMAGES, Progress
+from gsbench.init.base import Progress
 from gsbench.init.colmap.alignment import Array, Similarity, align_poses
 from gsbench.init.colmap.pairs import exhaustive_pairs, gps_positions, sequential_pairs, spatial_pairs
 from gsbench.scene.colmap import read_reference
@@ -92,43 +92,6 @@ def select_pairs(
     return [(names[first], names[second]) for first, second in pairs]
 
 
-def map_images(
-    database: Path, images: Path, output: Path, settings: MappingSettings, progress: Progress
-) -> tuple[pycolmap.Reconstruction, int]:
-    """COLMAP's incremental mapping: the model with the most images, not the first, and how many models there were.
-
-    Raises ``InputError`` where no model with at least `MIN_IMAGES` images comes out.
-    """
-    with pycolmap.Database.open(database) as opened:
-        total = opened.num_images()
-    registered = 0
-
-    def one_more() -> None:
-        nonlocal registered
-        registered += 1
-        progress("map", min(registered, total), total)
-
-    progress("map", 0, total)
-    pycolmap.set_random_seed(settings.seed)
-    output.mkdir(parents=True, exist_ok=True)
-    models = pycolmap.incremental_mapping(
-        database, images, output, options=_pipeline_options(settings), next_image_callback=one_more
-    )
-    progress("map", total, total)
-    if not models:
-        raise InputError(
-            "structure from motion found no pair of images to start from: the photos need more overlap (60 % and more "
-            "between neighbours), more texture, or a focal length (init.focal_length, px)"
-        )
-    largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    if largest.num_reg_images() < MIN_IMAGES:
-        raise InputError(
-            f"structure from motion placed only {largest.num_reg_images()} of {total} images: the photos need more "
-            "overlap, more texture, or a focal length (init.focal_length, px)"
-        )
-    return largest, len(models)
-
-
 def triangulate(
     database: Path,
     images: Path,
@@ -150,7 +113,7 @@ def triangulate(
             image = pycolmap.Image(name=stored.name, camera_id=stored.camera_id, image_id=stored.image_id)
             known.add_image_with_trivial_frame(image, pose)
     model = pycolmap.triangulate_points(
-        known, database, images, output, clear_points=True, options=_pipeline_options(settings), refine_intrinsics=False
+        known, database, images, output, clear_points=True, options=pipeline_options(settings), refine_intrinsics=False
     )
     progress("triangulate", 1, 1)
     if model.num_points3D() == 0:
@@ -205,7 +168,8 @@ def apply_similarity(model: pycolmap.Reconstruction, similarity: Similarity) -> 
     model.transform(pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation))
 
 
-def _pipeline_options(settings: MappingSettings) -> pycolmap.IncrementalPipelineOptions:
+def pipeline_options(settings: MappingSettings) -> pycolmap.IncrementalPipelineOptions:
+    """COLMAP's incremental pipeline as ``settings`` describe it; the triangulator reads the same options."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = settings.threads
     options.random_seed = settings.seed

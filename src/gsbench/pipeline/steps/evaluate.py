@@ -6,6 +6,7 @@ import csv
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,12 @@ from gsbench.logs import progress
 from gsbench.pipeline.components import options_of, rasterizer_inputs
 from gsbench.pipeline.steps.figures import draw_ellipsoids
 from gsbench.pipeline.steps.maps import view_maps
+from gsbench.pipeline.steps.model_metrics import (
+    ModelMetrics,
+    measure_flicker,
+    measure_geometry,
+    nothing_known,
+)
 from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
 from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, MAPS, METRICS, PER_VIEW, POINT_CLOUD, RENDERS
@@ -46,10 +53,13 @@ def evaluate_step(
     device: torch.device,
     earlier: Sequence[int] = (),
     made_by_program: bool = False,
+    geometry: bool = False,
+    flicker: bool = False,
 ) -> Step:
     """Render and measure the model of ``trained``, and its snapshots of the iterations ``earlier``.
 
-    ``maps`` also keeps what the report needs to say where an arm helps. The key of a training by another program
+    ``maps`` also keeps what the report needs to say where an arm helps; ``geometry`` and ``flicker`` also measure the
+    model itself (`gsbench.pipeline.steps.model_metrics`). The key of a training by another program
     (``made_by_program``) knows nothing of the rendering, so it is in this step's.
     """
     inputs: dict[str, Any] = {
@@ -62,7 +72,7 @@ def evaluate_step(
         inputs["earlier"] = list(earlier)
     if made_by_program:
         inputs |= {"raster": rasterizer_inputs(rasterizer), "background": list(background)}
-    inputs |= _own_metrics(evaluator)
+    inputs |= _further_metrics(evaluator) | _of_model(geometry, flicker)
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
@@ -93,19 +103,26 @@ def evaluate_step(
         if maps:
             write_maps(folder / MAPS, scene, views.store.path(views.init), gaussians, rasterizer)
             draw_figures(folder / FIGURES, folder / RENDERS, scene, training, gaussians)
-        write_per_view(folder / PER_VIEW, per_view)
-        write_json(folder / METRICS, summary_of(evaluator, per_view) | ({"at": at} if at else {}))
+        found = []
+        if geometry:
+            found.append(measure_geometry(rasterizer, gaussians, views))
+        if flicker:
+            found.append(measure_flicker(rasterizer, gaussians, scene, color))
+        _write_metrics(folder, evaluator, per_view, found, {"at": at} if at else {})
 
     return Step(EVALUATE, inputs, build)
 
 
-def measure_step(views: Views, trained: Step, evaluator: Evaluator) -> Step:
+def measure_step(
+    views: Views, trained: Step, evaluator: Evaluator, geometry: bool = False, flicker: bool = False
+) -> Step:
     """Measure the renders that another program left in ``trained``, as they are."""
     inputs: dict[str, Any] = {
         "renders": trained.key,
         "protocol": evaluator.protocol.id,
         "unavailable": sorted(evaluator.unavailable),
-    } | _own_metrics(evaluator)
+    }
+    inputs |= _further_metrics(evaluator) | _of_model(geometry, flicker)
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
@@ -117,16 +134,41 @@ def measure_step(views: Views, trained: Step, evaluator: Evaluator) -> Step:
                     read_image(folder / RENDERS / png_name(view.name)), view.image
                 )
                 report("views", done, len(scene.test))
-        write_per_view(folder / PER_VIEW, per_view)
-        write_json(folder / METRICS, summary_of(evaluator, per_view))
+        unknown = nothing_known(geometry, flicker, "another program's renders are known, not its model")
+        _write_metrics(folder, evaluator, per_view, [unknown])
 
     return Step(EVALUATE, inputs, build)
 
 
-def _own_metrics(evaluator: Evaluator) -> dict[str, Any]:
-    """The user's own metrics as they enter a key; nothing where there are none."""
+def _further_metrics(evaluator: Evaluator) -> dict[str, Any]:
+    """The user's own metrics and those of ``eval.more`` as they enter a key; nothing where there are none."""
     own = {name: options_of("eval", metric) for name, metric in evaluator.extra.items()}
-    return {"extra": own} if own else {}
+    further: dict[str, Any] = {"extra": own, "more": list(evaluator.more)}
+    return {name: value for name, value in further.items() if value}
+
+
+def _of_model(geometry: bool, flicker: bool) -> dict[str, bool]:
+    """What is measured of the model as it enters a key; nothing where nothing is."""
+    return {name: True for name, asked in (("geometry", geometry), ("flicker", flicker)) if asked}
+
+
+def _write_metrics(
+    folder: Path,
+    evaluator: Evaluator,
+    per_view: Mapping[str, Mapping[str, float]],
+    of_model: Sequence[ModelMetrics],
+    more: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
+    """Write the metrics of images and of the model, by view and as means."""
+    rows = {view: dict(row) for view, row in per_view.items()}
+    for found in of_model:
+        for view, row in found.per_view.items():
+            rows[view] |= row
+    write_per_view(folder / PER_VIEW, rows)
+    summary = summary_of(evaluator, rows)
+    for found in of_model:
+        summary["unavailable"] = summary["unavailable"] | found.unavailable
+    write_json(folder / METRICS, {**summary, **more})
 
 
 def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:

@@ -21,7 +21,6 @@ from gsbench.logs import progress
 from gsbench.pipeline.components import options_of, rasterizer_inputs
 from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
-from gsbench.runs.hashing import without_later
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
@@ -47,7 +46,7 @@ def train_step(
         "init": views.init.key,
         "densify": options_of("densify", densifier),
         "raster": rasterizer_inputs(rasterizer),
-        "train": without_later("train", of_model),
+        "train": of_model,
         "seed": seed,
     }
     if snapshot_at:

@@ -1,0 +1,333 @@
+"""The file of claims: what a paper says, and how it would be tested here, typed and checked before any trial runs.
+
+    name: check_volumetric
+    paper: Refining Gaussian Splatting (arXiv 2508.05187)
+    seeds: 4
+    settings: {train: quick, scene.max_size: 160}
+    scenes: {courtyard: {}, bonsai: {scene: bonsai}}
+    arms: {adc: {}, volumetric: {}}
+    claims:
+      - id: lpips
+        says: our approach consistently achieves lower LPIPS scores
+        where: section 5, Table 1
+        baseline: adc
+        arm: volumetric
+        metric: lpips_squeeze
+        direction: lower
+        least: 0.005
+        refuted_if: the difference is above 0, or within 0.005 of it
+
+Settings, scenes, arms, budgets and splits are settings as on the command line. docs/claims.md has every key.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from annotated_types import Ge, Interval, MinLen, Predicate, doc
+
+from gsbench.analysis.statistics import ALPHA
+from gsbench.claims.measures import find_measure, measure_names
+from gsbench.claims.sequential import FIRST_LOOK, MOST_ALPHA, Design, plan_looks
+from gsbench.errors import InputError
+from gsbench.eval.facts import find
+from gsbench.runs.hashing import sha256_of
+from gsbench.settings import checked
+from gsbench.words import closest
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,60}")
+KEY = re.compile(r"[+]?\w+([./]\w+)*")  # of a setting
+GIVEN_BY_CHECK = ("name", "seed", "runs", "eval.primary")  # settings that the plan sets by itself
+UNTOUCHED = ("says", "where")  # of a claim: words that may be mended without another plan
+NO_SIZE = "the whole of a claim hangs on it: 0.005, or 10% of the baseline's value"
+DIRECTIONS = {"higher": 1, "lower": -1, "same": 0}
+
+Name = Annotated[str, Predicate(lambda name: NAME.fullmatch(name) is not None), doc("letters, digits, _ and -")]
+Sentence = Annotated[str, MinLen(1), doc("a text that is not empty")]
+Settings = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Least:
+    """The least effect that matters: a difference of the metric, or (``relative``) a part of the baseline's value."""
+
+    size: float
+    relative: bool
+
+    @property
+    def margin(self) -> float:
+        """In the scale in which trials are compared: the metric's own, or logarithms."""
+        return math.log1p(self.size) if self.relative else self.size
+
+    def __str__(self) -> str:
+        return f"{100 * self.size:g} %" if self.relative else f"{self.size:g}"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One claim. ``scenes`` are all of the file's where none are named; ``seeds`` the file's.
+
+    ``not_testable`` is a reason why nobody can test it with this file, such as a size that is out of reach.
+    """
+
+    id: Name
+    says: Sentence
+    where: Sentence
+    baseline: Name
+    arm: Name
+    metric: Name
+    direction: Literal["higher", "lower", "same"]
+    least: float | str
+    refuted_if: Sentence
+    scenes: list[Name] = field(default_factory=list)
+    budget: Settings = field(default_factory=dict)
+    split: Settings = field(default_factory=dict)
+    not_testable: str = ""
+
+    @property
+    def sign(self) -> int:
+        """Of the claimed difference, arm minus baseline; 0 where none is claimed."""
+        return DIRECTIONS[self.direction]
+
+    @property
+    def effect(self) -> Least:
+        return read_least(self.least, f"claim {self.id}")
+
+
+@dataclass(frozen=True)
+class ClaimsFile:
+    """A checked file of claims.
+
+    ``error_rate`` is the chance that any verdict on the page is false; claims that can be tested share it. ``seeds``
+    are the most of each scene and arm. ``size`` says in words what the paper's own experiments were.
+    """
+
+    name: Name
+    paper: Sentence
+    seeds: Annotated[int, Ge(FIRST_LOOK)]
+    scenes: dict[str, Any]  # the settings of each, by name
+    arms: dict[str, Any]
+    claims: list[Claim]
+    settings: Settings = field(default_factory=dict)
+    error_rate: Annotated[float, Interval(gt=0, le=MOST_ALPHA)] = ALPHA
+    size: str = ""
+
+    def scenes_of(self, claim: Claim) -> tuple[str, ...]:
+        return tuple(claim.scenes or self.scenes)
+
+    def words(self, claim: Claim, scene: str, arm: str) -> list[str]:
+        """The settings of a claim's trials with this scene and arm, as words of a command line; seed and name apart."""
+        chosen = self.settings | self.scenes[scene] | self.arms[arm] | claim.split | claim.budget
+        return [f"{key}={_text(value)}" for key, value in chosen.items()]
+
+    def design(self, claim: Claim, scenes: int, sharing: int) -> Design:
+        """The looks of a claim over so many scenes, with its part of the error rate that ``sharing`` tests share."""
+        return Design(scenes, plan_looks(self.seeds), self.error_rate / sharing)
+
+    def plan(self) -> dict[str, Any]:
+        """All that decides about the verdicts, as plain values: what is written down before trials run."""
+        questions = []
+        for claim in self.claims:
+            kept = {entry.name: getattr(claim, entry.name) for entry in fields(Claim) if entry.name not in UNTOUCHED}
+            questions.append(kept | {"scenes": list(self.scenes_of(claim))})
+        return {
+            "claims": questions,
+            "settings": self.settings,
+            "scenes": self.scenes,
+            "arms": self.arms,
+            "error_rate": self.error_rate,
+            "looks": list(plan_looks(self.seeds)),
+        }
+
+    @property
+    def plan_hash(self) -> str:
+        """sha256 of the plan: another one is another plan. Words that are mended change nothing."""
+        return sha256_of(self.plan())
+
+
+def read_claims(path: Path) -> ClaimsFile:
+    """Read and check a file of claims; raises InputError, one line that names the place and the mend."""
+    try:
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeys)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8"
+        raise InputError(f"{path} cannot be read ({reason}): give a file of claims (docs/claims.md)") from None
+    except yaml.YAMLError as error:
+        raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
+    try:
+        return parse_claims(content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def parse_claims(content: object) -> ClaimsFile:
+    """The claims of what a YAML file holds."""
+    if not isinstance(content, dict):
+        raise InputError("it must be a mapping with name, paper, seeds, scenes, arms and claims")
+    given: dict[str, Any] = {str(key): value for key, value in content.items()}
+    listed = given.pop("claims", None)
+    values = checked(ClaimsFile, given, "")
+    _require(ClaimsFile, {*values, "claims"}, "")
+    scenes = _named_settings(values["scenes"], "scenes", "scene")
+    arms = _named_settings(values["arms"], "arms", "densify")
+    _check_settings(values.get("settings", {}), "settings")
+    if not isinstance(listed, list) or not listed:
+        raise InputError("claims must be a list of at least one claim")
+    claims = [_claim(entry, place) for place, entry in enumerate(listed, 1)]
+    file = ClaimsFile(**(values | {"scenes": scenes, "arms": arms, "claims": claims}))
+    for claim in claims:
+        _check_claim(claim, file)
+    _check_together(claims, file)
+    return file
+
+
+def read_least(value: float | str, where: str) -> Least:
+    """``0.005``, or ``10%`` of the baseline's value; raises InputError for one of no width."""
+    text = str(value).strip()
+    relative = text.endswith("%")
+    try:
+        size = float(text.removesuffix("%")) / (100 if relative else 1)
+    except ValueError:
+        size = math.nan
+    if not math.isfinite(size) or size <= 0:
+        raise InputError(f"{where}: least must be a number above 0, got {value!r}: {NO_SIZE}")
+    return Least(size, relative)
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """Refuses a key that stands twice in one mapping, of which the first would be lost without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.constructor.ConstructorError(None, None, f"{key!r} stands twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+def _claim(entry: object, place: int) -> Claim:
+    where = f"claims[{place}]"
+    if not isinstance(entry, dict):
+        raise InputError(f"{where} must be a mapping with id, says, where, …, got {entry!r}")
+    values = checked(Claim, {str(key): value for key, value in entry.items()}, where)
+    _require(Claim, values, where)
+    return Claim(**values)
+
+
+def _require(cls: type, values: Iterable[str], where: str) -> None:
+    """Raise InputError for the first field without a default that was not given."""
+    given = set(values)
+    for entry in fields(cls):
+        needed = entry.default is entry.default_factory  # both are dataclasses.MISSING
+        if needed and entry.name not in given:
+            raise InputError(
+                f"{where}{'.' if where else ''}{entry.name} is not given: a claim needs it (docs/claims.md)"
+            )
+
+
+def _named_settings(groups: Mapping[str, Any], where: str, group: str) -> dict[str, Settings]:
+    """Scenes or arms by name; one without settings is the choice of that name in ``group``."""
+    if not groups:
+        raise InputError(f"{where} must name at least one, as {where}: {{courtyard: {{}}}}")
+    found = {}
+    for name, settings in groups.items():
+        if not NAME.fullmatch(str(name)):
+            raise InputError(f"{where}: {name!r} must be a name of letters, digits, _ and -")
+        if settings is not None and not isinstance(settings, dict):
+            raise InputError(f"{where}.{name} must be a mapping of settings, as {{{group}: {name}}}, got {settings!r}")
+        _check_settings(settings or {}, f"{where}.{name}")
+        found[str(name)] = dict(settings or {group: str(name)})
+    return found
+
+
+def _check_settings(settings: Mapping[str, Any], where: str) -> None:
+    for key, value in settings.items():
+        if not isinstance(key, str) or not KEY.fullmatch(key):
+            raise InputError(f"{where}: {key!r} is no setting such as scene.max_size")
+        if key in GIVEN_BY_CHECK:
+            raise InputError(f"{where}: {key} is set by the plan itself: leave it out")
+        if isinstance(value, dict):
+            raise InputError(f"{where}.{key} must be one value: write nested settings with dots, as {key}.NAME: …")
+
+
+def _check_claim(claim: Claim, file: ClaimsFile) -> None:
+    where = f"claim {claim.id}"
+    for role, arm in (("baseline", claim.baseline), ("arm", claim.arm)):
+        if arm not in file.arms:
+            raise InputError(
+                f"{where}: {role} {arm!r} is none of the arms{closest(arm, file.arms)} "
+                f"(there are {', '.join(file.arms)})"
+            )
+    if claim.baseline == claim.arm:
+        raise InputError(f"{where}: {claim.arm} is held against itself: name two arms")
+    for scene in claim.scenes:
+        if scene not in file.scenes:
+            raise InputError(
+                f"{where}: {scene!r} is none of the scenes{closest(scene, file.scenes)} "
+                f"(there are {', '.join(file.scenes)})"
+            )
+    if len(set(claim.scenes)) < len(claim.scenes):
+        raise InputError(f"{where}: a scene stands twice in {', '.join(claim.scenes)}")
+    for group, settings in (("budget", claim.budget), ("split", claim.split)):
+        _check_settings(settings, f"{where}, {group}")
+    _check_metric(claim, file)
+    for entry in ("says", "where", "refuted_if"):
+        if not getattr(claim, entry).strip():
+            raise InputError(f"{where}: {entry} is empty")
+
+
+def _check_metric(claim: Claim, file: ClaimsFile) -> None:
+    where, names = f"claim {claim.id}", measure_names()
+    own = f"eval.extra.{claim.metric}."
+    if claim.metric not in names and not any(key.lstrip("+").startswith(own) for key in file.settings):
+        raise InputError(
+            f"{where}: {claim.metric!r} is no metric{closest(claim.metric, names)} (choose {', '.join(names)}; one "
+            f"of your own by settings: {{{own}_target_: mine.MyMetric}})"
+        )
+    effect = claim.effect
+    if find_measure(claim.metric).cost and not effect.relative:
+        raise InputError(f"{where}: least of {claim.metric} must be a part, such as 10%, got {effect}")
+    if claim.metric in ("ssim", "flip") and not effect.relative and effect.size >= 1:
+        raise InputError(f"{where}: least {effect} is more than {claim.metric} can differ by")
+
+
+def _check_together(claims: Sequence[Claim], file: ClaimsFile) -> None:
+    """Raise InputError for ids that stand twice, and for two claims that contradict or repeat each other."""
+    for place, one in enumerate(claims):
+        for other in claims[place + 1 :]:
+            if one.id == other.id:
+                raise InputError(f"two claims have the id {one.id}: give each its own")
+            shared = [scene for scene in file.scenes_of(one) if scene in file.scenes_of(other)]
+            alike = (one.metric, one.budget, one.split) == (other.metric, other.budget, other.split)
+            if not shared or not alike or {one.arm, one.baseline} != {other.arm, other.baseline}:
+                continue
+            turned = other.sign if one.arm == other.arm else -other.sign
+            arms = f"{one.arm} against {one.baseline} in {one.metric} on {', '.join(shared)}"
+            if turned != one.sign:
+                raise InputError(f"claims {one.id} and {other.id} contradict each other about {arms}: take one out")
+            raise InputError(f"claims {one.id} and {other.id} ask the same about {arms}: take one out")
+
+
+def direction_is_odd(claim: Claim) -> str:
+    """A remark where a claim praises what the metric counts as worse; "" elsewhere."""
+    facts = find(claim.metric)
+    if facts is None or facts.direction == 0 or claim.sign in (0, facts.direction):
+        return ""
+    return f"{claim.id} claims {claim.direction} {facts.name}, which is worse"
+
+
+def _text(value: object) -> str:
+    """A value of YAML as it is written on a command line."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f"[{','.join(_text(entry) for entry in value)}]"
+    return str(value)

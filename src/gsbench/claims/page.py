@@ -1,0 +1,190 @@
+"""The page at the end of a check, in Markdown and HTML: claim by claim the verdict and all that it rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+
+from jinja2 import Environment, StrictUndefined
+
+from gsbench.analysis.differences import IGNORED_SETTINGS
+from gsbench.analysis.report.charts import ForestRow, forest_plot
+from gsbench.analysis.report.crops import Crop, choose_crops
+from gsbench.analysis.results import TrialResult, canonical
+from gsbench.claims.file import ClaimsFile
+from gsbench.claims.verdict import Verdict, Word
+from gsbench.runs.declaration import DeclaredPlan
+from gsbench.words import counted
+
+LARGE = 1000.0  # numbers from here on are counts or seconds, and shown whole
+CROPS = 2  # pictures each for and against an arm
+SYMBOLS: dict[Word, str] = {"supported": "✔", "refuted": "✘", "undecided": "?", "not testable here": "–"}
+NAMES = ("init.name", "densify.name", "init._target_", "densify._target_")  # settings that only say which arm it is
+
+
+@dataclass(frozen=True)
+class Section:
+    """One claim, ready to be written."""
+
+    verdict: Verdict
+    headline: str
+    evidence: tuple[str, ...]
+    scenes: tuple[tuple[str, str], ...]
+    differing: tuple[tuple[str, str, str], ...]  # setting, baseline's, arm's
+    trials: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Page:
+    """What both formats show."""
+
+    title: str
+    lines: tuple[str, ...]
+    sections: tuple[Section, ...]
+
+
+def make_page(
+    file: ClaimsFile, verdicts: Sequence[Verdict], declared: DeclaredPlan, plans: Sequence[DeclaredPlan]
+) -> Page:
+    """The content of the page: the plan that was ``declared``, of all ``plans`` under this name, and its verdicts."""
+    counts = {word: sum(verdict.word == word for verdict in verdicts) for word in SYMBOLS}
+    tested = sum(verdict.word != "not testable here" for verdict in verdicts)
+    lines = [
+        f"{file.paper}. " + ", ".join(f"{count} {word}" for word, count in counts.items() if count) + ".",
+        f"The chance that any of the {counted(tested, 'verdict')} is false is at most {100 * file.error_rate:g} %, "
+        "which they share equally, each over all its looks at the trials (docs/verdict.md). A verdict is about these "
+        "scenes at this size.",
+        _declared_line(declared, plans),
+    ]
+    smaller = _size_line(file, [trial for verdict in verdicts for trial in verdict.trials])
+    return Page(f"{file.name}: claims and verdicts", (*lines, *smaller), tuple(map(_section, verdicts)))
+
+
+def to_markdown(page: Page) -> str:
+    """The page as GitHub-flavoured Markdown."""
+    parts = [f"# {page.title}", "", *(line + "\n" for line in page.lines)]
+    parts += ["| | claim | verdict |", "|---|---|---|"]
+    for section in page.sections:
+        one = section.verdict
+        parts.append(f"| {SYMBOLS[one.word]} | {one.claim.id} | **{one.word}**: {_pipe(section.headline)} |")
+    for section in page.sections:
+        claim = section.verdict.claim
+        parts += ["", f"## {claim.id}: {section.verdict.word}", "", f"> {claim.says}", ">", f"> {claim.where}", ""]
+        parts += [section.headline + "\n", *(f"- {line}" for line in section.evidence)]
+        if section.scenes:
+            parts += ["", "| scene | difference |", "|---|---|"]
+            parts += [f"| {scene} | {value} |" for scene, value in section.scenes]
+        if section.differing:
+            parts += ["", f"| setting | {claim.baseline} | {claim.arm} |", "|---|---|---|"]
+            parts += [f"| `{key}` | {_pipe(one)} | {_pipe(other)} |" for key, one, other in section.differing]
+        if section.trials:
+            parts += ["", "Trials: " + ", ".join(f"`{label}`" for label in section.trials)]
+    return "\n".join(parts).rstrip() + "\n"
+
+
+def to_html(page: Page) -> str:
+    """The page as one HTML file, with charts and pictures in it; needs no network and no other file."""
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string(_resource("gsbench.claims", "page.html.j2"))
+    shown = [(section, _chart(section.verdict), *_crops(section.verdict)) for section in page.sections]
+    style = _resource("gsbench.analysis.report", "style.css")
+    return template.render(page=page, sections=shown, symbols=SYMBOLS, style=style)
+
+
+def _section(verdict: Verdict) -> Section:
+    claim, decision = verdict.claim, verdict.decision
+    evidence = [f"what would refute it: {claim.refuted_if}"]
+    headline = verdict.reason
+    if decision is not None and decision.mean is not None and decision.interval is not None:
+        assert verdict.design is not None
+        level = f"{100 * (1 - verdict.design.alpha):.3g} %"
+        headline = (
+            f"{verdict.measure.name} of {claim.arm} against {claim.baseline}: {verdict.shown(decision.mean)} "
+            f"({level} interval {verdict.shown_interval(decision.interval)}); {verdict.reason}"
+        )
+        unit = "scenes" if verdict.design.by_scene else "pairs of trials"
+        planned = ", ".join(map(str, verdict.design.looks))
+        evidence += [
+            f"least effect that matters: {claim.effect}; baseline's mean {_number(verdict.baseline)}",
+            f"decided on {counted(decision.trials, 'trial')}: {counted(len(verdict.by_scene), 'scene')}, "
+            f"{decision.seeds} seeds, two arms; looks planned at {planned} seeds; units are {unit}",
+        ]
+    evidence += verdict.notes
+    return Section(
+        verdict,
+        headline,
+        tuple(evidence),
+        tuple((scene, verdict.shown(value)) for scene, value in verdict.by_scene),
+        tuple(differing_settings_of(verdict.trials[:2])),
+        tuple(trial.label for trial in verdict.trials),
+    )
+
+
+def differing_settings_of(pair: Sequence[TrialResult]) -> list[tuple[str, str, str]]:
+    """(setting, baseline's value, arm's value) of all in which the configurations of two trials differ."""
+    if len(pair) < 2:
+        return []
+    one, other = pair[0].config, pair[1].config
+    keys = sorted(key for key in {*one, *other} if not key.startswith(IGNORED_SETTINGS) and key not in NAMES)
+    return [
+        (key, canonical(one[key]) if key in one else "–", canonical(other[key]) if key in other else "–")
+        for key in keys
+        if one.get(key) != other.get(key)
+    ]
+
+
+def _declared_line(declared: DeclaredPlan, plans: Sequence[DeclaredPlan]) -> str:
+    line = f"The plan {declared.hash[:12]} was declared {declared.when}; a claim says where trials were there before."
+    earlier = [plan for plan in plans if plan.hash != declared.hash]
+    if earlier:
+        line += f" Before it, {counted(len(earlier), 'other plan')} had been declared under this name."
+    return line
+
+
+def _size_line(file: ClaimsFile, trials: Sequence[TrialResult]) -> list[str]:
+    """What was smaller than in the paper, where the file says how large that was."""
+    if not file.size or not trials:
+        return []
+    scenes = sorted({trial.scene for trial in trials})
+    steps = sorted({int(trial.data["iterations"]) for trial in trials})
+    sizes = sorted({f"{size[0]}×{size[1]}" for trial in trials if (size := trial.data.get("resolution"))})
+    seeds = len({trial.seed for trial in trials})
+    here = (
+        f"{counted(len(scenes), 'scene')} ({', '.join(scenes)}), up to {seeds} seeds, "
+        f"{' or '.join(f'{step:,}' for step in steps)} iterations, {', '.join(sizes)} px"
+    )
+    return [f"Here: {here}. The paper: {file.size}."]
+
+
+def _chart(verdict: Verdict) -> str:
+    decision = verdict.decision
+    if decision is None or decision.interval is None or decision.mean is None:
+        return ""
+    rows = [ForestRow(scene, value, None, None) for scene, value in verdict.by_scene]
+    rows.append(ForestRow("all", decision.mean, decision.interval.low, decision.interval.high))
+    unit = "log ratio" if verdict.claim.effect.relative else "difference"
+    title = f"{verdict.claim.arm} against {verdict.claim.baseline}"
+    return forest_plot(title, rows, f"{verdict.measure.name}, {unit}", verdict.claim.sign)
+
+
+def _crops(verdict: Verdict) -> tuple[list[Crop], list[Crop]]:
+    """Places where the arm is closer to the photographs, and where the baseline is."""
+    pairs = list(zip(verdict.trials[::2], verdict.trials[1::2], strict=True))
+    if not pairs or verdict.measure.cost:
+        return [], []
+    gained, lost, _ = choose_crops(pairs, CROPS)
+    return gained, lost
+
+
+def _number(value: float | None) -> str:
+    """Four digits, and none of powers of ten in large counts."""
+    return "unknown" if value is None else f"{value:,.0f}" if abs(value) >= LARGE else f"{value:.4g}"
+
+
+def _pipe(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def _resource(package: str, name: str) -> str:
+    return files(package).joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,205 @@
+"""From a file of claims to trials and back: what can be tested here, which trials that takes, the verdicts so far.
+
+The trials are ordinary ones of one experiment, found again by their folders, so a check that was killed goes on where
+it stopped and ends with the same verdicts.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.claims.file import Claim, ClaimsFile
+from gsbench.claims.sequential import plan_looks
+from gsbench.claims.verdict import Pair, PairKey, Verdict, judge_claim
+from gsbench.config.compose import Composed, compose_one
+from gsbench.errors import InputError
+from gsbench.runs.declaration import DeclaredPlan
+from gsbench.runs.hashing import sha256_of
+from gsbench.runs.trial_files import TrialPaths
+from gsbench.words import counted, some_of
+
+log = logging.getLogger(__name__)
+
+Lacking = Callable[[Composed, str], str]  # (trial, metric) -> why it cannot be had here, or ""
+
+
+@dataclass(frozen=True)
+class Question:
+    """A claim with the scenes that can be run here, and why others cannot."""
+
+    claim: Claim
+    scenes: tuple[str, ...]
+    missing: tuple[str, ...]
+
+    @property
+    def testable(self) -> bool:
+        return bool(self.scenes) and not self.claim.not_testable
+
+    @property
+    def why_not(self) -> str:
+        """Why it cannot be tested here at all; "" where it can."""
+        return "" if self.testable else self.claim.not_testable or "; ".join(self.missing)
+
+
+@dataclass(frozen=True)
+class Check:
+    """A file of claims in a runs folder: its questions, and the first trial of each scene and arm."""
+
+    file: ClaimsFile
+    runs: Path
+    questions: tuple[Question, ...]
+    first: dict[tuple[str, str, str], Composed]  # by claim, scene, arm
+
+    @property
+    def home(self) -> Path:
+        return self.runs / self.file.name
+
+    @property
+    def looks(self) -> tuple[int, ...]:
+        return plan_looks(self.file.seeds)
+
+    @property
+    def sharing(self) -> int:
+        """How many tests share the error rate."""
+        return max(1, sum(question.testable for question in self.questions))
+
+    @cached_property
+    def plan(self) -> dict[str, Any]:
+        """What is written down before trials run: the file's plan, and what of it can be tested here."""
+        tested = {question.claim.id: list(question.scenes) for question in self.questions if question.testable}
+        return self.file.plan() | {"tested": tested}
+
+    @property
+    def plan_hash(self) -> str:
+        return sha256_of(self.plan)
+
+    def trials(self, questions: Sequence[Question], seeds: int) -> list[Composed]:
+        """The trials that the questions need for their first ``seeds`` seeds; one that several need stands once."""
+        found: dict[Path, Composed] = {}
+        for seed in range(seeds):
+            for question in questions:
+                for scene in question.scenes if question.testable else ():
+                    for arm in (question.claim.baseline, question.claim.arm):
+                        trial = with_seed(self.first[question.claim.id, scene, arm], seed)
+                        found.setdefault(TrialPaths.of(trial.values).folder, trial)
+        return list(found.values())
+
+    def verdicts(self, declared: DeclaredPlan) -> list[Verdict]:
+        """The verdicts from the trials that are done."""
+        trials = read_experiment(self.home).trials if self.home.is_dir() else ()
+        by_folder = {trial.path: trial for trial in trials}
+        found = []
+        for question in self.questions:
+            pairs = self._pairs(question, by_folder)
+            verdict = judge_claim(question.claim, self.file, pairs, question.scenes, self.sharing, declared.time)
+            if not question.testable:
+                verdict = replace(verdict, reason=question.why_not)
+            elif question.missing:
+                verdict = replace(verdict, notes=(*question.missing, *verdict.notes))
+            found.append(verdict)
+        return found
+
+    def _pairs(self, question: Question, by_folder: dict[Path, TrialResult]) -> dict[PairKey, Pair]:
+        found: dict[PairKey, Pair] = {}
+        for scene in question.scenes if question.testable else ():
+            for seed in range(self.looks[-1]):
+                arms = (question.claim.baseline, question.claim.arm)
+                firsts = [with_seed(self.first[question.claim.id, scene, arm], seed) for arm in arms]
+                both = [by_folder.get(TrialPaths.of(trial.values).folder) for trial in firsts]
+                if both[0] is not None and both[1] is not None:
+                    found[scene, seed] = both[0], both[1]
+        return found
+
+
+def prepare(file: ClaimsFile, runs: Path, lacking: Lacking) -> Check:
+    """Compose the first trial of every scene and arm of every claim; ``lacking`` says what cannot be had here.
+
+    Raises InputError, naming claim, scene and arm, for settings that do not compose.
+    """
+    questions: list[Question] = []
+    first: dict[tuple[str, str, str], Composed] = {}
+    known: dict[tuple[str, ...], Composed] = {}
+    for claim in file.claims:
+        scenes: list[str] = []
+        missing: dict[str, list[str]] = {}  # scenes by reason
+        for scene in () if claim.not_testable else file.scenes_of(claim):
+            reason = ""
+            for arm in (claim.baseline, claim.arm):
+                words = (*file.words(claim, scene, arm), f"name={file.name}", "seed=0")
+                if words not in known:
+                    known[words] = _composed(words, runs, f"claim {claim.id}, scene {scene}, arm {arm}")
+                first[claim.id, scene, arm] = known[words]
+                reason = reason or lacking(known[words], claim.metric)
+            if reason:
+                missing.setdefault(reason, []).append(scene)
+            else:
+                scenes.append(scene)
+        _check_different(claim, scenes, first)
+        reasons = tuple(f"{some_of(names)}: {reason}" for reason, names in missing.items())
+        questions.append(Question(claim, tuple(scenes), reasons))
+    return Check(file, runs, tuple(questions), first)
+
+
+def run_looks(
+    check: Check,
+    declared: DeclaredPlan,
+    run: Callable[[Sequence[Composed]], object],
+    ready: Callable[[Composed], bool] = lambda trial: False,
+) -> list[Verdict]:
+    """Add seeds in the planned looks until every claim is decided; ``run`` runs what is not ``ready`` yet.
+
+    A claim whose trials failed waits; the others go on.
+    """
+    waiting: set[str] = set()
+    verdicts = check.verdicts(declared)
+    for seeds in check.looks:
+        left = [
+            question
+            for question, verdict in zip(check.questions, verdicts, strict=True)
+            if question.testable and not _is_final(verdict) and question.claim.id not in waiting
+        ]
+        if not left:
+            break
+        trials = [trial for trial in check.trials(left, seeds) if not ready(trial)]
+        if trials:
+            names = ", ".join(question.claim.id for question in left)
+            log.info("seeds up to %d: %s to be run for %s", seeds, counted(len(trials), "trial"), names)
+            run(trials)
+        verdicts = check.verdicts(declared)
+        for question, verdict in zip(check.questions, verdicts, strict=True):
+            reached = verdict.decision is not None and verdict.decision.seeds >= seeds
+            if question in left and not reached and not _is_final(verdict):
+                waiting.add(question.claim.id)
+    return verdicts
+
+
+def with_seed(trial: Composed, seed: int) -> Composed:
+    """The same trial with another seed."""
+    words = tuple(f"seed={seed}" if word.startswith("seed=") else word for word in trial.overrides)
+    return Composed(trial.values | {"seed": seed}, trial.yaml.replace("\nseed: 0\n", f"\nseed: {seed}\n"), words)
+
+
+def _is_final(verdict: Verdict) -> bool:
+    return verdict.decision is not None and verdict.decision.final
+
+
+def _composed(words: Sequence[str], runs: Path, where: str) -> Composed:
+    try:
+        trial = compose_one(words)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    return Composed(trial.values | {"runs": str(runs.resolve())}, trial.yaml, trial.overrides)
+
+
+def _check_different(claim: Claim, scenes: Sequence[str], first: dict[tuple[str, str, str], Composed]) -> None:
+    """Raise InputError where both arms are one and the same trial."""
+    for scene in scenes:
+        one, other = (TrialPaths.of(first[claim.id, scene, arm].values).folder for arm in (claim.baseline, claim.arm))
+        if one == other:
+            raise InputError(f"claim {claim.id}: {claim.baseline} and {claim.arm} are the same trial on {scene}")

@@ -1,0 +1,66 @@
+"""AbsGS: clones by the signed gradient, splits by the sum of its absolute values, and opacities held below one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from pydantic import PositiveFloat, PositiveInt
+from torch import Tensor
+
+from gsbench.densify.adc import ADC
+from gsbench.densify.base import Refinement, Rule
+from gsbench.densify.budget import admit
+from gsbench.raster.base import RenderOutput
+from gsbench.settings import OpenFraction
+
+
+@dataclass
+class AbsGS(ADC):
+    """ADC as Ye et al. (arXiv 2404.10484) publish it, in their own code.
+
+    The small are cloned by the signed mean gradient (``gradient_threshold``), the large are split by the mean of the
+    absolute one (``split_threshold``), in which the pixels of a Gaussian do not cancel. Every ``ceiling_interval``
+    iterations all opacities above ``opacity_ceiling`` are lowered to it, so that nothing hides what is behind.
+    """
+
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"absolute_sum": torch.float32}  # NDC, since the last refinement
+    needs_absolute_gradient = True
+
+    split_size: PositiveFloat = 0.001
+    split_threshold: PositiveFloat = 4e-4
+    opacity_ceiling: OpenFraction = 0.8
+    ceiling_interval: PositiveInt = 500
+
+    def observe(self, step: int, render: RenderOutput) -> None:
+        super().observe(step, render)
+        if step < self.stop:
+            assert render.screen_gradient_abs is not None  # it was asked for
+            self.statistics["absolute_sum"] += torch.where(render.visible, render.screen_gradient_abs.norm(dim=-1), 0.0)
+
+    def mean_absolute_gradient(self) -> Tensor:
+        """[N] NDC, over the iterations in which a Gaussian was visible; 0 where it never was."""
+        return self.statistics["absolute_sum"] / self.statistics["visible_count"].clamp_min(1)
+
+    def rules(self, refinement: Refinement) -> list[Rule]:
+        """Those of ADC, and the ceiling before the opacity reset."""
+        rules, step = super().rules(refinement), refinement.step
+        if step < self.stop and step % self.ceiling_interval == 0:
+            rules.insert(len(rules) - (self.reset_opacity in rules), self.lower_opacity)
+        return rules
+
+    def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
+        over, large = super().candidates(refinement)
+        return torch.where(large, self.reaches(self.mean_absolute_gradient(), self.split_threshold), over), large
+
+    def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
+        """Those farthest above their own threshold."""
+        _, large = self.candidates(refinement)
+        signed = self.mean_gradient() / self.gradient_threshold
+        excess = torch.where(large, self.mean_absolute_gradient() / self.split_threshold, signed)  # [N]
+        return admit(candidates, excess, gain, self.allowance(refinement))
+
+    def lower_opacity(self, refinement: Refinement) -> None:
+        """Bring all opacities below the ceiling."""
+        self.limit_opacity(refinement, self.opacity_ceiling)

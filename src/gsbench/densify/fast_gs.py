@@ -1,0 +1,99 @@
+"""FastGS: growth and pruning by how many badly rendered pixels a Gaussian covers, over several views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+from torch import Tensor
+
+from gsbench.densify.absgs import AbsGS
+from gsbench.densify.base import Refinement, Rule
+from gsbench.densify.scores import draw, draw_views, to_unit_range
+from gsbench.gaussians.model import Gaussians
+from gsbench.settings import Fraction, OpenFraction
+
+LEAST_WEIGHT = 1e-6  # keeps the weight finite by which the faint are drawn (the authors' code)
+
+
+@dataclass
+class FastGS(AbsGS):
+    """The candidates of AbsGS, of which only those grow that several views find badly rendered; Ren et al. (arXiv
+    2511.04283).
+
+    In each round ``score_views`` training views are drawn. In each, a pixel is bad where its L1 error, shifted and
+    scaled to [0, 1], is above ``error_threshold``; a Gaussian's count is the number of bad pixels that it is blended
+    into. Candidates grow whose mean count over the views, rounded down, is above ``least_count``. The pruning score is
+    the sum over views of the loss of the view times the count, shifted and scaled to [0, 1]. Of those to prune, half as
+    many as there are are drawn from all, in proportion to 1 / (1 - score), and only they go. Then opacities are lowered
+    to the ceiling. After the window, every ``final_interval`` iterations, all below ``final_opacity`` or above
+    ``final_score`` go.
+    """
+
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"count": torch.float32, "score": torch.float32}  # within a round
+    needs_footprint = True
+
+    split_threshold: PositiveFloat = 1.2e-3
+    cap: Literal["soft", "hard", "curve"] = "soft"  # others ask where a round leads before it has scores
+    score_views: PositiveInt = 10
+    error_threshold: Fraction = 0.1
+    least_count: NonNegativeFloat = 5.0
+    final_interval: PositiveInt = 3000
+    final_opacity: OpenFraction = 0.1
+    final_score: Fraction = 0.9
+
+    def rules(self, refinement: Refinement) -> list[Rule]:
+        """Those of ADC between the score and the ceiling; after the window, the final prunings."""
+        step = refinement.step
+        rules = [rule for rule in super().rules(refinement) if rule != self.lower_opacity]
+        if self.grow_by_gradient in rules:
+            rules.insert(rules.index(self.grow_by_gradient), self.score)
+            rules.insert(rules.index(self.prune) + 1, self.lower_opacity)
+        if step > self.stop and step % self.final_interval == 0:
+            rules += [self.score, self.prune_finally, self.reset_statistics]
+        return rules
+
+    def score(self, refinement: Refinement) -> None:
+        """The rule that counts the bad pixels of everyone."""
+        values, views = refinement.gaussians.values, self.context.training_views
+        chosen = draw_views(views, self.score_views, refinement.rng)
+        total, weighted = torch.zeros_like(values.opacity_logits), torch.zeros_like(values.opacity_logits)
+        for index in chosen:
+            counts, loss = self.bad_pixels(index, values, refinement.step)
+            total += counts
+            weighted += loss * counts
+        self.statistics["count"] = (total / len(chosen)).floor().float()
+        self.statistics["score"] = to_unit_range(weighted).float()
+
+    def bad_pixels(self, index: int, gaussians: Gaussians, step: int) -> tuple[Tensor, Tensor]:
+        """How many bad pixels of a view each Gaussian is blended into, [N], and the loss of the view."""
+        views = self.context.training_views
+        render = views.render(index, gaussians, step)
+        error = (render.image - views.image(index).to(render.image) / 255).abs().mean(-1)  # [H, W]
+        bad = to_unit_range(error) > self.error_threshold
+        return render.require_footprint(bad.to(error)).values, views.loss(index, render.image)
+
+    def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
+        over, large = super().candidates(refinement)
+        return over & (self.statistics["count"] > self.least_count), large
+
+    def prune(self, refinement: Refinement) -> None:
+        """Remove some of the faint and, after the first opacity reset, of the huge: more likely those that err."""
+        values, score = refinement.gaussians.values, self.statistics["score"]
+        faint, huge = self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
+        removed = refinement.event.split_gradient // (self.split_children - 1)  # parents; who remains stands first
+        known = torch.arange(len(score), device=score.device) < refinement.event.before - removed  # the new: no score
+        drawn = draw(known, 1 / (LEAST_WEIGHT + 1 - score), int((faint | huge).sum()) // 2, refinement.rng)
+        self._remove(refinement, faint & drawn, huge & ~faint & drawn)
+
+    def prune_finally(self, refinement: Refinement) -> None:
+        """Remove the rather faint and those that err most."""
+        faint = refinement.gaussians.values.opacities < self.final_opacity  # [N]
+        self._remove(refinement, faint, (self.statistics["score"] > self.final_score) & ~faint)
+
+    def _remove(self, refinement: Refinement, faint: Tensor, others: Tensor) -> None:
+        refinement.event.pruned_opacity += int(faint.sum())
+        refinement.event.pruned_size += int(others.sum())
+        self.edit(refinement, keep=~(faint | others))

@@ -1,0 +1,154 @@
+"""MRNF, the default strategy of LichtFeld-Studio: few long-axis splits, drawn by error and edges, and steady decay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+import torch
+from annotated_types import Interval
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from torch import Tensor
+
+from gsbench.densify.base import Refinement, Rule
+from gsbench.densify.budgeted import Budgeted
+from gsbench.densify.long_axis import halves
+from gsbench.densify.mcmc import spread_out
+from gsbench.densify.operations import standard_normal
+from gsbench.densify.scores import blended_sums, by_median, draw, draw_views, edge_scores
+from gsbench.events import Cause
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.raster.base import RenderOutput
+from gsbench.settings import Fraction, OpenFraction
+
+# Numbers of LichtFeld-Studio's code (src/training/strategies/mrnf.cpp, kernels/mrnf_kernels.cu).
+EDGE_WEIGHT = 0.25  # of the edge score, over its median, beside 1
+REACH = 100.0  # times the scene's half size: farther and larger Gaussians go
+LEAST_SCALE = 1e-10  # world units
+BOUNDS = (0.1, 0.9)  # quantiles of the means on each axis, between which the scene lies
+NOISE_POWER = 150.0  # of 1 - opacity
+SPLIT_OFFSET, SPLIT_LONGEST, SPLIT_ACROSS, SPLIT_OPACITY = 0.5, 0.5, 0.85, 0.6  # in standard deviations; factors
+LEAST_DECAYED = 1e-12  # of opacities and scales
+
+
+@dataclass
+class MRNF(Budgeted):
+    """Rounds that replace what was pruned and add a small share, by long-axis splits; opacities and scales decay.
+
+    The refine weight of a Gaussian is the largest, over ``score_views`` training views drawn in each round, of sum over
+    pixels of e alpha T, with e = max(0, 1 - SSIM) over its mean in the view. Candidates are those above
+    ``growth_threshold`` that were seen; ``growth_share`` of their number is how many Gaussians are split in the round:
+    first as many as were pruned, drawn by opacity, then, up to iteration ``grow_until``, the rest, drawn by refine
+    weight; both times by the edges that they cover, too. Pruned are those below ``prune_opacity``, and what has left
+    the scene by size or place. After each round every opacity falls by ``opacity_decay`` and every scale by the share
+    ``scale_decay``, less and less until ``decay_until``. After each step, means of faint Gaussians get noise.
+    """
+
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"seen": torch.bool}  # since the last round
+
+    start: NonNegativeInt = 0
+    stop: int = 25_000
+    interval: PositiveInt = 200
+    max_gaussians: PositiveInt = 1_000_000
+    cap: Literal["hard", "curve"] = "hard"
+    grow_until: NonNegativeInt = 15_000
+    growth_threshold: NonNegativeFloat = 0.003
+    growth_share: Fraction = 0.07
+    score_views: PositiveInt = 10
+    prune_opacity: Annotated[float, Interval(ge=0, lt=1)] = 1 / 255
+    opacity_decay: Fraction = 0.004
+    scale_decay: Annotated[float, Interval(ge=0, lt=1)] = 0.002
+    decay_until: PositiveInt = 30_000  # iterations; the length of the training
+    noise_rate: NonNegativeFloat = 50.0  # times the learning rate of the means
+    initial_opacity: OpenFraction = 0.5
+    initial_scale: PositiveFloat = 0.1  # of the distance to the neighbours
+
+    def prepare(self, gaussians: Gaussians) -> Gaussians:
+        return spread_out(gaussians, self.initial_opacity, self.initial_scale)
+
+    def observe(self, step: int, render: RenderOutput) -> None:
+        self.statistics["seen"] |= render.visible
+
+    def rules(self, refinement: Refinement) -> list[Rule]:
+        if not self.due(refinement.step):
+            return []
+        return [self.refill_and_grow, self.decay, self.reset_statistics]
+
+    def refill_and_grow(self, refinement: Refinement) -> None:
+        """Prune, split as many to fill the gaps, then split a share of the candidates."""
+        step, rng, event = refinement.step, refinement.rng, refinement.event
+        values, seen = refinement.gaussians.values, self.statistics["seen"]
+        gone = self.lost(values)  # [N]
+        views = draw_views(self.context.training_views, self.score_views, rng)
+        weights = self.refine_weights(views, values, step)
+        edges = edge_scores(self.context.training_views, views, values, step, by_median)
+        guidance = 1 + EDGE_WEIGHT * by_median(edges)  # [N]
+        above = (weights > self.growth_threshold) & seen
+        wanted = int(self.growth_share * int(above.sum()) + 0.5)
+
+        room = (self.allowance(refinement) or 0) + int(gone.sum())
+        replacements = values.opacities.detach() * guidance
+        refilled = draw(seen & ~gone & (replacements > 0), replacements, min(int(gone.sum()), room), rng)
+        left = max(0, wanted - int(refilled.sum())) if step < self.grow_until else 0
+        able = above & ~gone & ~refilled
+        grown = draw(able, weights * guidance, min(left, room - int(refilled.sum())), rng)
+        event.blocked_by_cap += max(0, min(left, int(able.sum())) - int(grown.sum()))
+        event.pruned_opacity += int(gone.sum())
+        event.split_gradient += int((refilled | grown).sum())
+        self.split_along(refinement, refilled | grown, ~gone)
+
+    def refine_weights(self, views: Sequence[int], gaussians: Gaussians, step: int) -> Tensor:
+        """The refine weight, [N]."""
+        training, largest = self.context.training_views, torch.zeros_like(gaussians.opacity_logits)
+        for index in views:
+            error = training.dissimilarity(index, training.render(index, gaussians, step).image.detach())  # [H, W]
+            error = (error / error.mean().clamp_min(torch.finfo(error.dtype).tiny)).unsqueeze(-1)
+            sums, _ = blended_sums(training, index, gaussians, step, error.expand(-1, -1, 3).contiguous())
+            largest = torch.maximum(largest, sums[:, 0])
+        return largest
+
+    def lost(self, gaussians: Gaussians) -> Tensor:
+        """Mask [N] of those to prune: transparent, without size, or out of the scene by size or place."""
+        center, half, _ = bounds(gaussians.means.detach())
+        limit = REACH * half
+        scales = gaussians.log_scales
+        far = (gaussians.means - center).abs().amax(-1) > limit
+        sizes = (scales.amin(-1) < math.log(LEAST_SCALE)) | (scales.amax(-1).exp() > limit)
+        return (gaussians.opacities < self.prune_opacity) | sizes | far
+
+    def split_along(self, refinement: Refinement, selected: Tensor, kept: Tensor) -> None:
+        """Replace the ``selected`` [N] by two halves along their longest axis; of all others keep ``kept`` [N]."""
+        parents = selected.nonzero().squeeze(-1)  # [S]
+        chosen = refinement.gaussians.values.detach().select(parents)
+        children = halves(chosen, SPLIT_OFFSET, SPLIT_LONGEST, SPLIT_ACROSS, SPLIT_OPACITY)
+        self.edit(refinement, kept & ~selected, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
+
+    def decay(self, refinement: Refinement) -> None:
+        """Lower all opacities and scales a little; the moments stay."""
+        values, left = refinement.gaussians.values, max(0.0, 1 - refinement.step / self.decay_until)
+        opacities = values.opacities - self.opacity_decay * left
+        finest = max(LEAST_DECAYED, torch.finfo(opacities.dtype).eps)
+        values.opacity_logits.copy_(torch.logit(opacities.clamp(LEAST_DECAYED, 1 - finest)))
+        values.log_scales.add_(math.log(1 - self.scale_decay * left)).clamp_min_(math.log(LEAST_DECAYED))
+
+    @torch.no_grad()
+    def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
+        if step >= self.stop:
+            return
+        values, seen = gaussians.values, self.statistics["seen"]
+        _, _, size = bounds(values.means)
+        weight = (1 - values.opacities).pow(NOISE_POWER) * (self.noise_rate * gaussians.position_rate)  # [N]
+        noise = standard_normal((len(gaussians), 3), rng, values.means) * weight.unsqueeze(-1)
+        values.means += torch.where(seen.unsqueeze(-1), noise.clamp(-size, size), 0.0)
+
+
+def bounds(means: Tensor) -> tuple[Tensor, float, float]:
+    """Of the box between the quantiles `BOUNDS` of ``means`` [N, 3]: its centre [3], half its longest edge, and the
+    edge of middle length (world units)."""
+    ordered = means.sort(dim=0).values
+    low, high = (ordered[int(share * (len(means) - 1))] for share in BOUNDS)
+    edges = (high - low).sort().values
+    return (low + high) / 2, float(edges[2]) / 2, float(edges[1])

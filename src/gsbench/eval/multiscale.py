@@ -1,0 +1,153 @@
+"""SSIM over five scales: MS-SSIM, and IW-SSIM, which weights each place by the information it carries.
+
+Both take images [H, W, 3] in [0, 1] of at least 161 px a side, so that the window fits into the smallest scale.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gsbench.eval.images import LUMA, as_batch, check_pair, check_size, mix_channels
+from gsbench.eval.ssim import WINDOW_SIZE, ssim_parts
+
+# How much each scale counts, from the finest: Wang, Simoncelli and Bovik 2003, section 3.2. IW-SSIM takes the same.
+SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+SCALES = len(SCALE_WEIGHTS)
+MIN_SIZE = (WINDOW_SIZE - 1) * 2 ** (SCALES - 1) + 1  # px: 161, halved four times and rounded up, is the window's 11
+# Of IW-SSIM.
+BYTE_RANGE = 255.0  # its model of the eye is for values from 0 to 255
+EYE_NOISE = 0.4  # variance of the noise of seeing: sigma_n², as in Sheikh and Bovik 2006, "Image information and..."
+BLOCK = 3  # px a side, of the neighbourhood whose coefficients are modelled as one vector
+BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)  # the filter of the pyramid, here times sqrt(2)
+FLAT = 1e-15  # a variance below it counts as none
+
+
+def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Multi-scale structural similarity, the mean over the three channels; 1 for identical images, at least 0.
+
+    Wang, Simoncelli and Bovik 2003, "Multiscale structural similarity for image quality assessment", eq. 7: contrast
+    and structure at five scales, luminance at the coarsest alone. Between scales, means of 2x2 px, an odd side's last
+    line counting twice. A scale whose mean is negative counts as 0. Raises ValueError below 161 px a side.
+    """
+    check_pair(image, target)
+    x, y = as_batch(image), as_batch(target)  # [B, 3, H, W] each
+    check_size(x, MIN_SIZE, "MS-SSIM")
+    values = torch.ones_like(x[:, :, 0, 0])  # [B, 3]
+    for scale, weight in enumerate(SCALE_WEIGHTS):
+        luminance, structure = ssim_parts(x, y, "valid")
+        compared = structure if scale < SCALES - 1 else luminance * structure
+        values = values * compared.mean(dim=(2, 3)).clamp_min(0) ** weight
+        x, y = _halved(x), _halved(y)
+    means = values.mean(dim=1)  # [B]
+    return means[0] if image.ndim == 3 else means
+
+
+def iw_ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Information content weighted SSIM of the luminance: 1 for identical images, at least 0.
+
+    Wang and Li 2011, "Information content weighting for perceptual image quality assessment", IEEE Trans. Image
+    Processing 20(5): contrast and structure in the bands of a Laplacian pyramid, weighted by what the two images tell a
+    noisy eye of each place, and SSIM in its lowest band, multiplied as in MS-SSIM. A scale whose mean is negative
+    counts by its absolute value, as in piq. Not a number where ``target`` is flat. Raises ValueError below 161 px a
+    side.
+    """
+    check_pair(image, target)
+    x, y = as_batch(image), as_batch(target)  # [B, 3, H, W] each
+    check_size(x, MIN_SIZE, "IW-SSIM")
+    values = [_iw_ssim(one, other) for one, other in zip(x.split(1), y.split(1), strict=True)]
+    return values[0] if image.ndim == 3 else torch.stack(values)
+
+
+def _halved(images: Tensor) -> Tensor:
+    height, width = images.shape[-2:]
+    return F.avg_pool2d(F.pad(images, [0, width % 2, 0, height % 2], mode="replicate"), 2)
+
+
+def _iw_ssim(image: Tensor, target: Tensor) -> Tensor:
+    """The value of one pair [1, 3, H, W]."""
+    bands = _laplacian_pyramid(mix_channels(image, LUMA) * BYTE_RANGE)
+    target_bands = _laplacian_pyramid(mix_channels(target, LUMA) * BYTE_RANGE)
+    value = image.new_ones(())
+    for scale, weight in enumerate(SCALE_WEIGHTS):
+        band, target_band = bands[scale], target_bands[scale]  # [1, 1, h, w] each
+        luminance, structure = ssim_parts(band, target_band, "valid", BYTE_RANGE)
+        if scale == SCALES - 1:
+            mean = (luminance * structure).mean()
+        else:
+            parent = target_bands[scale + 1] if scale < SCALES - 2 else None
+            inside = (WINDOW_SIZE - BLOCK) // 2  # the block fits in more places than the window
+            information = _information(band, target_band, parent)[inside:-inside, inside:-inside]
+            mean = (structure[0, 0] * information).sum() / information.sum()
+        value = value * mean.abs() ** (
+            weight / sum(SCALE_WEIGHTS)
+        )  # these sum to 1.0001; the authors normalise them here
+    return value
+
+
+def _laplacian_pyramid(image: Tensor) -> list[Tensor]:
+    """Four bands of [1, 1, H, W] from the finest and what is left, each half as large as the one before."""
+    kernel = image.new_tensor(BINOMIAL) * math.sqrt(2)  # [5]
+    bands = []
+    for _ in range(SCALES - 1):
+        low = _filtered(image, kernel)[..., ::2, ::2]
+        raised = torch.zeros_like(image)
+        raised[..., ::2, ::2] = low
+        bands.append(image - _filtered(raised, kernel))
+        image = low
+    return [*bands, image]
+
+
+def _filtered(image: Tensor, kernel: Tensor) -> Tensor:
+    """[1, 1, H, W] filtered along both axes, mirrored at the border's pixels."""
+    reach = len(kernel) // 2
+    padded = F.pad(image, [reach] * 4, mode="reflect")
+    return F.conv2d(F.conv2d(padded, kernel.view(1, 1, 1, -1)), kernel.view(1, 1, -1, 1))
+
+
+def _information(band: Tensor, target_band: Tensor, parent: Tensor | None) -> Tensor:
+    """The bits (times 2) that both images tell of each block in a band, [h - 2, w - 2].
+
+    A block of the target, with the coefficient of the coarser band ``parent`` above it, is a Gaussian vector of one
+    covariance times a local factor (a Gaussian scale mixture); the image is it times ``gain`` plus noise.
+    """
+    blocks = F.unfold(target_band, BLOCK)[0].T  # [P, 9], P the blocks inside
+    if parent is not None:
+        above = _enlarged(parent)[..., : target_band.shape[-2], : target_band.shape[-1]]
+        blocks = torch.cat([blocks, above[0, 0, 1:-1, 1:-1].reshape(-1, 1)], dim=1)  # [P, 10]
+    count, size = blocks.shape
+    # On the CPU: not every device has this decomposition, and the matrix is 10x10 at most.
+    variances, axes = (
+        found.to(blocks) for found in torch.linalg.eigh((blocks.T @ blocks / count).cpu())
+    )  # [K], [K, K]
+    kept = variances > torch.finfo(variances.dtype).eps * variances.max()
+    whitened = blocks @ axes[:, kept] / variances[kept].sqrt()  # [P, K']
+    factor = whitened.square().sum(dim=1, keepdim=True) / size  # [P, 1] local variance: s²
+
+    moments = F.avg_pool2d(torch.cat([band, target_band, band**2, target_band**2, band * target_band]), BLOCK, 1)
+    mean, target_mean, square, target_square, product = moments[:, 0].flatten(1).unsqueeze(-1)  # [P, 1] each
+    variance = (square - mean**2).clamp_min(0)
+    target_variance = (target_square - target_mean**2).clamp_min(0)
+    covariance = product - mean * target_mean
+    plain, target_plain = variance < FLAT, target_variance < FLAT
+    gain = torch.where(plain | target_plain, 0.0, covariance / target_variance.clamp_min(FLAT))
+    noise = torch.where(target_plain, variance, variance - gain * covariance)
+    noise = torch.where(plain, 0.0, noise)
+    seen = (noise + (1 + gain**2) * EYE_NOISE) * factor * variances[kept] + EYE_NOISE * noise  # [P, K']
+    height, width = target_band.shape[-2] - BLOCK + 1, target_band.shape[-1] - BLOCK + 1
+    return torch.log2(1 + seen / EYE_NOISE**2).sum(dim=1).view(height, width)
+
+
+def _enlarged(band: Tensor) -> Tensor:
+    """[1, 1, h, w] twice as large: bilinear onto 4h - 3 by 4w - 3, extended by a line all round, every other taken."""
+    height, width = band.shape[-2:]
+    fine = F.interpolate(band, (4 * height - 3, 4 * width - 3), mode="bilinear", align_corners=False)
+    for axis in (2, 3):
+        last = fine.shape[axis] - 1
+        before = 2 * fine.narrow(axis, 0, 1) - fine.narrow(axis, 1, 1)
+        after = 2 * fine.narrow(axis, last, 1) - fine.narrow(axis, last - 1, 1)
+        fine = torch.cat([before, fine, after], dim=axis)
+    return fine[..., ::2, ::2]

@@ -1,0 +1,201 @@
+"""From a database of verified matches to cameras and points, by the first of several ways that places the photographs.
+
+COLMAP's defaults want an initial pair that sees points under 16 degrees. Forward-facing captures of a small baseline
+and without a known focal length have none; other ways of the same library place them. Everything here calls native
+code that can abort the process: run it isolated.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pycolmap
+
+from gsbench.errors import InputError
+from gsbench.init.base import MIN_IMAGES, Progress
+from gsbench.init.colmap.database import assume_focal_lengths, cameras_without_prior, verify_pairs
+from gsbench.init.colmap.reconstruct import MappingSettings, Verification, pipeline_options
+from gsbench.init.report import REGISTERED_SHARE
+
+Mapper = Literal["auto", "incremental", "global"]
+SMALL_ANGLE_DEG = 2.0  # of the initial pair; COLMAP's default is 16
+FOCAL_FACTORS = (0.75, 1.0, 1.4)  # focal length over the longest side: lenses of 27, 36 and 50 mm on 35 mm film
+MIN_ANGLE_DEG = 0.5  # median over points of the widest angle that sees one; below it depth is a guess
+NO_PAIR = (
+    "structure from motion found no pair of images to start from: the photos need more overlap (60 % and more "
+    "between neighbours), more texture, or a focal length (init.focal_length, px)"
+)
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """The best model, how many models that way gave, and what was tried: the images that each way placed."""
+
+    model: pycolmap.Reconstruction
+    models: int
+    way: str
+    tried: tuple[tuple[str, int], ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the reader of a report should know where COLMAP's defaults were not enough; one line, or none."""
+        if len(self.tried) < 2:
+            return ()
+        others = ", ".join(f"{way} {count}" for way, count in self.tried)
+        return (
+            f"the cameras come from the way {self.way!r}, since COLMAP's defaults placed too few (images: {others})",
+        )
+
+
+def map_images(
+    database: Path,
+    images: Path,
+    output: Path,
+    settings: MappingSettings,
+    verification: Verification,
+    mapper: Mapper,
+    progress: Progress,
+) -> Mapped:
+    """Cameras and points from the matches in ``database``; of several models the one with the most images.
+
+    ``auto`` goes from COLMAP's incremental mapper to one that starts from smaller angles, to the global mapper and to
+    assumed focal lengths, until a way places `REGISTERED_SHARE` of the images; else the best of all counts.
+
+    Raises InputError where no model with at least `MIN_IMAGES` images comes out.
+    """
+    with pycolmap.Database.open(database) as opened:
+        total = opened.num_images()
+    best: tuple[pycolmap.Reconstruction, int, str] | None = None
+    tried: list[tuple[str, int]] = []
+    for way, run in _ways(database, images, output, settings, verification, mapper, progress, total):
+        models = [model for model in run() if _is_plausible(model)]
+        largest = max(models, key=_size, default=None)
+        tried.append((way, 0 if largest is None else largest.num_reg_images()))
+        if largest is not None and (best is None or _size(largest) > _size(best[0])):
+            best = largest, len(models), way
+        if best is not None and best[0].num_reg_images() >= REGISTERED_SHARE * total:
+            break
+    if best is None:
+        raise InputError(NO_PAIR)
+    if best[0].num_reg_images() < MIN_IMAGES:
+        raise InputError(
+            f"structure from motion placed only {best[0].num_reg_images()} of {total} images: the photos need more "
+            "overlap, more texture, or a focal length (init.focal_length, px)"
+        )
+    return Mapped(*best, tuple(tried))
+
+
+Run = Callable[[], Sequence[pycolmap.Reconstruction]]
+
+
+def _ways(
+    database: Path,
+    images: Path,
+    output: Path,
+    settings: MappingSettings,
+    verification: Verification,
+    mapper: Mapper,
+    progress: Progress,
+    total: int,
+) -> Iterator[tuple[str, Run]]:
+    """The ways that ``mapper`` allows, in the order of trying, each with what runs it."""
+
+    def incremental(found: Path, angle: float | None = None) -> Sequence[pycolmap.Reconstruction]:
+        return _incremental(found, images, _empty(output), settings, progress, total, angle)
+
+    def with_focal_lengths(factor: float) -> Sequence[pycolmap.Reconstruction]:
+        copy = database.with_name(f"assumed-{factor:g}.db")
+        return incremental(_with_focal_lengths(database, copy, factor, verification, progress), SMALL_ANGLE_DEG)
+
+    if mapper in ("auto", "incremental"):
+        yield "incremental", lambda: incremental(database)
+    if mapper == "auto":
+        yield f"incremental from {SMALL_ANGLE_DEG:g} degrees", lambda: incremental(database, SMALL_ANGLE_DEG)
+    if mapper in ("auto", "global"):
+        yield "global", lambda: _global(database, images, _empty(output), settings, progress, total)
+    if mapper == "auto" and cameras_without_prior(database):
+        for factor in FOCAL_FACTORS:
+            yield f"focal length {factor:g} x the longest side", partial(with_focal_lengths, factor)
+
+
+def _with_focal_lengths(
+    database: Path, copy: Path, factor: float, verification: Verification, progress: Progress
+) -> Path:
+    """A copy of the database whose unknown focal lengths are ``factor`` times the longest side, verified anew."""
+    shutil.copy(database, copy)
+    pairs = assume_focal_lengths(copy, factor)
+    verify_pairs(copy, pairs, verification.options(), progress)
+    return copy
+
+
+def _incremental(
+    database: Path,
+    images: Path,
+    output: Path,
+    settings: MappingSettings,
+    progress: Progress,
+    total: int,
+    initial_angle: float | None,
+) -> Sequence[pycolmap.Reconstruction]:
+    registered = 0
+
+    def one_more() -> None:
+        nonlocal registered
+        registered += 1
+        progress("map", min(registered, total), total)
+
+    options = pipeline_options(settings)
+    if initial_angle is not None:
+        options.mapper.init_min_tri_angle = initial_angle
+    progress("map", 0, total)
+    pycolmap.set_random_seed(settings.seed)
+    models = pycolmap.incremental_mapping(database, images, output, options=options, next_image_callback=one_more)
+    progress("map", total, total)
+    return list(models.values())
+
+
+def _global(
+    database: Path, images: Path, output: Path, settings: MappingSettings, progress: Progress, total: int
+) -> Sequence[pycolmap.Reconstruction]:
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = settings.threads
+    options.random_seed = settings.seed
+    options.min_model_size = settings.min_model_size
+    adjustment = options.mapper.bundle_adjustment
+    adjustment.refine_focal_length = not settings.fixed_intrinsics
+    adjustment.refine_extra_params = not settings.fixed_intrinsics
+    progress("map", 0, total)
+    pycolmap.set_random_seed(settings.seed)
+    models = pycolmap.global_mapping(database, images, output, options=options)
+    progress("map", total, total)
+    return list(models.values())
+
+
+def _empty(folder: Path) -> Path:
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
+
+
+def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:
+    return model.num_reg_images(), model.num_points3D()
+
+
+def _is_plausible(model: pycolmap.Reconstruction) -> bool:
+    """Whether points are seen under angles that tell their depth; copies of one photograph give none."""
+    centers = {image.image_id: image.projection_center() for image in model.images.values() if image.has_pose}
+    angles = [_widest_angle(point, centers) for point in model.points3D.values() if point.track.length() > 1]
+    return bool(angles) and float(np.median(angles)) >= MIN_ANGLE_DEG
+
+
+def _widest_angle(point: pycolmap.Point3D, centers: dict[int, np.ndarray]) -> float:
+    """The widest angle between two rays to a point, in degrees."""
+    rays = np.array([centers[element.image_id] for element in point.track.elements]) - point.xyz  # [T, 3]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return float(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)).max()))

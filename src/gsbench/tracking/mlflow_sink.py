@@ -1,0 +1,204 @@
+"""A trial as a run of MLflow.
+
+Each metric's time is a function of the files, so that MLflow, which drops exact repetitions, holds it once even if it
+was sent twice. Which run it is stands in the trial's folder, so that none is begun twice.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+import uuid
+from collections.abc import Sequence
+from typing import Any
+
+from gsbench.files import read_object, write_json
+from gsbench.runs import layout
+from gsbench.tracking.client import connect, default_uri, ensure_experiment, ensure_parent
+from gsbench.tracking.record import TrialRecord
+from gsbench.tracking.sink import Point, Summary
+from gsbench.tracking.source import source_tags, user_tags
+
+STATE = "mlflow.json"  # in the trial's folder: the run that mirrors it and how far
+OWN_DATABASE = "runs/mlflow.db"
+TOKEN_TAG = "gsbench.token"
+PARENT_TAG = "mlflow.parentRunId"
+ERROR_TAG = "error"
+MAX_TAG = 5000  # characters of a tag (MLflow's limit)
+DIGEST_CHARACTERS = 16  # of the fingerprint, in a dataset's digest, for which MLflow has 36
+MAX_VALUE = 6000  # characters of a parameter (MLflow's limit)
+MAX_PARAMS = 100  # parameters in a batch
+MAX_METRICS = 1000  # metrics in a batch
+TRIES = 5  # at entering a data set, which rivals may enter at the same moment
+SECONDS_BETWEEN_TRIES = 0.2
+NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-./ ]")  # what MLflow refuses in a picture's name
+
+
+class MlflowSink:
+    """The MLflow run of one trial."""
+
+    state_file = STATE
+
+    def __init__(self, options: dict[str, Any], record: TrialRecord, program: str | None) -> None:
+        self._options, self._record, self._program = options, record, program
+        self.client = connect(options["uri"], record.runs)
+        self.run_id = ""
+        self._started = 0  # ms since 1970
+        self._monitor: Any = None
+
+    def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
+        """See `gsbench.tracking.sink.Sink`; a deleted run, and one in another tracker, is as none."""
+        state = self._known(state, results) or self._create_run()
+        self.run_id, self._started = state["run_id"], state["started"]
+        if state["complete"] is None:
+            self.client.update_run(self.run_id, status="RUNNING")
+            if self._program is not None and self._options.get("system_metrics"):
+                self._monitor = start_system_metrics(self.run_id, str(self.client.tracking_uri))
+        return state
+
+    def log(self, points: Sequence[Point]) -> None:
+        """Log numbers in batches."""
+        from mlflow.entities import Metric
+
+        metrics = [Metric(point.key, point.value, self._time_of(point.seconds), point.step) for point in points]
+        for start in range(0, len(metrics), MAX_METRICS):
+            self.client.log_batch(self.run_id, metrics=metrics[start : start + MAX_METRICS])
+
+    def complete(self, summary: Summary) -> None:
+        """Log final metrics, data sets, pictures as a grid and files, and close the run."""
+        from mlflow.entities import RunTag
+        from PIL import Image
+
+        self._end_monitor()
+        if ERROR_TAG in self.client.get_run(self.run_id).data.tags:  # an earlier attempt failed
+            self.client.delete_tag(self.run_id, ERROR_TAG)
+        self._log_datasets(summary.results)
+        self.log(summary.points)
+        self.client.log_batch(self.run_id, tags=[RunTag(key, value) for key, value in summary.tags.items()])
+        for folder, path in summary.files:
+            self.client.log_artifact(self.run_id, str(path), folder or None)
+        for name, path in summary.pictures.items():
+            with Image.open(path) as image:
+                key = NOT_IN_A_KEY.sub("_", name)
+                at = self._time_of(summary.seconds)
+                self.client.log_image(self.run_id, image, key=key, step=summary.step, timestamp=at, synchronous=True)
+        self.client.set_terminated(self.run_id, "FINISHED")
+
+    def stop(self, status: str, reason: str | None) -> None:
+        """Close the run; the ``reason`` of a failure becomes a tag, and its files are shown."""
+        self._end_monitor()
+        if reason is not None:
+            self.client.set_tag(self.run_id, ERROR_TAG, reason[:MAX_TAG])
+            for name in (layout.CONFIG, layout.FAILED, layout.LOG):
+                if (self._record.folder / name).exists():
+                    self.client.log_artifact(self.run_id, str(self._record.folder / name))
+        self.client.set_terminated(self.run_id, status)
+
+    def remove(self) -> None:
+        """Delete the run."""
+        self.client.delete_run(self.run_id)
+
+    def _known(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
+        """How far the trial is mirrored here; empty where it never was, was elsewhere, or was since computed anew."""
+        from mlflow.exceptions import MlflowException
+
+        if state.get("uri") not in (self._uri(), self.client.tracking_uri) or "run_id" not in state:
+            return {}
+        try:
+            run = self.client.get_run(state["run_id"])
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+                raise
+            return {}
+        if run.info.lifecycle_stage != "active":
+            return {}
+        if state["complete"] not in (None, results):
+            self.client.delete_run(state["run_id"])  # it shows results that are no longer the trial's
+            return {}
+        return state
+
+    def _create_run(self) -> dict[str, Any]:
+        from mlflow.entities import Param, RunTag
+
+        record, client = self._record, self.client
+        begun = self._begin()
+        experiment_id = ensure_experiment(client, record.values["name"], record.runs)
+        tags = record.tags() | {TOKEN_TAG: begun["token"]} | user_tags()
+        if self._program is not None:
+            tags |= source_tags(self._program)
+        if sweep := record.sweep():
+            tags[PARENT_TAG] = ensure_parent(client, experiment_id, sweep, record.runs)
+        found = client.search_runs([experiment_id], f"tags.`{TOKEN_TAG}` = '{begun['token']}'", max_results=1)
+        run = found[0] if found else client.create_run(experiment_id, tags=tags, run_name=record.label)
+        run_id = run.info.run_id
+        params = [Param(key, value[:MAX_VALUE]) for key, value in record.params().items()]
+        for start in range(0, len(params), MAX_PARAMS):
+            client.log_batch(run_id, params=params[start : start + MAX_PARAMS], tags=[RunTag("gsbench", "1")])
+        return begun | {"run_id": run_id, "logged": {}, "complete": None}
+
+    def _begin(self) -> dict[str, Any]:
+        """Note, before a run is created, by what it is found again if nobody hears of its creation."""
+        file = self._record.folder / STATE
+        state = read_object(file)
+        if state.get("uri") == self._uri() and "token" in state and "run_id" not in state:
+            return state
+        begun = {"uri": self._uri(), "token": uuid.uuid4().hex, "started": int(time.time() * 1000)}
+        write_json(file, begun)
+        return begun
+
+    def _log_datasets(self, results: dict[str, Any]) -> None:
+        """The photographs, once for each split: MLflow tells data sets apart by name and digest."""
+        from mlflow.entities import Dataset, DatasetInput, InputTag
+
+        digest = results["hashes"].get("data")
+        if digest is None:
+            return
+        scene = self._record.values["scene"]
+        source = json.dumps({"uri": str(scene.get("path") or scene["name"])})
+        inputs = [
+            DatasetInput(
+                Dataset(
+                    name=scene["name"],
+                    digest=f"{digest[:DIGEST_CHARACTERS]}-{split}",
+                    source_type="local",
+                    source=source,
+                    profile=json.dumps({"views": results[f"{split}_views"], "split": split}),
+                ),
+                [InputTag("mlflow.data.context", split)],
+            )
+            for split in ("train", "test")
+            if f"{split}_views" in results  # of renders that another program made, the tests alone are known
+        ]
+        for tries_left in reversed(range(TRIES)):
+            try:
+                self.client.log_inputs(self.run_id, inputs)
+                return
+            except Exception as error:  # MLflow's own, or SQLAlchemy's
+                # MLflow looks whether a data set is there and then enters it, which a rival may do in between.
+                if "unique constraint" not in str(error).lower() or tries_left == 0:
+                    raise
+                time.sleep(SECONDS_BETWEEN_TRIES)
+
+    def _end_monitor(self) -> None:
+        if self._monitor is not None:
+            self._monitor.finish()
+            self._monitor = None
+
+    def _time_of(self, seconds: float) -> int:
+        """The time in ms of what happened after ``seconds`` of training."""
+        return int(self._started + 1000 * seconds)
+
+    def _uri(self) -> str:
+        """Where the run is: the tracker's address, or a word for the runs folder's own, which may move with it."""
+        uri = str(self.client.tracking_uri)
+        return OWN_DATABASE if uri == default_uri(self._record.runs) else uri
+
+
+def start_system_metrics(run_id: str, uri: str) -> Any:
+    """MLflow's own monitor of processors, memory, disk, network and GPUs, which logs to a run until ``finish``."""
+    from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
+
+    monitor = SystemMetricsMonitor(run_id, resume_logging=True, tracking_uri=uri)
+    monitor.start()
+    return monitor

@@ -1,0 +1,146 @@
+"""What the files of a trial say, in the terms of a tracker: names, settings, curves, results, pictures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsbench.files import read_object
+from gsbench.runs import layout
+from gsbench.runs.hashing import flatten, sha256_of
+from gsbench.runs.stages import TRAIN
+from gsbench.tracking.sink import Point, Summary
+
+FILES = (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS)
+# Of the init's report: is the cloud to be trusted, and what does a volume threshold mean there?
+INIT_FIELDS = ("num_registered", "num_points", "mean_reprojection_error", "mean_track_length", "pose_errors", "gauge")
+CURVES = {layout.CURVES: "train", layout.EVENTS: "events"}
+
+
+@dataclass(frozen=True)
+class TrialRecord:
+    """A trial in ``folder``, below the runs folder ``runs``, with the configuration ``values``."""
+
+    runs: Path
+    folder: Path
+    values: dict[str, Any]
+
+    @property
+    def arm(self) -> str:
+        """Initialiser and densifier."""
+        return f"{self.values['init']['name']}-{self.values['densify']['name']}"
+
+    @property
+    def label(self) -> str:
+        """The run's name: the seed first, since trackers cut names at their end."""
+        return f"seed {self.values['seed']} {self.values['scene']['name']} {self.arm}"
+
+    @property
+    def path(self) -> str:
+        """The trial's folder as seen from the runs folder."""
+        return self.folder.relative_to(self.runs).as_posix()
+
+    def tags(self) -> dict[str, str]:
+        """What the trial is found by."""
+        names = {group: self.values[group]["name"] for group in ("scene", "init", "densify")}
+        return {"kind": "trial", **names, "seed": str(self.values["seed"]), "folder": self.path}
+
+    def params(self) -> dict[str, str]:
+        """Every setting that has a value, by its dotted key; the arm is first in charts."""
+        return {"arm": self.arm} | {key: str(value) for key, value in flatten(self.values).items() if str(value)}
+
+    def sweep(self) -> dict[str, Any]:
+        """The sweep that asked for the trial: its ``id`` and ``count`` of trials; empty for one trial alone."""
+        home = self.folder.parents[2]
+        trials = read_object(home / layout.PLAN).get("trials")
+        entry = trials.get(self.folder.relative_to(home).as_posix()) if isinstance(trials, dict) else None
+        found = entry.get("sweep") if isinstance(entry, dict) else None
+        return found if isinstance(found, dict) else {}
+
+    def results(self) -> dict[str, Any]:
+        """What ``results.json`` holds; empty where there is none."""
+        return read_object(self.folder / layout.RESULTS)
+
+    def results_hash(self) -> str | None:
+        """The hash of the results, by which a mirror knows whether it shows them."""
+        results = self.results()
+        return sha256_of(results) if results else None
+
+    def curves(self, logged: dict[str, int]) -> Iterator[tuple[str, int, list[Point]]]:
+        """For each file of curves its name, its newest iteration, and what it says of those after ``logged[name]``."""
+        building = read_object(self.folder / layout.BUILDING)  # a training in progress writes elsewhere
+        sources = [Path(str(building.get("folder")))] if building.get("stage") == TRAIN.name else []
+        for name, prefix in CURVES.items():
+            source = next((folder / name for folder in (*sources, self.folder) if (folder / name).exists()), None)
+            records = [] if source is None else [r for r in _records(source) if r["step"] > logged.get(name, 0)]
+            if records:
+                points = [
+                    Point(f"{prefix}/{key}", float(value), record["step"], _seconds(record))
+                    for record in records
+                    for key, value in record.items()
+                    if key != "step" and isinstance(value, (int, float))
+                ]
+                yield name, records[-1]["step"], points
+
+    def summary(self, images: int, with_model: bool) -> Summary:
+        """What is shown of the finished trial, with ``images`` test views at most, and the model if ``with_model``."""
+        results = self.results()
+        step, seconds = results["iterations"], float(results["seconds"].get("train", results["iterations"] / 1000))
+        numbers = dict(results["metrics"]) | {
+            key: results[key]
+            for key in ("num_gaussians", "num_init_points", "peak_memory_mb")
+            if results[key] is not None  # not known of renders that another program made
+        }
+        numbers |= {f"seconds_{key}": value for key, value in results["seconds"].items()}
+        numbers |= {f"total/{key}": value for key, value in results["events"].items()}
+        numbers |= {f"init/{key}": value for key, value in _numbers(results.get("init_report", {}), INIT_FIELDS)}
+        points = [
+            Point(key, float(value), int(at), seconds * int(at) / max(1, step))
+            for at, measured in results.get("metrics_at", {}).items()
+            for key, value in measured["metrics"].items()
+        ]
+        tags = {"protocol": results["protocol"], "raster": results["raster"]}
+        names = (*FILES, *([layout.POINT_CLOUD] if with_model else []))
+        files = [("", self.folder / name) for name in names if (self.folder / name).exists()]
+        return Summary(
+            points=points + [Point(key, float(value), step, seconds) for key, value in numbers.items()],
+            tags=tags | {f"hash_{key}": value for key, value in results["hashes"].items()},
+            pictures={
+                f"{kind}/{path.stem}": path
+                for kind in (layout.RENDERS, layout.GROUND_TRUTH)
+                for path in self._pictures(kind, images)
+            },
+            files=files + [(layout.FIGURES, path) for path in self._pictures(layout.FIGURES, images)],
+            results=results,
+            step=step,
+            seconds=seconds,
+        )
+
+    def _pictures(self, kind: str, images: int) -> list[Path]:
+        return sorted((self.folder / kind).glob("*.png"))[:images]
+
+
+def _records(path: Path) -> Iterator[dict[str, Any]]:
+    for line in path.read_text().splitlines():
+        try:
+            yield json.loads(line)
+        except json.JSONDecodeError:  # the last line, still being written
+            return
+
+
+def _seconds(record: dict[str, Any]) -> float:
+    """The training time of a record, or else a function of its iteration: the same whenever it is read."""
+    return float(record.get("seconds", record["step"] / 1000))
+
+
+def _numbers(report: dict[str, Any], names: Sequence[str]) -> Iterator[tuple[str, float]]:
+    """The numbers among the fields ``names`` of a report, nested ones included; what is unknown is left out."""
+    for name in names:
+        value = report.get(name)
+        if isinstance(value, dict):
+            yield from _numbers(value, tuple(value))
+        elif isinstance(value, (int, float)) and not isinstance(value, bool):
+            yield name, float(value)

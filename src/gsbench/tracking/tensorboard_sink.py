@@ -1,0 +1,64 @@
+"""A trial as event files of TensorBoard, in ``tensorboard/`` of the runs folder."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from gsbench.runs.layout import TENSORBOARD
+from gsbench.tracking.record import TrialRecord
+from gsbench.tracking.sink import Point, Summary
+
+
+class TensorBoardSink:
+    """The event files of one trial. They cannot be mended: a trial that is gone on with is written anew."""
+
+    state_file = "tensorboard.json"
+
+    def __init__(self, record: TrialRecord) -> None:
+        self._record = record
+        self._folder = record.runs / TENSORBOARD / record.path
+        self._started = time.time()
+        self._writer: Any = None
+
+    def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
+        """See `gsbench.tracking.sink.Sink`."""
+        if self._folder.is_dir() and state.get("complete") is not None and state["complete"] == results:
+            return state
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.remove()
+        self._writer = SummaryWriter(str(self._folder))
+        for name, values in (("settings", self._record.params()), ("trial", self._record.tags())):
+            table = "".join(f"| {key} | {value} |\n" for key, value in values.items())
+            self._writer.add_text(name, f"| | |\n|---|---|\n{table}")
+        return {"complete": None, "logged": {}}
+
+    def log(self, points: Sequence[Point]) -> None:
+        """Write numbers, and see that they are in the file."""
+        for point in points:
+            self._writer.add_scalar(point.key, point.value, point.step, self._started + point.seconds)
+        self._writer.flush()
+
+    def complete(self, summary: Summary) -> None:
+        """Write final numbers, and the pictures of the test views."""
+        import numpy as np
+        from PIL import Image
+
+        self.log(summary.points)
+        for name, path in summary.pictures.items():
+            with Image.open(path) as image:
+                self._writer.add_image(name, np.asarray(image.convert("RGB")), summary.step, dataformats="HWC")
+        self._writer.add_text("status", "FINISHED", summary.step)
+        self._writer.flush()
+
+    def stop(self, status: str, reason: str | None) -> None:
+        """Write why the trial ended."""
+        self._writer.add_text("status", status if reason is None else f"{status}: {reason}")
+        self._writer.flush()
+
+    def remove(self) -> None:
+        """Delete the trial's event files."""
+        shutil.rmtree(self._folder, ignore_errors=True)

@@ -1,0 +1,82 @@
+"""A trial as a run of Weights & Biases: its server is ``tracking.uri``, or what WANDB_BASE_URL and WANDB_MODE say."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Sequence
+from typing import Any
+
+from gsbench.runs.layout import WANDB
+from gsbench.tracking.record import TrialRecord
+from gsbench.tracking.sink import Point, Summary
+
+STEP = "iteration"  # the axis of our curves: their own counter only goes up, and we read two files
+
+
+class WandbSink:
+    """The W&B run of one trial; the project is the experiment, the group is the sweep."""
+
+    state_file = "wandb.json"
+
+    def __init__(self, options: dict[str, Any], record: TrialRecord) -> None:
+        self._record = record
+        if options["uri"]:
+            os.environ["WANDB_BASE_URL"] = options["uri"]
+        self._run: Any = None
+
+    def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
+        """See `gsbench.tracking.sink.Sink`. A run that shows former results stays beside the new one."""
+        if state.get("complete") is not None:
+            if state["complete"] == results:
+                return state
+            state = {}
+        state = state or {"id": uuid.uuid4().hex[:8], "complete": None, "logged": {}}
+        import wandb
+
+        record = self._record
+        folder = record.runs / WANDB
+        folder.mkdir(exist_ok=True)
+        self._run = wandb.init(
+            project=record.values["name"],
+            name=record.label,
+            id=state["id"],
+            resume="allow",
+            group=record.sweep().get("id"),
+            config=record.params(),
+            tags=[record.values["scene"]["name"], record.arm],
+            dir=str(folder),
+            settings=wandb.Settings(silent=True, console="off"),
+        )
+        self._run.define_metric("*", step_metric=STEP)
+        return state
+
+    def log(self, points: Sequence[Point]) -> None:
+        """Log numbers, those of an iteration together."""
+        by_step: dict[int, dict[str, float]] = {}
+        for point in points:
+            by_step.setdefault(point.step, {})[point.key] = point.value
+        for step, values in by_step.items():
+            self._run.log({STEP: step, **values})
+
+    def complete(self, summary: Summary) -> None:
+        """Log final numbers, pictures and files, and finish the run."""
+        import wandb
+
+        self.log(summary.points)
+        pictures = {name: wandb.Image(str(path)) for name, path in summary.pictures.items()}
+        if pictures:
+            self._run.log({STEP: summary.step, **pictures})
+        self._run.summary.update({point.key: point.value for point in summary.points if point.step == summary.step})
+        self._run.config.update(summary.tags, allow_val_change=True)
+        for _, path in summary.files:
+            self._run.save(str(path), base_path=str(self._record.folder), policy="now")
+        self._run.finish(0)
+
+    def stop(self, status: str, reason: str | None) -> None:
+        """Finish the run with what went wrong."""
+        self._run.summary["error" if reason else "status"] = reason or status
+        self._run.finish(1)
+
+    def remove(self) -> None:
+        """Leave the run: deleting it is for its owner, on the page of the project. Another will be made."""

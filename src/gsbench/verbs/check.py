@@ -1,0 +1,86 @@
+"""``gsbench check``: a paper's claims in, verdicts out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsbench.claims.file import direction_is_odd, read_claims
+from gsbench.claims.here import Here
+from gsbench.claims.sweep import Check, prepare, run_looks
+from gsbench.files import make_runs_folder, write_text
+from gsbench.launch.declare import declare_plan
+from gsbench.launch.plan import describe_plan
+from gsbench.launch.preflight import missing_folders
+from gsbench.launch.trial import Trial
+from gsbench.runs.declaration import read_plans
+from gsbench.runs.finished import Done, find_finished
+from gsbench.runs.source import import_from_here
+from gsbench.verbs.arguments import ArgumentParser, path
+from gsbench.words import counted
+
+MARKDOWN, HTML = "claims.md", "claims.html"
+
+
+def main(argv: Sequence[str], runs: Path) -> int:
+    """The verb: 0 whatever the verdicts are; raises InputError for bad input."""
+    parser = ArgumentParser(
+        prog="gsbench check",
+        description="Test the claims of a file (docs/claims.md): write the plan down, run trials until each claim is "
+        "decided, and write a page with the verdicts.",
+    )
+    parser.add_argument("claims", type=path, help="a YAML file, such as conf/claims/volumetric.yaml")
+    parser.add_argument("--dry-run", action="store_true", help="show trials, time and what is not testable here")
+    options = parser.parse_args(argv)
+    file = read_claims(options.claims)
+    import_from_here()
+    check = prepare(file, runs, Here(missing_folders, download=not options.dry_run))
+    if options.dry_run:
+        print("\n".join(describe(check)))
+        return 0
+    _run(check)
+    return 0
+
+
+def describe(check: Check) -> list[str]:
+    """What a dry run shows: each claim with its question or why it is not testable, the trials, and the time."""
+    lines = [f"{check.file.paper}: plan {check.plan_hash[:12]}"]
+    for question in check.questions:
+        claim = question.claim
+        if not question.testable:
+            lines.append(f"not testable here  {claim.id}: {question.why_not}")
+            continue
+        asked = f"{claim.metric} of {claim.arm} against {claim.baseline}: {claim.direction}, by {claim.effect} at least"
+        scenes = ", ".join(question.scenes)
+        looks = ", ".join(map(str, check.looks))
+        lines.append(f"to be tested       {claim.id}: {asked}; on {scenes}; looks at {looks} seeds")
+        lines += [f"                   without {reason}" for reason in question.missing]
+        lines += [f"                   {remark}" for remark in [direction_is_odd(claim)] if remark]
+    first, most = (check.trials(check.questions, seeds) for seeds in (check.looks[0], check.looks[-1]))
+    lines.append(
+        f"{counted(len(first), 'trial')} until the first look, {len(most)} at most; "
+        f"each test may err in {100 * check.file.error_rate / check.sharing:.3g} % of such sweeps"
+    )
+    if most:
+        lines += describe_plan([Trial.of(trial) for trial in most], most[0].values["launch"]["parallel"])
+    return lines
+
+
+def _run(check: Check) -> None:
+    from gsbench.claims.page import make_page, to_html, to_markdown
+    from gsbench.launch.batch import run_batch
+
+    make_runs_folder(check.runs)
+    declared = declare_plan(check.home, check.plan, check.plan_hash)
+    verdicts = run_looks(
+        check,
+        declared,
+        lambda trials: run_batch([Trial.of(trial) for trial in trials]),
+        lambda trial: isinstance(find_finished(trial.values), Done),
+    )
+    page = make_page(check.file, verdicts, declared, read_plans(check.home))
+    for name, text in ((MARKDOWN, to_markdown(page)), (HTML, to_html(page))):
+        write_text(check.home / name, text)
+    for verdict in verdicts:
+        print(f"{verdict.word:<17}  {verdict.claim.id}: {verdict.reason}")
+    print(check.home / HTML)

@@ -1,0 +1,104 @@
+"""``gsbench plan``: from trials that are there, how many scenes and seeds resolve a difference."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsbench.analysis.cells import with_variants
+from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs, pair_arms
+from gsbench.analysis.quantities import Quantity, quantity
+from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.analysis.statistics import MIN_SCENES
+from gsbench.claims.planning import (
+    Components,
+    Size,
+    components,
+    sizes_needed,
+    smallest_difference,
+    within_hours,
+)
+from gsbench.errors import InputError
+from gsbench.verbs.arguments import ArgumentParser
+from gsbench.words import counted, readable_time
+
+MOST_SHOWN = 5  # designs
+
+
+def main(argv: Sequence[str], runs: Path) -> int:
+    """The verb; raises InputError for bad input."""
+    parser = ArgumentParser(
+        prog="gsbench plan",
+        description="From an experiment's trials: the scenes and seeds that resolve a difference with 80 % power.",
+    )
+    parser.add_argument("experiment")
+    parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_squeeze")
+    parser.add_argument("--difference", type=_above_zero, help="to be resolved; default: what papers count as one")
+    parser.add_argument("--hours", type=_above_zero, help="at hand, one trial at a time")
+    parser.add_argument("--baseline", default=BASELINE, help=f"the densifier that others are held against ({BASELINE})")
+    options = parser.parse_args(argv)
+    trials = with_variants(load_experiment(runs, options.experiment).trials)
+    shown = quantity(options.metric, trials)
+    if shown.cost:
+        raise InputError(f"--metric {options.metric}: only metrics can be planned for, not counts and times")
+    difference = options.difference or shown.worthwhile
+    if difference is None:
+        raise InputError(f"--difference is needed: what of {shown.name} is worth resolving is not known")
+    pairs = choose_pairs(sorted({trial.arm for trial in trials}), options.baseline)
+    if not pairs:
+        raise InputError(f"{options.experiment} has one arm, and planning needs pairs of trials of two")
+    views = ViewCache()
+    for one, other in pairs:
+        paired = pair_arms([trial for trial in trials if trial.arm in (one, other)], one, other, shown.key, views)
+        found = components([matrix.mean(axis=1) for matrix in paired.differences])
+        print("\n".join([f"{arm_name(other)} against {arm_name(one)}", *_lines(found, shown, difference)]))
+        if options.hours is not None:
+            own = [trial for trial in trials if trial.arm in (one, other)]
+            print("\n".join(_hours_lines(found, shown, options.hours, own)))
+    return 0
+
+
+def _lines(found: Components, shown: Quantity, difference: float) -> list[str]:
+    digits = f".{shown.decimals + 1}f"
+    between = "not known from one scene" if found.between is None else f"{found.between:{digits}}"
+    lines = [
+        f"  differences in {shown.name} vary by {found.within:{digits}} between seeds, and between scenes by {between} "
+        f"(from {counted(found.trials, 'pair')} on {counted(found.scenes, 'scene')})"
+    ]
+    for like_these in (False, True):
+        of_whom = f"scenes like these (from {MIN_SCENES} scenes on)" if like_these else "these scenes"
+        if like_these and found.between is None:
+            lines.append(f"  of {of_whom}: run pilot trials on a second scene")
+            continue
+        sizes = sorted(sizes_needed(difference, found, like_these), key=lambda size: (size.trials, size.scenes))
+        texts = [f"{size.scenes} × {size.seeds} ({size.trials} trials)" for size in sizes[:MOST_SHOWN]]
+        lines.append(f"  {difference:g} of {of_whom}, scenes × seeds: {', '.join(texts) or 'beyond reach'}")
+    return lines
+
+
+def _hours_lines(found: Components, shown: Quantity, hours: float, trials: Sequence[TrialResult]) -> list[str]:
+    timed = [sum(trial.data["seconds"].values()) for trial in trials if not trial.made_elsewhere]
+    if not timed:
+        return ["  hours: no trial tells how long one takes"]
+    seconds = statistics.fmean(timed)
+    size: Size | None = within_hours(hours, seconds, found.scenes)
+    if size is None:
+        return [f"  {hours:g} h do not suffice for two seeds of both arms, at {readable_time(seconds)} a trial"]
+    least = smallest_difference(size, found, like_these=False)
+    return [
+        f"  {hours:g} h, at {readable_time(seconds)} a trial: {size.scenes} × {size.seeds}, which resolve "
+        f"{least:.{shown.decimals + 1}f} of these scenes"
+    ]
+
+
+def _above_zero(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not value > 0 or not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be a number above 0, got {text!r}")
+    return value

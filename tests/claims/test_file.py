@@ -1,0 +1,227 @@
+"""Files of claims: those that ship, and every kind of bad input as one line that names the place and the mend."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from gsbench.claims.file import Claim, direction_is_odd, parse_claims, read_claims
+from gsbench.errors import InputError
+from tests.conftest import ROOT
+
+SHIPPED = sorted((ROOT / "conf" / "claims").glob("*.yaml"))
+GOOD: dict[str, Any] = {
+    "name": "check_it",
+    "paper": "A paper",
+    "seeds": 4,
+    "settings": {"scene.max_size": 160, "eval.lpips": ["squeeze"]},
+    "scenes": {"courtyard": None, "own": {"scene": "photos", "scene.path": "${oc.env:HOME}/own"}},
+    "arms": {"adc": {}, "volumetric": {"densify": "volumetric"}},
+    "claims": [
+        {
+            "id": "lpips",
+            "says": "it is better",
+            "where": "abstract",
+            "baseline": "adc",
+            "arm": "volumetric",
+            "metric": "lpips_squeeze",
+            "direction": "lower",
+            "least": 0.005,
+            "refuted_if": "it is not",
+        }
+    ],
+}
+
+
+def changed(*path: Any, to: Any) -> dict[str, Any]:
+    """The good file with another value somewhere."""
+    content = copy.deepcopy(GOOD)
+    place: Any = content
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = to
+    return content
+
+
+def without(*path: Any) -> dict[str, Any]:
+    content = copy.deepcopy(GOOD)
+    place: Any = content
+    for key in path[:-1]:
+        place = place[key]
+    del place[path[-1]]
+    return content
+
+
+def second_claim(**changes: Any) -> dict[str, Any]:
+    content = copy.deepcopy(GOOD)
+    content["claims"].append(content["claims"][0] | {"id": "other"} | changes)
+    return content
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_the_files_that_ship_are_sound(path: Path) -> None:
+    file = read_claims(path)
+    assert len(file.claims) >= 4
+    assert file.size
+    assert any(claim.not_testable for claim in file.claims)
+    assert not [remark for claim in file.claims if (remark := direction_is_odd(claim))]
+
+
+def test_words_of_a_trial_are_those_of_a_command_line() -> None:
+    file = parse_claims(changed("claims", 0, "budget", to={"densify.max_gaussians": 15000, "densify.cap": None}))
+    assert file.words(file.claims[0], "own", "adc") == [
+        "scene.max_size=160",
+        "eval.lpips=[squeeze]",
+        "scene=photos",
+        "scene.path=${oc.env:HOME}/own",
+        "densify=adc",
+        "densify.max_gaussians=15000",
+        "densify.cap=null",
+    ]
+    assert file.words(file.claims[0], "courtyard", "volumetric")[2] == "scene=courtyard"
+
+
+def test_the_nearer_setting_counts() -> None:
+    content = changed("settings", to={"densify.max_gaussians": 1, "scene.max_size": 160})
+    content["arms"]["adc"] = {"densify": "adc", "densify.max_gaussians": 2}
+    content["claims"][0]["budget"] = {"densify.max_gaussians": 3}
+    words = (file := parse_claims(content)).words(file.claims[0], "courtyard", "adc")
+    assert [word for word in words if "max_gaussians" in word] == ["densify.max_gaussians=3"]
+
+
+def test_the_plan_changes_with_what_decides_and_not_with_words() -> None:
+    plan = parse_claims(GOOD).plan_hash
+    for path, value in (
+        (("claims", 0, "least"), 0.006),
+        (("claims", 0, "direction"), "higher"),
+        (("claims", 0, "metric"), "psnr"),
+        (("claims", 0, "refuted_if"), "never"),
+        (("claims", 0, "budget"), {"densify.cap": "hard"}),
+        (("claims", 0, "split"), {"scene.test_every": 4}),
+        (("claims", 0, "scenes"), ["courtyard"]),
+        (("seeds",), 5),
+        (("error_rate",), 0.1),
+        (("settings", "scene.max_size"), 200),
+        (("arms", "volumetric", "densify.volume_threshold"), 0.1),
+    ):
+        assert parse_claims(changed(*path, to=value)).plan_hash != plan, path
+    for path, text in ((("claims", 0, "says"), "mended"), (("claims", 0, "where"), "page 2"), (("paper",), "B")):
+        assert parse_claims(changed(*path, to=text)).plan_hash == plan, path
+    assert parse_claims(changed("claims", 0, "scenes", to=["courtyard", "own"])).plan_hash == plan
+
+
+def test_effects_are_differences_or_parts() -> None:
+    absolute = parse_claims(GOOD).claims[0].effect
+    relative = parse_claims(changed("claims", 0, "least", to="10%")).claims[0].effect
+    assert (absolute.margin, str(absolute)) == (0.005, "0.005")
+    assert (relative.margin, str(relative)) == (pytest.approx(math.log(1.1)), "10 %")
+
+
+BAD: list[tuple[str, Callable[[], Any], str]] = [
+    ("an unknown arm", lambda: changed("claims", 0, "arm", to="volumetrik"), "did you mean volumetric"),
+    ("an unknown baseline", lambda: changed("claims", 0, "baseline", to="adcc"), "baseline 'adcc'.*did you mean adc"),
+    ("an unknown metric", lambda: changed("claims", 0, "metric", to="lpips_squeze"), "did you mean lpips_squeeze"),
+    ("an unknown scene", lambda: changed("claims", 0, "scenes", to=["courtyrad"]), "did you mean courtyard"),
+    ("a scene twice", lambda: changed("claims", 0, "scenes", to=["own", "own"]), "stands twice"),
+    ("an arm against itself", lambda: changed("claims", 0, "arm", to="adc"), "against itself"),
+    ("zero width", lambda: changed("claims", 0, "least", to=0), "above 0"),
+    ("zero percent", lambda: changed("claims", 0, "least", to="0%"), "above 0"),
+    ("a negative width", lambda: changed("claims", 0, "least", to=-0.1), "above 0"),
+    ("no number", lambda: changed("claims", 0, "least", to="much"), "above 0"),
+    ("an infinite width", lambda: changed("claims", 0, "least", to="inf"), "above 0"),
+    ("a count without percent", lambda: changed("claims", 0, "metric", to="gaussians"), "such as 10%"),
+    ("an unknown direction", lambda: changed("claims", 0, "direction", to="lowre"), "'higher', 'lower' or 'same'"),
+    ("an unknown key", lambda: changed("claims", 0, "metrics", to="psnr"), "did you mean metric"),
+    ("an unknown key at the top", lambda: changed("clams", to=[]), "did you mean claims"),
+    ("a key that is missing", lambda: without("claims", 0, "refuted_if"), "claims.1..refuted_if is not given"),
+    ("no seeds", lambda: without("seeds"), "seeds is not given"),
+    ("one seed", lambda: changed("seeds", to=1), "at least 2"),
+    ("no claims", lambda: changed("claims", to=[]), "at least one claim"),
+    ("claims that are missing", lambda: without("claims"), "at least one claim|claims is not given"),
+    ("a claim that is text", lambda: changed("claims", 0, to="it is better"), "must be a mapping"),
+    ("an empty sentence", lambda: changed("claims", 0, "says", to="  "), "says is empty"),
+    ("no scenes", lambda: changed("scenes", to={}), "at least one"),
+    ("a scene that is text", lambda: changed("scenes", "own", to="photos"), "must be a mapping of settings"),
+    ("nested settings", lambda: changed("settings", to={"scene": {"max_size": 160}}), "with dots"),
+    ("a nested budget", lambda: changed("claims", 0, "budget", to={"densify": {"cap": "hard"}}), "with dots"),
+    ("a seed of its own", lambda: changed("settings", to={"seed": 3}), "set by the plan"),
+    ("a name of its own", lambda: changed("arms", "adc", to={"name": "x"}), "set by the plan"),
+    ("a primary metric", lambda: changed("settings", to={"eval.primary": "psnr"}), "set by the plan"),
+    ("no setting", lambda: changed("settings", to={"scene max": 160}), "no setting"),
+    ("an error rate of 1", lambda: changed("error_rate", to=1.0), "error_rate"),
+    ("a list", lambda: [], "must be a mapping"),
+    ("nothing", lambda: None, "must be a mapping"),
+    ("a name that is a path", lambda: changed("name", to="../other"), "letters, digits"),
+    ("contradicting claims", lambda: second_claim(direction="higher"), "lpips and other contradict"),
+    ("contradicting: none", lambda: second_claim(direction="same"), "contradict"),
+    ("contradicting, arms swapped", lambda: second_claim(baseline="volumetric", arm="adc"), "contradict"),
+    ("contradicting on one scene", lambda: second_claim(direction="higher", scenes=["own"]), "contradict.*on own"),
+    ("one claim twice", lambda: second_claim(), "ask the same"),
+    ("one id twice", lambda: second_claim(id="lpips", metric="psnr"), "each its own"),
+]
+
+
+@pytest.mark.parametrize(("content", "message"), [case[1:] for case in BAD], ids=[case[0] for case in BAD])
+def test_bad_input_is_one_line(content: Callable[[], Any], message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        parse_claims(content())
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"metric": "psnr"}, {"budget": {"densify.cap": "hard"}}, {"split": {"scene.test_every": 4}}]
+)
+def test_claims_about_other_things_do_not_contradict(changes: dict[str, Any]) -> None:
+    assert len(parse_claims(second_claim(direction="higher", **changes)).claims) == 2
+
+
+def test_claims_on_other_scenes_do_not_contradict() -> None:
+    content = second_claim(direction="higher", scenes=["own"])
+    content["claims"][0]["scenes"] = ["courtyard"]
+    assert len(parse_claims(content).claims) == 2
+
+
+def test_a_metric_of_ones_own_needs_its_class() -> None:
+    content = changed("claims", 0, "metric", to="sharpness")
+    with pytest.raises(InputError, match=r"eval\.extra\.sharpness"):
+        parse_claims(content)
+    content["settings"]["eval.extra.sharpness._target_"] = "mine.Sharpness"
+    assert parse_claims(content).claims[0].metric == "sharpness"
+
+
+def test_a_claim_against_the_metrics_direction_is_remarked() -> None:
+    assert "worse" in direction_is_odd(parse_claims(changed("claims", 0, "direction", to="higher")).claims[0])
+    assert not direction_is_odd(parse_claims(GOOD).claims[0])
+
+
+def test_the_file_that_the_document_shows_is_sound() -> None:
+    page = (ROOT / "docs" / "claims.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```yaml\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    file = parse_claims(yaml.safe_load(block))
+    for entry in dataclasses.fields(Claim):
+        assert f"`{entry.name}`" in page  # the table has every key
+    assert [claim.id for claim in file.claims] == ["quality"]
+
+
+def test_files_that_cannot_be_read_say_so(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        read_claims(tmp_path / "none.yaml")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_claims(tmp_path)
+    for text, message in (("a: [", "not YAML"), ("name: a\nname: b\n", "stands twice"), ("", "mapping")):
+        path = tmp_path / "bad.yaml"
+        path.write_text(text)
+        with pytest.raises(InputError, match=message) as caught:
+            read_claims(path)
+        assert "\n" not in str(caught.value)
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match=r"UTF-8|YAML"):
+        read_claims(path)

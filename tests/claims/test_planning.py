@@ -1,0 +1,108 @@
+"""Variance components and power, against a textbook's estimator restated, and simulation with scipy's tests."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from gsbench.claims.planning import (
+    Components,
+    Size,
+    components,
+    power,
+    sizes_needed,
+    smallest_difference,
+    within_hours,
+)
+from gsbench.errors import InputError
+
+KNOWN = Components(between=0.3, within=0.5, scenes=4, trials=12)
+
+
+def test_components_are_unbiased_also_with_unequal_seeds() -> None:
+    rng = np.random.default_rng(0)
+    within, between = [], []
+    for _ in range(4000):
+        pilot = [rng.normal(0, 0.3) + rng.normal(0, 0.5, count) for count in (2, 3, 5, 3, 4, 2)]
+        found = components(pilot)
+        within.append(found.within**2)
+        between.append(found.between**2)
+    assert np.mean(within) == pytest.approx(0.25, rel=0.03)
+    assert np.mean(between) == pytest.approx(0.09, abs=0.03)  # cut off at zero, so a little above
+
+
+def test_components_of_equal_scenes_by_hand() -> None:
+    # Means 1 and 4, variance 2 within each: 4.5 between means, of which 2 / 2 is noise.
+    found = components([np.array([0.0, 2.0]), np.array([3.0, 5.0])])
+    assert found.within == pytest.approx(2**0.5)
+    assert found.between == pytest.approx(3.5**0.5)
+    assert (found.scenes, found.trials) == (2, 4)
+
+
+def test_scenes_that_do_not_differ_have_no_variance_of_their_own() -> None:
+    assert components([np.array([0.0, 2.0]), np.array([0.0, 2.0])]).between == 0.0
+    assert components([np.array([0.0, 2.0])]).between is None
+    with pytest.raises(InputError, match="two seeds"):
+        components([np.array([1.0]), np.array([2.0])])
+
+
+@pytest.mark.parametrize("like_these", [False, True])
+def test_power_is_the_share_of_simulated_sweeps_that_see_it(like_these: bool) -> None:
+    rng = np.random.default_rng(1)
+    size, effect = Size(8, 3), 0.35
+    scenes = rng.normal(0, KNOWN.between, (20_000, size.scenes, 1)) if like_these else 0.0
+    values = effect + scenes + rng.normal(0, KNOWN.within, (20_000, size.scenes, size.seeds))
+    if like_these:
+        p = scipy.stats.ttest_1samp(values.mean(axis=2), 0, axis=1).pvalue
+    else:
+        error = np.sqrt(values.var(axis=2, ddof=1).mean(axis=1) / (size.scenes * size.seeds))
+        p = 2 * scipy.stats.t.sf(np.abs(values.mean(axis=(1, 2)) / error), size.scenes * (size.seeds - 1))
+    assert power(size, effect, KNOWN, like_these) == pytest.approx(np.mean(p < 0.05), abs=0.01)
+
+
+@pytest.mark.parametrize("like_these", [False, True])
+def test_sizes_that_are_needed_just_suffice(like_these: bool) -> None:
+    sizes = sizes_needed(0.35, KNOWN, like_these)
+    assert sizes
+    for one in sizes:
+        assert power(one, 0.35, KNOWN, like_these) >= 0.8
+        if one.seeds > 2:
+            assert power(Size(one.scenes, one.seeds - 1), 0.35, KNOWN, like_these) < 0.8
+    assert all(b.scenes > a.scenes and b.seeds < a.seeds for a, b in itertools.pairwise(sizes))
+    assert min(one.scenes for one in sizes) >= (6 if like_these else 1)
+
+
+def test_seeds_do_not_replace_scenes() -> None:
+    """Where scenes differ by more than the effect, no number of seeds speaks of scenes like these."""
+    scattered = Components(between=5.0, within=0.1, scenes=4, trials=12)
+    assert sizes_needed(0.5, scattered, like_these=True) == []
+    assert sizes_needed(0.5, scattered, like_these=False)[0] == Size(1, 3)
+
+
+def test_the_smallest_difference_is_seen_with_the_wanted_power() -> None:
+    for like_these in (False, True):
+        least = smallest_difference(Size(6, 3), KNOWN, like_these)
+        assert power(Size(6, 3), least, KNOWN, like_these) == pytest.approx(0.8, abs=1e-4)
+    assert smallest_difference(Size(6, 3), Components(0.0, 0.0, 2, 4), True) == 0.0
+
+
+def test_hours_buy_scenes_first_and_then_seeds() -> None:
+    assert within_hours(1.0, 100.0, scenes=4) == Size(4, 4)  # 36 trials: 18 pairs
+    assert within_hours(1.0, 600.0, scenes=4) == Size(1, 3)  # 6 trials: two seeds come before a second scene
+    assert within_hours(1.0, 450.0, scenes=4) == Size(2, 2)
+    assert within_hours(0.1, 600.0, scenes=4) is None
+    for hours, seconds in ((0.0, 1.0), (1.0, 0.0), (float("nan"), 1.0)):
+        with pytest.raises(InputError):
+            within_hours(hours, seconds, 4)
+
+
+def test_questions_without_an_answer_are_refused() -> None:
+    one_scene = components([np.array([0.0, 2.0])])
+    with pytest.raises(InputError, match="two"):
+        sizes_needed(1.0, one_scene, like_these=True)
+    for difference in (0.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="other than 0"):
+            sizes_needed(difference, KNOWN, like_these=False)

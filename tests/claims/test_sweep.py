@@ -1,0 +1,165 @@
+"""A check from its file to its page: what is asked, what is run at each look, and that again nothing is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from gsbench.claims.file import parse_claims
+from gsbench.claims.page import make_page, to_html, to_markdown
+from gsbench.claims.sweep import Check, prepare, run_looks, with_seed
+from gsbench.cli import run
+from gsbench.config.compose import Composed
+from gsbench.errors import InputError
+from gsbench.runs.declaration import DeclaredPlan, read_plans
+from gsbench.runs.trial_files import TrialPaths
+from gsbench.verbs.check import describe
+from tests.analysis.synthetic import Plan, trial_data, write_trial
+from tests.claims.test_file import GOOD, changed, without
+from tests.launch.test_declare import TINY
+
+EFFECT = 1.0  # dB, of "volumetric" in the made-up trials
+DECLARED = DeclaredPlan(0, "hash", {})
+
+
+def content(**changes: Any) -> dict[str, Any]:
+    claims = [GOOD["claims"][0] | {"metric": "psnr", "direction": "higher", "least": 0.3} | changes]
+    return without("settings", "eval.lpips") | {"scenes": {"courtyard": None}, "claims": claims}
+
+
+def check_of(tmp_path: Path, **changes: Any) -> Check:
+    return prepare(parse_claims(content(**changes)), tmp_path, lambda trial, metric: "")
+
+
+class FakeRunner:
+    """Writes made-up results in the place of trained ones; ``fails`` names a seed that fails."""
+
+    def __init__(self, noise: float, fails: int | None = None) -> None:
+        self.noise, self.fails = noise, fails
+        self.batches: list[int] = []
+
+    def __call__(self, trials: Sequence[Composed]) -> None:
+        import numpy as np
+
+        self.batches.append(len(trials))
+        for trial in trials:
+            paths, values = TrialPaths.of(trial.values), trial.values
+            if values["seed"] == self.fails:
+                continue
+            arm = values["densify"]["name"]
+            rng = np.random.default_rng([values["seed"], arm == "adc"])
+            views = {"psnr": 26 + EFFECT * (arm != "adc") + rng.normal(0, self.noise) + np.zeros(3)}
+            data = trial_data(Plan(experiment="check_it"), "courtyard", "sfm", arm, values["seed"], views)
+            write_trial(paths.runs, data, views, paths.folder.name.partition("-")[0])
+
+
+def ready(trial: Composed) -> bool:
+    return (TrialPaths.of(trial.values).folder / "results.json").exists()
+
+
+def test_a_clear_effect_ends_at_the_first_look_and_again_nothing_is_run(tmp_path: Path) -> None:
+    check, runner = check_of(tmp_path), FakeRunner(noise=0.001)
+    first = run_looks(check, DECLARED, runner, ready)
+    assert [verdict.word for verdict in first] == ["supported"]
+    assert runner.batches == [4]
+    again = run_looks(check, DECLARED, runner, ready)
+    assert runner.batches == [4]
+    assert again == first
+
+
+def test_seeds_are_added_look_by_look_up_to_the_most(tmp_path: Path) -> None:
+    runner = FakeRunner(noise=2.0)
+    (verdict,) = run_looks(check_of(tmp_path), DECLARED, runner, ready)
+    assert verdict.word == "undecided"
+    assert runner.batches == [4, 2, 2]
+
+
+def test_a_failed_seed_makes_its_claim_wait_and_its_return_decides(tmp_path: Path) -> None:
+    check, runner = check_of(tmp_path), FakeRunner(noise=0.001, fails=1)
+    (verdict,) = run_looks(check, DECLARED, runner, ready)
+    assert (verdict.word, runner.batches) == ("undecided", [4])
+    assert "waits for courtyard" in verdict.reason
+    runner.fails = None
+    (verdict,) = run_looks(check, DECLARED, runner, ready)
+    assert (verdict.word, runner.batches) == ("supported", [4, 2])
+
+
+def test_what_is_missing_here_is_named_and_nothing_is_run_for_it(tmp_path: Path) -> None:
+    file = parse_claims(content() | {"scenes": {"courtyard": None, "garden": None}})
+    check = prepare(file, tmp_path, lambda trial, metric: "no data" * (trial.values["scene"]["name"] == "garden"))
+    assert check.questions[0].scenes == ("courtyard",)
+    (verdict,) = run_looks(check, DECLARED, FakeRunner(noise=0.001), ready)
+    assert verdict.word == "supported"
+    assert verdict.notes[0] == "garden: no data"
+    nothing = prepare(file, tmp_path / "b", lambda trial, metric: "no data")
+    assert run_looks(nothing, DECLARED, FakeRunner(0.1), ready)[0].reason == "courtyard, garden: no data"
+    assert "not testable here  lpips: courtyard, garden: no data" in describe(nothing)
+    assert nothing.plan_hash != check.plan_hash  # what can be tested here is a part of the plan
+
+
+def test_settings_that_do_not_compose_name_their_place(tmp_path: Path) -> None:
+    for bad, message in (
+        (changed("arms", "adc", to={"densify": "adcc"}), "claim lpips, scene courtyard, arm adc: .*did you mean adc"),
+        (changed("settings", to={"scene.max_siz": 160}), "did you mean max_size"),
+        (changed("arms", "volumetric", to={"densify": "adc"}), "the same trial on courtyard"),
+        (changed("arms", "adc", to={"densify.cap": "soft,hard"}), "several values"),
+    ):
+        bad["scenes"] = {"courtyard": None}
+        with pytest.raises(InputError, match=message):
+            prepare(parse_claims(bad), tmp_path, lambda trial, metric: "")
+
+
+def test_another_seed_is_another_folder_and_the_same_settings(tmp_path: Path) -> None:
+    trial = next(iter(check_of(tmp_path).first.values()))
+    other = with_seed(trial, 7)
+    assert yaml.safe_load(other.yaml)["seed"] == other.values["seed"] == 7
+    assert yaml.safe_load(other.yaml) | {"seed": 0} == yaml.safe_load(trial.yaml)
+    assert TrialPaths.of(other.values).folder.name == TrialPaths.of(trial.values).folder.name.replace("seed0", "seed7")
+    assert "seed=7" in other.overrides
+
+
+def test_the_page_says_all_in_both_formats(tmp_path: Path) -> None:
+    check = check_of(tmp_path, says="it is <better> | by far")
+    verdicts = run_looks(check, DECLARED, FakeRunner(noise=0.001), ready)
+    page = make_page(check.file, verdicts, DECLARED, [DECLARED, DeclaredPlan(0, "older", {})])
+    for text in (to_markdown(page), to_html(page)):
+        for part in ("supported", "PSNR", "courtyard", "1 other plan", "looks planned at 2, 3, 4 seeds", "abstract"):
+            assert part in text
+    assert "<better>" not in to_html(page)
+    assert "<svg" in to_html(page)
+    assert "http" not in to_html(page).replace("http://www.w3.org", "")  # one file, no network
+
+
+@pytest.mark.end_to_end
+def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    words = dict(word.split("=", 1) for word in TINY)
+    settings = {key: yaml.safe_load(value) for key, value in words.items()}
+    arms = {"few": {"init.count": 200}, "many": {"init.count": 300}}
+    claim = content()["claims"][0] | {"baseline": "few", "arm": "many"}
+    claims = [claim | {"id": "points"}, claim | {"id": "size", "not_testable": "too large", "metric": "ssim"}]
+    path = tmp_path / "claims.yaml"
+    path.write_text(json.dumps(content() | {"settings": settings, "arms": arms, "claims": claims, "seeds": 2}))
+    assert run(["check", str(path), "--dry-run"]) == 0
+    assert "4 trials until the first look" in capsys.readouterr().out
+    assert not (tmp_path / "runs" / "check_it").exists()
+    assert run(["check", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "  points: " in out
+    assert "not testable here  size: too large" in out
+    home = tmp_path / "runs" / "check_it"
+    (plan,) = read_plans(home)
+    measured = [json.loads(file.read_text())["measured"] for file in home.glob("*/*/*/results.json")]
+    assert len(measured) == 4
+    assert min(measured) >= plan.to_record()["time"]
+    first = (home / "claims.md").read_text(), (home / "claims.html").read_text()
+    assert run(["check", str(path)]) == 0
+    assert ((home / "claims.md").read_text(), (home / "claims.html").read_text()) == first
+    assert read_plans(home) == [plan]

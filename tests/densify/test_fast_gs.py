@@ -1,0 +1,111 @@
+"""FastGS against a restatement: counts of bad pixels, who grows, who is drawn to go."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.densify import FastGS
+from gsbench.densify.scores import draw
+from gsbench.errors import InputError
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.raster.reference import ReferenceRasterizer
+from gsbench.train.loss import torch_photometric_loss
+from tests.densify.test_absgs import growth
+from tests.densify.test_rounds import EXTENT, assert_same, to_rows
+from tests.densify.test_scores import BLACK, COUNT, Room, alphas, at, started
+
+
+def counted(values: Gaussians, threshold: float) -> tuple[np.ndarray, np.ndarray]:
+    """Over the three views: the mean number of bad pixels, rounded down, and loss times number, scaled to [0, 1]."""
+    room, total, weighted = Room(), np.zeros(COUNT), np.zeros(COUNT)
+    for view, camera in enumerate(room.cameras):
+        image = ReferenceRasterizer().render(values, camera, 0, BLACK).image.detach()
+        error = np.abs(image.numpy() - room.images[view].numpy() / 255).mean(-1)
+        bad = (error - error.min()) / (error.max() - error.min()) > threshold
+        count = ((alphas(values, camera) > 0) & bad).sum((1, 2))
+        total += count
+        weighted += count * float(torch_photometric_loss(image, room.images[view])[0])
+    return total // 3, (weighted - weighted.min()) / (weighted.max() - weighted.min())
+
+
+def ready(densifier: FastGS, seed: int) -> tuple[TrainableGaussians, np.ndarray, np.ndarray]:
+    trainable, _ = started(densifier, seed)
+    trainable.values.log_scales.data[::4] -= 3.0
+    draws = np.random.default_rng(seed)
+    signed, absolute = draws.uniform(0, 4e-4, COUNT), draws.uniform(0, 2.4e-3, COUNT)
+    densifier.statistics["gradient_sum"] = torch.from_numpy(signed)
+    densifier.statistics["absolute_sum"] = torch.from_numpy(absolute)
+    return trainable, signed, absolute
+
+
+@pytest.mark.parametrize("step", [600, 3100])
+@pytest.mark.parametrize("seed", range(2))
+def test_fast_gs_round(seed: int, step: int) -> None:
+    densifier = FastGS(error_threshold=0.5)
+    trainable, signed, absolute = ready(densifier, seed)
+    trainable.values.opacity_logits.data[20:40] = -9.0
+    rows, counts = to_rows(trainable), counted(trainable.values.detach(), 0.5)
+    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
+
+    rng = torch.Generator().manual_seed(seed)
+    torch.randperm(3, generator=rng)  # the views: all three
+    several = counts[0] > 5
+    assert 5 < several.sum() < COUNT - 5
+    splits = several & (absolute >= 1.2e-3)  # .0004 in the restatement of AbsGS
+    clones = several & (signed >= 2e-4)
+    large = np.array([np.exp(row["log_scales"]).max() > 0.001 * EXTENT for row in rows])
+    drawn = torch.randn(2 * int((splits & large).sum()), 3, generator=rng, dtype=torch.float64).numpy()
+    grown, cloned, split = growth(rows, np.where(clones, 1.0, 0), np.where(splits, 1.0, 0), iter(drawn))
+    assert (event.cloned, event.split_gradient) == (cloned, split)
+    assert split > 0
+
+    faint = np.array([1 / (1 + np.exp(-row["opacity_logits"])) < 0.005 for row in grown])
+    huge = np.array([np.exp(row["log_scales"]).max() > 0.1 * EXTENT for row in grown]) & (step > 3000)
+    scores = np.delete(counts[1].astype(np.float32), np.nonzero(splits & large)[0])
+    weights = np.zeros(len(grown), np.float32)
+    weights[: len(scores)] = 1 / (np.float32(1e-6) + np.float32(1) - scores)
+    known = torch.arange(len(grown)) < len(scores)  # those that were there before
+    some = draw(known, torch.from_numpy(weights), (faint | huge).sum() // 2, rng).numpy()
+    kept = [row for row, gone in zip(grown, (faint | huge) & some, strict=True) if not gone]
+    limit = np.log(0.8 / 0.2)
+    for row in kept:
+        row["opacity_logits"] = np.minimum(row["opacity_logits"], limit)
+        row["first opacity_logits"], row["second opacity_logits"] = np.zeros(()), np.zeros(())
+    assert_same(trainable, kept)
+    assert event.pruned_opacity == (faint & some).sum()
+    assert event.pruned_size == (huge & ~faint & some).sum()
+    assert event.pruned_opacity + event.pruned_size > 0
+    assert event.balances()
+
+
+def test_after_the_window_the_rather_faint_and_those_that_err_most_go() -> None:
+    densifier = FastGS()
+    trainable, _, _ = ready(densifier, 1)
+    trainable.values.opacity_logits.data[:5] = -3.0  # .047
+    rows, (_, scores) = to_rows(trainable), counted(trainable.values.detach(), 0.1)
+    event = densifier.refine(18_000, trainable, torch.Generator())
+    opacities = np.array([1 / (1 + np.exp(-row["opacity_logits"])) for row in rows])
+    assert_same(trainable, [row for i, row in enumerate(rows) if opacities[i] >= 0.1 and scores[i] <= 0.9])
+    assert event.pruned_opacity == (opacities < 0.1).sum() >= 5
+    assert event.pruned_size == ((scores > 0.9) & (opacities >= 0.1)).sum() > 0
+    assert event.balances()
+    assert densifier.refine(15_000, trainable, torch.Generator()) is None
+    assert densifier.refine(16_500, trainable, torch.Generator()) is None
+
+
+def test_without_bad_pixels_nobody_grows() -> None:
+    densifier = FastGS(error_threshold=1.0)
+    trainable, _, _ = ready(densifier, 0)
+    event = densifier.refine(600, trainable, torch.Generator())
+    assert event.cloned == event.split_gradient == 0
+    over, _ = densifier.candidates(at(700, trainable, torch.Generator()))
+    assert not over.any()
+
+
+@pytest.mark.parametrize("cap", ["freeze", "governor"])
+def test_caps_that_ask_where_a_round_leads_are_refused(cap: str) -> None:
+    with pytest.raises(InputError, match=r"densify\.cap must be"):
+        FastGS(cap=cap)  # type: ignore[arg-type]

@@ -1,0 +1,198 @@
+"""MS-SSIM, IW-SSIM, FSIM and GMSD against piq, restatements with scipy and scikit-image, and values by hand."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable, Iterator
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+from skimage import data
+from skimage.metrics import structural_similarity
+
+from gsbench.errors import InputError
+from gsbench.eval.evaluator import Evaluator
+from gsbench.eval.facts import METRICS, further_keys
+from gsbench.eval.fsim import fsim, phase_congruency
+from gsbench.eval.gmsd import gmsd
+from gsbench.eval.multiscale import MIN_SIZE, SCALE_WEIGHTS, iw_ssim, ms_ssim
+from gsbench.eval.protocol import PAPER
+
+FUNCTIONS = {"ms_ssim": ms_ssim, "iw_ssim": iw_ssim, "fsim": fsim, "gmsd": gmsd}
+PEERS = {
+    "ms_ssim": "ms_ssim.multi_scale_ssim",
+    "iw_ssim": "iw_ssim.information_weighted_ssim",
+    "fsim": "fsim.fsim",
+    "gmsd": "gmsd.gmsd",
+}
+ODD = (201, 180)  # px, height and width
+# piq 0.8.0 of the pairs below, in the order of PEERS. It is no dependency of the tests, since it asks for torchvision;
+# where it is installed (pip install --no-deps piq), the values are computed again.
+PIQ = {
+    ((176, 208), "noise"): (0.855058, 0.918725, 0.795243, 0.094648),
+    ((176, 208), "blur"): (0.975246, 0.947219, 0.892405, 0.071217),
+    ((176, 208), "colour"): (0.991429, 0.998934, 0.962485, 0.026642),
+    (ODD, "noise"): (0.846831, 0.917124, 0.790528, 0.097128),
+    (ODD, "blur"): (0.97566, 0.945774, 0.888644, 0.070438),
+    (ODD, "colour"): (0.991679, 0.998897, 0.961885, 0.025274),
+    ((384, 416), "noise"): (0.879034, 0.933155, 0.935063, 0.088751),
+}
+
+
+@pytest.fixture(scope="module")
+def peer() -> Iterator[Callable[[str], Callable[..., torch.Tensor]]]:
+    """piq's function for a metric. Its modules are loaded one by one: the package as a whole wants torchvision."""
+    spec = importlib.util.find_spec("piq")
+    if spec is None:
+        pytest.skip("piq is not installed")
+    package = ModuleType("piq")
+    package.__path__ = list(spec.submodule_search_locations or [])
+    sys.modules["piq"] = package
+
+    def find(key: str) -> Callable[..., torch.Tensor]:
+        module, _, name = PEERS[key].partition(".")
+        return getattr(importlib.import_module(f"piq.{module}"), name)
+
+    yield find
+    for name in [name for name in sys.modules if name == "piq" or name.startswith("piq.")]:
+        del sys.modules[name]
+
+
+def pair(height: int, width: int, distortion: str = "noise") -> tuple[torch.Tensor, torch.Tensor]:
+    """A distorted photograph and the photograph, [H, W, 3] float64 in [0, 1]."""
+    truth = data.astronaut()[40 : 40 + height, 60 : 60 + width] / 255
+    if distortion == "blur":
+        image = ndimage.gaussian_filter(truth, (1.5, 1.5, 0))
+    elif distortion == "colour":
+        image = np.clip(truth * [0.8, 1.0, 1.1] + 0.05, 0, 1)
+    else:
+        image = np.clip(truth + np.random.default_rng(0).normal(0, 0.08, truth.shape), 0, 1)
+    return torch.tensor(image), torch.tensor(truth)
+
+
+@pytest.mark.parametrize("case", PIQ, ids=str)
+def test_agrees_with_piq(case: tuple[tuple[int, int], str]) -> None:
+    image, truth = pair(*case[0], case[1])
+    for key, expected in zip(PEERS, PIQ[case], strict=True):
+        if key == "ms_ssim" and case[0] == ODD:
+            continue  # piq lengthens odd sides at their beginning; a test below restates what the authors do
+        assert float(FUNCTIONS[key](image, truth)) == pytest.approx(expected, abs=1e-4), key
+
+
+@pytest.mark.parametrize("case", PIQ, ids=str)
+def test_the_values_noted_here_are_those_of_piq(case: tuple[tuple[int, int], str], peer: Callable) -> None:
+    images = (x.permute(2, 0, 1).unsqueeze(0) for x in pair(*case[0], case[1]))
+    first, second = images
+    assert [float(peer(key)(first, second, data_range=1.0)) for key in PEERS] == pytest.approx(PIQ[case], abs=1e-6)
+
+
+@pytest.mark.parametrize("size", [(161, 170), (187, 161), (192, 192)], ids=str)
+def test_ms_ssim_halves_as_its_authors_do(size: tuple[int, int]) -> None:
+    """Their ``imfilter(image, ones(2) / 4, 'symmetric')`` and every other pixel, restated with scipy; SSIM itself is
+    scikit-image's, and contrast and structure are its quotient by luminance."""
+    image, truth = (x.numpy() for x in pair(*size))
+    products = []
+    for channel in range(3):
+        x, y, product = image[..., channel], truth[..., channel], 1.0
+        for scale, weight in enumerate(SCALE_WEIGHTS):
+            options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
+            full = structural_similarity(x, y, full=True, **options)[1]
+            mean_x, mean_y = (ndimage.gaussian_filter(z, 1.5, truncate=3.5, mode="reflect") for z in (x, y))
+            luminance = (2 * mean_x * mean_y + 1e-4) / (mean_x**2 + mean_y**2 + 1e-4)
+            compared = full if scale == 4 else full / luminance
+            product *= compared[5:-5, 5:-5].mean() ** weight
+            x, y = (ndimage.correlate(z, np.full((2, 2), 0.25), mode="reflect", origin=-1)[::2, ::2] for z in (x, y))
+        products.append(product)
+    assert float(ms_ssim(*map(torch.tensor, (image, truth)))) == pytest.approx(np.mean(products), abs=1e-7)
+
+
+def test_gmsd_by_hand() -> None:
+    """A vertical edge of height 1 against none, as [2, 4] after halving: its similarity is c / (m² + c) where m is not
+    0. Zeros outside make an edge all round the black picture's partner too, so both have black borders."""
+    truth = torch.zeros(12, 12, 3, dtype=torch.float64)
+    image = truth.clone()
+    image[4:8, 4:8] = 0.5  # 2x2 px of 0.5 in 6x6
+    plane = np.zeros((6, 6))
+    plane[2:4, 2:4] = 0.5
+    across = ndimage.correlate(plane, np.array([[-1, 0, 1]] * 3) / 3, mode="constant")
+    down = ndimage.correlate(plane, np.array([[-1, 0, 1]] * 3).T / 3, mode="constant")
+    constant = 170 / 255**2
+    expected = np.std(constant / (across**2 + down**2 + constant))
+    assert float(gmsd(image, truth)) == pytest.approx(expected, abs=1e-12)
+
+
+def test_phase_congruency_does_not_depend_on_contrast() -> None:
+    """What it is for (Kovesi 1999): an edge is one whatever its height, and noise is none."""
+    rows = torch.zeros(128, 128, dtype=torch.float64)
+    rows[64:] = 1.0
+    rows += 0.02 * torch.randn(rows.shape, generator=torch.Generator().manual_seed(0), dtype=rows.dtype)
+    low, high = (phase_congruency((40 + step * rows)[None, None])[0, 0] for step in (20.0, 200.0))
+    assert torch.allclose(low, high, atol=1e-3)
+    assert high[63:65].mean() > 0.5 > 5 * high[28:36].mean()
+
+
+@pytest.mark.parametrize("key", FUNCTIONS)
+def test_identical_images_are_best_and_worse_ones_worse(key: str) -> None:
+    facts = next(facts for facts in METRICS if facts.key == key)
+    image, truth = pair(176, 180)
+    best = float(FUNCTIONS[key](truth, truth))
+    values = [float(FUNCTIONS[key](truth + share * (image - truth), truth)) for share in (0.25, 0.5, 1.0)]
+    assert best == pytest.approx(facts.highest if facts.direction > 0 else facts.lowest, abs=1e-9)
+    assert [best, *values] == sorted([best, *values], reverse=facts.direction > 0)
+    assert all(facts.lowest <= value <= facts.highest for value in values)
+
+
+@pytest.mark.parametrize("key", FUNCTIONS)
+def test_a_batch_gives_the_values_of_its_images(key: str) -> None:
+    pairs = [pair(176, 180, distortion) for distortion in ("noise", "blur")]
+    first, second = (torch.stack([one[k] for one in pairs]).permute(0, 3, 1, 2) for k in (0, 1))
+    single = [float(FUNCTIONS[key](*one)) for one in pairs]
+    assert FUNCTIONS[key](first, second).tolist() == pytest.approx(single, abs=1e-9)
+
+
+@pytest.mark.parametrize(("key", "smallest"), [("ms_ssim", 161), ("iw_ssim", 161), ("fsim", 16), ("gmsd", 2)])
+def test_what_is_too_small_is_refused_and_reported(key: str, smallest: int) -> None:
+    assert MIN_SIZE == 161
+    with pytest.raises(ValueError, match=f"at least {smallest} px"):
+        FUNCTIONS[key](torch.rand(smallest - 1, 300, 3), torch.rand(smallest - 1, 300, 3))
+    rng = np.random.default_rng(0)
+    for side, there in ((smallest, True), (smallest - 1, False)):
+        evaluator = Evaluator(PAPER, lpips=[], flip=False, more=[key])
+        render, truth = rng.integers(0, 256, (2, max(side, 1), 170, 3), dtype=np.uint8)
+        assert (key in evaluator.evaluate_view(render, truth)) is there
+        assert (key in evaluator.unavailable) is not there
+    assert evaluator.unavailable[key] == f"a view is 170x{smallest - 1} px, below {smallest} px a side"
+    assert key not in evaluator.awaited
+
+
+@pytest.mark.parametrize("key", ["iw_ssim", "fsim"])
+def test_flat_views_have_a_reason_and_no_number(key: str) -> None:
+    evaluator = Evaluator(PAPER, lpips=[], flip=False, more=[key])
+    flat = np.full((170, 170, 3), 90, dtype=np.uint8)
+    assert key not in evaluator.evaluate_view(flat, flat)
+    assert evaluator.unavailable[key] == "a view is flat: it has no structure to compare"
+
+
+def test_views_that_are_flat_in_part_are_measured() -> None:
+    """Black borders of undistorted photographs, and renders of one colour."""
+    image, truth = pair(176, 180)
+    image[:90], truth[:90] = 0, 0
+    for function in FUNCTIONS.values():
+        assert 0 < float(function(image, truth)) < 1
+        assert np.isfinite(float(function(torch.full_like(truth, 0.5), truth)))
+
+
+def test_metrics_that_are_not_asked_for_leave_no_trace() -> None:
+    evaluator, image = Evaluator(PAPER, lpips=[], flip=False), np.zeros((9, 9, 3), np.uint8)
+    assert further_keys() == tuple(FUNCTIONS)
+    assert not {*evaluator.unavailable, *evaluator.evaluate_view(image, image)} & {*further_keys()}
+
+
+def test_an_unknown_metric_is_refused() -> None:
+    with pytest.raises(InputError, match="choose among ms_ssim, iw_ssim, fsim, gmsd"):
+        Evaluator(PAPER, more=["psnr"])

@@ -1,0 +1,40 @@
+"""What an evaluation depends on: its key must not change for a setting that changes nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from gsbench.eval.evaluator import Evaluator
+from gsbench.eval.protocol import PAPER
+from gsbench.pipeline.steps.evaluate import evaluate_step, measure_step
+from gsbench.raster import create_rasterizer
+from gsbench.runs.stages import TRAIN
+from gsbench.runs.step import Step
+
+TRAINED = Step(TRAIN, {}, lambda folder: None)
+FOUR_LPIPS = ["lpips_alex", "lpips_squeeze", "lpips_vgg", "lpips_vgg_raw"]
+
+
+def inputs(of_model: dict[str, bool] | None = None, **options: Any) -> dict[str, Any]:
+    """The inputs of an evaluation without LPIPS, whose views are not needed for a key."""
+    evaluator = Evaluator(PAPER, lpips=[], **options)
+    cpu, asked = torch.device("cpu"), of_model or {}
+    rasterizer = create_rasterizer("reference", cpu, 1)
+    step = evaluate_step(None, TRAINED, rasterizer, evaluator, (0, 0, 0), False, cpu, **asked)  # type: ignore[arg-type]
+    measured = measure_step(None, TRAINED, evaluator, **asked)  # type: ignore[arg-type]
+    new = {"more", "geometry", "flicker"}
+    assert {key: measured.inputs[key] for key in new & measured.inputs.keys()} == {
+        key: step.inputs[key] for key in new & step.inputs.keys()
+    }
+    return dict(step.inputs)
+
+
+def test_an_evaluation_that_asks_for_nothing_new_has_the_key_that_it_had() -> None:
+    old = {"train": TRAINED.key, "protocol": "paper-1", "unavailable": FOUR_LPIPS, "maps": False}
+    assert inputs() == old
+    assert inputs({"geometry": False, "flicker": False}) == old
+    assert inputs({"geometry": True}) == old | {"geometry": True}
+    assert inputs({"geometry": True, "flicker": True}) == old | {"geometry": True, "flicker": True}
+    assert inputs(more=["gmsd", "fsim"]) == old | {"more": ["fsim", "gmsd"]} == inputs(more=["fsim", "gmsd"])

@@ -1,0 +1,180 @@
+"""What each tracker shows of the same files; the packages of some are optional."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsbench.config.compose import compose_one
+from gsbench.errors import InputError
+from gsbench.launch.preflight import check_trackers
+from gsbench.tracking import connect, ensure_experiment, mirror_trial, prepare
+from gsbench.tracking.mlflow_sink import STATE, TRIES, MlflowSink
+from gsbench.tracking.record import TrialRecord
+from tests.tracking.helpers import RECORDS, begin_trial, found_runs, history, options, trial_values, write_trial
+
+AT = {"50": {"metrics": {"psnr": 15.0}, "num_gaussians": 7}}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A runs folder with a database; making one takes MLflow seconds."""
+    folder = tmp_path_factory.mktemp("runs")
+    prepare(options(), folder, "tracked")
+    return folder
+
+
+def finished_trial(runs: Path, seed: int) -> tuple[Path, dict[str, Any]]:
+    """A trial that was measured at iteration 50 too, with a picture."""
+    values = trial_values(runs, seed)
+    folder = begin_trial(values)
+    write_trial(folder, values)
+    results = json.loads((folder / "results.json").read_text()) | {"metrics_at": AT}
+    (folder / "results.json").write_text(json.dumps(results))
+    (folder / "renders").mkdir()
+    Image.fromarray(np.full((4, 6, 3), 200, np.uint8)).save(folder / "renders" / "view 1#.png")
+    return folder, values
+
+
+def run_of(client: Any, seed: int) -> Any:
+    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags.get("seed") == str(seed)]
+    return run
+
+
+def test_measurements_on_the_way_are_steps_of_the_final_metrics_curve(runs: Path) -> None:
+    folder, values = finished_trial(runs, seed=1)
+    mirror_trial(options(), runs, folder, values)
+    client = connect(None, runs)
+    run = run_of(client, 1)
+    assert history(client, run.info.run_id, "psnr") == [(50, 15.0), (RECORDS, 20.0)]
+    assert run.data.metrics["psnr"] == 20.0  # what the tables show is the last
+
+
+def test_test_pictures_are_an_image_grid(runs: Path) -> None:
+    folder, values = finished_trial(runs, seed=2)
+    mirror_trial(options(), runs, folder, values)
+    client = connect(None, runs)
+    run = run_of(client, 2)
+    assert run.data.tags["mlflow.loggedImages"] == "True"  # by which the page knows that it has a grid to show
+    names = [Path(item.path).name for item in client.list_artifacts(run.info.run_id, "images")]
+    assert any(name.startswith(f"renders~view 1_+step+{RECORDS}+") and name.endswith(".png") for name in names), names
+
+
+def test_run_names_begin_with_the_seed(runs: Path) -> None:
+    folder, values = finished_trial(runs, seed=3)
+    mirror_trial(options(), runs, folder, values)
+    assert run_of(connect(None, runs), 3).info.run_name == "seed 3 a_scene a_init-a_densify"
+
+
+def test_experiments_open_as_machine_learning(runs: Path) -> None:
+    client = connect(None, runs)
+    tag = "mlflow.experimentKind"
+    assert client.get_experiment(ensure_experiment(client, "kind", runs)).tags[tag] == "custom_model_development"
+    plain, chosen = client.create_experiment("plain"), client.create_experiment("chosen", tags={tag: "regression"})
+    assert ensure_experiment(client, "plain", runs) == plain
+    assert client.get_experiment(plain).tags[tag] == "custom_model_development"
+    ensure_experiment(client, "chosen", runs)
+    assert client.get_experiment(chosen).tags[tag] == "regression"  # what somebody chose stays
+
+
+def test_the_trials_of_a_sweep_have_one_parent(runs: Path) -> None:
+    trials = [finished_trial(runs, seed) for seed in (10, 11, 12)]
+    home = trials[0][0].parents[2]
+    sweep = {"sweep": {"id": "0123abcd", "count": 2}}
+    entries = {folder.relative_to(home).as_posix(): sweep for folder, _ in trials[:2]}
+    alone = {trials[2][0].relative_to(home).as_posix(): {"overrides": []}}
+    (home / "plan.json").write_text(json.dumps({"trials": entries | alone}))
+    for folder, values in trials:
+        mirror_trial(options(), runs, folder, values)
+    client = connect(None, runs)
+    (parent,) = [run for run in found_runs(client, "tracked") if run.data.tags["kind"] == "sweep"]
+    assert parent.info.run_name == "sweep of 2 trials"
+    assert parent.info.status == "FINISHED"
+    parents = [run_of(client, seed).data.tags.get("mlflow.parentRunId") for seed in (10, 11, 12)]
+    assert parents == [parent.info.run_id, parent.info.run_id, None]
+
+
+class Rivals:
+    """A client before whose nose others enter the data set, ``times`` times."""
+
+    def __init__(self, times: int, text: str) -> None:
+        self.times, self.text, self.entered = times, text, 0
+
+    def log_inputs(self, run_id: str, inputs: list[Any]) -> None:
+        if self.times > 0:
+            self.times -= 1
+            raise RuntimeError(self.text)
+        self.entered += len(inputs)
+
+
+@pytest.mark.parametrize("text", [
+    "(sqlite3.IntegrityError) UNIQUE constraint failed: datasets.experiment_id, datasets.name, datasets.digest",
+    'duplicate key value violates unique constraint "datasets_pkey"',
+])  # fmt: skip
+def test_a_race_for_a_data_set_is_run_again(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsbench.tracking.mlflow_sink.SECONDS_BETWEEN_TRIES", 0.0)
+    values = trial_values(tmp_path)
+    folder = begin_trial(values)
+    write_trial(folder, values)
+    sink = object.__new__(MlflowSink)
+    sink._record, sink.run_id = TrialRecord(tmp_path, folder, values), "x"
+    sink.client = rivals = Rivals(TRIES - 1, text)
+    sink._log_datasets(sink._record.results())
+    assert rivals.entered == 2
+    for times, said in ((TRIES, text), (1, "no such table: datasets")):  # for good, or something else
+        sink.client = rivals = Rivals(times, said)
+        with pytest.raises(RuntimeError, match="datasets"):
+            sink._log_datasets(sink._record.results())
+        assert rivals.entered == 0
+
+
+def test_a_tracker_whose_package_is_missing_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"tracking.sink=wandb needs a package: pip install .*\[wandb\]"):
+        check_trackers([compose_one(["tracking=wandb"])])
+    check_trackers([compose_one(["tracking=none"])])
+
+
+def test_tensorboard_shows_the_same_numbers_once(tmp_path: Path) -> None:
+    accumulator = pytest.importorskip(
+        "tensorboard.backend.event_processing.event_accumulator", reason="needs tensorboard"
+    )
+    folder, values = finished_trial(tmp_path, seed=1)
+    there = tmp_path / "tensorboard" / folder.relative_to(tmp_path)
+    sink = options() | {"sink": "tensorboard"}
+
+    def shown() -> Any:
+        events = accumulator.EventAccumulator(str(there), size_guidance={"scalars": 0, "images": 0})
+        return events.Reload()
+
+    for _ in range(2):  # after a crash between sending and noting it, too
+        assert mirror_trial(sink, tmp_path, folder, values)
+        assert not mirror_trial(sink, tmp_path, folder, values)
+        assert len(list(there.iterdir())) == 1
+        losses = [(event.step, event.value) for event in shown().Scalars("train/loss")]
+        assert losses == [(i, pytest.approx(1 / i)) for i in range(1, RECORDS + 1)]
+        assert [(event.step, event.value) for event in shown().Scalars("psnr")] == [(50, 15.0), (RECORDS, 20.0)]
+        assert [event.step for event in shown().Images("renders/view 1#")] == [RECORDS]
+        state = json.loads((folder / "tensorboard.json").read_text())
+        (folder / "tensorboard.json").write_text(json.dumps(state | {"complete": None}))
+    assert not (folder / STATE).exists()
+
+
+def test_weights_and_biases_takes_a_trial_without_a_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("wandb", reason="needs wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    folder, values = finished_trial(tmp_path, seed=1)
+    sink = options() | {"sink": "wandb"}
+    assert mirror_trial(sink, tmp_path, folder, values)
+    assert not mirror_trial(sink, tmp_path, folder, values)
+    (file,) = (tmp_path / "wandb").rglob("*.wandb")
+    said = file.read_bytes()
+    for word in (b"train/loss", b"psnr", b"seed 1 a_scene a_init-a_densify"):
+        assert word in said

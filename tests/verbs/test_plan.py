@@ -1,0 +1,52 @@
+"""``gsbench plan``: the words it prints for made-up trials, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gsbench.errors import InputError
+from gsbench.verbs.plan import main
+from tests.analysis.synthetic import Plan, write_runs
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    write_runs(tmp_path, Plan(scenes=("a", "b", "c"), trial_noise=0.3, effect_noise=0.2))
+    write_runs(tmp_path, Plan(experiment="one", scenes=("a",), trial_noise=0.3))
+    write_runs(tmp_path, Plan(experiment="alone", densifiers=("adc",)))
+    return tmp_path
+
+
+def test_it_names_designs_that_suffice(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["exp", "--metric", "psnr", "--difference", "0.2", "--hours", "1"], runs) == 0
+    out = capsys.readouterr().out
+    assert "sfm-volumetric against sfm-adc" in out
+    assert "(from 9 pairs on 3 scenes)" in out
+    assert "scenes like these (from 6 scenes on)" in out
+    assert "1 h, at" in out
+    assert "which resolve" in out
+
+
+def test_one_scene_does_not_speak_of_others(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["one"], runs) == 0
+    assert "run pilot trials on a second scene" in capsys.readouterr().out
+    assert main(["one", "--hours", "0.001"], runs) == 0
+    assert "do not suffice" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["exp", "--metric", "psn"], "unknown metric"),
+        (["exp", "--metric", "gaussians"], "not counts"),
+        (["exp", "--difference", "0"], "above 0"),
+        (["exp", "--hours", "nan"], "above 0"),
+        (["alone"], "one arm"),
+        (["nothing"], "no experiment"),
+    ],
+)
+def test_bad_input_is_refused(runs: Path, words: list[str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        main(words, runs)
