@@ -10,9 +10,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
+from rich import progress as bars
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsbench.words import printable
 
@@ -115,21 +115,33 @@ log = logging.getLogger(__name__)
 SECONDS_BETWEEN_LINES = 20.0
 
 
-class Report(Protocol):
-    """Called with how far a piece of work is, of a ``total`` that may be unknown; ``note`` is shown as it is."""
+class Progress(Protocol):
+    """Told how far a ``phase`` of a piece of work is: ``done`` of a ``total`` that may be unknown.
+
+    The unit is the phase's own (images, pairs, bytes), and a phase may start anew at 0. ``note`` is shown as it is.
+    """
 
     def __call__(self, phase: str, done: int, total: int | None, note: str = "") -> None: ...
 
 
+def no_progress(phase: str, done: int, total: int | None, note: str = "") -> None:
+    """The `Progress` that tells nobody."""
+
+
 @contextmanager
-def progress(title: str) -> Iterator[Report]:
+def progress(title: str) -> Iterator[Progress]:
     """Show progress of the work called ``title`` while the block runs."""
     console = Console(file=getattr(sys.stderr, "raw", sys.stderr))  # which may obey: it draws a bar
     if not console.is_terminal:
         yield _lines(title)
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    columns = (
+        bars.TextColumn("{task.description}"),
+        bars.BarColumn(),
+        bars.TextColumn("{task.fields[note]}"),
+        bars.TimeRemainingColumn(),
+    )
+    with bars.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(title, total=None, note="")
 
         def report(phase: str, done: int, total: int | None, note: str = "") -> None:
@@ -144,7 +156,7 @@ def progress(title: str) -> Iterator[Report]:
         yield report
 
 
-def _lines(title: str) -> Report:
+def _lines(title: str) -> Progress:
     last_phase, last_done, last_time = "", -1, 0.0
 
     def report(phase: str, done: int, total: int | None, note: str = "") -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbench.analysis.declaration import STAMP, read_declarations, standing
+from gsbench.analysis.declaration import standing
 from gsbench.analysis.pairing import Paired, ViewCache, choose_pairs
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import Experiment, load_experiment
@@ -25,6 +25,7 @@ from gsbench.analysis.statistics import (
 )
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdicts import ArmVerdicts, judge
+from gsbench.runs.declaration import STAMP, read_declarations
 from tests.analysis.false_verdicts import measure
 from tests.analysis.synthetic import Plan, write_runs
 
@@ -198,7 +199,8 @@ def test_trials_remember_a_declaration_whose_record_is_gone(tmp_path: Path) -> N
     data = json.loads((path / "results.json").read_text())
     (path / "results.json").write_text(json.dumps(data | {"declared": {"metric": "psnr", "time": EARLY}}))
     experiment = load_experiment(tmp_path, "exp")
-    assert [one.metric for one in read_declarations(experiment.folder, experiment.trials)] == ["psnr"]
+    repeated = [trial.data.get("declared") for trial in experiment.trials]
+    assert [one.metric for one in read_declarations(experiment.folder, repeated)] == ["psnr"]
     assert read_declarations(tmp_path / "nothing") == []
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.analysis.results import list_experiments, load_experiment, read_json_lines, read_views
+from gsbench.analysis.results import list_experiments, load_experiment, read_views
 from gsbench.errors import InputError
+from gsbench.files import read_json_lines
 from tests.analysis.synthetic import Plan, write_runs
 
 

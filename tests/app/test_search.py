@@ -13,6 +13,7 @@ from gsbench.analysis.report.search_charts import search_part
 from gsbench.errors import GsbenchError
 from gsbench.launch import serial
 from gsbench.launch.outcome import Outcome, outcome_of_error
+from gsbench.runs.finished import Done, NotDone
 from gsbench.runs.trial_files import TrialPaths
 
 optuna = pytest.importorskip("optuna", reason="needs Optuna (extra search)")
@@ -59,8 +60,12 @@ class Trials:
 def trials(monkeypatch: pytest.MonkeyPatch) -> Trials:
     stand_in = Trials()
     monkeypatch.setattr(serial, "run_one", stand_in.run_one)
+
     # What a stand-in leaves has no record of what it was made of; how finished trials are known is tested elsewhere.
-    found = lambda values, *rest: json.loads(path.read_text()) if (path := results_of(values)).exists() else None  # noqa: E731
+    def found(values: dict[str, Any], *rest: Any) -> Done | NotDone:
+        path = results_of(values)
+        return Done(json.loads(path.read_text())) if path.exists() else NotDone("unfinished", "")
+
     monkeypatch.setattr("gsbench.launch.batch.find_finished", found)
     return stand_in
 

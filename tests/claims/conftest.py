@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsbench.analysis.results import Trial, read_experiment
+from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.claims.verdict import Pair, PairKey
 from tests.analysis.synthetic import Plan, write_runs
 
@@ -26,7 +26,7 @@ def make_pairs(tmp_path: Path) -> Callable[..., dict[PairKey, Pair]]:
     return make
 
 
-def pairs_of(trials: tuple[Trial, ...]) -> dict[PairKey, Pair]:
+def pairs_of(trials: tuple[TrialResult, ...]) -> dict[PairKey, Pair]:
     by_arm = {(trial.densify, trial.scene, trial.seed): trial for trial in trials}
     keys = {(trial.scene, trial.seed) for trial in trials}
     return {(scene, seed): (by_arm["adc", scene, seed], by_arm["volumetric", scene, seed]) for scene, seed in keys}

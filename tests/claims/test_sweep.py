@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 import yaml
 
-from gsbench.analysis.declaration import DeclaredPlan, read_plans
 from gsbench.claims.file import parse_claims
 from gsbench.claims.page import make_page, to_html, to_markdown
 from gsbench.claims.sweep import Check, prepare, run_looks, with_seed
 from gsbench.cli import run
 from gsbench.config.compose import Composed
 from gsbench.errors import InputError
+from gsbench.runs.declaration import DeclaredPlan, read_plans
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.verbs.check import describe
 from tests.analysis.synthetic import Plan, trial_data, write_trial

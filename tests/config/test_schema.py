@@ -45,6 +45,9 @@ PROGRAMS = {
 }
 
 
+PLACES = {option: ["init.path=/data/model.ply"] for option in ("ply", "points")}
+
+
 def needs(option: str) -> list[str]:
     return [*PROGRAMS[option], "densify.version='1'"] if option in PROGRAMS else []
 
@@ -52,7 +55,7 @@ def needs(option: str) -> list[str]:
 @pytest.mark.parametrize(("group", "option"), [(group, option) for group in GROUPS for option in options(group)])
 def test_every_option_composes(group: str, option: str) -> None:
     extra = ["scene.path=/data/capture"] if group == "scene" else []
-    extra += ["init.path=/data/model.ply"] if option in ("ply", "points") else []
+    extra += PLACES.get(option, [])
     extra += ["densify=none"] if (group, option) == ("train", "none") else []
     extra += needs(option) if group == "densify" else []
     values = composed(f"{group}={option}", *extra)
@@ -162,6 +165,15 @@ def test_wrong_type_in_a_component_names_the_key() -> None:
         build("densify", composed("densify.max_gaussians=1.5")["densify"], [])
     with pytest.raises(InputError, match=r"densify\.cap.*'soft'"):
         build("densify", composed("densify.cap=squishy")["densify"], [])
+
+
+def test_every_component_of_gsbench_checks_its_own_options() -> None:
+    """`build` leaves it to them; what is wrong in every kind of option is a list of lists."""
+    for group, option in [(name, option) for name in ("init", "densify") for option in options(name)]:
+        values = composed(f"{group}={option}", *needs(option), *PLACES.get(option, []))[group]
+        for key in values.keys() - {"_target_", "name"}:
+            with pytest.raises(InputError, match=rf"{group}\.{key}"):
+                build(group, values | {key: [[None]]}, [])
 
 
 def test_only_trusted_code_is_imported() -> None:

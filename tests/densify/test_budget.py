@@ -12,7 +12,8 @@ import torch
 from gsbench.densify import ADC, MCMC, Budgeted, DensifyContext, Refinement, Volumetric
 from gsbench.densify.budget import settle
 from gsbench.errors import InputError
-from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
 from tests.densify.test_rounds import EXTENT, prepared, to_rows
 from tests.gaussians.helpers import random_gaussians
 

@@ -11,7 +11,8 @@ from gsbench.densify.budget import limit_at
 from gsbench.densify.mcmc import shared_opacity
 from gsbench.densify.operations import revised_logits
 from gsbench.errors import InputError
-from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from tests.gaussians.helpers import random_gaussians
 

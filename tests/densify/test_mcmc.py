@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from gsbench.densify import MCMC, DensifyContext
-from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
 from tests.densify import restatement
 from tests.densify.test_rounds import assert_same, to_rows
 from tests.gaussians.helpers import random_gaussians

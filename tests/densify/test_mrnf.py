@@ -10,7 +10,8 @@ from gsbench.densify import ADC, MRNF, DensifyContext
 from gsbench.densify.mrnf import bounds
 from gsbench.densify.scores import draw
 from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.reference import ReferenceRasterizer
 from tests.densify import restatement
 from tests.densify.test_rounds import EXTENT, assert_same, to_rows

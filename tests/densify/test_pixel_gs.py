@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from gsbench.densify import ADC, DensifyContext, PixelGS, Refinement
-from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.footprint import Footprint
 from tests.densify import restatement

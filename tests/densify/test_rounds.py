@@ -8,7 +8,8 @@ import torch
 
 from gsbench.densify import ADC, Densifier, DensifyContext, Volumetric
 from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from tests.densify import restatement
 from tests.gaussians.helpers import random_gaussians

@@ -14,7 +14,8 @@ from gsbench.errors import InputError
 from gsbench.eval.ssim import ssim_map
 from gsbench.events import RefineEvent
 from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.reference import ReferenceRasterizer, bin_gaussians, blending_weights, project, tile_rectangles
 from gsbench.scene.camera import Camera

@@ -120,7 +120,8 @@ def test_initialiser(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder: Path) -> None:
     """What its checklist asks of others."""
     from gsbench.densify import DensifyContext
-    from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+    from gsbench.gaussians.paper_values import LearningRates
+    from gsbench.gaussians.trainable import TrainableGaussians
     from gsbench.raster.base import RenderOutput
     from tests.gaussians.helpers import random_gaussians
 
@@ -161,7 +162,8 @@ def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder: 
 
 def test_governed_class_of_the_document_ends_at_its_limit(folder: Path) -> None:
     from gsbench.densify import DensifyContext
-    from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+    from gsbench.gaussians.paper_values import LearningRates
+    from gsbench.gaussians.trainable import TrainableGaussians
     from tests.gaussians.helpers import random_gaussians
 
     (code,) = (b for b in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text()) if b.startswith("# opaque.py"))
@@ -194,7 +196,8 @@ def test_class_of_the_readme_is_a_densifier(folder: Path) -> None:
     import mine  # type: ignore[import-not-found]
 
     from gsbench.densify import DensifyContext
-    from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+    from gsbench.gaussians.paper_values import LearningRates
+    from gsbench.gaussians.trainable import TrainableGaussians
     from tests.gaussians.helpers import random_gaussians
 
     densifier = mine.Patient(min_views=8)

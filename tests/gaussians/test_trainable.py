@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
 from tests.gaussians.helpers import random_gaussians
 
 

@@ -11,7 +11,6 @@ import torch
 from PIL import Image
 
 from gsbench.init import Sfm
-from gsbench.init.base import no_progress
 from gsbench.init.colmap.database import (
     create_database,
     database_counts,
@@ -26,6 +25,7 @@ from gsbench.init.colmap.sift import extract_sift
 from gsbench.init.colmap.sift_matching import match_sift
 from gsbench.init.networks.extractors import build_extractor, extract_features
 from gsbench.init.networks.features import Features, FeatureSettings
+from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 
 MAPPING = MappingSettings(seed=0, threads=1, min_model_size=3, two_view_tracks=False, fixed_intrinsics=False)

@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.analysis.declaration import measured, read_declarations, read_plans, standing
+from gsbench.analysis.declaration import measured, standing
 from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
-from gsbench.config.compose import Composed, compose_one
+from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.declare import declare, declare_plan, declared_metrics
+from gsbench.launch.trial import Trial
+from gsbench.runs.declaration import read_declarations, read_plans
 from tests.end_to_end.conftest import SMALL
 
 # later words win: a trial of seconds
@@ -24,8 +26,8 @@ TINY = [
 ]
 
 
-def composed(runs: Path, *words: str) -> Composed:
-    return compose_one(["name=exp", f"runs={runs}", *words])
+def composed(runs: Path, *words: str) -> Trial:
+    return Trial.of(compose_one(["name=exp", f"runs={runs}", *words]))
 
 
 def test_a_declaration_is_kept_with_its_time_and_changes_are_added(

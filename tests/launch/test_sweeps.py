@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -30,11 +32,14 @@ from gsbench.launch.plan import (
     same_trial_elsewhere,
 )
 from gsbench.launch.states import states_of_experiment
+from gsbench.launch.trial import Trial
+from gsbench.runs import finished
+from gsbench.runs.finished import Done, NotDone, find_finished, record_inputs
 from gsbench.runs.hashing import config_hash
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
-from gsbench.runs.trial_files import TrialPaths, find_finished, record_inputs, state_of
+from gsbench.runs.trial_files import TrialPaths, state_of
 from gsbench.system.locks import BusyError, hold, is_held
 
 
@@ -94,7 +99,7 @@ def finish(
 
 
 @cache
-def experiment(name: str) -> list[Composed]:
+def experiment(name: str) -> list[Trial]:
     """Composed once: the paper's tables take seconds."""
     return compose_trials([f"+experiment={name}"])
 
@@ -250,36 +255,82 @@ def test_own_and_allowed_targets_pass() -> None:
 
 def test_finished_trial_is_recognised_until_something_changes(runs: Path) -> None:
     values = trial_values()
-    assert find_finished(values) is None
+    assert isinstance(find_finished(values), NotDone)
     results = finish(values)
-    assert find_finished(values) == results
+    assert find_finished(values) == Done(results)
     assert state_of(TrialPaths.of(values).folder) == "done"
-    assert find_finished(trial_values("seed=1")) is None
+    assert isinstance(find_finished(trial_values("seed=1")), NotDone)
 
 
 @pytest.mark.parametrize(
-    "change", ["photo", "new photo", "published", "stage", "results", "no inputs", "weights", "half a file"]
+    ("change", "cause", "names"),
+    [
+        ("photo", "file", "photos/a.jpg has changed"),
+        ("photo gone", "file", "photos/a.jpg cannot be read (No such file"),
+        ("new photo", "file", "files have come to .*photos, or gone"),
+        ("published", "file", "table.csv cannot be read"),
+        ("store", "store", r"stage train in the store is damaged or gone \(model differs"),
+        ("store gone", "store", "stage train .*manifest.json is missing"),
+        ("stage", "stage", "version 1 of the stage train, which is now at 2"),
+        ("package", "package", "made with pycolmap 0.1, and .* is installed"),
+        ("results", "record", "results.json is not as it was written"),
+        ("no inputs", "record", "inputs.json is not there"),
+        ("an input less", "record", "lacks what a finished trial has"),
+        ("inputs of another kind", "record", "lacks what a finished trial has"),
+        ("weights", "metric", "it lacks lpips_vgg, which may"),
+        ("half a file", "unfinished", "results.json is not there, or not complete"),
+    ],
 )
-def test_changes_are_noticed(change: str, runs: Path) -> None:
+def test_changes_are_noticed_and_named(
+    change: str, cause: str, names: str, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     values = trial_values()
     finish(values, awaited=["lpips_vgg"] if change == "weights" else ())
     folder = TrialPaths.of(values).folder
+    record = json.loads((folder / "inputs.json").read_text())
     if change == "photo":
         (runs.parent / "photos" / "a.jpg").write_bytes(b"other")
+    elif change == "photo gone":
+        (runs.parent / "photos" / "a.jpg").unlink()
     elif change == "new photo":
         os.utime(runs.parent / "photos", ns=(1, 1))
     elif change == "published":
         (folder / "table.csv").unlink()
-    elif change == "stage":
+    elif change == "store":
         (model,) = (runs / "store" / "train").glob("*/model")
         model.write_text("n")
+    elif change == "store gone":
+        shutil.rmtree(runs / "store")
+    elif change == "stage":
+        monkeypatch.setattr(finished, "STAGES", [replace(stage, version=2) for stage in finished.STAGES[2:3]])
+        record["stages"] = {"train": 1}
+    elif change == "package":
+        record["pycolmap"] = "0.1"
     elif change == "results":
         (folder / "results.json").write_text((folder / "results.json").read_text().replace("20.5", "30.5"))
-    elif change == "no inputs":
-        (folder / "inputs.json").unlink()
+    elif change == "an input less":
+        del record["entries"]
+    elif change == "inputs of another kind":
+        record["sources"] = ["a.jpg"]
     elif change == "half a file":
         (folder / "results.json").write_text((folder / "results.json").read_text()[:100])
-    assert find_finished(values) is None
+    (folder / "inputs.json").write_text(json.dumps(record))
+    if change == "no inputs":
+        (folder / "inputs.json").unlink()
+    found = find_finished(values)
+    assert isinstance(found, NotDone)
+    assert found.cause == cause
+    assert re.search(names.replace("read (No", r"read \(No"), found.reason), found.reason
+    assert "\n" not in found.reason
+
+
+def test_a_dry_run_says_what_has_changed(runs: Path) -> None:
+    values = trial_values()
+    finish(values)
+    trial = Trial.of(replace(_composed(), values=values))
+    assert describe_plan([trial])[0].startswith("done     courtyard/sfm-volumetric seed 0")
+    (runs.parent / "photos" / "a.jpg").write_bytes(b"other")
+    assert describe_plan([trial])[0].endswith(f"  will be checked: {runs.parent / 'photos' / 'a.jpg'} has changed")
 
 
 def test_metric_that_cannot_come_later_does_not_hinder() -> None:
@@ -288,14 +339,14 @@ def test_metric_that_cannot_come_later_does_not_hinder() -> None:
         values,
         unavailable={"flip": "not asked for (eval.flip)", "lpips_alex": "a view is 20x20 px, below 63 px a side"},
     )
-    assert find_finished(values) is not None
+    assert isinstance(find_finished(values), Done)
 
 
 def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do() -> None:
     values = trial_values()
     finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"}, awaited=["lpips_vgg"])
-    assert find_finished(values, lambda options: {"lpips_vgg", "flip"}) is not None
-    assert find_finished(values, lambda options: {"flip"}) is None
+    assert isinstance(find_finished(values, lambda options: {"lpips_vgg", "flip"}), Done)
+    assert isinstance(find_finished(values, lambda options: {"flip"}), NotDone)
 
 
 # ---- plan and states
@@ -304,10 +355,10 @@ def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do() -> None:
 def test_what_is_awaited_is_not_read_from_the_prose_of_reasons() -> None:
     values = trial_values("seed=3")
     finish(values, unavailable={"lpips_vgg": "weights not found", "own": "no reason that anyone knows"}, awaited=[])
-    assert find_finished(values) is not None
+    assert isinstance(find_finished(values), Done)
     finish(values, unavailable={"lpips_vgg": "a view is too small"}, awaited=["lpips_vgg"])
-    assert find_finished(values) is None
-    assert find_finished(values, lambda options: ["lpips_vgg"]) is not None
+    assert isinstance(find_finished(values), NotDone)
+    assert isinstance(find_finished(values, lambda options: ["lpips_vgg"]), Done)
 
 
 def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs: Path) -> None:
@@ -394,12 +445,12 @@ def fake_trial(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
     return behaviour, order
 
 
-def sweep() -> list[Composed]:
+def sweep() -> list[Trial]:
     return [replace(trial, values=trial.values | {"runs": os.environ["GSBENCH_RUNS"]}) for trial in _composed_sweep()]
 
 
 @cache
-def _composed_sweep() -> list[Composed]:
+def _composed_sweep() -> list[Trial]:
     return compose_trials(["name=x", "densify=adc", "seed=0,1,2"], multirun=True)
 
 

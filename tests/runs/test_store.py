@@ -15,8 +15,9 @@ import pytest
 
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError
+from gsbench.runs.layout import MANIFEST
 from gsbench.runs.step import Stage, Step
-from gsbench.runs.store import MANIFEST, Store, read_manifest
+from gsbench.runs.store import Store, read_manifest
 from tests.runs.toy import TOY, expected_text, toy_inputs
 
 LETTERS = Stage("letters", 1)

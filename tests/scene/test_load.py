@@ -96,9 +96,9 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     done = []
     options = {"downscale": 2, "progress": lambda *step: done.append(step)}
     first = load_scene(capture, capture.model, tmp_path / "cache", **options)
-    assert done == [(6, 6)]
+    assert done == [("views", 6, 6)]
     second = load_scene(capture, capture.model, tmp_path / "cache", **options)
-    assert done == [(6, 6)]  # nothing was prepared again
+    assert done == [("views", 6, 6)]  # nothing was prepared again
     third = load_scene(capture, capture.model, tmp_path / "other", threads=1, **options)
     for scene in (second, third):
         for a, b in zip(first.train, scene.train, strict=True):

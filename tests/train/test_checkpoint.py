@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.system.stopping import Stopped, deferred, requested, stop_on_signals
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint, save_checkpoint, to_host
 from tests.gaussians.helpers import random_gaussians

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.errors_by_region import read_image, view_names
-from gsbench.analysis.results import Arm, Trial
+from gsbench.analysis.results import Arm, TrialResult
 from gsbench.errors import InputError
 from gsbench.runs.layout import POINT_CLOUD, RENDERS
 
@@ -59,7 +59,7 @@ class Agreement:
     faults: tuple[str, ...]
 
 
-def agreements(trials: Sequence[Trial]) -> list[Agreement]:
+def agreements(trials: Sequence[TrialResult]) -> list[Agreement]:
     """For each scene and arm with at least two seeds under one set of conditions, sorted by name."""
     found = []
     read = cache(read_positions)  # a training stands in two pairs
@@ -72,7 +72,7 @@ def agreements(trials: Sequence[Trial]) -> list[Agreement]:
     return found
 
 
-def render_psnr(first: Trial, second: Trial) -> float:
+def render_psnr(first: TrialResult, second: TrialResult) -> float:
     """The mean over test views of the PSNR of one trial's renders against the other's, dB; the same either way round.
 
     Raises `InputError` where renders are missing, damaged, or of other views or sizes.
@@ -119,11 +119,11 @@ def read_positions(path: Path) -> NDArray[np.float64]:
     return points[(logits >= np.log(MIN_OPACITY / (1 - MIN_OPACITY))) & np.isfinite(points).all(axis=1)]
 
 
-def _agreement(scene: str, arm: Arm, pairs: Sequence[tuple[Trial, Trial]], read: Reader) -> Agreement:
+def _agreement(scene: str, arm: Arm, pairs: Sequence[tuple[TrialResult, TrialResult]], read: Reader) -> Agreement:
     faults: list[str] = []
     psnrs = list(_measured(pairs, render_psnr, faults))
 
-    def apart(first: Trial, second: Trial) -> tuple[float, float]:
+    def apart(first: TrialResult, second: TrialResult) -> tuple[float, float]:
         distance = cloud_distance(*(read(trial.path / POINT_CLOUD) for trial in (first, second)))
         return distance.mean / first.data["scene_extent"], distance.far / first.data["scene_extent"]
 
@@ -137,7 +137,9 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _measured(
-    pairs: Sequence[tuple[Trial, Trial]], measure: Callable[[Trial, Trial], T], faults: list[str]
+    pairs: Sequence[tuple[TrialResult, TrialResult]],
+    measure: Callable[[TrialResult, TrialResult], T],
+    faults: list[str],
 ) -> Iterator[T]:
     """What can be measured of the pairs; why others cannot goes to ``faults``."""
     for pair in pairs:

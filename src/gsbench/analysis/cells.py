@@ -14,7 +14,7 @@ from gsbench.analysis.differences import (
     differing_settings,
 )
 from gsbench.analysis.quantities import Quantity
-from gsbench.analysis.results import Trial
+from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
 
 K = TypeVar("K", bound=Hashable)
@@ -36,7 +36,7 @@ class Cell:
     count: int
     expected: int
     scenes: int
-    trials: tuple[Trial, ...]
+    trials: tuple[TrialResult, ...]
     reason: str = ""
 
     @property
@@ -44,7 +44,7 @@ class Cell:
         return self.mean is not None and self.count == self.expected
 
 
-def field_value(trial: Trial, name: str) -> str:
+def field_value(trial: TrialResult, name: str) -> str:
     """A field of a trial, or a dotted key of its configuration, as text; raises ``InputError`` where it has none."""
     if name in TRIAL_FIELDS:
         return str(trial.data[name])
@@ -55,7 +55,7 @@ def field_value(trial: Trial, name: str) -> str:
     )
 
 
-def select_trials(trials: Iterable[Trial], where: Mapping[str, str]) -> list[Trial]:
+def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> list[TrialResult]:
     """The trials whose fields have the given values; raises ``InputError`` where none is left."""
     kept = [trial for trial in trials if all(field_value(trial, key) == value for key, value in where.items())]
     if not kept:
@@ -63,7 +63,7 @@ def select_trials(trials: Iterable[Trial], where: Mapping[str, str]) -> list[Tri
     return kept
 
 
-def check_averageable(trials: Sequence[Trial], where: str) -> None:
+def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
     """Raise ``InputError``, naming the differing keys, unless the trials are repetitions of the same thing by scene."""
     if code := differing_code(trials):
         raise _code_refusal(where, code, trials[0].experiment)
@@ -84,13 +84,13 @@ def check_averageable(trials: Sequence[Trial], where: str) -> None:
         raise _refusal(where, across, trials)
 
 
-def swept_settings(trials: Iterable[Trial]) -> list[str]:
+def swept_settings(trials: Iterable[TrialResult]) -> list[str]:
     """The settings in which trials of one scene, initialiser and densifier differ, apart from what may differ."""
     groups = by_key(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values()
     return sorted({key for group in groups for key in differing_settings(group)})
 
 
-def with_variants(trials: Sequence[Trial]) -> list[Trial]:
+def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
     """The trials, each with its values of the swept settings as its variant, so that they are arms of their own."""
     swept = swept_settings(trials)
     if not swept:
@@ -101,7 +101,7 @@ def with_variants(trials: Sequence[Trial]) -> list[Trial]:
     ]
 
 
-def make_cell(trials: Sequence[Trial], quantity: Quantity, scenes: Sequence[str], expected: int) -> Cell:
+def make_cell(trials: Sequence[TrialResult], quantity: Quantity, scenes: Sequence[str], expected: int) -> Cell:
     """The cell over ``scenes``, each expected to have ``expected`` trials, of what ``check_averageable`` accepts."""
     values: dict[str, dict[int, float]] = {scene: {} for scene in scenes}
     for trial in trials:
@@ -130,15 +130,15 @@ def best_cells(cells: Mapping[K, Cell], quantity: Quantity) -> set[K]:
     return {key for key, mean in means.items() if mean == best}
 
 
-def by_key(trials: Iterable[Trial], key: Callable[[Trial], K]) -> dict[K, list[Trial]]:
+def by_key(trials: Iterable[TrialResult], key: Callable[[TrialResult], K]) -> dict[K, list[TrialResult]]:
     """Trials grouped by ``key(trial)``, in order of appearance."""
-    groups: dict[K, list[Trial]] = {}
+    groups: dict[K, list[TrialResult]] = {}
     for trial in trials:
         groups.setdefault(key(trial), []).append(trial)
     return groups
 
 
-def _code_refusal(where: str, code: Mapping[str, Mapping[str, Sequence[Trial]]], experiment: str) -> InputError:
+def _code_refusal(where: str, code: Mapping[str, Mapping[str, Sequence[TrialResult]]], experiment: str) -> InputError:
     listed = "; ".join(describe_code(part, versions) for part, versions in code.items())
     return InputError(
         f"the table cell {where} would average trials made by different versions of {listed}: `gsbench status "
@@ -146,7 +146,7 @@ def _code_refusal(where: str, code: Mapping[str, Mapping[str, Sequence[Trial]]],
     )
 
 
-def _refusal(where: str, keys: Mapping[str, Sequence[str]], trials: Sequence[Trial]) -> InputError:
+def _refusal(where: str, keys: Mapping[str, Sequence[str]], trials: Sequence[TrialResult]) -> InputError:
     listed = "; ".join(f"{key}: {' | '.join(values)}" for key, values in keys.items())
     first = next(iter(keys))
     return InputError(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gsbench.analysis.origins import machine_of
-from gsbench.analysis.results import Trial
+from gsbench.analysis.results import TrialResult
 from gsbench.eval.facts import LPIPS, find
 from gsbench.eval.protocol import PAPER, PROTOCOLS
 
@@ -39,8 +39,8 @@ class Topic:
 
     key: str  # in ``setup`` of a paper's YAML
     label: str
-    read: Callable[[Trial], str | None]
-    detail: Callable[[Sequence[Trial]], str] = lambda trials: ""  # of all trials, after their choices
+    read: Callable[[TrialResult], str | None]
+    detail: Callable[[Sequence[TrialResult]], str] = lambda trials: ""  # of all trials, after their choices
 
 
 def read_setup(content: Mapping[str, Any]) -> dict[str, PaperChoice]:
@@ -54,12 +54,12 @@ def read_setup(content: Mapping[str, Any]) -> dict[str, PaperChoice]:
     }
 
 
-def choice_lines(trials: Sequence[Trial], setup: Mapping[str, PaperChoice]) -> list[str]:
+def choice_lines(trials: Sequence[TrialResult], setup: Mapping[str, PaperChoice]) -> list[str]:
     """A line for each topic of ``setup`` in which our trials and the paper do not state the same."""
     own = [trial for trial in trials if not trial.made_elsewhere]
     lines = []
     for topic in TOPICS:
-        chosen: dict[str, list[Trial]] = {}
+        chosen: dict[str, list[TrialResult]] = {}
         for trial in own:
             if (text := _read(topic, trial)) is not None:
                 chosen.setdefault(text, []).append(trial)
@@ -69,14 +69,14 @@ def choice_lines(trials: Sequence[Trial], setup: Mapping[str, PaperChoice]) -> l
     return lines
 
 
-def _read(topic: Topic, trial: Trial) -> str | None:
+def _read(topic: Topic, trial: TrialResult) -> str | None:
     try:
         return topic.read(trial)
     except KeyError:
         return NOT_RECORDED
 
 
-def _of_whom(chosen: Mapping[str, Sequence[Trial]]) -> str:
+def _of_whom(chosen: Mapping[str, Sequence[TrialResult]]) -> str:
     """``2,048 an image for dim, 8,192 an image for sfm``: of several choices, each with those whose it is."""
     if len(chosen) == 1:
         return next(iter(chosen))
@@ -87,14 +87,14 @@ def _of_whom(chosen: Mapping[str, Sequence[Trial]]) -> str:
     return ", ".join(f"{text} in {len(trials)} trials" for text, trials in chosen.items())
 
 
-def _poses(trial: Trial) -> str:
+def _poses(trial: TrialResult) -> str:
     trial.config["init.name"]  # raises where nothing was recorded
     if trial.config.get("init.poses") == "own":
         return "estimated by each initialiser (init.poses=own)"
     return "the same for all arms of a scene (init.poses=shared)" if "init.poses" in trial.config else "as they came"
 
 
-def _gauge(trial: Trial) -> str:
+def _gauge(trial: TrialResult) -> str:
     own = trial.config["init.name"] and trial.config.get("init.poses") == "own"
     if not own:
         return "that of the given cameras"
@@ -105,7 +105,7 @@ def _gauge(trial: Trial) -> str:
     )
 
 
-def _keypoints(trial: Trial) -> str | None:
+def _keypoints(trial: TrialResult) -> str | None:
     trial.config["init.name"]
     for key in ("max_keypoints", "max_num_features"):
         if (count := trial.config.get(f"init.{key}")) is not None:
@@ -113,30 +113,30 @@ def _keypoints(trial: Trial) -> str | None:
     return None
 
 
-def _networks(trial: Trial) -> str | None:
+def _networks(trial: TrialResult) -> str | None:
     trial.config["init.name"]
     parts = [trial.config.get(f"init.{key}") for key in ("extractor", "matcher")]
     return " and ".join(map(str, parts)) if all(parts) else None
 
 
-def _cap(trial: Trial) -> str:
+def _cap(trial: TrialResult) -> str:
     count, cap = trial.config.get("densify.max_gaussians"), trial.config["densify.cap"]
     return "none" if count is None else f"{count:,} (densify.cap={cap})"
 
 
-def _hold_out(trial: Trial) -> str:
+def _hold_out(trial: TrialResult) -> str:
     config = trial.config
     return "by lists" if config.get("scene.test_list") else f"every {config['scene.test_every']}th image"
 
 
-def _selection(trial: Trial) -> str:
+def _selection(trial: TrialResult) -> str:
     return f"at most {trial.config['scene.max_images']}, evenly spaced over the sorted names"
 
 
-def _volume(key: str, say: Callable[[Any], str]) -> Callable[[Trial], str | None]:
+def _volume(key: str, say: Callable[[Any], str]) -> Callable[[TrialResult], str | None]:
     """Reads a setting of the volume rule; None for arms without the rule."""
 
-    def read(trial: Trial) -> str | None:
+    def read(trial: TrialResult) -> str | None:
         trial.config["densify.name"]  # raises where nothing was recorded
         value = trial.config.get(f"densify.{key}")
         return None if value is None else say(value)
@@ -144,7 +144,7 @@ def _volume(key: str, say: Callable[[Any], str]) -> Callable[[Trial], str | None
     return read
 
 
-def _window(trial: Trial) -> str | None:
+def _window(trial: TrialResult) -> str | None:
     config = trial.config
     if config.get("densify.volume_order") is None:
         config["densify.name"]  # raises where nothing was recorded
@@ -157,7 +157,7 @@ def _window(trial: Trial) -> str | None:
     return f"every {interval} iterations, after {start:,} and before {stop:,}"
 
 
-def _images(trial: Trial) -> str:
+def _images(trial: TrialResult) -> str:
     config = trial.config
     text = f"the files of {config['scene.images']}" if config.get("scene.images") else "the photographs"
     if config["scene.downscale"] != 1:
@@ -167,14 +167,14 @@ def _images(trial: Trial) -> str:
     return f"{text} ({config['scene.resample']} where shrunk)"
 
 
-def _sizes(trials: Sequence[Trial]) -> str:
+def _sizes(trials: Sequence[TrialResult]) -> str:
     """`` at 400×300 px``, or the smallest and the largest."""
     sizes = sorted({tuple(size) for trial in trials if (size := trial.data.get("resolution"))}, key=math.prod)
     shown = [f"{width}×{height}" for width, height in dict.fromkeys([*sizes[:1], *sizes[-1:]])]
     return f", {' to '.join(shown)} px" if shown else ""
 
 
-def _lpips(trial: Trial) -> str:
+def _lpips(trial: TrialResult) -> str:
     protocol = PROTOCOLS.get(str(trial.data["protocol"]).rsplit("-", 1)[0], PAPER)
     facts = find(f"{LPIPS}{protocol.lpips}")
     assert facts is not None

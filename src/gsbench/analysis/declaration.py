@@ -1,57 +1,17 @@
 """Which metric a verdict was declared to be about (``eval.primary``), when, and which results were there before.
 
-Every change of the declaration is a line of ``<runs>/<experiment>/declared.jsonl``, written when a command is given; a
-trial's ``results.json`` repeats what stood when it was run (``declared``) and says when it was measured (``measured``).
-Plans of claims (`gsbench.claims`) stand in the same file, each a line of its own.
+`gsbench.runs.declaration` keeps the record; a trial's ``results.json`` says when it was measured (``measured``).
 """
 
 from __future__ import annotations
 
-import calendar
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from gsbench.analysis.results import Trial, read_json_lines
-from gsbench.runs.layout import DECLARED
+from gsbench.analysis.results import TrialResult
+from gsbench.runs.declaration import Declaration, read_declarations, unix_time
 from gsbench.words import counted
-
-STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
-
-
-@dataclass(frozen=True)
-class Declaration:
-    """The metric ``metric`` was declared at ``time`` (Unix, whole seconds)."""
-
-    time: int
-    metric: str
-
-    @property
-    def when(self) -> str:
-        """``2026-11-21 20:05 UTC``"""
-        return _readable(self.time)
-
-    def to_record(self) -> dict[str, Any]:
-        return {"metric": self.metric, "time": time.strftime(STAMP, time.gmtime(self.time))}
-
-
-@dataclass(frozen=True)
-class DeclaredPlan:
-    """The plan of claims with this hash, all that decides about their verdicts, was written down at ``time``."""
-
-    time: int
-    hash: str
-    plan: dict[str, Any] = field(compare=False, repr=False)
-
-    @property
-    def when(self) -> str:
-        """As that of a `Declaration`."""
-        return _readable(self.time)
-
-    def to_record(self) -> dict[str, Any]:
-        return {"plan": self.plan, "hash": self.hash, "time": time.strftime(STAMP, time.gmtime(self.time))}
 
 
 @dataclass(frozen=True)
@@ -62,7 +22,7 @@ class ActiveDeclaration:
     """
 
     declaration: Declaration
-    seen: tuple[Trial, ...]
+    seen: tuple[TrialResult, ...]
     trials: int
     earlier: tuple[Declaration, ...]
 
@@ -95,22 +55,9 @@ class ActiveDeclaration:
         return counted(self.trials, "trial")
 
 
-def read_declarations(folder: Path, trials: Sequence[Trial] = ()) -> list[Declaration]:
-    """Every declaration for the experiment in ``folder``, the oldest first; also those that only its trials record."""
-    records = [*read_json_lines(folder / DECLARED), *(trial.data.get("declared") for trial in trials)]
-    found = [declaration for declaration in map(_from_record, records) if declaration is not None]
-    return sorted(dict.fromkeys(found), key=lambda declaration: declaration.time)
-
-
-def read_plans(folder: Path) -> list[DeclaredPlan]:
-    """Every plan of claims that was declared for the experiment in ``folder``, the oldest first."""
-    found = [_plan_from_record(record) for record in read_json_lines(folder / DECLARED)]
-    return sorted((plan for plan in found if plan is not None), key=lambda plan: plan.time)
-
-
-def standing(folder: Path, trials: Sequence[Trial]) -> ActiveDeclaration | None:
+def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration | None:
     """The declaration that holds for the experiment in ``folder`` with these trials: the latest; None without any."""
-    declared = read_declarations(folder, trials)
+    declared = read_declarations(folder, (trial.data.get("declared") for trial in trials))
     if not declared:
         return None
     latest = declared[-1]
@@ -118,32 +65,7 @@ def standing(folder: Path, trials: Sequence[Trial]) -> ActiveDeclaration | None:
     return ActiveDeclaration(latest, seen, len(trials), tuple(declared[:-1]))
 
 
-def measured(trial: Trial) -> float:
+def measured(trial: TrialResult) -> float:
     """When the trial's metrics were there, Unix time; of results that do not say it, when they were written."""
-    moment = _unix(trial.data.get("measured"))
+    moment = unix_time(trial.data.get("measured"))
     return trial.finished if moment is None else moment
-
-
-def _from_record(record: object) -> Declaration | None:
-    if not isinstance(record, dict) or not isinstance(record.get("metric"), str):
-        return None
-    moment = _unix(record.get("time"))
-    return None if moment is None else Declaration(moment, record["metric"])
-
-
-def _plan_from_record(record: dict[str, Any]) -> DeclaredPlan | None:
-    moment = _unix(record.get("time"))
-    if moment is None or not isinstance(record.get("hash"), str) or not isinstance(record.get("plan"), dict):
-        return None
-    return DeclaredPlan(moment, record["hash"], record["plan"])
-
-
-def _readable(moment: int) -> str:
-    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(moment))
-
-
-def _unix(text: object) -> int | None:
-    try:
-        return calendar.timegm(time.strptime(str(text), STAMP))
-    except ValueError:
-        return None

@@ -6,20 +6,20 @@ import time
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 
-from gsbench.analysis.results import Trial, canonical
+from gsbench.analysis.results import TrialResult, canonical
 from gsbench.runs.source import SHOWN
 
-Versions = dict[str, list[Trial]]  # version -> the trials that it made
+Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 
 # Settings in which trials of one cell may differ: they name the trial or say where it runs, not what is computed.
 IGNORED_SETTINGS = (
     *("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path"),
     "eval.primary",
 )
-CODE = "code of "  # how the keys of ``Trial.code`` start that are a user's own classes
+CODE = "code of "  # how the keys of ``TrialResult.code`` start that are a user's own classes
 
 
-def differing_conditions(trials: Sequence[Trial]) -> dict[str, list[str]]:
+def differing_conditions(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
     """The conditions in which trials differ, with their values; the code that made them is one.
 
     Unlike budgets of which none acted are no difference: all of the trials grew as they liked.
@@ -35,7 +35,7 @@ def differing_conditions(trials: Sequence[Trial]) -> dict[str, list[str]]:
     return {key: sorted(values) for key, values in seen.items() if len(values) > 1}
 
 
-def differing_settings(trials: Sequence[Trial]) -> dict[str, list[str]]:
+def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
     """The settings in which trials with different configuration hashes differ, those that may differ left out."""
     if len({trial.config_hash for trial in trials}) == 1:
         return {}
@@ -44,7 +44,7 @@ def differing_settings(trials: Sequence[Trial]) -> dict[str, list[str]]:
     return {key: found for key, found in values.items() if len(found) > 1}
 
 
-def differing_code(trials: Iterable[Trial]) -> dict[str, Versions]:
+def differing_code(trials: Iterable[TrialResult]) -> dict[str, Versions]:
     """The classes and stages of which the trials used several versions."""
     found: dict[str, Versions] = defaultdict(lambda: defaultdict(list))
     for trial in trials:
@@ -53,7 +53,7 @@ def differing_code(trials: Iterable[Trial]) -> dict[str, Versions]:
     return {part: dict(versions) for part, versions in found.items() if len(versions) > 1}
 
 
-def describe_code(part: str, versions: Mapping[str, Sequence[Trial]]) -> str:
+def describe_code(part: str, versions: Mapping[str, Sequence[TrialResult]]) -> str:
     """``mine.Patient: 3fa9c1d2 (garden seeds 0, 1; 2026-11-21 18:40) | …``, the oldest version first."""
     ordered = sorted(versions.items(), key=lambda item: max(trial.finished for trial in item[1]))
     texts = [f"{short_version(version)} ({_places(own)}; {_when(own)})" for version, own in ordered]
@@ -65,7 +65,7 @@ def short_version(version: str) -> str:
     return version[:SHOWN]
 
 
-def _places(trials: Sequence[Trial]) -> str:
+def _places(trials: Sequence[TrialResult]) -> str:
     """``garden seeds 0, 1; room seed 0``"""
     seeds: dict[str, list[int]] = defaultdict(list)
     for trial in trials:
@@ -76,7 +76,7 @@ def _places(trials: Sequence[Trial]) -> str:
     )
 
 
-def _when(trials: Sequence[Trial]) -> str:
+def _when(trials: Sequence[TrialResult]) -> str:
     """When the trials were finished: a minute, or the first and the last."""
     times = sorted(trial.finished for trial in trials)
     minutes = [time.strftime("%Y-%m-%d %H:%M", time.localtime(finished)) for finished in times]

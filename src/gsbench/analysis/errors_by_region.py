@@ -17,7 +17,7 @@ from PIL import Image, UnidentifiedImageError
 
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.pairing import Paired, pair_trials
-from gsbench.analysis.results import Arm, Trial
+from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import Comparison, compare
 from gsbench.errors import InputError
 from gsbench.runs.layout import GROUND_TRUTH, MAPS, RENDERS
@@ -65,7 +65,7 @@ def absolute_error(render: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Array
 
 
 def errors_by_region(
-    trials: Sequence[Trial], first: Arm, second: Arm, property_name: str = "texture", bins: int = BINS
+    trials: Sequence[TrialResult], first: Arm, second: Arm, property_name: str = "texture", bins: int = BINS
 ) -> RegionErrors:
     """Compare two arms in bins of ``texture`` or of a map (``MAP_PROPERTIES``).
 
@@ -102,7 +102,7 @@ def errors_by_region(
     return RegionErrors(property_name, first_means, second_means, tuple(comparisons), edges)
 
 
-def view_names(trial: Trial) -> list[str]:
+def view_names(trial: TrialResult) -> list[str]:
     """The names of the rendered test views, sorted; raises ``InputError`` where there are none."""
     folder = trial.path / RENDERS
     names = sorted(path.stem for path in folder.glob("*.png"))
@@ -120,7 +120,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         raise InputError(f"{path} cannot be read as an image ({error})") from None
 
 
-Reader = Callable[[Trial, str, NDArray[np.uint8]], Array]
+Reader = Callable[[TrialResult, str, NDArray[np.uint8]], Array]
 
 
 def _property_reader(name: str) -> Reader:
@@ -131,7 +131,7 @@ def _property_reader(name: str) -> Reader:
     raise InputError(f"unknown property {name!r}; choose texture, {', '.join(MAP_PROPERTIES)}")
 
 
-def _read_map(trial: Trial, view: str, name: str, shape: tuple[int, int]) -> Array:
+def _read_map(trial: TrialResult, view: str, name: str, shape: tuple[int, int]) -> Array:
     path = trial.path / MAPS / f"{view}.npz"
     if not path.is_file():
         raise InputError("the trials kept no maps; eval.maps=true keeps them")
@@ -145,7 +145,7 @@ def _read_map(trial: Trial, view: str, name: str, shape: tuple[int, int]) -> Arr
     return values
 
 
-def _edges(trial: Trial, read_property: Reader, bins: int) -> Array:
+def _edges(trial: TrialResult, read_property: Reader, bins: int) -> Array:
     """The inner edges [bins - 1] that cut the finite values over a scene's test views into equal parts."""
     names = view_names(trial)
     samples = []
@@ -156,7 +156,9 @@ def _edges(trial: Trial, read_property: Reader, bins: int) -> Array:
     return np.quantile(np.concatenate(samples), np.linspace(0, 1, bins + 1)[1:-1])
 
 
-def _pair_means(one: Trial, other: Trial, read_property: Reader, edges: Array) -> Iterator[tuple[Array, Array]]:
+def _pair_means(
+    one: TrialResult, other: TrialResult, read_property: Reader, edges: Array
+) -> Iterator[tuple[Array, Array]]:
     """For each view: the mean error of both trials in every bin, [bins] each; a bin without pixels is not a number."""
     if view_names(one) != view_names(other):
         raise InputError(f"{one.label} and {other.label} have different renders")

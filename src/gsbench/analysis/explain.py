@@ -11,7 +11,7 @@ from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.paper import load_paper
 from gsbench.analysis.paper_tables import agreement, layout_of, paper_init
 from gsbench.analysis.quantities import Quantity, quantity
-from gsbench.analysis.results import Experiment, Trial, load_experiment
+from gsbench.analysis.results import Experiment, TrialResult, load_experiment
 from gsbench.analysis.tables import format_cell
 from gsbench.errors import InputError
 
@@ -51,7 +51,7 @@ def explain_cell(address: str, runs: Path) -> str:
     return "\n".join(lines)
 
 
-def _find(experiment: Experiment, scene: str, arm: str) -> list[Trial]:
+def _find(experiment: Experiment, scene: str, arm: str) -> list[TrialResult]:
     """The trials of a scene and an arm, given as ``<init>-<densify>`` or as the densifier alone where that is clear."""
     of_scene = [trial for trial in experiment.trials if trial.scene == scene]
     if not of_scene:
@@ -65,7 +65,7 @@ def _find(experiment: Experiment, scene: str, arm: str) -> list[Trial]:
     return [trial for trial in of_scene if (trial.init, trial.densify) == chosen[0]]
 
 
-def _paper_lines(name: str, scene: str, trial: Trial, shown: Quantity, cell: Cell) -> list[str]:
+def _paper_lines(name: str, scene: str, trial: TrialResult, shown: Quantity, cell: Cell) -> list[str]:
     layout = layout_of(name)
     if layout is None or cell.mean is None:
         return []
@@ -82,7 +82,7 @@ def _paper_lines(name: str, scene: str, trial: Trial, shown: Quantity, cell: Cel
     return [f"  the paper prints {printed.text} ({in_paper_units.name}): difference {delta} ({words})"]
 
 
-def _baseline_lines(experiment: Experiment, trial: Trial) -> list[str]:
+def _baseline_lines(experiment: Experiment, trial: TrialResult) -> list[str]:
     """The settings in which the arm differs from the baseline of the same scene and initialiser."""
     others = [t for t in experiment.trials if (t.scene, t.init, t.densify) == (trial.scene, trial.init, BASELINE)]
     if not others or trial.densify == BASELINE or trial.from_renders:
@@ -95,7 +95,7 @@ def _baseline_lines(experiment: Experiment, trial: Trial) -> list[str]:
     return lines if settings else []
 
 
-def _trial_lines(trial: Trial, shown: Quantity) -> list[str]:
+def _trial_lines(trial: TrialResult, shown: Quantity) -> list[str]:
     value = shown.read(trial)
     data = trial.data
     text = "n/a" if value is None else f"{value:.6g}"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.quantities import metric_keys
-from gsbench.analysis.results import Experiment, Trial
+from gsbench.analysis.results import Experiment, TrialResult
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -17,7 +17,7 @@ CONDITIONS = ("protocol", "raster", "iterations")
 COUNTS = ("num_init_points", "num_gaussians", "scene_extent", "peak_memory_mb", "train_views", "test_views")
 
 
-def to_frame(trials: Experiment | Sequence[Trial]) -> pd.DataFrame:
+def to_frame(trials: Experiment | Sequence[TrialResult]) -> pd.DataFrame:
     """The complete trials of an experiment, or some of them, as a data frame with these columns:
 
     - ``experiment``, ``scene``, ``init``, ``densify``, ``seed``: which trial it is;
@@ -44,7 +44,7 @@ def to_frame(trials: Experiment | Sequence[Trial]) -> pd.DataFrame:
     )
 
 
-def _row(trial: Trial, swept: Sequence[str], metrics: Sequence[str]) -> dict[str, Any]:
+def _row(trial: TrialResult, swept: Sequence[str], metrics: Sequence[str]) -> dict[str, Any]:
     data = trial.data
     size = data.get("resolution") or (None, None)
     groups = {"seconds": data["seconds"], "event": data.get("events") or {}, "hash": data.get("hashes") or {}}

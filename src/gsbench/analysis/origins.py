@@ -6,13 +6,13 @@ from collections import Counter
 from collections.abc import Sequence
 
 from gsbench.analysis.cells import by_key
-from gsbench.analysis.results import Trial
+from gsbench.analysis.results import TrialResult
 from gsbench.runs.source import SHOWN
 from gsbench.system.machine import kind_of_machine
 from gsbench.words import counted
 
 
-def machine_of(trial: Trial) -> str | None:
+def machine_of(trial: TrialResult) -> str | None:
     """The kind of machine that trained the trial, in a phrase; None where it was not recorded."""
     try:
         return kind_of_machine(trial.data["machine"])
@@ -20,13 +20,13 @@ def machine_of(trial: Trial) -> str | None:
         return None
 
 
-def cloud_of(trial: Trial) -> str | None:
+def cloud_of(trial: TrialResult) -> str | None:
     """The hash of the initial model's files (cameras, poses, points); None where it was not recorded."""
     found = trial.data.get("hashes", {}).get("cloud")
     return None if found is None else str(found)
 
 
-def machine_notes(trials: Sequence[Trial]) -> list[str]:
+def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
     """A line that names the kinds of machine, where trials ran on several."""
     kinds = Counter(machine_of(trial) for trial in trials)
     unknown = kinds.pop(None, 0)
@@ -40,7 +40,7 @@ def machine_notes(trials: Sequence[Trial]) -> list[str]:
     ]
 
 
-def cloud_notes(trials: Sequence[Trial]) -> list[str]:
+def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
     """A line for each scene and initialiser whose trials, by the same settings, started from several clouds."""
     notes = []
     for (scene, init, _), group in by_key(trials, lambda trial: (trial.scene, trial.init, _init_key(trial))).items():
@@ -51,7 +51,7 @@ def cloud_notes(trials: Sequence[Trial]) -> list[str]:
     return notes
 
 
-def cloud_lines(trials: Sequence[Trial]) -> list[str]:
+def cloud_lines(trials: Sequence[TrialResult]) -> list[str]:
     """For each scene and initialiser: the hashes of the clouds that its trials started from, and their points."""
     lines = []
     for (scene, init), group in sorted(by_key(trials, lambda trial: (trial.scene, trial.init)).items()):
@@ -64,7 +64,7 @@ def cloud_lines(trials: Sequence[Trial]) -> list[str]:
     return lines
 
 
-def unlike_clouds(pairs: Sequence[tuple[Trial, Trial]]) -> list[str]:
+def unlike_clouds(pairs: Sequence[tuple[TrialResult, TrialResult]]) -> list[str]:
     """A line for each scene in which trials that are compared started from different clouds."""
     notes: dict[str, str] = {}
     for one, other in pairs:
@@ -77,11 +77,11 @@ def unlike_clouds(pairs: Sequence[tuple[Trial, Trial]]) -> list[str]:
     return list(notes.values())
 
 
-def _init_key(trial: Trial) -> str:
+def _init_key(trial: TrialResult) -> str:
     return str(trial.data.get("hashes", {}).get("init"))
 
 
-def _arms(trials: Sequence[Trial]) -> str:
+def _arms(trials: Sequence[TrialResult]) -> str:
     """``adc seeds 0, 1; volumetric seed 0``"""
     return "; ".join(
         f"{densify} {'seed' if len(own) == 1 else 'seeds'} {', '.join(str(trial.seed) for trial in own)}"

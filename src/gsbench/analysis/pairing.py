@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gsbench.analysis.cells import by_key, check_averageable
 from gsbench.analysis.differences import differing_conditions
-from gsbench.analysis.results import Arm, Trial, read_views
+from gsbench.analysis.results import Arm, TrialResult, read_views
 from gsbench.errors import InputError
 
 Views = Mapping[str, Mapping[str, float]]
@@ -40,7 +40,7 @@ class ViewCache:
     def __init__(self) -> None:
         self._views: dict[str, Views | InputError] = {}
 
-    def __call__(self, trial: Trial) -> Views:
+    def __call__(self, trial: TrialResult) -> Views:
         key = str(trial.path)
         if key not in self._views:
             try:
@@ -72,7 +72,7 @@ def arm_name(arm: Arm) -> str:
     return f"{arm[0]}-{arm[1]}"
 
 
-def pair_arms(trials: Sequence[Trial], first: Arm, second: Arm, metric: str, views: ViewCache) -> Paired:
+def pair_arms(trials: Sequence[TrialResult], first: Arm, second: Arm, metric: str, views: ViewCache) -> Paired:
     """Pair the trials of two arms; raises ``InputError`` where nothing can be paired."""
     scenes, matrices, baselines, left_out = [], [], [], []
     for scene, group in by_key(trials, lambda trial: trial.scene).items():
@@ -96,9 +96,9 @@ def pair_arms(trials: Sequence[Trial], first: Arm, second: Arm, metric: str, vie
     return Paired(metric, tuple(scenes), tuple(matrices), float(np.mean(baselines)), tuple(left_out))
 
 
-def pair_trials(trials: Sequence[Trial], first: Arm, second: Arm) -> list[tuple[Trial, Trial]]:
+def pair_trials(trials: Sequence[TrialResult], first: Arm, second: Arm) -> list[tuple[TrialResult, TrialResult]]:
     """The pairs (first arm, second arm) of one scene and seed, sorted; those under unlike conditions are left out."""
-    pairs: list[tuple[Trial, Trial]] = []
+    pairs: list[tuple[TrialResult, TrialResult]] = []
     for scene, group in sorted(by_key(trials, lambda trial: trial.scene).items()):
         one, other = (_by_seed(group, arm, scene) for arm in (first, second))
         both = [(one[seed], other[seed]) for seed in sorted(one.keys() & other.keys())]
@@ -106,7 +106,7 @@ def pair_trials(trials: Sequence[Trial], first: Arm, second: Arm) -> list[tuple[
     return pairs
 
 
-def _by_seed(group: Sequence[Trial], arm: Arm, scene: str) -> dict[int, Trial]:
+def _by_seed(group: Sequence[TrialResult], arm: Arm, scene: str) -> dict[int, TrialResult]:
     own = [trial for trial in group if trial.arm == arm]
     if own:
         check_averageable(own, f"scene={scene} {arm_name(arm)}")
@@ -114,7 +114,7 @@ def _by_seed(group: Sequence[Trial], arm: Arm, scene: str) -> dict[int, Trial]:
 
 
 def _common_seeds(
-    one: Mapping[int, Trial], other: Mapping[int, Trial], metric: str, scene: str
+    one: Mapping[int, TrialResult], other: Mapping[int, TrialResult], metric: str, scene: str
 ) -> tuple[list[int], list[str]]:
     """Seeds of both arms that have the metric, and what is left out; refuses arms under different conditions."""
     if one and other:
@@ -129,7 +129,7 @@ def _common_seeds(
 
 
 def _view_rows(
-    one: Trial, other: Trial, metric: str, views: ViewCache
+    one: TrialResult, other: TrialResult, metric: str, views: ViewCache
 ) -> tuple[tuple[str, ...], NDArray[np.float64], NDArray[np.float64]]:
     """(names, first arm's values [V], second arm's values [V]) of a pair of trials."""
     before, after = views(one), views(other)

@@ -19,7 +19,7 @@ from gsbench.analysis.paper import (
     load_paper,
 )
 from gsbench.analysis.quantities import Quantity, quantity
-from gsbench.analysis.results import Experiment, Trial
+from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.tables import Column, Entry, Row, Table, build_table
 from gsbench.errors import InputError
 from gsbench.words import signed
@@ -39,7 +39,7 @@ class Agreement(Enum):
 
 
 def paper_tables(
-    experiment: Experiment, name: str, trials: Sequence[Trial] | None = None, metrics: Sequence[str] | None = None
+    experiment: Experiment, name: str, trials: Sequence[TrialResult] | None = None, metrics: Sequence[str] | None = None
 ) -> list[Table]:
     """The measured table in the paper's layout and the table of differences from the printed numbers."""
     trials = list(experiment.trials if trials is None else trials)
@@ -118,7 +118,7 @@ def t_half_width(std: float, count: int) -> float:
     return float(stdtrit(count - 1, 0.5 + CONFIDENCE / 2)) * std / math.sqrt(count)
 
 
-def _arms(name: str, trials: Sequence[Trial]) -> tuple[list[tuple[str, str]], list[str]]:
+def _arms(name: str, trials: Sequence[TrialResult]) -> tuple[list[tuple[str, str]], list[str]]:
     """The (init, densify) arms of a table; where DIM was not run and one other initialiser was, that one stands in."""
     inits = {trial.init for trial in trials}
     arms = [(_run_as(init, inits), densify) for init, densify in (TABLE1_ARMS if name == "table1" else TABLE2_ARMS)]
@@ -136,7 +136,7 @@ def _run_as(init: str, inits: set[str]) -> str:
 
 
 def _differences(
-    name: str, measured: Table, arms: Sequence[tuple[str, str]], trials: Sequence[Trial], notes: Sequence[str]
+    name: str, measured: Table, arms: Sequence[tuple[str, str]], trials: Sequence[TrialResult], notes: Sequence[str]
 ) -> Table:
     paper = load_paper()
     printed_table = paper.table(name)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from gsbench.analysis.results import Trial
+from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS, find, from_record, known_keys
 from gsbench.eval.protocol import PAPER, PROTOCOLS
@@ -26,7 +26,7 @@ class Quantity:
     name: str
     direction: int
     decimals: int
-    read: Callable[[Trial], float | None]
+    read: Callable[[TrialResult], float | None]
     cost: bool = False
     worthwhile: float | None = None  # the smallest difference worth resolving
 
@@ -43,7 +43,7 @@ ALIASES = {"num_gaussians": "gaussians", "seconds": "train_time", "train": "trai
 AT = "@"  # psnr@7000 is the PSNR at iteration 7000 (eval.at)
 
 
-def choose_quantities(trials: Iterable[Trial], names: Iterable[str] | None = None) -> list[Quantity]:
+def choose_quantities(trials: Iterable[TrialResult], names: Iterable[str] | None = None) -> list[Quantity]:
     """The quantities by name; by default all metrics that some trial has, the protocol's LPIPS, and the main costs."""
     trials = list(trials)
     if names is None:
@@ -52,7 +52,7 @@ def choose_quantities(trials: Iterable[Trial], names: Iterable[str] | None = Non
     return [quantity(name, trials) for name in names]
 
 
-def quantity(name: str, trials: Iterable[Trial]) -> Quantity:
+def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
     """The quantity ``name`` (a metric, a cost or an alias); raises ``InputError``.
 
     Counts and times come in a unit that suits the trials, those named by their unit always in that one.
@@ -83,19 +83,19 @@ def quantity(name: str, trials: Iterable[Trial]) -> Quantity:
     raise InputError(f"unknown metric {name!r}; choose among {', '.join([*metric_keys(trials, known_keys()), *COSTS])}")
 
 
-def metric_quantity(key: str, trials: Iterable[Trial]) -> Quantity:
+def metric_quantity(key: str, trials: Iterable[TrialResult]) -> Quantity:
     """The metric ``key`` at the end of trials; of a user's own that no trial has, nothing but the key is known."""
     return _metric(key, "", list(trials))
 
 
-def metric_keys(trials: Iterable[Trial], wanted: Container[str] = ()) -> list[str]:
+def metric_keys(trials: Iterable[TrialResult], wanted: Container[str] = ()) -> list[str]:
     """The metrics that some trial has or that are ``wanted``, in the order of tables; a user's own come last."""
     present = {key for trial in trials for key in trial.metrics}
     own = sorted(key for key in present if find(key) is None)
     return [key for key in known_keys() if key in present or key in wanted] + own
 
 
-def _metric(key: str, step: str, trials: Sequence[Trial]) -> Quantity:
+def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
     """A metric at the end, or after the iteration ``step`` (text); a user's own is described by the trials' files."""
     records = [trial.data.get("metric_facts", {}).get(key) for trial in trials if key in trial.metrics]
     facts = find(key) or from_record(key, records[0] if records else None)
@@ -111,32 +111,32 @@ def _metric(key: str, step: str, trials: Sequence[Trial]) -> Quantity:
     )
 
 
-def _final_value(key: str, trial: Trial) -> float | None:
+def _final_value(key: str, trial: TrialResult) -> float | None:
     return trial.metrics.get(key)
 
 
-def _value_at(key: str, step: str, trial: Trial) -> float | None:
+def _value_at(key: str, step: str, trial: TrialResult) -> float | None:
     value: float | None = trial.data.get("metrics_at", {}).get(step, {}).get("metrics", {}).get(key)
     return value
 
 
-def _protocol_lpips(trial: Trial) -> str:
+def _protocol_lpips(trial: TrialResult) -> str:
     """What the trial's protocol means by LPIPS."""
     name = str(trial.data["protocol"]).rsplit("-", 1)[0]  # without its version
     return f"{LPIPS}{PROTOCOLS.get(name, PAPER).lpips}"
 
 
-def _total_seconds(trial: Trial) -> float | None:
+def _total_seconds(trial: TrialResult) -> float | None:
     return None if trial.made_elsewhere else sum(trial.data["seconds"].values())
 
 
 def _count(
-    key: str, name: str, field: str, trials: list[Trial], unit: tuple[str, float, int] | None = None
+    key: str, name: str, field: str, trials: list[TrialResult], unit: tuple[str, float, int] | None = None
 ) -> Quantity:
     largest = max((trial.data.get(field) or 0 for trial in trials), default=0)
     symbol, scale, decimals = unit or (("M", MILLION, 2) if largest >= MILLION else ("k", THOUSAND, 1))
 
-    def read(trial: Trial) -> float | None:
+    def read(trial: TrialResult) -> float | None:
         value = trial.data.get(field)
         return None if value is None else value / scale
 
@@ -146,14 +146,14 @@ def _count(
 def _time(
     key: str,
     name: str,
-    seconds: Callable[[Trial], float | None],
-    trials: list[Trial],
+    seconds: Callable[[TrialResult], float | None],
+    trials: list[TrialResult],
     unit: tuple[str, float] | None = None,
 ) -> Quantity:
     longest = max((seconds(trial) or 0.0 for trial in trials), default=0.0)
     symbol, scale = unit or (("min", MINUTE) if longest >= 10 * MINUTE else ("s", 1.0))
 
-    def read(trial: Trial) -> float | None:
+    def read(trial: TrialResult) -> float | None:
         value = seconds(trial)
         return None if value is None else value / scale
 

@@ -22,6 +22,7 @@ import yaml
 from gsbench.errors import InputError
 from gsbench.runs.hashing import flatten
 from gsbench.runs.layout import CONFIG, FAILED, IN_RUNS, PER_VIEW, RESULTS
+from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 
 TRIAL_FOLDER = re.compile(r"(?P<hash>[0-9a-f]{8})-seed(?P<seed>\d+)")
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
@@ -30,13 +31,10 @@ Arm = tuple[str, str]  # initialiser, densifier
 
 TEXT_KEYS = ("experiment", "scene", "init", "densify", "raster", "protocol")
 COUNT_KEYS = ("seed", "iterations", "num_gaussians")
-# What ``evaluated_from`` says of a trial that gsbench did not train: its model was rendered here, or renders are all.
-FROM_MODEL, FROM_RENDERS = "model", "renders"
-MADE_ELSEWHERE = "made by another program"  # how the reason of a quantity starts that nobody can know of such a trial
 
 
 @dataclass(frozen=True)
-class Trial:
+class TrialResult:
     """One complete trial; ``data`` is the whole of its ``results.json``, ``config_hash`` that in its folder's name."""
 
     path: Path
@@ -137,7 +135,7 @@ class Experiment:
 
     name: str
     folder: Path
-    trials: tuple[Trial, ...]
+    trials: tuple[TrialResult, ...]
     warnings: tuple[str, ...]
 
     @property
@@ -160,7 +158,7 @@ def load_experiment(runs_dir: Path, name: str) -> Experiment:
 def read_experiment(folder: Path) -> Experiment:
     """Every trial of the experiment in ``folder``, which may have none yet."""
     runs_dir = folder.parent
-    trials: list[Trial] = []
+    trials: list[TrialResult] = []
     warnings: list[str] = []
     for place in _trial_folders(folder):
         try:
@@ -191,7 +189,7 @@ class _UnusableError(Exception):
     """Why a folder is not a usable trial."""
 
 
-def read_trial(path: Path, runs_dir: Path) -> Trial:
+def read_trial(path: Path, runs_dir: Path) -> TrialResult:
     """Read and check one trial folder."""
     try:
         text = (path / RESULTS).read_text(encoding="utf-8")
@@ -214,7 +212,7 @@ def read_trial(path: Path, runs_dir: Path) -> Trial:
             raise _UnusableError(f"foreign, its {RESULTS} is of {key} {value!r}")
     if data["seed"] != int(match["seed"]):
         raise _UnusableError(f"foreign, its {RESULTS} is of seed {data['seed']}")
-    return Trial(
+    return TrialResult(
         path=path,
         experiment=data["experiment"],
         scene=data["scene"],
@@ -228,7 +226,7 @@ def read_trial(path: Path, runs_dir: Path) -> Trial:
     )
 
 
-def read_views(trial: Trial) -> dict[str, dict[str, float]]:
+def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
     """The metrics of every test view, ``{view: {metric: value}}``; raises ``InputError`` where the file is damaged.
 
     The file must average to the trial's own metrics, so that a truncated one cannot pass.
@@ -253,20 +251,6 @@ def read_views(trial: Trial) -> dict[str, dict[str, float]]:
                 f"{path} does not average to the {key} of its trial ({mean:.6g}, not {expected:.6g}): damaged"
             )
     return views
-
-
-def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """The objects of a JSON-lines file up to the first damaged line, as a killed writer leaves it; [] if absent."""
-    rows: list[dict[str, Any]] = []
-    try:
-        with path.open(encoding="utf-8") as file:
-            for line in file:
-                row = json.loads(line)
-                if isinstance(row, dict):
-                    rows.append(row)
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError):
-        pass
-    return rows
 
 
 def canonical(value: object) -> str:

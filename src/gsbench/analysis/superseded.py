@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gsbench.analysis.differences import CODE, short_version
-from gsbench.analysis.results import Trial
+from gsbench.analysis.results import TrialResult
 
 
 def find_superseded(
-    trials: Sequence[Trial], present: Callable[[str, Trial], str | None] = lambda target, trial: None
+    trials: Sequence[TrialResult], present: Callable[[str, TrialResult], str | None] = lambda target, trial: None
 ) -> dict[Path, str]:
     """Folders of trials whose code is no longer the present one, each with the reason.
 
@@ -30,5 +30,5 @@ def find_superseded(
     return reasons
 
 
-def _finished(trial: Trial) -> float:
+def _finished(trial: TrialResult) -> float:
     return trial.finished

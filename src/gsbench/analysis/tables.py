@@ -26,7 +26,8 @@ from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.origins import cloud_notes, machine_notes
 from gsbench.analysis.pairing import BASELINE, ViewCache, choose_pairs
 from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS, Experiment, Trial
+from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 from gsbench.words import counted, signed
 
 DEFAULT_ROWS = ("scene", "init", "densify")
@@ -70,7 +71,7 @@ class Table:
 
 def build_table(
     experiment: Experiment,
-    trials: Sequence[Trial] | None = None,
+    trials: Sequence[TrialResult] | None = None,
     rows: Sequence[str] | None = None,
     columns: Sequence[str] = (),
     metrics: Sequence[str] | None = None,
@@ -171,7 +172,7 @@ def _best(
 
 
 def _mean_rows(
-    groups: dict[tuple[str, ...], list[Trial]],
+    groups: dict[tuple[str, ...], list[TrialResult]],
     rows: Sequence[str],
     row_keys: Sequence[tuple[str, ...]],
     arm_keys: Sequence[tuple[str, ...]],
@@ -248,7 +249,7 @@ _BY_PROGRAM = (
 )
 
 
-def _origin_notes(trials: Sequence[Trial]) -> list[str]:
+def _origin_notes(trials: Sequence[TrialResult]) -> list[str]:
     """Which arms gsbench did not train, and what of them it saw."""
     notes = []
     for what, origin in _BY_PROGRAM:
@@ -283,7 +284,7 @@ def _declared_notes(experiment: Experiment) -> list[str]:
     return declared_lines(declared, judge(trials, pairs, ViewCache(), declared))
 
 
-def _cost_notes(trials: Sequence[Trial]) -> list[str]:
+def _cost_notes(trials: Sequence[TrialResult]) -> list[str]:
     """For every densifier against the baseline, the change of the costs by both averaging rules, over common scenes."""
     notes = []
     for init, group in by_key(trials, lambda trial: trial.init).items():
@@ -297,7 +298,7 @@ def _cost_notes(trials: Sequence[Trial]) -> list[str]:
 
 
 def cost_change(
-    baseline: Sequence[Trial], other: Sequence[Trial], read: Callable[[Trial], float | None]
+    baseline: Sequence[TrialResult], other: Sequence[TrialResult], read: Callable[[TrialResult], float | None]
 ) -> tuple[float, float, int] | None:
     """Relative change of a cost over the scenes that both have: (ratio of totals, mean of ratios, scenes)."""
     means = []
@@ -324,7 +325,7 @@ def change_words(of_totals: float, of_scenes: float, scenes: int) -> str:
     return f"{totals} as a ratio of totals, {ratios} as the mean of {scenes} scenes"
 
 
-_COSTS: dict[str, Callable[[Trial], float | None]] = {
+_COSTS: dict[str, Callable[[TrialResult], float | None]] = {
     "Gaussians": lambda trial: trial.data.get("num_gaussians"),
     "Training time": lambda trial: trial.data["seconds"].get("train"),
 }

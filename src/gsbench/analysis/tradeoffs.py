@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.quantities import Quantity
-from gsbench.analysis.results import Arm, Trial, read_json_lines
+from gsbench.analysis.results import Arm, TrialResult
+from gsbench.files import read_json_lines
 from gsbench.runs.layout import CURVES
 
 GRID = 200  # points at which two curves are compared
 
 Array = NDArray[np.float64]
-COST_READERS: dict[str, Callable[[Trial], float | None]] = {
+COST_READERS: dict[str, Callable[[TrialResult], float | None]] = {
     "gaussians": lambda trial: trial.data.get("num_gaussians"),
     "seconds": lambda trial: trial.data["seconds"].get("train"),
 }
@@ -42,7 +43,7 @@ class CurveGap:
     high: float
 
 
-def family_curve(trials: Sequence[Trial], family: Arm, quality: Quantity, cost: str) -> Curve:
+def family_curve(trials: Sequence[TrialResult], family: Arm, quality: Quantity, cost: str) -> Curve:
     """One point for each variant of a densifier (init, densify): means over seeds, then over scenes."""
     read = COST_READERS[cost]
     own = [trial for trial in trials if (trial.init, trial.densify) == family]
@@ -55,7 +56,7 @@ def family_curve(trials: Sequence[Trial], family: Arm, quality: Quantity, cost: 
     return _curve(points)
 
 
-def training_curve(trials: Sequence[Trial], cost: str, quality: str) -> Curve:
+def training_curve(trials: Sequence[TrialResult], cost: str, quality: str) -> Curve:
     """Quality during training against Gaussians or seconds, averaged over trials step by step (``metrics.jsonl``)."""
     key = {"gaussians": "num_gaussians", "seconds": "seconds"}[cost]
     by_step: dict[int, list[tuple[float, float]]] = {}
@@ -92,7 +93,7 @@ def curve_gap(first: Curve, second: Curve) -> CurveGap | None:
     return CurveGap(float(area / (grid[-1] - grid[0])), float(low), float(high))
 
 
-def _mean_of_scenes(group: Sequence[Trial], read: Callable[[Trial], float | None]) -> float | None:
+def _mean_of_scenes(group: Sequence[TrialResult], read: Callable[[TrialResult], float | None]) -> float | None:
     means = []
     for trials in by_key(group, lambda trial: trial.scene).values():
         values = [value for value in map(read, trials) if value is not None]

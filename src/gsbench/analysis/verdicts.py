@@ -21,7 +21,7 @@ from typing import Literal
 from gsbench.analysis.declaration import ActiveDeclaration
 from gsbench.analysis.pairing import Paired, ViewCache, arm_name, pair_arms
 from gsbench.analysis.quantities import Quantity, choose_quantities, metric_quantity
-from gsbench.analysis.results import Arm, Trial
+from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import Comparison, compare, compare_family, seeds_needed
 from gsbench.errors import InputError
 from gsbench.words import signed
@@ -65,7 +65,7 @@ class _Question:
 
 
 def judge(
-    trials: Sequence[Trial], pairs: Sequence[Pair], views: ViewCache, declared: ActiveDeclaration | None = None
+    trials: Sequence[TrialResult], pairs: Sequence[Pair], views: ViewCache, declared: ActiveDeclaration | None = None
 ) -> dict[Pair, ArmVerdicts]:
     """Compare each pair of arms in every metric that has a direction, in the families that ``declared`` makes."""
     primary = None if declared is None else declared_quantity(trials, declared)
@@ -102,7 +102,7 @@ def judge(
     return judged
 
 
-def declared_quantity(trials: Sequence[Trial], declared: ActiveDeclaration) -> Quantity:
+def declared_quantity(trials: Sequence[TrialResult], declared: ActiveDeclaration) -> Quantity:
     """The declared metric; also one of the user's own that no trial could compute."""
     return metric_quantity(declared.metric, trials)
 

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from gsbench.app.hydra_app import run_app
 from gsbench.app.task import StopAfterListing, Task
 from gsbench.config.command_words import parse
-from gsbench.config.compose import Composed
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.batch import run_batch
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.plan import describe_plan
-from gsbench.launch.preflight import check_components, missing_folders, need_no_check
+from gsbench.launch.preflight import check_parts, missing_folders, need_no_check
+from gsbench.launch.trial import Trial
 
 log = logging.getLogger(__name__)
 
@@ -30,20 +30,20 @@ def launch(argv: list[str]) -> int:
     return 0 if dry_run else summarize(task.outcomes, task.trials)
 
 
-def list_trials(trials: Sequence[Composed]) -> list[Outcome]:
+def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
     """Print the trials with their states, and what they will miss; run none."""
     if not need_no_check(trials):
-        check_components(trials, here=False)
+        check_parts(trials, here=False)
     print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"]) + missing_folders(trials)))
     raise StopAfterListing
 
 
-def run_trials(trials: Sequence[Composed]) -> int:
+def run_trials(trials: Sequence[Trial]) -> int:
     """Run what is not done among ``trials`` by the launcher that they name; the exit code."""
     return summarize(run_batch(trials), trials)
 
 
-def summarize(outcomes: Sequence[Outcome], trials: Sequence[Composed]) -> int:
+def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
     """Say how the trials ended; 0 if all are done, 1 if some failed, 2 if all failed for bad input.
 
     A single trial's failure is raised, so that it is the one line that the program prints.

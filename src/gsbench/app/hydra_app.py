@@ -7,7 +7,6 @@ trials are only listed, no callback hears of it.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 
 from hydra._internal.callbacks import Callbacks
@@ -18,11 +17,12 @@ from omegaconf import DictConfig
 from gsbench.app.grids import grids_aside
 from gsbench.app.task import OWN, StopAfterListing, Task
 from gsbench.config.command_words import check_words, is_sweep
-from gsbench.config.compose import Composed, compose_master, composing, explained, ready_trial
+from gsbench.config.compose import compose_master, composing, explained, ready_trial
 from gsbench.config.hydra_guard import load_callbacks
 from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, start, words_of
 from gsbench.errors import InputError
 from gsbench.launch.outcome import Outcome
+from gsbench.launch.trial import Trial
 from gsbench.logs import show_details
 
 
@@ -51,7 +51,7 @@ def run_app(words: Sequence[str], multirun: bool, task: Task) -> None:
             return
 
 
-def compose_trials(words: Sequence[str], multirun: bool = False) -> list[Composed]:
+def compose_trials(words: Sequence[str], multirun: bool = False) -> list[Trial]:
     """The trials that a command line would run."""
 
     task = Task(_stop_here, look_only=True)
@@ -59,7 +59,7 @@ def compose_trials(words: Sequence[str], multirun: bool = False) -> list[Compose
     return task.trials
 
 
-def _stop_here(trials: Sequence[Composed]) -> list[Outcome]:
+def _stop_here(trials: Sequence[Trial]) -> list[Outcome]:
     raise StopAfterListing
 
 
@@ -67,7 +67,7 @@ def _run(context: HydraContext, config: DictConfig, words: Sequence[str], task: 
     """As `hydra.run`, by way of the settings below ``launch``."""
     context.callbacks.on_run_start(config=config, config_name=CONFIG_NAME)
     job = HydraJob(config, tuple(words), callbacks=context.callbacks, loader=context.config_loader)
-    (returned,) = task.launch([ready_trial(copy.deepcopy(config), words, job)])
+    (returned,) = task.launch([Trial.of(ready_trial(config, words, job))])
     context.callbacks.on_run_end(config=config, config_name=CONFIG_NAME, job_return=returned)
 
 

@@ -20,15 +20,15 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext
 from omegaconf import DictConfig
 
-from gsbench.app.task import Task, grid, launch_trials
+from gsbench.app.task import Task, grid, launch_trials, trials_of_jobs
 from gsbench.config.command_words import check_makes_trials
-from gsbench.config.compose import Composed, compose_jobs, explained
+from gsbench.config.compose import explained
 from gsbench.errors import InputError
 from gsbench.eval.facts import find, known_keys
 from gsbench.files import checked_runs_folder, make_runs_folder, read_object, write_json
+from gsbench.launch.trial import Trial
 from gsbench.runs.hashing import config_hash, sha256_of
 from gsbench.runs.layout import RESULTS, SEARCH, SEARCH_JOURNAL
-from gsbench.runs.trial_files import TrialPaths
 from gsbench.settings import checked
 from gsbench.system.install import install_command
 from gsbench.system.locks import hold
@@ -100,7 +100,7 @@ def search(
     with explained(words):
         space = read_space(OverridesParser.create(context.config_loader).parse_overrides(list(words)))
     lowest = {key: _lowest(distribution) for key, distribution in space.searched.items()}
-    first = compose_jobs(context, master, space.jobs(lowest))
+    first = trials_of_jobs(context, master, space.jobs(lowest))
     if task.look_only:
         seeds = counted(len(space.seeds), "seed")
         print(
@@ -108,14 +108,14 @@ def search(
         )
         task.launch(first)
     make_runs_folder(checked_runs_folder(first[0].values["runs"]))
-    home = TrialPaths.of(first[0].values).home
+    home = first[0].paths.home
     home.mkdir(exist_ok=True)
     with hold(home / f".{SEARCH}.lock", "the search"):
         study = _open(home, wanted, _identity(first[0], wanted, space))
         while batch := _next_points(study, wanted, space):
             trials = []
             for number, values in batch.items():
-                trials += compose_jobs(context, master, space.jobs(values), number * len(space.seeds))
+                trials += trials_of_jobs(context, master, space.jobs(values), number * len(space.seeds))
             launch_trials(task, master, launcher, trials)
             for place, number in enumerate(batch):
                 _tell(study, number, trials[place * len(space.seeds) :][: len(space.seeds)], wanted)
@@ -175,7 +175,7 @@ def _text(value: Any) -> str:
     return f"{value:.{DIGITS}g}" if isinstance(value, float) else str(value)
 
 
-def _identity(trial: Composed, wanted: SearchSettings, space: Space) -> str:
+def _identity(trial: Trial, wanted: SearchSettings, space: Space) -> str:
     """A study's name: searches that differ in anything that has a part in a result do not learn from each other."""
     searched = {key: repr(distribution) for key, distribution in space.searched.items()}
     return sha256_of([config_hash(trial.values), wanted.metric, searched, list(space.seeds)])[:16]
@@ -217,11 +217,11 @@ def _next_points(study: Study, wanted: SearchSettings, space: Space) -> dict[int
     return points
 
 
-def _tell(study: Study, number: int, trials: Sequence[Composed], wanted: SearchSettings) -> None:
+def _tell(study: Study, number: int, trials: Sequence[Trial], wanted: SearchSettings) -> None:
     """Judge a point by the files of its trials."""
     from optuna.trial import TrialState
 
-    folders = [TrialPaths.of(trial.values).folder for trial in trials]
+    folders = [trial.folder for trial in trials]
     found = [read_object(folder / RESULTS).get("metrics", {}).get(wanted.metric) for folder in folders]
     values = [value for value in found if value is not None]
     if len(values) < len(found):

@@ -17,13 +17,13 @@ from omegaconf import DictConfig
 
 from gsbench.app.grids import words_of_grids
 from gsbench.config.command_words import check_sweep
-from gsbench.config.compose import Composed, compose_jobs, explained, ready_trial
+from gsbench.config.compose import compose_jobs, explained, ready_trial
 from gsbench.config.hydra_job import words_of
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.batch import begin_for_another_launcher
 from gsbench.launch.outcome import Outcome, objective, outcome_of_error
+from gsbench.launch.trial import Trial
 from gsbench.logs import set_up_logging
-from gsbench.runs.trial_files import TrialPaths
 from gsbench.system.own_modules import import_only
 
 OWN = "gsbench"  # the names of gsbench's own launcher and sweeper
@@ -41,10 +41,10 @@ class Task:
     together, over all batches of a sweep.
     """
 
-    handle: Callable[[Sequence[Composed]], list[Outcome]]
+    handle: Callable[[Sequence[Trial]], list[Outcome]]
     look_only: bool = False
     grids: list[dict[str, str]] = field(default_factory=list)
-    trials: list[Composed] = field(default_factory=list)
+    trials: list[Trial] = field(default_factory=list)
     outcomes: list[Outcome] = field(default_factory=list)
 
     def __call__(self, config: DictConfig) -> float | None:
@@ -52,12 +52,12 @@ class Task:
         import_only(config.allow_targets)
         set_up_logging()
         for_hydra, words = words_of(HydraConfig.get().overrides)
-        (outcome,) = self.handle([ready_trial(config, [*for_hydra, *words])])
+        (outcome,) = self.handle([Trial.of(ready_trial(config, [*for_hydra, *words]))])
         if outcome.status != "done":
             raise (InputError if outcome.bad_input else GsbenchError)(outcome.message)
         return objective(outcome.metrics or {})
 
-    def launch(self, trials: Sequence[Composed]) -> list[JobReturn]:
+    def launch(self, trials: Sequence[Trial]) -> list[JobReturn]:
         """Run a batch of trials; raises GsbenchError where no other trial can succeed either."""
         self.trials += trials
         outcomes = self.handle(trials)
@@ -65,14 +65,21 @@ class Task:
         if fatal := next((outcome for outcome in outcomes if outcome.fatal), None):
             raise (InputError if fatal.bad_input else GsbenchError)(fatal.message)
         ended = {outcome.folder: outcome for outcome in outcomes}
-        return [_returned(trial, ended[TrialPaths.of(trial.values).folder]) for trial in trials]
+        return [_returned(trial, ended[trial.folder]) for trial in trials]
 
 
 def launch_jobs(
     task: Task, context: HydraContext, master: DictConfig, jobs: Sequence[Sequence[str]], first: int
 ) -> list[JobReturn]:
     """What gsbench's launcher does with the jobs of a sweep: each is the list of its words."""
-    return task.launch(compose_jobs(context, master, jobs, first))
+    return task.launch(trials_of_jobs(context, master, jobs, first))
+
+
+def trials_of_jobs(
+    context: HydraContext, master: DictConfig, jobs: Sequence[Sequence[str]], first: int = 0
+) -> list[Trial]:
+    """The trials of a sweep's jobs, whose numbers begin at ``first``."""
+    return [Trial.of(composed) for composed in compose_jobs(context, master, jobs, first)]
 
 
 def sweep(
@@ -94,12 +101,10 @@ def sweep(
             for of_grid in words_of_grids(params, task.grids, words)
             for point in grid(parser.parse_overrides(of_grid))
         ]
-    return launch_trials(task, master, launcher, compose_jobs(context, master, jobs))
+    return launch_trials(task, master, launcher, trials_of_jobs(context, master, jobs))
 
 
-def launch_trials(
-    task: Task, master: DictConfig, launcher: Launcher, trials: Sequence[Composed]
-) -> Sequence[JobReturn]:
+def launch_trials(task: Task, master: DictConfig, launcher: Launcher, trials: Sequence[Trial]) -> Sequence[JobReturn]:
     """Run trials that a sweeper of gsbench's has composed, by any launcher.
 
     Another launcher than gsbench's gets them after a look at all, so that what is refused is refused before any work.
@@ -139,7 +144,7 @@ def grid(overrides: Sequence[Override]) -> list[list[str]]:
     return [list(point) for point in product(*choices.values())]
 
 
-def _returned(trial: Composed, outcome: Outcome) -> JobReturn:
+def _returned(trial: Trial, outcome: Outcome) -> JobReturn:
     words = trial.job.words if trial.job is not None else trial.overrides
     returned = JobReturn(overrides=list(words), task_name="gsbench")
     if outcome.status == "done":
@@ -149,8 +154,7 @@ def _returned(trial: Composed, outcome: Outcome) -> JobReturn:
     return returned  # left to Slurm: not known
 
 
-def _outcome(trial: Composed, returned: JobReturn) -> Outcome:
+def _outcome(trial: Trial, returned: JobReturn) -> Outcome:
     """How a trial ended that another launcher ran."""
-    folder = TrialPaths.of(trial.values).folder
     value: Any = returned._return_value  # the property of that name would write a line to stderr
-    return outcome_of_error(folder, value) if isinstance(value, Exception) else Outcome(folder, "done")
+    return outcome_of_error(trial.folder, value) if isinstance(value, Exception) else Outcome(trial.folder, "done")

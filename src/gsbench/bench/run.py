@@ -9,7 +9,7 @@ from typing import Any
 
 from gsbench.bench.peer import PEER, PEER_NOTE
 from gsbench.bench.stepper import WARM_UP_STEPS, Setting, Stepper, peak_memory
-from gsbench.logs import Report, progress
+from gsbench.logs import Progress, progress
 from gsbench.system.isolate import run_isolated
 
 
@@ -42,7 +42,9 @@ def run_bench(
     return rows
 
 
-def _compare(rasters: list[str], setting: Setting, repeats: int, memory: bool, report: Report) -> list[dict[str, Any]]:
+def _compare(
+    rasters: list[str], setting: Setting, repeats: int, memory: bool, report: Progress
+) -> list[dict[str, Any]]:
     model = f"{setting.count:,} Gaussians" if setting.ply is None else setting.ply.name
     what, turns = f"{setting.width}x{setting.height}, {model}", WARM_UP_STEPS + repeats
     steppers = {raster: Stepper(raster, setting) for raster in rasters}

@@ -15,10 +15,11 @@ from gsbench.bench.scenes import SEED, make_scene
 from gsbench.bench.waits import counting_waits
 from gsbench.densify import ADC
 from gsbench.errors import InputError
-from gsbench.pipeline.components import build_rasterizer, keep_float32
+from gsbench.pipeline.components import build_rasterizer
 from gsbench.raster.base import Rasterizer
 from gsbench.raster.executors import find
 from gsbench.system.memory import peak_memory_mb, reset_peak_memory
+from gsbench.train.device import keep_float32
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer
 

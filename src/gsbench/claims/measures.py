@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gsbench.analysis.errors_by_region import absolute_error, read_image, texture_energy, view_names
-from gsbench.analysis.results import Trial
+from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
 from gsbench.eval.facts import find, from_record, known_keys
 from gsbench.runs.layout import GROUND_TRUTH, RENDERS
@@ -26,12 +26,12 @@ class Measure:
 
     key: str
     name: str
-    read: Callable[[Trial], float | None] = field(compare=False, repr=False)
+    read: Callable[[TrialResult], float | None] = field(compare=False, repr=False)
     cost: bool = False
     decimals: int = 3
 
 
-def textured_error(trial: Trial) -> float:
+def textured_error(trial: TrialResult) -> float:
     """Mean absolute error (8-bit levels) over the most textured fifth of each held-out photograph, mean over views.
 
     Grass, foliage, fabric and gravel lie there. Raises InputError where renders are missing.
@@ -65,7 +65,7 @@ def measure_names() -> tuple[str, ...]:
     return (*known_keys(), *REGIONS, *COSTS)
 
 
-def find_measure(key: str, trials: Sequence[Trial] = ()) -> Measure:
+def find_measure(key: str, trials: Sequence[TrialResult] = ()) -> Measure:
     """The measure ``key``; of a user's own metric, what the trials' files say of it."""
     known = REGIONS.get(key) or COSTS.get(key)
     if known is not None:
@@ -75,7 +75,7 @@ def find_measure(key: str, trials: Sequence[Trial] = ()) -> Measure:
     return Measure(key, facts.name, lambda trial: trial.metrics.get(key), decimals=facts.decimals)
 
 
-def read_measure(measure: Measure, trial: Trial) -> float:
+def read_measure(measure: Measure, trial: TrialResult) -> float:
     """The trial's value; raises InputError that says why there is none."""
     value = measure.read(trial)
     if value is None:

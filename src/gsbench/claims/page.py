@@ -8,13 +8,13 @@ from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
 
-from gsbench.analysis.declaration import DeclaredPlan
 from gsbench.analysis.differences import IGNORED_SETTINGS
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.report.crops import Crop, choose_crops
-from gsbench.analysis.results import Trial, canonical
+from gsbench.analysis.results import TrialResult, canonical
 from gsbench.claims.file import ClaimsFile
 from gsbench.claims.verdict import Verdict, Word
+from gsbench.runs.declaration import DeclaredPlan
 from gsbench.words import counted
 
 LARGE = 1000.0  # numbers from here on are counts or seconds, and shown whole
@@ -121,7 +121,7 @@ def _section(verdict: Verdict) -> Section:
     )
 
 
-def differing_settings_of(pair: Sequence[Trial]) -> list[tuple[str, str, str]]:
+def differing_settings_of(pair: Sequence[TrialResult]) -> list[tuple[str, str, str]]:
     """(setting, baseline's value, arm's value) of all in which the configurations of two trials differ."""
     if len(pair) < 2:
         return []
@@ -142,7 +142,7 @@ def _declared_line(declared: DeclaredPlan, plans: Sequence[DeclaredPlan]) -> str
     return line
 
 
-def _size_line(file: ClaimsFile, trials: Sequence[Trial]) -> list[str]:
+def _size_line(file: ClaimsFile, trials: Sequence[TrialResult]) -> list[str]:
     """What was smaller than in the paper, where the file says how large that was."""
     if not file.size or not trials:
         return []

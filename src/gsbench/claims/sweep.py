@@ -13,13 +13,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.declaration import DeclaredPlan
-from gsbench.analysis.results import Trial, read_experiment
+from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.claims.file import Claim, ClaimsFile
 from gsbench.claims.sequential import plan_looks
 from gsbench.claims.verdict import Pair, PairKey, Verdict, judge_claim
 from gsbench.config.compose import Composed, compose_one
 from gsbench.errors import InputError
+from gsbench.runs.declaration import DeclaredPlan
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.words import counted, some_of
@@ -105,7 +105,7 @@ class Check:
             found.append(verdict)
         return found
 
-    def _pairs(self, question: Question, by_folder: dict[Path, Trial]) -> dict[PairKey, Pair]:
+    def _pairs(self, question: Question, by_folder: dict[Path, TrialResult]) -> dict[PairKey, Pair]:
         found: dict[PairKey, Pair] = {}
         for scene in question.scenes if question.testable else ():
             for seed in range(self.looks[-1]):

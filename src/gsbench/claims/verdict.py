@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gsbench.analysis.declaration import measured
 from gsbench.analysis.differences import differing_conditions
-from gsbench.analysis.results import Trial
+from gsbench.analysis.results import TrialResult
 from gsbench.analysis.statistics import Interval
 from gsbench.claims.file import Claim, ClaimsFile
 from gsbench.claims.measures import Measure, find_measure, read_measure
@@ -26,7 +26,7 @@ NOT_TESTABLE: Word = "not testable here"
 ALLOWED_TO_DIFFER = ("budget",)  # of two arms' conditions: a claim may be about arms with budgets of their own
 
 PairKey = tuple[str, int]  # scene, seed
-Pair = tuple[Trial, Trial]  # baseline, arm
+Pair = tuple[TrialResult, TrialResult]  # baseline, arm
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Verdict:
     decision: Decision | None = None
     by_scene: tuple[tuple[str, float], ...] = ()
     baseline: float | None = None
-    trials: tuple[Trial, ...] = ()
+    trials: tuple[TrialResult, ...] = ()
     notes: tuple[str, ...] = ()
     beforehand: bool = True
 

@@ -104,6 +104,13 @@ def _quoted(word: str) -> str:
     return f"; special characters need quotes of their own, which the shell must leave: {shlex.quote(quoted)}"
 
 
+def check_single(words: Sequence[str], mend: str) -> None:
+    """`check_words`, and refuse a list of values, with the ``mend``, where one configuration is asked for."""
+    check_words(words)
+    if swept := [word for word in words if is_sweep(word)]:
+        raise InputError(f"{swept[0]} lists several values: {mend}")
+
+
 def is_sweep(word: str) -> bool:
     """Whether a word lists several values."""
     return bool(parse_word(word).is_sweep_override())

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from hydra import initialize_config_dir
@@ -17,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from gsbench.config.command_words import GROUPS, check_words, is_sweep, options
+from gsbench.config.command_words import GROUPS, check_single, options
 from gsbench.config.hydra_guard import GuardedLoader, typed_permissions
 from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, number_job, words_of
 from gsbench.config.old_names import know_old_names
@@ -86,7 +87,10 @@ def _guard(hydra: Hydra, words: Sequence[str] = ()) -> None:
 def compose_jobs(
     context: HydraContext, master: DictConfig, jobs: Sequence[Sequence[str]], first: int = 0
 ) -> list[Composed]:
-    """The trials of a sweep from the words of each; those that differ in the seed alone share a composition."""
+    """The trials of a sweep from the words of each; those that differ in the seed alone share a composition.
+
+    A composition stays with the job that it was made for; the job of a trial that shares it has none yet.
+    """
     shared: dict[tuple[str, ...], DictConfig] = {}
     trials = []
     for_hydra, _ = words_of(master.hydra.overrides)
@@ -94,7 +98,7 @@ def compose_jobs(
         given = (*for_hydra, *words)
         seeds = [match for word in words if (match := SEED.fullmatch(word))]
         rest = tuple(word for word in words if not SEED.fullmatch(word))
-        job = HydraJob(master, tuple(words), number, context.config_loader, context.callbacks)
+        job = HydraJob(None, tuple(words), number, master, context.config_loader, context.callbacks)
         if rest in shared:
             config = shared[rest]
             for match in seeds:
@@ -104,18 +108,16 @@ def compose_jobs(
         with explained(given):
             config = context.config_loader.load_sweep_config(master, list(words))
         number_job(config, number)
-        asks = settle(config, given)
-        trials.append(_resolved(config, given, job))
-        if not asks:
-            shared[rest] = config
+        trial = settle(config, given)
+        trials.append(_resolved(trial, given, replace(job, config=config)))
+        if not _asks_hydra(trial):
+            shared[rest] = trial
     return trials
 
 
 def compose_one(overrides: Sequence[str]) -> Composed:
     """The configuration of the single trial that ``overrides`` describe, as ``Composed.overrides`` has them."""
-    check_words(overrides)
-    if swept := [word for word in overrides if is_sweep(word)]:
-        raise InputError(f"{swept[0]} lists several values: choose one")
+    check_single(overrides, "choose one")
     with composing() as hydra:
         return ready_trial(compose_master(hydra, overrides), overrides)
 
@@ -125,40 +127,38 @@ def compose_values(overrides: Sequence[str]) -> DictConfig:
     with composing() as hydra:
         config = compose_master(hydra, overrides)
         with explained(overrides):
-            _take_hydra_away(config)
-            check_values(config)
-    return config
+            values = _without_hydra(config)
+            check_values(values)
+    return values
 
 
 def ready_trial(config: DictConfig, overrides: Sequence[str], job: HydraJob | None = None) -> Composed:
-    """The trial of a composed configuration, checked, whose node ``hydra`` is taken away."""
-    settle(config, overrides)
-    return _resolved(config, overrides, job)
+    """The trial of a composed configuration, checked; ``config`` stays as it is."""
+    return _resolved(settle(config, overrides), overrides, job)
 
 
-def settle(config: DictConfig, overrides: Sequence[str]) -> bool:
-    """Take the node ``hydra`` away from ``config`` and check what is left; whether a value asks Hydra (``${hydra:…}``).
-
-    Such a value differs from trial to trial, or may.
-    """
+def settle(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """What ``config`` says of the trial, checked: a copy without Hydra's own node ``hydra``."""
     with explained(overrides):  # such as an interpolation that leads nowhere
-        asks = _take_hydra_away(config)
-        check(config)
-    return asks
+        trial = _without_hydra(config)
+        check(trial)
+    return trial
 
 
-def _take_hydra_away(config: DictConfig) -> bool:
-    raw = OmegaConf.to_container(config, resolve=False)
-    assert isinstance(raw, dict)
-    if "hydra" not in raw:  # Hydra has taken it already, and knows it: it runs the job
-        return True
-    del raw["hydra"]
-    asks = "${hydra" in repr(raw)
-    if asks:
-        HydraConfig.instance().set_config(config)
-    with open_dict(config):
-        del config["hydra"]
-    return asks
+def _without_hydra(config: DictConfig) -> DictConfig:
+    """A copy without the node ``hydra``, which stays known to the values that ask for it."""
+    trial = copy.deepcopy(config)
+    if "hydra" in trial:  # else Hydra has taken it already, and knows it: it runs the job
+        with open_dict(trial):
+            del trial["hydra"]
+        if _asks_hydra(trial):
+            HydraConfig.instance().set_config(config)
+    return trial
+
+
+def _asks_hydra(trial: DictConfig) -> bool:
+    """Whether a value asks Hydra (``${hydra:…}``): such a value differs from trial to trial, or may."""
+    return "${hydra" in repr(OmegaConf.to_container(trial, resolve=False))
 
 
 def _resolved(config: DictConfig, overrides: Sequence[str], job: HydraJob | None) -> Composed:

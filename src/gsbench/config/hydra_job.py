@@ -22,33 +22,34 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class HydraJob:
-    """One job of a run or sweep whose configuration, with the node ``hydra``, is ``master``.
+    """One job of a run or sweep.
 
-    ``words`` are the job's own and ``number`` its place in the sweep; a single run has none. The configuration is
-    composed when the job begins, unless it is ``ready``.
+    ``words`` are the job's own and ``number`` its place in the sweep; a single run has none. ``config`` is the job's
+    configuration with the node ``hydra``. A job whose trial shares the composition of another has None, and is composed
+    from that of the sweep, ``master``, when it begins: so every job is composed once.
     """
 
-    master: DictConfig
+    config: DictConfig | None
     words: tuple[str, ...] = ()
     number: int | None = None
+    master: DictConfig | None = None
     loader: ConfigLoader | None = None
     callbacks: Callbacks | None = None  # None: made anew from the configuration
-    ready: bool = False
 
     def composed(self) -> DictConfig:
         """The job's configuration with the node ``hydra``."""
-        if self.ready:
-            return self.master
-        if self.number is None:
-            return start(self.master, RunMode.RUN)
+        if self.config is not None:
+            return start(self.config, RunMode.RUN if self.number is None else RunMode.MULTIRUN)
         assert self.loader is not None
+        assert self.master is not None
+        assert self.number is not None
         config = self.loader.load_sweep_config(self.master, list(self.words))
         number_job(config, self.number)
         return start(config, RunMode.MULTIRUN)
 
     def for_another_process(self) -> HydraJob:
         """The same job without what belongs to this process; the classes of a user's callbacks are imported there."""
-        return replace(self, master=self.composed(), loader=None, callbacks=None, ready=True)
+        return replace(self, config=self.composed(), master=None, loader=None, callbacks=None)
 
     def run(self, work: Callable[[], Result], value_of: Callable[[Result], object]) -> Result:
         """Do ``work`` as Hydra runs a job; ``value_of`` its result is what callbacks are told. Raises what it raises.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +17,7 @@ from gsbench.datasets.records import RECORDS, FileRecord, SceneRecord, add_recor
 from gsbench.datasets.remote import FetchError, Patience, RangesRefusedError, RemoteFile, download, size_of
 from gsbench.errors import InputError
 from gsbench.files import atomic, file_sha256
+from gsbench.logs import Progress
 from gsbench.words import readable_bytes, some_of
 
 log = logging.getLogger(__name__)
@@ -24,8 +25,6 @@ log = logging.getLogger(__name__)
 STAGING = ".fetch"  # below the data folder: what has come so far
 ATTEMPTS = 2  # at a member that arrives damaged
 SPARE_BYTES = 1 << 26  # that a fetch leaves free on the disk
-
-Report = Callable[[str, int, int], None]  # phase, bytes done, bytes in all
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class Fetcher:
     mirror: str | None
     patience: Patience
     accept_changes: bool
-    report: Report
+    report: Progress  # in bytes
 
     def record_if_here(self, files: SceneFiles) -> SceneRecord | None:
         """The record of a fetch whose files all lie in the scene's folder, as they were recorded; else None."""

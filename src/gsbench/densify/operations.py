@@ -27,12 +27,9 @@ def standard_normal(shape: tuple[int, ...], rng: torch.Generator, like: Tensor) 
 
 
 def sample_inside(gaussians: Gaussians, rng: torch.Generator) -> Tensor:
-    """One point drawn from each Gaussian as a density, mu + R e with e ~ N(0, diag(s^2)), [N, 3].
-
-    The draw is made on the CPU, so that a seed means the same on every device.
-    """
-    noise = torch.randn(len(gaussians), 3, generator=rng, dtype=gaussians.means.dtype)
-    offsets = noise.to(gaussians.means.device) * gaussians.scales  # [N, 3] in the axes of each ellipsoid
+    """One point drawn from each Gaussian as a density, mu + R e with e ~ N(0, diag(s^2)), [N, 3]."""
+    noise = standard_normal((len(gaussians), 3), rng, gaussians.means)  # [N, 3]
+    offsets = noise * gaussians.scales  # [N, 3] in the axes of each ellipsoid
     return gaussians.means + (gaussians.rotations @ offsets.unsqueeze(-1)).squeeze(-1)
 
 

@@ -22,6 +22,7 @@ from gsbench.densify.operations import quantile
 from gsbench.densify.volume import ConditionOf, child_log_scales, log_volume
 from gsbench.errors import InputError
 from gsbench.events import Cause
+from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.settings import OpenFraction
 
 ThresholdMode = Literal["absolute", "extent_relative", "quantile", "auto"]
@@ -43,7 +44,7 @@ class Volumetric(ADC):
     it multiplies: 3, the size of which V_th is the cube; 1, V_th itself, so that sizes move by the factor's cube root.
     """
 
-    volume_threshold: PositiveFloat = 0.03
+    volume_threshold: PositiveFloat = VOLUME_THRESHOLD
     threshold_mode: ThresholdMode = "absolute"
     volume_quantile: OpenFraction = 0.9978  # 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03
     condition_of: ConditionOf = "eigenvalues"  # what kappa divides: eigenvalues (eq. 7) or scales

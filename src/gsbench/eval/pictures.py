@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
+from gsbench.logs import Progress, no_progress
 from gsbench.scene.images import image_size, read_image
 
 
@@ -31,13 +32,11 @@ def check_sizes(pairs: Sequence[Pair]) -> None:
             )
 
 
-def measure(
-    pairs: Sequence[Pair], evaluator: Evaluator, report: Callable[[int, int], None] = lambda done, total: None
-) -> dict[str, dict[str, float]]:
+def measure(pairs: Sequence[Pair], evaluator: Evaluator, report: Progress = no_progress) -> dict[str, dict[str, float]]:
     """The metrics of every view, in the pairs' order. Raises `InputError` for damaged files and unequal sizes."""
     check_sizes(pairs)
     per_view = {}
     for done, pair in enumerate(pairs, 1):
         per_view[pair.view] = evaluator.evaluate_view(read_image(pair.picture), read_image(pair.photograph))
-        report(done, len(pairs))
+        report("views", done, len(pairs))
     return per_view

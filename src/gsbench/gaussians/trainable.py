@@ -3,35 +3,15 @@
 from __future__ import annotations
 
 import copy
-import math
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
+from gsbench.gaussians.paper_values import LearningRates
 
 ADAM_EPSILON = 1e-15  # 3DGS
-
-
-@dataclass(frozen=True)
-class LearningRates:
-    """Adam's learning rates; the defaults are those of the 2023 code of 3DGS (later code uses 0.025 for opacity)."""
-
-    position_initial: float = 1.6e-4  # times the scene extent
-    position_final: float = 1.6e-6  # times the scene extent
-    position_steps: int = 30_000  # the position rate falls log-linearly over so many iterations
-    sh_dc: float = 2.5e-3
-    sh_rest: float = 2.5e-3 / 20
-    opacity: float = 0.05
-    scale: float = 5e-3
-    rotation: float = 1e-3
-
-    def position(self, step: int) -> float:
-        """The log-linear schedule, without the factor of the scene extent."""
-        t = min(max(step / self.position_steps, 0.0), 1.0)
-        return math.exp((1 - t) * math.log(self.position_initial) + t * math.log(self.position_final))
 
 
 class TrainableGaussians:

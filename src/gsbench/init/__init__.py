@@ -11,7 +11,6 @@ from gsbench.init.base import (
     InitReport,
     PointCloud,
     PoseErrors,
-    Progress,
     read_cloud,
 )
 from gsbench.init.dataset import Dataset
@@ -21,6 +20,7 @@ from gsbench.init.ply import Ply
 from gsbench.init.points import Points
 from gsbench.init.random import Carved, Random
 from gsbench.init.sfm import Sfm, SfmDense
+from gsbench.logs import Progress
 
 __all__ = [
     "GAUSSIANS_FILE",

@@ -9,12 +9,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
+from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
 
 MODEL_FOLDER = Path("sparse", "0")  # below the output folder: where COLMAP users and 3DGS trainers look
@@ -25,16 +26,6 @@ PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
 MIN_IMAGES = 3  # two views have no third that could contradict a wrong geometry
 Poses = Literal["shared", "own"]
 Seed = Annotated[int, Interval(ge=0, le=2**31 - 1)]  # COLMAP takes no larger one
-
-
-class Progress(Protocol):
-    """Told how far a phase is: ``done`` of ``total`` steps (images, pairs); a phase may start anew at 0."""
-
-    def __call__(self, phase: str, done: int, total: int) -> None: ...
-
-
-def no_progress(phase: str, done: int, total: int) -> None:
-    """The `Progress` that tells nobody."""
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import ClassVar
 
 from gsbench.errors import InputError
-from gsbench.init.base import Initializer, InitReport, Progress, Timer, no_progress
+from gsbench.init.base import Initializer, InitReport, Timer
 from gsbench.init.colmap.progress_pipe import run_with_progress
+from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
 
 

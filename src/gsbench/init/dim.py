@@ -12,13 +12,14 @@ from annotated_types import Ge, Interval
 from pydantic import NonNegativeFloat, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.init.base import Preparation, Progress, Timer
+from gsbench.init.base import Preparation, Timer
 from gsbench.init.colmap.initializer import ColmapInitializer
 from gsbench.init.colmap.options import MIN_DETECTION_SIZE, DatabaseTask
 from gsbench.init.colmap.pairs import Pairing
 from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.init.networks.features import FeatureSettings
 from gsbench.init.networks.weights import ALIKED_WEIGHTS, EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS, SUPERPOINT_LICENCE
+from gsbench.logs import Progress
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath, Fraction
 from gsbench.weights import find_all_weights

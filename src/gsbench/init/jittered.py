@@ -10,10 +10,11 @@ import numpy as np
 from pydantic import PositiveFloat, PositiveInt
 from scipy.spatial import cKDTree
 
-from gsbench.init.base import MODEL_FOLDER, InitReport, Progress, no_progress
+from gsbench.init.base import MODEL_FOLDER, InitReport
 from gsbench.init.colmap.alignment import Array
 from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.init.sfm import Sfm
+from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
 
 

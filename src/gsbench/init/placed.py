@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsbench.errors import InputError
-from gsbench.init.base import Initializer, InitReport, PointCloud, Progress, Timer, no_progress
+from gsbench.init.base import Initializer, InitReport, PointCloud, Timer
 from gsbench.init.colmap.progress_pipe import run_with_progress
+from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
 from gsbench.settings import check_settings
 

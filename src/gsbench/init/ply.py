@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from gsbench.errors import InputError
-from gsbench.init.base import GAUSSIANS_FILE, InitReport, PointCloud, Progress, no_progress
+from gsbench.init.base import GAUSSIANS_FILE, InitReport, PointCloud
 from gsbench.init.placed import PlacedCloud
+from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath
 

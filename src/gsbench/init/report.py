@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.init.base import MODEL_FOLDER, PICTURE_FILE, REPORT_FILE, Gauge, InitReport, PoseErrors
 from gsbench.init.colmap.alignment import Similarity, rotation_angles, transformed_rotations
 from gsbench.init.colmap.reconstruct import common_poses, poses_by_name, save_reconstruction
 from gsbench.init.plot import draw_cloud
 from gsbench.scene.types import EXTENT_MARGIN, Capture
-
-PAPER_VOLUME_THRESHOLD = 0.03  # V_th of the paper, in raw units of its COLMAP models
 
 REGISTERED_SHARE = 0.9  # below this share of the images is a warning
 ROTATION_WARNING_DEG = 2.0  # sound models stay below 0.5; wrong ones that register every image reach 20 and more
@@ -39,15 +38,15 @@ def training_extent(model: pycolmap.Reconstruction, capture: Capture) -> float:
 
 def measure_gauge(extent: float, scale_to_reference: float | None) -> Gauge:
     """What the paper's V_th is in a model with this scene extent."""
-    radius = (3 * PAPER_VOLUME_THRESHOLD / (4 * math.pi)) ** (1 / 3)
+    radius = (3 * VOLUME_THRESHOLD / (4 * math.pi)) ** (1 / 3)
     return Gauge(
         scene_extent=extent,
         scale_to_reference=scale_to_reference,
-        volume_threshold=PAPER_VOLUME_THRESHOLD,
-        threshold_over_extent_cubed=PAPER_VOLUME_THRESHOLD / extent**3 if extent > 0 else None,
+        volume_threshold=VOLUME_THRESHOLD,
+        threshold_over_extent_cubed=VOLUME_THRESHOLD / extent**3 if extent > 0 else None,
         threshold_radius=radius,
         threshold_radius_over_extent=radius / extent if extent > 0 else None,
-        threshold_in_reference=None if scale_to_reference is None else PAPER_VOLUME_THRESHOLD * scale_to_reference**3,
+        threshold_in_reference=None if scale_to_reference is None else VOLUME_THRESHOLD * scale_to_reference**3,
     )
 
 

@@ -9,9 +9,10 @@ from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.init.base import Progress, Timer
+from gsbench.init.base import Timer
 from gsbench.init.colmap.initializer import ColmapInitializer
 from gsbench.init.colmap.options import MIN_DETECTION_SIZE, DatabaseTask
+from gsbench.logs import Progress
 
 DEFAULT_PEAK_THRESHOLD = 0.02 / 3  # COLMAP's defaults
 DEFAULT_EDGE_THRESHOLD = 10.0

@@ -9,25 +9,25 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from gsbench.config.compose import Composed
 from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.declare import declare, declared_metrics
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
-from gsbench.launch.preflight import check_components, check_trackers, missing_folders, missing_weights
+from gsbench.launch.preflight import check_parts, check_trackers, missing_folders, missing_weights
 from gsbench.launch.serial import run_serial
+from gsbench.launch.trial import Trial, drop_parts
+from gsbench.runs.finished import Done, NotDone, find_finished
 from gsbench.runs.layout import STORE
 from gsbench.runs.stages import STAGES
 from gsbench.runs.store import Store
-from gsbench.runs.trial_files import TrialPaths, find_finished
 from gsbench.system.stopping import stop_on_signals
 
 log = logging.getLogger(__name__)
 
 
-def run_batch(trials: Sequence[Composed]) -> list[Outcome]:
+def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
     """Run what is not done among ``trials`` by the launcher that they name; how each ended."""
     for trial in trials:
         check_permissions(trial.values)
@@ -51,24 +51,27 @@ def run_batch(trials: Sequence[Composed]) -> list[Outcome]:
     return outcomes
 
 
-def begin_for_another_launcher(trials: Sequence[Composed]) -> None:
+def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
     """All that precedes the first trial where a launcher of somebody else's will run them, several at once perhaps."""
     from gsbench.launch.jobs import prepare_tracking
 
     values = trials[0].values
     with storage_errors(checked_runs_folder(values["runs"])):
-        _begin(trials, [trial for trial in trials if find_finished(trial.values, _unavailable_metrics) is None])
+        _begin(trials, [trial for trial in trials if not isinstance(_find(trial), Done)])
+        drop_parts(trials)  # Hydra composes each of its launcher's trials itself
         prepare_tracking(values)
 
 
-def _begin(trials: Sequence[Composed], unfinished: Sequence[Composed]) -> None:
+def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
     """Refuse what can be known to fail, then make the runs folder, tidy the store, write plan and declaration."""
     metrics = declared_metrics(trials)
     runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
     # A node of a cluster may have folders and devices that this machine lacks.
     if launcher != "slurm" and (missing := missing_folders(unfinished)):
         raise InputError("; ".join(missing))
-    check_components(unfinished, here=launcher != "slurm")
+    check_parts(unfinished, here=launcher != "slurm")
+    if launcher != "serial":  # the processes that run the trials make their own
+        drop_parts(unfinished)
     if launcher != "slurm":
         check_trackers(unfinished)
     make_runs_folder(runs)
@@ -77,22 +80,26 @@ def _begin(trials: Sequence[Composed], unfinished: Sequence[Composed]) -> None:
     declare(metrics)
 
 
-def _skip_finished(trials: Sequence[Composed]) -> tuple[list[Outcome], list[Composed]]:
+def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]:
     outcomes: list[Outcome] = []
-    unfinished: list[Composed] = []
+    unfinished: list[Trial] = []
     seen: set[Path] = set()
     for trial in trials:
-        folder = TrialPaths.of(trial.values).folder
+        folder = trial.folder
         if folder in seen:  # a sweep may list a value twice
             continue
         seen.add(folder)
-        results = find_finished(trial.values, _unavailable_metrics)
-        if results is None:
-            unfinished.append(trial)
-        else:
-            outcomes.append(outcome_of_results(folder, results))
+        found = _find(trial)
+        if isinstance(found, Done):
+            outcomes.append(outcome_of_results(folder, found.results))
             log.info("%s: was done  %s", outcomes[-1].label, outcomes[-1].message)
+        else:
+            unfinished.append(trial)
     return outcomes, unfinished
+
+
+def _find(trial: Trial) -> Done | NotDone:
+    return find_finished(trial.values, _unavailable_metrics)
 
 
 def _unavailable_metrics(options: dict[str, Any]) -> frozenset[str]:

@@ -9,25 +9,24 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.declaration import Declaration, DeclaredPlan, read_declarations, read_plans
-from gsbench.config.compose import Composed
 from gsbench.errors import InputError
 from gsbench.files import write_text
+from gsbench.launch.trial import Trial
+from gsbench.runs.declaration import Declaration, DeclaredPlan, read_declarations, read_plans
 from gsbench.runs.layout import DECLARED
-from gsbench.runs.trial_files import TrialPaths
 from gsbench.system.locks import hold
 
 log = logging.getLogger(__name__)
 
 
-def declared_metrics(trials: Sequence[Composed]) -> dict[Path, str | None]:
+def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
     """The metric that each experiment's trials declare (``eval.primary``), by its folder; None where none does.
 
     Raises InputError where trials of one experiment declare different ones.
     """
     found: dict[Path, str | None] = {}
     for trial in trials:
-        home = TrialPaths.of(trial.values).home
+        home = trial.paths.home
         metric, known = trial.values["eval"].get("primary"), found.get(home)
         if metric and known and metric != known:
             raise InputError(

@@ -19,12 +19,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gsbench.config.compose import Composed
 from gsbench.config.hydra_job import HydraJob
 from gsbench.errors import InputError
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.queue import forget_submission
-from gsbench.runs.trial_files import TrialPaths, find_finished
+from gsbench.launch.trial import Trial
+from gsbench.runs.finished import Done, find_finished
+from gsbench.runs.layout import JOBS
+from gsbench.runs.trial_files import TrialPaths
 from gsbench.system.install import install_command
 from gsbench.system.own_modules import import_only, importable
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
@@ -67,7 +69,7 @@ class TrialJob:
                 assign_threads(self.values["threads"], launch["parallel"])
                 from gsbench.launch.serial import run_one
 
-                outcome = run_one(Composed(self.values, self.yaml, (), self.job), wait=True)
+                outcome = run_one(Trial(self.values, self.yaml, (), self.job), wait=True)
                 if launch["name"] == "slurm":
                     with suppress(OSError):
                         forget_submission(outcome.folder)
@@ -83,7 +85,7 @@ class TrialJob:
         return DelayedSubmission(self)
 
 
-def run_local(trials: Sequence[Composed]) -> list[Outcome]:
+def run_local(trials: Sequence[Trial]) -> list[Outcome]:
     """Run the trials in processes of this machine, ``launch.parallel`` at once; returns when all have ended."""
     values = trials[0].values
     need_submitit("local")
@@ -103,19 +105,19 @@ def need_submitit(launcher: str) -> None:
 
 def job_folder(values: dict[str, Any]) -> Path:
     """Where the jobs of an experiment write what they print; made if it is not there."""
-    folder = TrialPaths.of(values).runs / ".jobs" / values["name"]
+    folder = TrialPaths.of(values).runs / JOBS / values["name"]
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
-def _run(trials: Sequence[Composed], executor: Executor, parallel: int) -> list[Outcome]:
+def _run(trials: Sequence[Trial], executor: Executor, parallel: int) -> list[Outcome]:
     """At most ``parallel`` processes at once; a stopped parent stops them, a killed one leaves them to finish."""
     waiting, running, outcomes = list(trials), dict[Path, "Job[Outcome]"](), list[Outcome]()
     try:
         while waiting or running:
             while waiting and len(running) < parallel and not any(outcome.fatal for outcome in outcomes):
                 trial = waiting.pop(0)
-                running[TrialPaths.of(trial.values).folder] = executor.submit(job_of(trial))
+                running[trial.folder] = executor.submit(job_of(trial))
             ended = [folder for folder, job in running.items() if job.done()]
             for folder in ended:
                 outcomes.append(collect(running.pop(folder), folder, trials))
@@ -133,12 +135,12 @@ def _run(trials: Sequence[Composed], executor: Executor, parallel: int) -> list[
     return outcomes
 
 
-def collect(job: Job[Outcome], folder: Path, trials: Sequence[Composed]) -> Outcome:
+def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome:
     """The outcome of an ended job: the trial's files first, then what the job returned, then its log's last words."""
-    values = next(trial.values for trial in trials if TrialPaths.of(trial.values).folder == folder)
+    values = next(trial.values for trial in trials if trial.folder == folder)
     finished = find_finished(values)
-    if finished is not None:
-        return outcome_of_results(folder, finished)
+    if isinstance(finished, Done):
+        return outcome_of_results(folder, finished.results)
     if job.paths.result_pickle.exists():
         try:
             kind, value = _read_result(job.paths.result_pickle)
@@ -172,7 +174,7 @@ class _Outcomes(pickle.Unpickler):
         raise pickle.UnpicklingError(f"a job's result holds {module}.{name}")
 
 
-def job_of(trial: Composed) -> TrialJob:
+def job_of(trial: Trial) -> TrialJob:
     """The trial as a job of the environment that this process has."""
     job = None if trial.job is None else trial.job.for_another_process()
     path = [entry for entry in sys.path if entry]

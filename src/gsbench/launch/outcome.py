@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import DiskFullError
+from gsbench.runs.layout import LOG
 from gsbench.runs.trial_files import label_of
 
 OBJECTIVE = "psnr"  # what a trial returns to Hydra's sweepers
@@ -45,7 +46,7 @@ def outcome_of_error(folder: Path, error: Exception) -> Outcome:
     if isinstance(error, GsbenchError):
         return Outcome(folder, "failed", str(error), isinstance(error, InputError), isinstance(error, DiskFullError))
     text = f"{type(error).__name__}: {error}".splitlines()[0]
-    return Outcome(folder, "failed", f"{text}; the traceback is in {folder / 'log.txt'}")
+    return Outcome(folder, "failed", f"{text}; the traceback is in {folder / LOG}")
 
 
 def objective(metrics: Mapping[str, float]) -> float | None:

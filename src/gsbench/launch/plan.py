@@ -15,13 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbench.config.compose import Composed
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import read_object, write_json
 from gsbench.launch.queue import ask_queue, state_in_queue
+from gsbench.launch.trial import Trial
+from gsbench.runs.finished import NotDone, find_finished
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import PLAN, RESULTS, STORE, TRIAL_GLOB
-from gsbench.runs.trial_files import TrialPaths, find_finished, stage_and_step, state_of
+from gsbench.runs.trial_files import TrialPaths, stage_and_step, state_of
 from gsbench.system.locks import hold
 from gsbench.words import counted, readable_time
 
@@ -38,11 +39,11 @@ class Planned:
     time: float
 
 
-def add_to_plan(trials: Sequence[Composed]) -> None:
+def add_to_plan(trials: Sequence[Trial]) -> None:
     """Write the trials into the plans of their experiments; those that were there stay."""
     by_plan: dict[Path, dict[str, Any]] = {}
     for trial in trials:
-        paths = TrialPaths.of(trial.values)
+        paths = trial.paths
         entry = {"overrides": list(trial.overrides), "cwd": os.getcwd(), "time": time.time()}
         by_plan.setdefault(paths.home, {})[paths.folder.relative_to(paths.home).as_posix()] = entry
     for home, entries in by_plan.items():
@@ -137,26 +138,26 @@ class Estimator:
         return Estimate(0.0, 0)
 
 
-def _stage_finder(trials: Sequence[Composed]) -> Callable[[dict[str, Any]], list[str]]:
+def _stage_finder(trials: Sequence[Trial]) -> Callable[[Trial], list[str]]:
     """A function that tells which stages of a trial are in the store; loads torch only where there is such a store."""
-    store = TrialPaths.of(trials[0].values).runs / STORE if trials else None
+    store = trials[0].paths.runs / STORE if trials else None
     if store is None or not store.is_dir():
-        return lambda values: []
+        return lambda trial: []
     from gsbench.pipeline.wiring import StepFinder
     from gsbench.runs.store import Store
 
     finder = StepFinder(Store(store))
 
-    def built(values: dict[str, Any]) -> list[str]:
+    def built(trial: Trial) -> list[str]:
         try:
-            return finder.built_stages(values)
+            return finder.built_stages(trial.parts)
         except GsbenchError:  # what is missing here is named elsewhere, or known where the trial will run
             return []
 
     return built
 
 
-def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
+def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
     """Lines for ``--dry-run``: each trial with its state, and the time that the unfinished ones will take."""
     lines, remaining, unknown, counts = (
         [],
@@ -164,19 +165,20 @@ def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
         0,
         dict.fromkeys(("done", "partial", "missing", "running", "queued", "failed"), 0),
     )
-    estimator = Estimator(TrialPaths.of(trials[0].values).runs) if trials else None
+    estimator = Estimator(trials[0].paths.runs) if trials else None
     learned = 0
     built_stages = _stage_finder(trials)
-    queue = ask_queue(TrialPaths.of(trial.values).folder for trial in trials)
+    queue = ask_queue(trial.folder for trial in trials)
     for trial in trials:
-        paths = TrialPaths.of(trial.values)
+        paths = trial.paths
         state: str = state_of(paths.folder)
         if state not in ("done", "running"):
             state = state_in_queue(paths.folder, queue) or state
         note = ""
-        if state == "done" and find_finished(trial.values) is None:
-            note = "  will be checked: something that it was made of has changed, or a metric is missing"
-        elif state != "done":
+        if state == "done":
+            if isinstance(found := find_finished(trial.values), NotDone):
+                note = f"  will be checked: {found.reason}"
+        else:
             shared = same_trial_elsewhere(paths)
             if shared is not None:
                 note = f"  as in {shared}: nothing to compute"
@@ -186,7 +188,7 @@ def describe_plan(trials: Sequence[Composed], parallel: int = 1) -> list[str]:
                 done = stage_and_step(paths.folder)[1] / max(1, trial.values["train"]["iterations"])
                 remaining += estimate.seconds * (1 - min(1.0, done))
                 learned = max(learned, estimate.learned_from)
-                if built := built_stages(trial.values):
+                if built := built_stages(trial):
                     note = f"  the store has its {', '.join(built)}"
                 unknown += estimate.learned_from == 0
         counts[state] += 1

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from gsbench.config.command_words import options
 from gsbench.config.compose import Composed
 from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
+from gsbench.launch.trial import Trial
 from gsbench.system.install import install_command
 
 READ = ("colmap", "photos")  # the kinds of scenes that are read from scene.path
@@ -45,39 +44,23 @@ def missing_weights(trials: Sequence[Composed]) -> list[str]:
     ]
 
 
-def check_components(trials: Sequence[Composed], here: bool) -> None:
-    """Make what the trials' init, densify and raster describe, so that their classes refuse what they do not take.
+def check_parts(trials: Sequence[Trial], here: bool) -> None:
+    """Refuse what the parts of the trials, which stay with them, do not take.
 
     With ``here``, the trials will run on this machine, whose devices are known. Raises InputError naming the key.
     """
-    from gsbench.external.settings import External
-    from gsbench.pipeline.components import build, check_footprint, select_device
-    from gsbench.raster.executors import AUTO, resolve
-
-    for values in _distinct(trials, (*COMPONENTS, "raster", "device", "allow_targets")):
-        own_raster = values["raster"]["_target_"] is not None
-        groups = (*COMPONENTS, *(["raster"] if own_raster else []))
-        made = {group: build(group, values[group], values["allow_targets"]) for group in groups}
-        if here and isinstance(made["densify"], External):
-            made["densify"].executable()
-        if own_raster or values["raster"]["name"] != AUTO:
-            own = made.get("raster")
-            raster = getattr(own, "name", values["raster"]["name"])
-            check_footprint(made["densify"], values["densify"]["name"], raster, own)
-        if here:
-            device = select_device(values["device"])
-            if not own_raster and values["raster"]["name"] != AUTO:
-                resolve(values["raster"]["name"], device.type)
+    for trial in trials:
+        trial.parts.check(here)
 
 
-def check_trackers(trials: Sequence[Composed]) -> None:
+def check_trackers(trials: Sequence[Trial]) -> None:
     """Raise InputError where a trial's tracker needs a package that is not installed."""
     for sink in sorted({t.values["tracking"]["sink"] for t in trials if t.values["tracking"]["enabled"]}):
         if importlib.util.find_spec(sink) is None:
             raise InputError(f"tracking.sink={sink} needs a package: {install_command(sink)} (or pip install {sink})")
 
 
-def need_no_check(trials: Sequence[Composed]) -> bool:
+def need_no_check(trials: Sequence[Trial]) -> bool:
     """Whether the trials take their components as they ship, whose options gsbench's own tests have checked.
 
     A dry run then answers without loading torch.
@@ -88,8 +71,3 @@ def need_no_check(trials: Sequence[Composed]) -> bool:
         if group == "hydra" or (group in (*COMPONENTS, "raster", "train") and value not in options(key)):
             return False
     return True
-
-
-def _distinct(trials: Iterable[Composed], keys: Sequence[str]) -> list[dict[str, Any]]:
-    """The different values that trials have under ``keys``, in the order of their first appearance."""
-    return list({json.dumps([t.values[k] for k in keys], default=str): t.values for t in trials}.values())

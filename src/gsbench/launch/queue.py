@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Literal
 
 from gsbench.files import read_object, write_json
+from gsbench.runs.layout import SUBMITTED
 
-SUBMITTED = ".submitted.json"  # in the trial's folder: the Slurm job that was given this trial
 SECONDS_TO_ANSWER = 60.0
 WAITING = ("PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED", "RESV_DEL_HOLD", "SPECIAL_EXIT")
 

@@ -7,35 +7,41 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from gsbench.config.compose import Composed
 from gsbench.launch.outcome import Outcome, objective, outcome_of_error, outcome_of_results
+from gsbench.launch.trial import Trial, drop_parts
 from gsbench.runs.layout import LOCK
-from gsbench.runs.trial_files import TrialPaths, label_of
+from gsbench.runs.trial_files import label_of
 from gsbench.system.locks import BusyError, describe_holder, is_held
 
 log = logging.getLogger(__name__)
 
 
-def run_serial(trials: Sequence[Composed]) -> list[Outcome]:
+def run_serial(trials: Sequence[Trial]) -> list[Outcome]:
     """Run the trials; one that another process is at comes last, so that two sweeps share the work."""
     outcomes: list[Outcome] = []
-    busy: list[Composed] = []
+    busy: list[Trial] = []
     for trial in trials:
         try:
-            outcomes.append(run_one(trial, wait=len(trials) == 1))
+            outcomes.append(_run_to_its_end(trial, wait=len(trials) == 1))
         except BusyError as error:
             log.info("%s; later", error)
             busy.append(trial)
             continue
         if outcomes[-1].fatal:
             return outcomes
-    outcomes += [run_one(trial, wait=True) for trial in busy]
+    outcomes += [_run_to_its_end(trial, wait=True) for trial in busy]
     return outcomes
 
 
-def run_one(trial: Composed, wait: bool) -> Outcome:
+def _run_to_its_end(trial: Trial, wait: bool) -> Outcome:
+    outcome = run_one(trial, wait)
+    drop_parts([trial])  # the other trials need the memory
+    return outcome
+
+
+def run_one(trial: Trial, wait: bool) -> Outcome:
     """Run one trial; only BusyError, and what ends the program, is raised."""
-    folder = TrialPaths.of(trial.values).folder
+    folder = trial.folder
     try:
         if trial.job is None:
             return outcome_of_results(folder, _run(trial, wait))
@@ -49,7 +55,7 @@ def run_one(trial: Composed, wait: bool) -> Outcome:
         return outcome_of_error(folder, error)
 
 
-def _run(trial: Composed, wait: bool) -> dict[str, Any]:
+def _run(trial: Trial, wait: bool) -> dict[str, Any]:
     from gsbench.pipeline.trial import run_trial  # here, because a sweep that is done needs no torch
 
-    return run_trial(trial.values, trial.yaml, wait)
+    return run_trial(trial.parts, trial.yaml, wait)

@@ -9,7 +9,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gsbench.config.compose import Composed
 from gsbench.errors import InputError
 from gsbench.launch.jobs import SECONDS_BETWEEN_POLLS, collect, job_folder, job_of, need_submitit, prepare_tracking
 from gsbench.launch.outcome import Outcome
@@ -21,7 +20,7 @@ from gsbench.launch.queue import (
     read_submission,
     record_submission,
 )
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.launch.trial import Trial
 from gsbench.system.locks import hold
 from gsbench.words import counted
 
@@ -35,7 +34,7 @@ SECONDS_BETWEEN_QUEUE_CHECKS = 20.0
 CHECKS_UNTIL_LOST = 2  # a job that the queue does not know so often in a row, and that left no result, is lost
 
 
-def run_slurm(trials: Sequence[Composed]) -> list[Outcome]:
+def run_slurm(trials: Sequence[Trial]) -> list[Outcome]:
     """Run the trials in Slurm, those that an earlier command left there included.
 
     Returns when all have ended; with ``launch.wait=false`` as soon as Slurm has them, as outcomes of status "queued".
@@ -86,16 +85,16 @@ def make_executor(launch: dict[str, Any], folder: Path) -> SlurmExecutor:
     return slurm
 
 
-def _submit(trials: Sequence[Composed], executor: SlurmExecutor) -> dict[Path, Job[Outcome]]:
+def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[Outcome]]:
     """The job of each trial by the trial's folder: one that is in the queue already, else a task of a new array job."""
     import submitit
 
-    homes = [TrialPaths.of(trial.values).folder for trial in trials]
+    homes = [trial.folder for trial in trials]
     queue = ask_queue(homes)
     if queue is None:
         raise InputError("Slurm does not say what it has (squeue failed), so nothing was submitted: try again later")
     jobs: dict[Path, Job[Outcome]] = {}
-    fresh: dict[Path, Composed] = {}
+    fresh: dict[Path, Trial] = {}
     for home, trial in zip(homes, trials, strict=True):
         known = read_submission(home)
         if known and known.job in queue:
@@ -113,7 +112,7 @@ def _submit(trials: Sequence[Composed], executor: SlurmExecutor) -> dict[Path, J
     return jobs
 
 
-def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Composed]) -> list[Outcome]:
+def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Trial]) -> list[Outcome]:
     outcomes: list[Outcome] = []
     users = {known.user for folder in jobs if (known := read_submission(folder))} | {current_user()}
     unseen = dict.fromkeys(jobs, 0)

@@ -41,8 +41,9 @@ METHODS = {
 def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     """The object that ``values`` of ``group`` (init, densify, raster, eval.extra.NAME) describes.
 
-    ``_target_`` names a class by its import path; the other keys are its arguments. For dataclasses, values are checked
-    against the annotations. Raises InputError naming the key that is unknown or wrong.
+    ``_target_`` names a class by its import path; the other keys are its arguments. gsbench's own classes hold them
+    against their annotations themselves; for a user's dataclass this is done here, before its code sees them. Raises
+    InputError naming the key that is unknown or wrong.
     """
     target = values["_target_"]
     for place, named in targets_in(values, tuple(group.split("."))):
@@ -52,15 +53,16 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
         check_program(values, allow_targets)
     require_values(values, group)
     options = {key: value for key, value in values.items() if key not in RESERVED}
-    if dataclasses.is_dataclass(cls):
+    own = target.startswith(OWN)
+    if dataclasses.is_dataclass(cls) and not own:
         options = checked(cls, options, group)
     else:
         _check_names(cls, options, group)
-    if options and not dataclasses.is_dataclass(cls) and not target.startswith(OWN):
-        raise InputError(
-            f"{group}._target_={target} has options but is no dataclass: make it one, so that results are stored under "
-            "their values"
-        )
+        if options and not own:
+            raise InputError(
+                f"{group}._target_={target} has options but is no dataclass: make it one, so that results are stored "
+                "under their values"
+            )
     try:
         return cls(**options)
     except InputError:
@@ -68,7 +70,7 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     except (TypeError, ValueError) as error:
         raise InputError(f"{group}: {error}") from error
     except Exception as error:  # a user's class may raise anything
-        if target.startswith(OWN):
+        if own:
             raise
         raise InputError(f"{group}: {target} cannot be made ({type(error).__name__}: {error})") from error
 
@@ -80,8 +82,14 @@ def build_rasterizer(
 
     Raises InputError where it cannot run on ``device``.
     """
+    own = build_own_rasterizer(values, allow_targets)
+    return create_rasterizer(values["name"], device, threads) if own is None else own
+
+
+def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Rasterizer | None:
+    """The user's own rasterizer; None where ``values`` of the group raster name one of gsbench's."""
     if values.get("_target_") is None:
-        return create_rasterizer(values["name"], device, threads)
+        return None
     rasterizer: Rasterizer = build("raster", values, allow_targets)
     target, name = values["_target_"], getattr(rasterizer, "name", None)
     if not isinstance(name, str) or any(name == executor.name for executor in EXECUTORS):
@@ -176,32 +184,3 @@ def make_evaluator(
     protocol = get_protocol(options.protocol)
     lpips, more = tuple(options.lpips), tuple(options.more)
     return Evaluator(protocol, device, lpips, options.flip, weights, options.download, extra, more)
-
-
-def select_device(name: str) -> torch.device:
-    """``auto`` is the GPU where torch can use one, else the CPU."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise InputError(f"device={name} is not known to torch; use auto, cpu, cuda or cuda:1") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise InputError(
-            f"device={name}: torch finds no CUDA device here; use device=cpu, or install a CUDA build of torch"
-        )
-    if device.type == "cuda" and device.index is not None and device.index >= torch.cuda.device_count():
-        raise InputError(f"device={name}: there are {torch.cuda.device_count()} CUDA devices, numbered from 0")
-    if device.type == "cuda":
-        keep_float32()
-    return device
-
-
-def keep_float32() -> None:
-    """Let GPUs compute float32 as float32 in the whole process, also in backward passes.
-
-    torch lets cuDNN's convolutions round to TF32, 10 bits, by default. SSIM takes differences of nearly equal moments:
-    with TF32 its map was off by up to 350 and its gradient was noise.
-    """
-    torch.backends.cudnn.allow_tf32 = False
-    torch.backends.cuda.matmul.allow_tf32 = False

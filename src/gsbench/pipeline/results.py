@@ -10,17 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from gsbench import __version__
-from gsbench.analysis.declaration import read_declarations
-from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS, MADE_ELSEWHERE
 from gsbench.events import sum_events
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
-from gsbench.pipeline.steps.evaluate import METRICS_FILE
-from gsbench.pipeline.steps.train import TRAINING_FILE
+from gsbench.runs.declaration import read_declarations
 from gsbench.runs.hashing import config_hash, sha256_of
-from gsbench.runs.layout import EVENTS
+from gsbench.runs.layout import EVENTS, MANIFEST, METRICS, TRAINING
+from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS, MADE_ELSEWHERE, RENDERS_ALONE
 from gsbench.runs.source import sources_of
 from gsbench.runs.stages import EVALUATE, INIT, STAGES, TRAIN
-from gsbench.runs.store import MANIFEST, Entry
+from gsbench.runs.store import Entry
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.scene.types import Scene
 
@@ -38,8 +36,8 @@ def results_of(
     ``fingerprint`` is that of the photographs, ``raster`` the executor that rendered.
     """
     init, trained, evaluated = entries[INIT.name], entries[TRAIN.name], entries[EVALUATE.name]
-    training = _read(trained.path / TRAINING_FILE)
-    metrics = _read(evaluated.path / METRICS_FILE)
+    training = _read(trained.path / TRAINING)
+    metrics = _read(evaluated.path / METRICS)
     events = [json.loads(line) for line in (trained.path / EVENTS).read_text().splitlines()]
     sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]}, reverse=True)
     results = {
@@ -95,7 +93,7 @@ def _by_program(results: dict[str, Any], training: Mapping[str, Any]) -> dict[st
     origin = training["evaluated_from"]
     unknown = {}
     if origin == FROM_RENDERS:
-        unknown["gaussians"] = f"{MADE_ELSEWHERE}, of which only the renders are known"
+        unknown["gaussians"] = RENDERS_ALONE
     if training["peak_memory_mb"] is None:
         unknown["peak_memory_mb"] = "another program's memory of a GPU is not measured"
     return results | {

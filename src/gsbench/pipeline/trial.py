@@ -17,14 +17,16 @@ from gsbench.errors import GsbenchError
 from gsbench.files import link_or_copy, read_object, remove_temporaries, storage_errors, write_json, write_text
 from gsbench.init.base import PICTURE_FILE, REPORT_FILE
 from gsbench.logs import log_to
+from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.results import results_of
-from gsbench.pipeline.wiring import Parts, Trial
+from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs import layout
+from gsbench.runs.finished import Done, find_finished, record_inputs
 from gsbench.runs.layout import BUILDING, CONFIG, FAILED, LOG, RESULTS
 from gsbench.runs.stages import EVALUATE, GROUND_TRUTH, INIT, TRAIN
 from gsbench.runs.step import Stage
 from gsbench.runs.store import Entry, Store
-from gsbench.runs.trial_files import TrialPaths, find_finished, record_inputs
+from gsbench.runs.trial_files import TrialPaths
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture
 from gsbench.system.locks import hold
@@ -38,23 +40,23 @@ PUBLISHED_TRAINING = (
 )  # fmt: skip
 
 
-def run_trial(values: dict[str, Any], config_yaml: str, wait: bool = True) -> dict[str, Any]:
-    """Run the trial with the resolved configuration ``values``, or find it done; returns what ``results.json`` holds.
+def run_trial(parts: Parts, config_yaml: str, wait: bool = True) -> dict[str, Any]:
+    """Run the trial with these parts, or find it done; returns what ``results.json`` holds.
 
     On failure ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again. Where
     another process runs this trial, waits for it, or raises BusyError if ``wait`` is False.
     """
     take_signals_back()
-    paths = TrialPaths.of(values)
+    paths = TrialPaths.of(parts.values)
     with storage_errors(paths.runs):
         paths.folder.mkdir(parents=True, exist_ok=True)
         with hold(paths.lock, paths.label, wait), log_to(paths.folder / LOG):
-            finished = find_finished(values)
-            if finished is not None:
+            finished = find_finished(parts.values)
+            if isinstance(finished, Done):
                 log.info("%s: was done", paths.label)
-                return finished
+                return finished.results
             remove_temporaries(paths.folder)
-            return _run(values, config_yaml, paths)
+            return _run(parts, config_yaml, paths)
 
 
 @contextmanager
@@ -77,10 +79,11 @@ def _record_failure(error: Exception, values: dict[str, Any], paths: TrialPaths)
         write_json(paths.folder / FAILED, record | {"time": time.time(), "seed": values["seed"]})
 
 
-def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[str, Any]:
+def _run(parts: Parts, config_yaml: str, paths: TrialPaths) -> dict[str, Any]:
     """Build every step, show its files in the trial's folder, write the results."""
+    values = parts.values
     with _recorded_failures(values, paths):
-        parts = Parts.of(values)
+        parts.complete()
         torch.set_num_threads(parts.threads)
         mirror = Mirror(values["tracking"], paths.runs, paths.folder)
 
@@ -90,7 +93,7 @@ def _run(values: dict[str, Any], config_yaml: str, paths: TrialPaths) -> dict[st
         store = Store(paths.runs / layout.STORE, announce)
         write_text(paths.folder / CONFIG, config_yaml)
         (paths.folder / FAILED).unlink(missing_ok=True)
-        trial = Trial(parts, store)
+        trial = TrialSteps(parts, store)
     entries: dict[str, Entry] = {}
     with mirror, _recorded_failures(values, paths):
         for step in trial.steps():
@@ -131,7 +134,7 @@ def _publish(folder: Path, entries: Mapping[str, Entry]) -> list[Path]:
         files = sorted([*source.glob("*.png"), *source.glob("*.npz")])
         links |= {folder / name / file.name: file for file in files}
     if (init / PICTURE_FILE).exists():
-        links[folder / layout.FIGURES / "initial_cloud.png"] = init / PICTURE_FILE
+        links[folder / layout.FIGURES / layout.INITIAL_CLOUD] = init / PICTURE_FILE
     for link, file in links.items():
         link.parent.mkdir(exist_ok=True)
         link_or_copy(file, link)

@@ -1,4 +1,4 @@
-"""The one place that wires a trial: its parts, made once from the configuration, and its steps in order.
+"""The one place that wires a trial: its steps in order, from its parts.
 
 A run builds the steps, ``--dry-run`` and ``explain --stale`` only ask for their keys.
 """
@@ -6,30 +6,12 @@ A run builds the steps, ``--dry-run`` and ``explain --stale`` only ask for their
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
-from functools import cached_property
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
-import torch
-
-from gsbench.config.trust import check_permissions
-from gsbench.densify import Densifier
-from gsbench.eval.evaluator import Evaluator
-from gsbench.eval.metric import Metric
-from gsbench.eval.options import EvalConfig
-from gsbench.external.settings import External
 from gsbench.init import Sfm
-from gsbench.init.base import Initializer
-from gsbench.pipeline.components import (
-    build,
-    build_metrics,
-    build_rasterizer,
-    check_footprint,
-    make_evaluator,
-    select_device,
-)
+from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.capture import capture_step, read_capture
 from gsbench.pipeline.steps.evaluate import evaluate_step, measure_step
 from gsbench.pipeline.steps.external import external_step
@@ -37,61 +19,15 @@ from gsbench.pipeline.steps.ground_truth import ground_truth_step
 from gsbench.pipeline.steps.init import init_step
 from gsbench.pipeline.steps.train import train_step
 from gsbench.pipeline.steps.views import Views
-from gsbench.raster import Rasterizer
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.types import Capture
-from gsbench.system.resources import available_threads
-from gsbench.train.options import TrainConfig
 
 CaptureReader = Callable[[SceneConfig, Path | None], Capture]
 
 
-@dataclass(frozen=True)
-class Parts:
-    """What a trial's configuration describes, as objects."""
-
-    scene: SceneConfig
-    initializer: Initializer
-    densifier: Densifier | External
-    rasterizer: Rasterizer
-    train: TrainConfig
-    eval: EvalConfig
-    metrics: Mapping[str, Metric]  # the user's own
-    seed: int
-    device: torch.device
-    threads: int
-
-    @classmethod
-    def of(cls, values: dict[str, Any]) -> Parts:
-        """The parts of the trial with the resolved configuration ``values``. Raises InputError naming a wrong key."""
-        check_permissions(values)
-        device = select_device(values["device"])
-        threads = available_threads(values["launch"]["parallel"]) if values["threads"] == "auto" else values["threads"]
-        densifier = build("densify", values["densify"], values["allow_targets"])
-        rasterizer = build_rasterizer(values["raster"], values["allow_targets"], device, threads)
-        check_footprint(densifier, values["densify"]["name"], rasterizer.name, rasterizer)
-        return cls(
-            scene=SceneConfig(**values["scene"]),
-            initializer=build("init", values["init"], values["allow_targets"]),
-            densifier=densifier,
-            rasterizer=rasterizer,
-            train=TrainConfig(**values["train"]),
-            eval=EvalConfig(**values["eval"]),
-            metrics=build_metrics(values["eval"], values["allow_targets"]),
-            seed=values["seed"],
-            device=device,
-            threads=threads,
-        )
-
-    @property
-    def measured_earlier(self) -> list[int]:
-        """The iterations before the last at which the test views are measured as well."""
-        return sorted({step for step in self.eval.at if step < self.train.iterations})
-
-
-class Trial:
+class TrialSteps:
     """A trial before, while and after its steps are built; each step's result is found in ``store`` under its key."""
 
     capture: Capture  # known once `steps` is past the making of photographs
@@ -99,10 +35,6 @@ class Trial:
 
     def __init__(self, parts: Parts, store: Store, read: CaptureReader = read_capture) -> None:
         self.parts, self.store, self._read = parts, store, read
-
-    @cached_property
-    def evaluator(self) -> Evaluator:
-        return make_evaluator(self.parts.eval, self.parts.device, self.parts.metrics)
 
     def steps(self) -> Iterator[Step]:
         """The steps in order. A caller that wants results builds each before it asks for the next.
@@ -131,9 +63,9 @@ class Trial:
 
     def _train_step(self) -> Step:
         parts = self.parts
-        if isinstance(parts.densifier, External):
+        if parts.program is not None:
             return external_step(
-                self.views, parts.densifier, parts.train.iterations, parts.seed, parts.device, parts.threads
+                self.views, parts.program, parts.train.iterations, parts.seed, parts.device, parts.threads
             )
         return train_step(
             self.views, parts.densifier, parts.rasterizer, parts.train, parts.seed, parts.device, parts.measured_earlier
@@ -141,19 +73,18 @@ class Trial:
 
     def _evaluate_step(self, trained: Step) -> Step:
         parts = self.parts
-        program = parts.densifier if isinstance(parts.densifier, External) else None
-        if program is not None and not program.leaves_model:
-            return measure_step(self.views, trained, self.evaluator, parts.eval.geometry, parts.eval.flicker)
+        if parts.program is not None and not parts.program.leaves_model:
+            return measure_step(self.views, trained, parts.evaluator, parts.eval.geometry, parts.eval.flicker)
         return evaluate_step(
             self.views,
             trained,
             parts.rasterizer,
-            self.evaluator,
+            parts.evaluator,
             parts.train.background,
             parts.eval.maps,
             parts.device,
             parts.measured_earlier,
-            made_by_program=program is not None,
+            made_by_program=parts.program is not None,
             geometry=parts.eval.geometry,
             flicker=parts.eval.flicker,
         )
@@ -166,11 +97,10 @@ class StepFinder:
         self.store = store
         self._captures: dict[str, Capture] = {}
 
-    def built_stages(self, values: dict[str, Any]) -> list[str]:
-        """The stages of the trial with the configuration ``values`` whose results are there, up to the first that is
-        not."""
+    def built_stages(self, parts: Parts) -> list[str]:
+        """The stages of the trial with these parts whose results are there, up to the first that is not."""
         built = []
-        for step in Trial(Parts.of(values), self.store, self._read_once).steps():
+        for step in TrialSteps(parts, self.store, self._read_once).steps():
             if self.store.find(step) is None:
                 break
             built.append(step.stage.name)

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 from PIL import Image
 
-from gsbench.analysis.results import FROM_RENDERS, MADE_ELSEWHERE, Trial, read_experiment
+from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.pictures import Pair
@@ -24,12 +24,12 @@ from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.renders.reference_images import Truth
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import CONFIG, GROUND_TRUTH, PER_VIEW, RENDERS, RESULTS
+from gsbench.runs.origin import FROM_RENDERS, RENDERS_ALONE
 from gsbench.runs.stages import EVALUATE
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
 from gsbench.settings import is_folder_name
 
-UNKNOWN = f"{MADE_ELSEWHERE}, of which only the renders are known"
 KEPT_GROUPS = ("scene", "eval", "tracking", "launch")  # of the configuration: what is true of renders too
 
 
@@ -132,7 +132,7 @@ def _results(
     source: Mapping[str, str],
 ) -> dict[str, Any]:
     summary = summary_of(evaluator, per_view)
-    unknown = dict.fromkeys(("gaussians", "train_time", "init_points", "total_time", "peak_memory_mb"), UNKNOWN)
+    unknown = dict.fromkeys(("gaussians", "train_time", "init_points", "total_time", "peak_memory_mb"), RENDERS_ALONE)
     return {
         "status": "complete",
         "experiment": place.experiment,
@@ -170,6 +170,6 @@ def _config(place: Place, truth: Truth, runs: Path) -> dict[str, Any]:
     return names | groups | {"init": own, "densify": {"name": place.densify, "evaluated_from": FROM_RENDERS}}
 
 
-def _trials(home: Path, scene: str) -> list[Trial]:
+def _trials(home: Path, scene: str) -> list[TrialResult]:
     """The experiment's trials of a scene; none where there is no such experiment yet."""
     return [trial for trial in read_experiment(home).trials if trial.scene == scene] if home.is_dir() else []

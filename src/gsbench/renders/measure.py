@@ -21,12 +21,13 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.pictures import Pair, measure
 from gsbench.files import storage_errors
 from gsbench.logs import progress
-from gsbench.pipeline.components import build_metrics, make_evaluator, select_device
+from gsbench.pipeline.components import build_metrics, make_evaluator
 from gsbench.renders.import_renders import check_place, enter, find_place
 from gsbench.renders.reference_images import Truth, find_truth, truth_of_trial
 from gsbench.scene.readers import list_images
 from gsbench.system.own_modules import import_only
 from gsbench.system.resources import available_threads
+from gsbench.train.device import select_device
 from gsbench.words import counted, some_of
 
 
@@ -45,7 +46,7 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
     torch.set_num_threads(available_threads())
     evaluator = _evaluator(truth, options.protocol, options.settings)
     with progress("evaluate") as report:
-        per_view = measure(pairs, evaluator, lambda done, total: report("views", done, total))
+        per_view = measure(pairs, evaluator, report)
     folder = None
     if place is not None:
         source = {"folder": str(renders.resolve()), "names matched": matching.rule or "as they are"}

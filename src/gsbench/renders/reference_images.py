@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.results import Trial, read_views
+from gsbench.analysis.results import TrialResult, read_views
 from gsbench.config.command_words import options
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
-from gsbench.pipeline.wiring import Parts
-from gsbench.pipeline.wiring import Trial as TrialSteps
+from gsbench.pipeline.parts import Parts
+from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs import stages
 from gsbench.runs.layout import GROUND_TRUTH, RENDERS, RESULTS, STORE
 from gsbench.runs.store import Store
@@ -64,7 +64,7 @@ def find_truth(place: str, settings: Sequence[str], runs: Path) -> Truth:
     return _scene(place, settings)
 
 
-def truth_of_trial(trial: Trial) -> Truth:
+def truth_of_trial(trial: TrialResult) -> Truth:
     """What a finished trial was tested on, under the names and in the order of its own evaluation."""
     photographs = {view: trial.path / GROUND_TRUTH / png_name(view) for view in read_views(trial)}
     width, height = trial.data["resolution"]
@@ -82,7 +82,7 @@ def _scene(name: str, settings: Sequence[str]) -> Truth:
     if not any(word.startswith("init=") for word in settings) and config["scene"]["kind"] != "photos":
         config = compose_one([f"scene={name}", *CAMERAS_ONLY, *settings]).values
     store = Store(Path(config["runs"]).expanduser().resolve() / STORE)
-    trial = TrialSteps(Parts.of(config), store)
+    trial = TrialSteps(Parts(config), store)
     for step in trial.steps():
         if step.stage in (stages.CAPTURE, stages.INIT, stages.GROUND_TRUTH):
             entry = store.get(step)

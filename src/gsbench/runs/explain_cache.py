@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.runs.hashing import flatten
+from gsbench.runs.layout import MANIFEST
 from gsbench.runs.step import Step
-from gsbench.runs.store import MANIFEST, Store, read_manifest
+from gsbench.runs.store import Store, read_manifest
 
 KEY = re.compile(r'"[0-9a-f]{64}"')
 MAX_SHOWN = 80  # characters of a value

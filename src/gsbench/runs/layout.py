@@ -1,4 +1,4 @@
-"""The names of files and folders: what lies in the runs folder, and what in a trial's. Spelled here and nowhere else.
+"""The names of files and folders: in the runs folder, in the store and in a trial's. Spelled here and nowhere else.
 
 A trial lies in ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>/``.
 """
@@ -10,6 +10,15 @@ STORE = "store"  # results of stages by content
 ARTIFACTS, DATABASE = "mlartifacts", "mlflow.db"  # MLflow's mirror
 TENSORBOARD, WANDB = "tensorboard", "wandb"  # the mirrors of others
 IN_RUNS = (STORE, ARTIFACTS, DATABASE, TENSORBOARD, WANDB)
+JOBS = ".jobs"  # what the processes of launch=local and Slurm's jobs print, a folder for each experiment
+
+# in the store
+MANIFEST = "manifest.json"  # in every result of a stage: what made it
+VIEWS = "views"  # beside the stages: photographs undistorted and at their final size
+
+# in the result of a stage
+TRAINING = "training.json"  # what a training took and gave
+METRICS = "metrics.json"  # of an evaluation
 
 # in an experiment's folder
 PLAN = "plan.json"  # the trials that were asked for
@@ -23,6 +32,7 @@ RESULTS = "results.json"  # written last: a trial that has it is complete
 FAILED = "failed.json"  # why it failed
 LOG = "log.txt"
 LOCK = ".lock"
+SUBMITTED = ".submitted.json"  # the Slurm job that was given the trial
 INPUTS = "inputs.json"  # what the results were made of: a finished trial is recognised without reading photographs
 BUILDING = "building.json"  # the stage that an unfinished trial is at, and where
 INIT_REPORT = "init_report.json"
@@ -35,3 +45,5 @@ TRAINER_LOG = "trainer.log"  # the output of another program that trained
 LINEAGE = "lineage.npz"  # for each Gaussian its parent, and the rule that made it
 RENDERS, GROUND_TRUTH, MAPS = "renders", "ground_truth", "maps"  # a file for each test view
 FIGURES = "figures"  # pictures for the report
+INITIAL_CLOUD = "initial_cloud.png"  # one of them
+ELLIPSOIDS = "ellipsoids.png"  # another

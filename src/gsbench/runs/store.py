@@ -21,12 +21,12 @@ from typing import Any
 from gsbench import __version__
 from gsbench.files import file_sha256, remove_temporaries, storage_errors, sync_to_disk, write_json
 from gsbench.runs.hashing import sha256_of
+from gsbench.runs.layout import MANIFEST, VIEWS
 from gsbench.runs.step import Stage, Step
 from gsbench.system.locks import BusyError, hold
 
 log = logging.getLogger(__name__)
 
-MANIFEST = "manifest.json"
 LEFTOVER_AGE = 24 * 3600.0  # seconds: temporary files outside the locks are swept when older
 
 
@@ -120,7 +120,7 @@ class Store:
                         _remove(partial)
             for doomed in (self.root / stage.name).glob(".*.removed"):
                 shutil.rmtree(doomed, ignore_errors=True)
-        for work in (self.root / "views").glob(".*"):  # prepared images are published by a rename from such folders
+        for work in (self.root / VIEWS).glob(".*"):  # prepared images are published by a rename from such folders
             with suppress(OSError):
                 if work.is_dir() and time.time() - work.stat().st_mtime > LEFTOVER_AGE:
                     shutil.rmtree(work, ignore_errors=True)

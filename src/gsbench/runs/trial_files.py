@@ -1,27 +1,22 @@
-"""A trial's folder: where it lies, in which state it is, and whether its results still hold. Loads no torch."""
+"""A trial's folder: where it lies, and in which state it is. Loads no torch."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 
 from gsbench.errors import InputError
-from gsbench.files import read_object, write_json
-from gsbench.runs.hashing import config_hash, sha256_of
-from gsbench.runs.layout import BUILDING, CONFIG, CURVES, FAILED, INPUTS, LOCK, RESULTS
-from gsbench.runs.stages import STAGES
-from gsbench.runs.store import read_manifest
+from gsbench.files import read_object
+from gsbench.runs.hashing import config_hash
+from gsbench.runs.layout import BUILDING, CONFIG, CURVES, FAILED, LOCK, RESULTS
 from gsbench.system.locks import is_held
 
 TAIL_BYTES = 4096
-INPUTS_VERSION = 1
 
 State = Literal["done", "running", "failed", "partial", "missing"]
 
@@ -102,73 +97,3 @@ def stage_and_step(folder: Path) -> tuple[str, int]:
     except (OSError, KeyError, TypeError):
         steps = []
     return str(building.get("stage", "")), int(steps[-1]) if steps else 0
-
-
-def record_inputs(
-    folder: Path,
-    values: dict[str, Any],
-    results: dict[str, Any],
-    sources: Iterable[Path],
-    entries: Mapping[str, Path],
-    published: Iterable[Path],
-) -> None:
-    """Write down what ``find_finished`` needs: source files, stage results by name, files shown in ``folder``."""
-    sources = list(sources)
-    folders = sorted({path.parent for path in sources})  # their time of change tells of files that came or went
-    record = {
-        "version": INPUTS_VERSION,
-        "config": config_hash(values),
-        "results": sha256_of(results),
-        "stages": {stage.name: stage.version for stage in STAGES},
-        "pycolmap": _version("pycolmap"),
-        "sources": {str(path): _stamp(path) for path in sorted(sources)},
-        "folders": {str(path): path.stat().st_mtime_ns for path in folders},
-        "entries": {name: str(path) for name, path in entries.items()},
-        "published": {path.relative_to(folder).as_posix(): _stamp(path) for path in published},
-    }
-    write_json(folder / INPUTS, record)
-
-
-def find_finished(
-    values: dict[str, Any], unavailable_now: Callable[[dict[str, Any]], Collection[str]] = lambda options: ()
-) -> dict[str, Any] | None:
-    """What ``results.json`` holds if the trial is done and nothing that it was made of has changed; else None.
-
-    Quick, since files are compared by size and time of change. A trial that lacks a metric for want of weights is done
-    only if ``unavailable_now``, called with the ``eval`` settings, says that it would lack it again.
-    """
-    folder = TrialPaths.of(values).folder
-    results, record = read_object(folder / RESULTS), read_object(folder / INPUTS)
-    try:
-        if results["status"] != "complete" or results["hashes"]["config"] != config_hash(values):
-            return None
-        lacking = set(results["awaited"])  # metrics that may still come, once their weights or packages are there
-        same = (
-            record["version"] == INPUTS_VERSION
-            and record["config"] == config_hash(values)
-            and record["results"] == sha256_of(results)
-            and record["stages"] == {stage.name: stage.version for stage in STAGES}
-            and record["pycolmap"] == _version("pycolmap")
-            and all(_stamp(Path(path)) == stamp for path, stamp in record["sources"].items())
-            and all(Path(path).stat().st_mtime_ns == changed for path, changed in record["folders"].items())
-            and all(_stamp(folder / name) == stamp for name, stamp in record["published"].items())
-        )
-        if same:
-            for path in record["entries"].values():
-                read_manifest(Path(path))
-        same = same and (not lacking or lacking <= set(unavailable_now(values["eval"])))
-    except (KeyError, TypeError, AttributeError, ValueError, OSError):
-        return None
-    return results if same else None
-
-
-def _stamp(path: Path) -> list[int]:
-    state = os.stat(path)
-    return [state.st_size, state.st_mtime_ns]
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None

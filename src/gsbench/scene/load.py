@@ -12,7 +12,6 @@ import logging
 import os
 import secrets
 import shutil
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Literal
 import numpy as np
 
 from gsbench.errors import InputError
+from gsbench.logs import Progress, no_progress
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import Resample, check_size, image_size, read_image
@@ -46,13 +46,13 @@ def load_scene(
     resample: Resample = "lanczos",
     principal_point: PrincipalPoint = "used",
     threads: int = 2,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = no_progress,
 ) -> Scene:
     """Load the views of a capture with the cameras of the COLMAP model in ``model_dir``.
 
     Images of a distorted camera are undistorted, then all are shrunk by ``downscale`` and to a longest side of
     ``max_size`` px (see `downscaled_size`). ``centred`` moves principal points to the image centre, as 3DGS assumes.
-    Views without a pose in the model are left out with a warning. ``progress`` gets (images done, all images).
+    Views without a pose in the model are left out with a warning. ``progress`` counts images.
 
     Raises `InputError` if fewer than three views or no training view have a pose, or an image does not fit its camera.
     """
@@ -93,7 +93,7 @@ def _build(
     max_size: int | None,
     resample: Resample,
     threads: int,
-    progress: Callable[[int, int], None] | None,
+    progress: Progress,
 ) -> None:
     """Prepare all registered images of the capture and publish them as ``folder``."""
     cameras = _model_cameras(capture, model_dir)

@@ -8,7 +8,7 @@ passes through JPEG again.
 from __future__ import annotations
 
 import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherwise crashes Pillow's PNG code
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.errors import InputError
+from gsbench.logs import Progress, no_progress
 from gsbench.scene.images import Resample, read_image, resize_image
 from gsbench.scene.sizes import downscaled_size
 from gsbench.system.isolate import CrashError, run_isolated
@@ -75,13 +76,11 @@ def intrinsics_of(camera: CameraModel) -> Intrinsics:
     return Intrinsics(camera.width, camera.height, fx, fy, cx, cy)
 
 
-def prepare_all(
-    jobs: Sequence[Job], threads: int = 2, progress: Callable[[int, int], None] | None = None
-) -> list[Intrinsics]:
+def prepare_all(jobs: Sequence[Job], threads: int = 2, progress: Progress = no_progress) -> list[Intrinsics]:
     """Prepare all images and return their final intrinsics, in the order of ``jobs``.
 
     Distorted images go through child processes, because COLMAP's native code can abort the process it runs in; such an
-    abort, like an unreadable image, raises `InputError`. ``progress`` is called with (images done, all images).
+    abort, like an unreadable image, raises `InputError`. ``progress`` counts images.
     """
     results: list[Intrinsics] = []
     for chunk in _chunks(jobs):
@@ -93,8 +92,7 @@ def prepare_all(
                 raise InputError(f"{error} ({names}): check these images and their cameras") from error
         else:
             results += prepare_chunk(chunk, threads)
-        if progress is not None:
-            progress(len(results), len(jobs))
+        progress("views", len(results), len(jobs))
     return results
 
 

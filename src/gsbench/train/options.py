@@ -6,7 +6,10 @@ from dataclasses import dataclass, field
 
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
+from gsbench.gaussians.paper_values import LearningRates
 from gsbench.settings import MISSING, Fraction, check_settings
+
+WITHOUT_EFFECT_ON_MODEL = ("name", "log_every", "checkpoint_every", "checkpoint_minutes", "volume_histogram")
 
 
 @dataclass
@@ -16,14 +19,14 @@ class TrainConfig:
     sh_interval: PositiveInt = 1000  # spherical harmonics gain a degree so often
     ssim_weight: Fraction = 0.2  # loss = 0.8 L1 + 0.2 (1 - SSIM)
     background: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
-    position_initial: PositiveFloat = 1.6e-4  # learning rates; positions times the scene extent
-    position_final: PositiveFloat = 1.6e-6
-    position_steps: PositiveInt = 30_000
-    sh_dc: PositiveFloat = 2.5e-3
-    sh_rest: PositiveFloat = 1.25e-4
-    opacity: PositiveFloat = 0.05  # 2023 code; 0.025 in late-2024 code
-    scale: PositiveFloat = 5e-3
-    rotation: PositiveFloat = 1e-3
+    position_initial: PositiveFloat = LearningRates.position_initial  # learning rates; positions times the scene extent
+    position_final: PositiveFloat = LearningRates.position_final
+    position_steps: PositiveInt = LearningRates.position_steps
+    sh_dc: PositiveFloat = LearningRates.sh_dc
+    sh_rest: PositiveFloat = LearningRates.sh_rest
+    opacity: PositiveFloat = LearningRates.opacity
+    scale: PositiveFloat = LearningRates.scale
+    rotation: PositiveFloat = LearningRates.rotation
     densify_start: NonNegativeInt = 500  # the window of the densifiers, which read it from here
     densify_stop: NonNegativeInt = 15_000
     densify_interval: PositiveInt = 100

@@ -11,7 +11,7 @@ from torch import Tensor
 from gsbench.scene.types import View
 from gsbench.words import readable_bytes
 
-STAGES = 2  # buffers between an image and the device: one is filled while the other is copied
+BUFFERS = 2  # page-locked, between an image and the device: one is filled while the other is copied
 
 log = logging.getLogger(__name__)
 
@@ -63,14 +63,14 @@ class _Stream:
     def __init__(self, device: torch.device, largest: int) -> None:
         self._device = device
         self._on_cuda = device.type == "cuda"
-        self._buffers = [torch.empty(largest, dtype=torch.uint8, pin_memory=self._on_cuda) for _ in range(STAGES)]
-        self._copied: list[torch.cuda.Event | None] = [None] * STAGES
+        self._buffers = [torch.empty(largest, dtype=torch.uint8, pin_memory=self._on_cuda) for _ in range(BUFFERS)]
+        self._copied: list[torch.cuda.Event | None] = [None] * BUFFERS
         self._turn = 0
         self._stream = torch.cuda.Stream(device) if self._on_cuda else None
 
     def send(self, image: Tensor) -> Tensor:
         """``image`` on the device, of which work must not be queued before `join`."""
-        self._turn = (self._turn + 1) % STAGES
+        self._turn = (self._turn + 1) % BUFFERS
         event = self._copied[self._turn]
         if event is not None:
             event.synchronize()  # of the copy before the last: long done

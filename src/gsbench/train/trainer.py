@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,9 @@ from gsbench.errors import TrainingError
 from gsbench.events import RefineEvent
 from gsbench.files import write_text
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
+from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.ply import write_ply
-from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
+from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster import Rasterizer
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.scene.types import Scene
@@ -274,16 +275,8 @@ def sh_degree_at(options: TrainConfig, step: int) -> int:
 
 
 def learning_rates(options: TrainConfig) -> LearningRates:
-    return LearningRates(
-        position_initial=options.position_initial,
-        position_final=options.position_final,
-        position_steps=options.position_steps,
-        sh_dc=options.sh_dc,
-        sh_rest=options.sh_rest,
-        opacity=options.opacity,
-        scale=options.scale,
-        rotation=options.rotation,
-    )
+    """Those among the settings of a training."""
+    return LearningRates(**{field.name: getattr(options, field.name) for field in fields(LearningRates)})
 
 
 def generator(seed: int, stream: int) -> torch.Generator:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.analysis.declaration import read_plans
 from gsbench.claims.file import direction_is_odd, read_claims
 from gsbench.claims.here import Here
 from gsbench.claims.sweep import Check, prepare, run_looks
@@ -15,7 +14,9 @@ from gsbench.files import make_runs_folder, write_text
 from gsbench.launch.declare import declare_plan
 from gsbench.launch.plan import describe_plan
 from gsbench.launch.preflight import missing_folders
-from gsbench.runs.trial_files import find_finished
+from gsbench.launch.trial import Trial
+from gsbench.runs.declaration import read_plans
+from gsbench.runs.finished import Done, find_finished
 from gsbench.verbs.arguments import ArgumentParser, path
 from gsbench.words import counted
 
@@ -74,7 +75,9 @@ def describe(check: Check) -> list[str]:
         f"{counted(len(first), 'trial')} until the first look, {len(most)} at most; "
         f"each test may err in {100 * check.file.error_rate / check.sharing:.3g} % of such sweeps"
     )
-    return lines + (describe_plan(most, most[0].values["launch"]["parallel"]) if most else [])
+    if most:
+        lines += describe_plan([Trial.of(trial) for trial in most], most[0].values["launch"]["parallel"])
+    return lines
 
 
 def _run(check: Check) -> None:
@@ -83,7 +86,12 @@ def _run(check: Check) -> None:
 
     make_runs_folder(check.runs)
     declared = declare_plan(check.home, check.plan, check.plan_hash)
-    verdicts = run_looks(check, declared, run_batch, lambda trial: find_finished(trial.values) is not None)
+    verdicts = run_looks(
+        check,
+        declared,
+        lambda trials: run_batch([Trial.of(trial) for trial in trials]),
+        lambda trial: isinstance(find_finished(trial.values), Done),
+    )
     page = make_page(check.file, verdicts, declared, read_plans(check.home))
     for name, text in ((MARKDOWN, to_markdown(page)), (HTML, to_html(page))):
         write_text(check.home / name, text)

@@ -42,7 +42,8 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
     words = parser.parse_args(argv).trial
     from gsbench.app.hydra_app import compose_trials
     from gsbench.config.hydra_guard import PERMISSIONS, typed_permissions
-    from gsbench.pipeline.wiring import Parts, Trial
+    from gsbench.pipeline.parts import Parts
+    from gsbench.pipeline.wiring import TrialSteps
     from gsbench.renders.import_renders import is_entered
     from gsbench.runs.explain_cache import explain_steps
     from gsbench.runs.store import Store
@@ -60,6 +61,6 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
     else:
         values = compose_trials(words)[0].values
     store = Store(runs / STORE)
-    for line in explain_steps(Trial(Parts.of(values), store).steps(), store):
+    for line in explain_steps(TrialSteps(Parts(values), store).steps(), store):
         print(line)
     return 0

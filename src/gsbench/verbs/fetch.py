@@ -38,8 +38,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
     with storage_errors(data), progress("fetch") as report:
         data.mkdir(parents=True, exist_ok=True)
 
-        def show(phase: str, done: int, total: int) -> None:
-            report(phase, done, total, f"{readable_bytes(done)} of {readable_bytes(total)}")
+        def show(phase: str, done: int, total: int | None, note: str = "") -> None:
+            report(phase, done, total, note or f"{readable_bytes(done)} of {readable_bytes(total or done)}")
 
         with hold(data / LOCK, f"fetching into {data}"):
             remove_temporaries(data / STAGING)

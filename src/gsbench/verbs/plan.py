@@ -11,7 +11,7 @@ from pathlib import Path
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs, pair_arms
 from gsbench.analysis.quantities import Quantity, quantity
-from gsbench.analysis.results import Trial, load_experiment
+from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.analysis.statistics import MIN_SCENES
 from gsbench.claims.planning import (
     Components,
@@ -79,7 +79,7 @@ def _lines(found: Components, shown: Quantity, difference: float) -> list[str]:
     return lines
 
 
-def _hours_lines(found: Components, shown: Quantity, hours: float, trials: Sequence[Trial]) -> list[str]:
+def _hours_lines(found: Components, shown: Quantity, hours: float, trials: Sequence[TrialResult]) -> list[str]:
     timed = [sum(trial.data["seconds"].values()) for trial in trials if not trial.made_elsewhere]
     if not timed:
         return ["  hours: no trial tells how long one takes"]

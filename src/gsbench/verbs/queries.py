@@ -7,7 +7,7 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
-from gsbench.config.command_words import check_words, is_sweep, parse_word, search_path
+from gsbench.config.command_words import check_single, parse_word, search_path
 from gsbench.config.compose import compose_values
 from gsbench.config.hydra_guard import check_search_path, typed_permissions
 from gsbench.config.questions import answer, has_part
@@ -35,9 +35,7 @@ def ask_hydra(argv: list[str]) -> int:
 
 
 def _check(overrides: list[str], config_dir: Path | None, package: str | None) -> None:
-    check_words(overrides)
-    if swept := [word for word in overrides if is_sweep(word)]:
-        raise InputError(f"{swept[0]} lists several values: choose one whose configuration is shown")
+    check_single(overrides, "choose one whose configuration is shown")
     config = compose_values([*search_path([config_dir] if config_dir else [], overrides), *overrides])
     if package is not None and not has_part(config, package):
         raise InputError(f"--package {package}: there is no such part of the configuration")

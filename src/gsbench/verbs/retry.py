@@ -16,6 +16,7 @@ from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
 from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
+from gsbench.launch.trial import Trial
 from gsbench.runs.trial_files import TrialPaths, label_of, read_config
 from gsbench.system.own_modules import import_only
 from gsbench.verbs.arguments import ArgumentParser
@@ -52,7 +53,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
-    replaced = [old for old, trial in zip(unfinished, trials, strict=True) if TrialPaths.of(trial.values).folder != old]
+    replaced = [old for old, trial in zip(unfinished, trials, strict=True) if trial.folder != old]
     for old in replaced:
         log.info("%s: its configuration has changed since; the new one is run", label_of(old))
     code = run_trials(trials)
@@ -60,7 +61,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return code
 
 
-def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[str]) -> Composed:
+def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[str]) -> Trial:
     """The trial in ``folder``: from its planned overrides, else from the configuration that it wrote.
 
     Neither allows anything to run: that ``changes``, which were typed, must do again.
@@ -82,7 +83,7 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
             raise InputError(
                 f"{' '.join(changes)} would make other trials than those of the plan: give the sweep's own command"
             )
-        return Composed(trial.values | {"runs": str(runs)}, trial.yaml, trial.overrides)
+        return Trial(trial.values | {"runs": str(runs)}, trial.yaml, trial.overrides)
     if any(key_of(change) != PERMISSIONS for change in changes):
         raise InputError(
             f"{label_of(folder)} is in no plan, so no setting of it can be changed: run it by its own command"
@@ -90,7 +91,7 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
     import_only(allowed, here)
     values = read_config(folder) | {"runs": str(runs), PERMISSIONS: list(allowed)}
     check_permissions(values)
-    return Composed(values, yaml.safe_dump(values, sort_keys=False), ())
+    return Trial(values, yaml.safe_dump(values, sort_keys=False), ())
 
 
 def key_of(word: str) -> str:

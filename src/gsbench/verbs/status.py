@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from gsbench.analysis.results import Trial, experiment_home, list_experiments, read_experiment
+from gsbench.analysis.results import TrialResult, experiment_home, list_experiments, read_experiment
 from gsbench.analysis.superseded import find_superseded
 from gsbench.launch.plan import forget, read_plan, remove
 from gsbench.launch.states import TrialState, states_of_experiment
@@ -63,7 +63,7 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
     """
     places = {trial.folder: trial.cwd for trial in read_plan(home)}
 
-    def present(target: str, trial: Trial) -> str | None:
+    def present(target: str, trial: TrialResult) -> str | None:
         return source_on_disk(target, places[trial.path]) if trial.path in places else None
 
     reasons = find_superseded(read_experiment(home).trials, present)

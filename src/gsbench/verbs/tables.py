@@ -12,7 +12,7 @@ from gsbench.analysis.frame import to_frame
 from gsbench.analysis.paper import inconsistencies, load_paper
 from gsbench.analysis.paper_tables import PAPER_TABLES, layout_of, paper_tables
 from gsbench.analysis.published import published_names, published_table
-from gsbench.analysis.results import Experiment, Trial, load_experiment
+from gsbench.analysis.results import Experiment, TrialResult, load_experiment
 from gsbench.analysis.table_formats import FORMATS
 from gsbench.analysis.tables import DEFAULT_ROWS, build_table
 from gsbench.errors import InputError
@@ -38,7 +38,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
-def _trials(trials: Sequence[Trial], options: argparse.Namespace) -> dict[str, str]:
+def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
     """One row a trial; what only a table has is refused."""
     for name in ("rows", "columns", "metrics", "layout", "paper"):
         if getattr(options, name) is not None:
@@ -46,7 +46,7 @@ def _trials(trials: Sequence[Trial], options: argparse.Namespace) -> dict[str, s
     return {"-trials.csv": to_frame(trials).to_csv(index=False, lineterminator="\n")}
 
 
-def _tables(experiment: Experiment, trials: Sequence[Trial], options: argparse.Namespace) -> dict[str, str]:
+def _tables(experiment: Experiment, trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
     """The tables as text, each with what its file's name ends in."""
     layout = options.layout or (_is_plain(options) and layout_of(experiment.name)) or "plain"
     metrics = options.metrics

@@ -28,8 +28,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
     if importlib.util.find_spec("viser") is None:
         raise InputError(f"the viewer needs viser: {install_command('view')}")
 
-    from gsbench.pipeline.components import select_device
     from gsbench.raster import create_rasterizer
+    from gsbench.train.device import select_device
     from gsbench.view.picture import TrialPainter
     from gsbench.view.server import Viewer, check_port
     from gsbench.view.trials import find_trial, load_viewed

@@ -15,6 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from gsbench.eval.evaluator import quantize
 from gsbench.events import Cause
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians, quaternion_to_matrix
+from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.raster.base import Rasterizer
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
@@ -37,7 +38,7 @@ class Layers:
     sh_degree: int = MAX_SH_DEGREE
     max_gaussians: int | None = None
     ellipsoids: bool = False
-    log10_volume: float = math.log10(0.03)
+    log10_volume: float = math.log10(VOLUME_THRESHOLD)
     cloud: bool = False
     cameras: bool = False
 

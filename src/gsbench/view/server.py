@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.events import Cause
+from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
 from gsbench.view.picture import Layers, Picture, TrialPainter, photograph_at, side_by_side
@@ -30,7 +31,7 @@ FREE_VIEW = "free"
 MOVING_HEIGHT = 240  # px while the camera moves
 HEIGHTS = ("270", "540", "810")  # px when it rests
 REST_SECONDS = 0.25  # after the last change the sharp picture is drawn
-DEFAULT_THRESHOLD = math.log10(0.03)  # the paper's V_th
+DEFAULT_THRESHOLD = math.log10(VOLUME_THRESHOLD)
 SHARES = (1, 100)  # %, of the Gaussians, the most opaque first
 
 

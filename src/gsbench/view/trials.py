@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsbench.analysis.results import Trial, load_experiment
+from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.densify.volume import log_volume
 from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
@@ -43,7 +43,7 @@ class ViewedTrial:
     background: tuple[float, float, float]
 
 
-def find_trial(address: str, runs: Path) -> Trial:
+def find_trial(address: str, runs: Path) -> TrialResult:
     """The trial at ``address`` (see ``ADDRESS``), of several seeds the first.
 
     Raises InputError where there is none, and where several arms answer to it.
@@ -72,7 +72,7 @@ def find_trial(address: str, runs: Path) -> Trial:
     return found[0]
 
 
-def _trial_in(folder: Path) -> Trial:
+def _trial_in(folder: Path) -> TrialResult:
     if len(folder.parents) < 4 or not (folder / RESULTS).is_file():
         raise InputError(f"{folder} is not a trial's folder; give {ADDRESS}")
     experiment = load_experiment(folder.parents[3], folder.parents[2].name)
@@ -82,14 +82,14 @@ def _trial_in(folder: Path) -> Trial:
     raise InputError(f"{folder} is not a complete trial; give {ADDRESS}")
 
 
-def model_file(trial: Trial) -> Path:
+def model_file(trial: TrialResult) -> Path:
     """The PLY of a trial's Gaussians; raises InputError for a trial that has none."""
     if trial.from_renders:
         raise InputError(f"{trial.label} was evaluated from renders: it has no model")
     return trial.path / POINT_CLOUD
 
 
-def load_viewed(trial: Trial, device: torch.device) -> ViewedTrial:
+def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
     """Read what the viewer draws of ``trial``; raises InputError naming the file that is missing or damaged."""
     gaussians = read_ply(model_file(trial), device)
     runs = trial.path.parents[3]
@@ -120,7 +120,7 @@ def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
     return causes
 
 
-def read_test_views(trial: Trial, model_dir: Path) -> tuple[View, ...]:
+def read_test_views(trial: TrialResult, model_dir: Path) -> tuple[View, ...]:
     """The test views in the order of their names: ground truth and camera as the evaluation used them."""
     import pycolmap
 

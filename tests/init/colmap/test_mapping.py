@@ -10,7 +10,6 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.init.base import no_progress
 from gsbench.init.colmap.alignment import align_poses
 from gsbench.init.colmap.database import (
     assume_focal_lengths,
@@ -23,6 +22,7 @@ from gsbench.init.colmap.database import (
 )
 from gsbench.init.colmap.mapping import Mapped, Mapper, map_images
 from gsbench.init.colmap.reconstruct import MappingSettings, Verification, poses_by_name
+from gsbench.logs import no_progress
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 520.0  # px; COLMAP's guess without EXIF is 1.2 x 640 = 768
 SETTINGS = MappingSettings(seed=0, threads=1, min_model_size=3, two_view_tracks=False, fixed_intrinsics=False)

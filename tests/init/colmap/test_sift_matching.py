@@ -13,13 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsbench.init import MODEL_FOLDER, Sfm
-from gsbench.init.base import Timer, no_progress
+from gsbench.init.base import Timer
 from gsbench.init.colmap.database import create_database, guessed_groups
 from gsbench.init.colmap.options import DatabaseTask
 from gsbench.init.colmap.reconstruct import Verification
 from gsbench.init.colmap.sift import extract_sift
 from gsbench.init.colmap.sift_matching import deal, divide, match_sift
 from gsbench.init.preview import best_pairs
+from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 
 pairs_of_some_images = st.integers(2, 40).flatmap(

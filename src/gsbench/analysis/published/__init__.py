@@ -15,7 +15,7 @@ from gsbench.analysis.choices import PaperChoice, choice_lines, read_setup
 from gsbench.analysis.paper import Printed
 from gsbench.analysis.paper_tables import Agreement, compare_with_printed, legend
 from gsbench.analysis.quantities import quantity
-from gsbench.analysis.results import Trial
+from gsbench.analysis.results import TrialResult
 from gsbench.analysis.tables import Column, Entry, Row, Table
 from gsbench.errors import InputError
 from gsbench.words import closest
@@ -59,7 +59,7 @@ def load_published(name: str) -> Published:
     return Published(name, title, source, conventions, content["densify"], quantities, printed, setup)
 
 
-def published_table(trials: Sequence[Trial], name: str) -> Table:
+def published_table(trials: Sequence[TrialResult], name: str) -> Table:
     """Each of our arms on the paper's scenes beside the printed numbers, with the differences.
 
     Raises InputError where no trial is of a scene of the paper, or where a cell would mix what may not be averaged.

@@ -26,7 +26,7 @@ from gsbench.analysis.report.sections import (
 )
 from gsbench.analysis.report.sweep_charts import sweep_charts
 from gsbench.analysis.report.tradeoff_charts import tradeoff_charts, tradeoff_gaps
-from gsbench.analysis.results import Experiment, Trial
+from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdicts import families, judge
@@ -82,7 +82,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
     )
 
 
-def trial_figures(trials: Sequence[Trial]) -> list[tuple[str, str]]:
+def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
     """(caption, data URI) of the pictures that trials left for the report; one seed of each scene and arm."""
     found = []
     for group in by_key(trials, lambda trial: (trial.scene, trial.arm)).values():

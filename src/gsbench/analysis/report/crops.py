@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.analysis.errors_by_region import absolute_error, read_image, view_names
-from gsbench.analysis.results import Trial
+from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
 from gsbench.runs.layout import GROUND_TRUTH, RENDERS
 
@@ -35,12 +35,14 @@ class Crop:
     second_error: float
 
 
-def choose_crops(pairs: Sequence[tuple[Trial, Trial]], count: int) -> tuple[list[Crop], list[Crop], list[str]]:
+def choose_crops(
+    pairs: Sequence[tuple[TrialResult, TrialResult]], count: int
+) -> tuple[list[Crop], list[Crop], list[str]]:
     """Up to ``count`` places each where the second arm gains most and loses most, and what could not be read.
 
     One seed of each scene is looked at, and at most one place in a view is taken for each list.
     """
-    places: list[tuple[float, tuple[Trial, Trial], str, tuple[int, int, int, int]]] = []
+    places: list[tuple[float, tuple[TrialResult, TrialResult], str, tuple[int, int, int, int]]] = []
     faults: dict[str, str] = {}  # by scene
     seen: set[str] = set()
     for one, other in pairs:
@@ -66,7 +68,9 @@ def data_uri(image: NDArray[np.uint8]) -> str:
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _read(one: Trial, other: Trial, view: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
+def _read(
+    one: TrialResult, other: TrialResult, view: str
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
     first = read_image(one.path / RENDERS / f"{view}.png")
     second = read_image(other.path / RENDERS / f"{view}.png")
     truth = read_image(one.path / GROUND_TRUTH / f"{view}.png")
@@ -92,7 +96,7 @@ def _extremes(
     return found
 
 
-def _cut(pair: tuple[Trial, Trial], view: str, box: tuple[int, int, int, int]) -> Crop:
+def _cut(pair: tuple[TrialResult, TrialResult], view: str, box: tuple[int, int, int, int]) -> Crop:
     left, top, right, bottom = box
     images = [image[top:bottom, left:right] for image in _read(*pair, view)]
     errors = [float(absolute_error(image, images[2]).mean()) for image in images[:2]]

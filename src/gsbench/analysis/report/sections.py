@@ -15,13 +15,14 @@ from gsbench.analysis.pairing import ViewCache, arm_name, pair_trials
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart, short_number
 from gsbench.analysis.report.crops import Crop, choose_crops
 from gsbench.analysis.report.volumes import share_above, volume_histogram
-from gsbench.analysis.results import Arm, Trial, read_json_lines
+from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import ALPHA
 from gsbench.analysis.tables import change_words, cost_change
 from gsbench.analysis.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve
 from gsbench.analysis.verdicts import ArmVerdicts, Verdict, judge
 from gsbench.errors import InputError
 from gsbench.events import Cause, RefineEvent
+from gsbench.files import read_json_lines
 from gsbench.runs import layout
 from gsbench.words import signed
 
@@ -68,7 +69,7 @@ class Versus:
 
 
 def compare_arms(
-    trials: Sequence[Trial], first: Arm, second: Arm, views: ViewCache, judged: ArmVerdicts | None = None
+    trials: Sequence[TrialResult], first: Arm, second: Arm, views: ViewCache, judged: ArmVerdicts | None = None
 ) -> Versus:
     """Verdicts, costs, forest plots, regions and crops of two arms; what cannot be had is said in the notes.
 
@@ -105,7 +106,7 @@ def compare_arms(
     )
 
 
-def training_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
+def training_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str]:
     """Curves by arm, averaged over scenes and seeds at the steps that all trials have."""
     charts = []
     for key, title, y_label in CURVES:
@@ -118,7 +119,7 @@ def training_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
     return [chart for chart in charts if chart]
 
 
-def event_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
+def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str]:
     """Events by cause: totals of every arm, and over the iterations of each arm."""
     totals = []
     for arm in arms:
@@ -143,7 +144,7 @@ def event_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> list[str]:
     return [chart for chart in charts if chart]
 
 
-def _strictness_chart(trials: Sequence[Trial], arms: Sequence[Arm]) -> str:
+def _strictness_chart(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> str:
     """How a governor moved the thresholds; empty where none did."""
     series = []
     for arm in arms:
@@ -154,7 +155,7 @@ def _strictness_chart(trials: Sequence[Trial], arms: Sequence[Arm]) -> str:
     return line_chart(title, series, "iteration", "factor", log_y=True)
 
 
-def _origin_chart(trials: Sequence[Trial], arms: Sequence[Arm]) -> str:
+def _origin_chart(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> str:
     """What made the Gaussians that are left at the end, as the mean of a trial."""
     origins = {arm: [trial.data.get("causes") or {} for trial in trials if trial.arm == arm] for arm in arms}
     causes = list(dict.fromkeys(cause for logged in origins.values() for counts in logged for cause in counts))
@@ -171,7 +172,7 @@ def _origin_chart(trials: Sequence[Trial], arms: Sequence[Arm]) -> str:
     return bar_chart("What made the final Gaussians, mean of a trial", labels, bars, "Gaussians")
 
 
-def volume_charts(trials: Sequence[Trial], arms: Sequence[Arm]) -> tuple[list[str], list[str]]:
+def volume_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> tuple[list[str], list[str]]:
     """(charts, notes): histograms of the Gaussians' volumes, final by arm and at earlier iterations where logged."""
     notes: list[str] = []
     final = []
@@ -206,7 +207,7 @@ def mean_by_step(curves: Sequence[Sequence[tuple[float, float]]]) -> list[tuple[
     return [(step, statistics.fmean(curve[step] for curve in filled)) for step in shared]
 
 
-def provenance(trials: Sequence[Trial]) -> list[dict[str, str]]:
+def provenance(trials: Sequence[TrialResult]) -> list[dict[str, str]]:
     """One row a trial: where it lies, what it came from, with which versions."""
     return [
         {
@@ -284,7 +285,7 @@ def _by_scene(verdicts: Sequence[Verdict]) -> list[str]:
     return lines
 
 
-def _costs(trials: Sequence[Trial], first: Arm, second: Arm) -> list[str]:
+def _costs(trials: Sequence[TrialResult], first: Arm, second: Arm) -> list[str]:
     arms = [[trial for trial in trials if trial.arm == arm] for arm in (first, second)]
     lines = []
     for name, key, caution in (
@@ -300,12 +301,12 @@ def _costs(trials: Sequence[Trial], first: Arm, second: Arm) -> list[str]:
     return lines
 
 
-def _unequal_counts(change: float, _: Sequence[Sequence[Trial]]) -> str:
+def _unequal_counts(change: float, _: Sequence[Sequence[TrialResult]]) -> str:
     unequal = abs(change) > EQUAL_COUNTS
     return "; so this is no comparison at one count, which densify.cap=governor makes" if unequal else ""
 
 
-def _unsteady_times(_: float, arms: Sequence[Sequence[Trial]]) -> str:
+def _unsteady_times(_: float, arms: Sequence[Sequence[TrialResult]]) -> str:
     """How far the training times of equal trials differ, without which a change of them says little."""
     cells = by_key([trial for arm in arms for trial in arm], lambda trial: (trial.arm, trial.scene)).values()
     times = [[t for trial in cell if (t := COST_READERS["seconds"](trial))] for cell in cells]
@@ -339,7 +340,7 @@ def _region_chart(errors: RegionErrors, first: Arm, second: Arm) -> str:
     return bar_chart(f"Error by {what}", labels, series, "error (8-bit levels)")
 
 
-def _rows(trial: Trial, name: str, key: str) -> list[tuple[float, float]]:
+def _rows(trial: TrialResult, name: str, key: str) -> list[tuple[float, float]]:
     return [
         (float(row["step"]), float(row[key]))
         for row in read_json_lines(trial.path / name)
@@ -351,7 +352,7 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float)
 
 
-def _logged_histograms(trials: Sequence[Trial]) -> dict[int, list[tuple[float, float]]]:
+def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, list[tuple[float, float]]]:
     """Pooled counts of ``volume_histograms.jsonl`` by iteration, as (volume at the bin's centre, share)."""
     pooled: dict[int, Counter[float]] = {}
     for trial in trials:
@@ -366,7 +367,7 @@ def _logged_histograms(trials: Sequence[Trial]) -> dict[int, list[tuple[float, f
     }
 
 
-def _threshold(trials: Sequence[Trial]) -> float | None:
+def _threshold(trials: Sequence[TrialResult]) -> float | None:
     """The volume threshold in scene units, where every arm that has one has this one."""
     settings = [group[0].config for group in by_key(trials, lambda trial: trial.arm).values()]
     found = {

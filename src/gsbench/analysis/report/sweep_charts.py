@@ -10,13 +10,13 @@ from gsbench.analysis.differences import differing_settings
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.report.charts import Series, line_chart, short_number
-from gsbench.analysis.results import Trial, canonical
+from gsbench.analysis.results import TrialResult, canonical
 
 NAMES = ("densify.name", "init.name")  # an arm may be named after the value that it has
 FAMILY = ("init.name", "densify._target_")
 
 
-def sweep_charts(trials: Sequence[Trial]) -> list[str]:
+def sweep_charts(trials: Sequence[TrialResult]) -> list[str]:
     """For each initialiser and class of densifier of which one setting was varied, a chart for each quantity.
 
     A line is a scene, relative to its own mean over the values, so that scenes of unlike levels share an axis and each
@@ -45,7 +45,7 @@ def sweep_charts(trials: Sequence[Trial]) -> list[str]:
     return [chart for chart in charts if chart]
 
 
-def _baseline(trials: Sequence[Trial], swept: Sequence[Trial], setting: str) -> list[Trial]:
+def _baseline(trials: Sequence[TrialResult], swept: Sequence[TrialResult], setting: str) -> list[TrialResult]:
     """The trials of the baseline beside those ``swept``, where it is one arm and has no such setting."""
     if any(trial.config.get(setting) is None for trial in swept):
         return []
@@ -55,7 +55,7 @@ def _baseline(trials: Sequence[Trial], swept: Sequence[Trial], setting: str) -> 
     return found if one_arm and not any(setting in trial.config for trial in found) else []
 
 
-def _varied(group: Sequence[Trial]) -> str | None:
+def _varied(group: Sequence[TrialResult]) -> str | None:
     """The one setting in which the trials of every scene differ, or None where it is none or several."""
     found: set[str] = set()
     for own in by_key(group, lambda trial: trial.scene).values():
@@ -64,7 +64,7 @@ def _varied(group: Sequence[Trial]) -> str | None:
 
 
 def _deviations(
-    trials: Sequence[Trial], setting: str, places: Mapping[str, int], quantity: Quantity
+    trials: Sequence[TrialResult], setting: str, places: Mapping[str, int], quantity: Quantity
 ) -> list[tuple[float, float]]:
     """(place of the value, mean over seeds minus the mean over all values) of one scene."""
     means: dict[int, float] = {}

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from gsbench.analysis.pairing import BASELINE, arm_name
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.report.charts import Series, line_chart, short_number
-from gsbench.analysis.results import Arm, Trial
+from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.tradeoffs import Curve, curve_gap, family_curve
 from gsbench.eval.facts import METRICS
 from gsbench.words import signed
@@ -15,7 +15,7 @@ from gsbench.words import signed
 COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time (s)"}
 
 
-def tradeoff_charts(trials: Sequence[Trial]) -> list[str]:
+def tradeoff_charts(trials: Sequence[TrialResult]) -> list[str]:
     """One chart for each pair of main metric and cost; a densifier's variants are the points of its line."""
     charts = []
     for metric in _main_metrics(trials):
@@ -29,7 +29,7 @@ def tradeoff_charts(trials: Sequence[Trial]) -> list[str]:
     return [chart for chart in charts if chart]
 
 
-def tradeoff_gaps(trials: Sequence[Trial], baseline: str = BASELINE) -> list[str]:
+def tradeoff_gaps(trials: Sequence[TrialResult], baseline: str = BASELINE) -> list[str]:
     """The area between every densifier's curve and the baseline's, in words, where both have several points."""
     lines = []
     for metric in _main_metrics(trials):
@@ -46,7 +46,7 @@ def tradeoff_gaps(trials: Sequence[Trial], baseline: str = BASELINE) -> list[str
     return lines
 
 
-def _main_metrics(trials: Sequence[Trial]) -> list[Quantity]:
+def _main_metrics(trials: Sequence[TrialResult]) -> list[Quantity]:
     """PSNR, and the first perceptual metric that is at hand, beginning with the protocol's LPIPS."""
     for name in ("lpips", *(facts.key for facts in METRICS if facts.perceptual)):
         perceptual = quantity(name, trials)
@@ -55,7 +55,7 @@ def _main_metrics(trials: Sequence[Trial]) -> list[Quantity]:
     return [quantity("psnr", trials)]
 
 
-def _curves(trials: Sequence[Trial], metric: Quantity, cost: str) -> dict[Arm, Curve]:
+def _curves(trials: Sequence[TrialResult], metric: Quantity, cost: str) -> dict[Arm, Curve]:
     families = sorted({(trial.init, trial.densify) for trial in trials})
     curves = {family: family_curve(trials, family, metric, cost) for family in families}
     return {family: curve for family, curve in curves.items() if len(curve.cost)}

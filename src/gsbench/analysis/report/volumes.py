@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.analysis.results import Trial
+from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
 from gsbench.runs.layout import POINT_CLOUD
 
@@ -29,7 +29,7 @@ def log10_volumes(path: Path) -> NDArray[np.float64]:
     return LOG10_SPHERE + np.asarray(logs) / math.log(10)
 
 
-def volume_histogram(trials: Sequence[Trial]) -> list[tuple[float, float]]:
+def volume_histogram(trials: Sequence[TrialResult]) -> list[tuple[float, float]]:
     """(volume, share of Gaussians) of the trials' pooled Gaussians, in bins of a quarter decade; only filled bins."""
     volumes = np.concatenate([log10_volumes(trial.path / POINT_CLOUD) for trial in trials])
     volumes = volumes[np.isfinite(volumes)]
@@ -39,7 +39,7 @@ def volume_histogram(trials: Sequence[Trial]) -> list[tuple[float, float]]:
     ]
 
 
-def share_above(trials: Sequence[Trial], threshold: float) -> float:
+def share_above(trials: Sequence[TrialResult], threshold: float) -> float:
     """The share of the trials' pooled Gaussians whose volume exceeds ``threshold``."""
     volumes = np.concatenate([log10_volumes(trial.path / POINT_CLOUD) for trial in trials])
     return float(np.mean(volumes > math.log10(threshold)))

@@ -12,7 +12,7 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
-from gsbench.init.base import Progress
+from gsbench.logs import Progress
 from gsbench.scene.colmap import rescaled_camera
 from gsbench.scene.images import image_size, read_image
 

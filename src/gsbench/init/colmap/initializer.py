@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import ClassVar
 
 from gsbench.errors import InputError
-from gsbench.init.base import MIN_IMAGES, Initializer, InitReport, Preparation, Progress, no_progress
+from gsbench.init.base import MIN_IMAGES, Initializer, InitReport, Preparation
 from gsbench.init.colmap.options import ColmapOptions
 from gsbench.init.colmap.progress_pipe import run_with_progress
+from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
 
 logger = logging.getLogger(__name__)

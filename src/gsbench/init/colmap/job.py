@@ -11,11 +11,12 @@ import pycolmap
 
 from gsbench.errors import InputError
 from gsbench.init import report
-from gsbench.init.base import OWN_GAUGE_FOLDER, InitReport, Preparation, Progress, Timer
+from gsbench.init.base import OWN_GAUGE_FOLDER, InitReport, Preparation, Timer
 from gsbench.init.colmap import database as colmap_database
 from gsbench.init.colmap import mapping, reconstruct
 from gsbench.init.colmap.alignment import Similarity
 from gsbench.init.colmap.options import ColmapOptions, DatabaseTask
+from gsbench.logs import Progress
 from gsbench.scene.types import Capture
 
 

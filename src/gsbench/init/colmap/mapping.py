@@ -18,10 +18,11 @@ import numpy as np
 import pycolmap
 
 from gsbench.errors import InputError
-from gsbench.init.base import MIN_IMAGES, Progress
+from gsbench.init.base import MIN_IMAGES
 from gsbench.init.colmap.database import assume_focal_lengths, cameras_without_prior, verify_pairs
 from gsbench.init.colmap.reconstruct import MappingSettings, Verification, pipeline_options
 from gsbench.init.report import REGISTERED_SHARE
+from gsbench.logs import Progress
 
 Mapper = Literal["auto", "incremental", "global"]
 SMALL_ANGLE_DEG = 2.0  # of the initial pair; COLMAP's default is 16

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
 
-from gsbench.init.base import Poses, Progress, Seed, Timer
+from gsbench.init.base import Poses, Seed, Timer
 from gsbench.init.colmap.pairs import Pairing
+from gsbench.logs import Progress
 from gsbench.scene.types import Capture
 from gsbench.settings import Fraction, check_settings
 from gsbench.system.resources import available_cores

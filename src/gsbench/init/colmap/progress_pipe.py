@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsbench.init.base import Progress
+from gsbench.logs import Progress
 from gsbench.system.isolate import run_isolated
 
 T = TypeVar("T")
@@ -23,9 +23,9 @@ class ProgressFile:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def __call__(self, phase: str, done: int, total: int) -> None:
+    def __call__(self, phase: str, done: int, total: int | None, note: str = "") -> None:
         with self.path.open("a", encoding="utf-8") as file:
-            file.write(f"{phase}\t{done}\t{total}\n")
+            file.write(f"{phase}\t{done}\t{'' if total is None else total}\t{note}\n")
 
 
 def run_with_progress(
@@ -52,8 +52,8 @@ def _listen(path: Path, progress: Progress, ended: threading.Event) -> None:
             last = ended.wait(POLL_SECONDS)
             *lines, rest = (rest + file.read()).split("\n")
             for line in lines:
-                phase, done, total = line.split("\t")
+                phase, done, total, note = line.split("\t")
                 with suppress(BrokenPipeError):  # a closed terminal must not end the work
-                    progress(phase, int(done), int(total))
+                    progress(phase, int(done), int(total) if total else None, note)
             if last:
                 return

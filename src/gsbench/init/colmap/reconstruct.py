@@ -14,9 +14,9 @@ import numpy as np
 import pycolmap
 
 from gsbench.errors import InputError
-from gsbench.init.base import Progress
 from gsbench.init.colmap.alignment import Array, Similarity, align_poses
 from gsbench.init.colmap.pairs import exhaustive_pairs, gps_positions, sequential_pairs, spatial_pairs
+from gsbench.logs import Progress
 from gsbench.scene.colmap import read_reference
 from gsbench.scene.types import Capture
 

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import pycolmap
 
-from gsbench.init.base import Progress
+from gsbench.logs import Progress
 
 IMAGES_PER_CALL = 8  # COLMAP reports no progress within a call, so it is called for a few images at a time, …
 IMAGES_PER_THREAD = 2  # … and for more where many threads want work

@@ -20,11 +20,11 @@ from pathlib import Path
 
 import pycolmap
 
-from gsbench.init.base import Progress
 from gsbench.init.colmap.database import image_ids, rename_images, write_pairs
 from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.init.colmap.reconstruct import Verification
 from gsbench.init.colmap.sift import SiftSettings
+from gsbench.logs import Progress
 
 MAX_BLOCK = 16  # images on each side of a part; more would report progress too seldom
 PARTS_PER_PROCESS = 6  # enough that processes end at about the same time
@@ -153,7 +153,7 @@ def _match_in_processes(jobs: Sequence[MatchingJob], count: int, progress: Progr
     matched = [0] * len(jobs)
 
     def run(index: int) -> None:
-        def all_together(phase: str, done: int, total: int) -> None:
+        def all_together(phase: str, done: int, total: int | None, note: str = "") -> None:
             matched[index] = done
             progress(phase, sum(matched), count)
 

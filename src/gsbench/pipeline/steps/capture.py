@@ -25,7 +25,7 @@ def capture_step(options: SceneConfig) -> Step | None:
 
     def build(folder: Path) -> None:
         with progress("scene") as report:
-            render_courtyard(folder, progress=lambda done, total: report("courtyard", done, total), **inputs)
+            render_courtyard(folder, progress=report, **inputs)
 
     return Step(CAPTURE, inputs, build)
 

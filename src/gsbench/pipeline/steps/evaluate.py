@@ -18,6 +18,7 @@ from gsbench.eval.evaluator import Evaluator, quantize, summarize
 from gsbench.eval.facts import to_record
 from gsbench.files import write_json
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
+from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.gaussians.ply import read_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
@@ -33,16 +34,13 @@ from gsbench.pipeline.steps.model_metrics import (
 )
 from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
-from gsbench.runs.layout import FIGURES, LINEAGE, MAPS, PER_VIEW, POINT_CLOUD, RENDERS
+from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, MAPS, METRICS, PER_VIEW, POINT_CLOUD, RENDERS
 from gsbench.runs.stages import EVALUATE
 from gsbench.runs.step import Step
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
 from gsbench.scene.types import Scene
 from gsbench.train.trainer import snapshot_file
-
-METRICS_FILE = "metrics.json"
-FIGURE_VOLUME = 0.03  # the paper's V_th, for baseline and idea alike
 
 
 def evaluate_step(
@@ -170,7 +168,7 @@ def _write_metrics(
     summary = summary_of(evaluator, rows)
     for found in of_model:
         summary["unavailable"] = summary["unavailable"] | found.unavailable
-    write_json(folder / METRICS_FILE, {**summary, **more})
+    write_json(folder / METRICS, {**summary, **more})
 
 
 def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
@@ -201,8 +199,8 @@ def draw_figures(folder: Path, renders: Path, scene: Scene, training: Path, gaus
         causes = torch.from_numpy(lineage["causes"][lineage["ids"]])  # [N]
     for view in scene.test[:1]:
         render = np.asarray(Image.open(renders / png_name(view.name)))
-        picture = draw_ellipsoids(render, gaussians, causes, view.camera, FIGURE_VOLUME)
-        picture.save(folder / "ellipsoids.png")
+        picture = draw_ellipsoids(render, gaussians, causes, view.camera, VOLUME_THRESHOLD)
+        picture.save(folder / ELLIPSOIDS)
 
 
 def write_per_view(path: Path, per_view: Mapping[str, Mapping[str, float]]) -> None:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsbench.analysis.results import FROM_MODEL, FROM_RENDERS
 from gsbench.densify import Lineage
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.inputs import write_test_cameras, write_training_views
@@ -27,9 +26,9 @@ from gsbench.files import write_json
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.components import options_of
-from gsbench.pipeline.steps.train import TRAINING_FILE
 from gsbench.pipeline.steps.views import Views
-from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG
+from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG, TRAINING
+from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 from gsbench.runs.stages import EXTERNAL
 from gsbench.runs.step import Step
 from gsbench.system.machine import describe_machine
@@ -100,7 +99,7 @@ def external_step(
                 "command": [fill(word, values | placeless, "densify.command") for word in trainer.words],
             },
         }
-        write_json(folder / TRAINING_FILE, summary)
+        write_json(folder / TRAINING, summary)
 
     return Step(EXTERNAL, inputs, build)
 

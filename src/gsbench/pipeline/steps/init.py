@@ -7,7 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from gsbench.init.base import MODEL_FOLDER, Initializer
-from gsbench.logs import Report, progress
+from gsbench.logs import Progress, progress
 from gsbench.pipeline.components import options_of
 from gsbench.pipeline.steps.capture import split_of
 from gsbench.runs.stages import INIT
@@ -39,7 +39,7 @@ def init_step(store: Store, capture: Capture, initializer: Initializer, referenc
     return Step(INIT, inputs, build)
 
 
-def check_readable(capture: Capture, report: Report) -> None:
+def check_readable(capture: Capture, report: Progress) -> None:
     """Decode every photograph once, so that a damaged file is named before hours of work. Raises InputError."""
     with ThreadPoolExecutor(max_workers=available_threads()) as pool:
         for done, _ in enumerate(pool.map(lambda name: read_image(capture.images / name).shape, capture.image_names)):

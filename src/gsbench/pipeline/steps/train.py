@@ -21,17 +21,13 @@ from gsbench.logs import progress
 from gsbench.pipeline.components import options_of, rasterizer_inputs
 from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
-from gsbench.runs.layout import LINEAGE, POINT_CLOUD
+from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
 from gsbench.system.machine import describe_machine
 from gsbench.system.memory import peak_memory_mb, reset_peak_memory
-from gsbench.train.options import TrainConfig
+from gsbench.train.options import WITHOUT_EFFECT_ON_MODEL, TrainConfig
 from gsbench.train.trainer import Status, Trainer
-
-TRAINING_FILE = "training.json"
-# Options that cannot change the model.
-WITHOUT_EFFECT = ("name", "log_every", "checkpoint_every", "checkpoint_minutes", "volume_histogram")
 
 
 def train_step(
@@ -44,12 +40,13 @@ def train_step(
     snapshot_at: Sequence[int] = (),
 ) -> Step:
     """Train on the training views, from the cloud of the initialiser; keep the model at ``snapshot_at`` too."""
+    of_model = {key: value for key, value in dataclasses.asdict(options).items() if key not in WITHOUT_EFFECT_ON_MODEL}
     inputs: dict[str, Any] = {
         "scene": views.inputs,
         "init": views.init.key,
         "densify": options_of("densify", densifier),
         "raster": rasterizer_inputs(rasterizer),
-        "train": {key: value for key, value in dataclasses.asdict(options).items() if key not in WITHOUT_EFFECT},
+        "train": of_model,
         "seed": seed,
     }
     if snapshot_at:
@@ -81,7 +78,7 @@ def train_step(
             "peak_memory_mb": peak_memory_mb(device),
             "machine": describe_machine(device),
         }
-        write_json(folder / TRAINING_FILE, summary)
+        write_json(folder / TRAINING, summary)
 
     return Step(TRAIN, inputs, build)
 

@@ -8,6 +8,7 @@ from typing import Any
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.logs import progress
 from gsbench.pipeline.steps.capture import split_of
+from gsbench.runs.layout import VIEWS
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
 from gsbench.scene.load import load_scene
@@ -40,10 +41,10 @@ class Views:
             return load_scene(
                 self.capture,
                 self.store.path(self.init) / MODEL_FOLDER,
-                self.store.root / "views",
+                self.store.root / VIEWS,
                 downscale=self.options.downscale,
                 max_size=self.options.max_size,
                 resample=self.options.resample,
                 principal_point=self.options.principal_point,
-                progress=lambda done, total: report("views", done, total),
+                progress=report,
             )

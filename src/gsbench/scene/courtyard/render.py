@@ -6,7 +6,6 @@ for structure from motion beside the low-texture ground on which 3DGS grows over
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from math import cos, pi, radians, sin, tan
 from pathlib import Path
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.errors import InputError
+from gsbench.logs import Progress, no_progress
 from gsbench.scene.camera import Camera
 from gsbench.scene.courtyard.kernels import distances, render
 from gsbench.scene.courtyard.layout import Layout, build_layout
@@ -35,12 +35,12 @@ def render_courtyard(
     height: int = 300,
     seed: int = 0,
     threads: int = 2,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = no_progress,
 ) -> None:
     """Write the capture: ``output_dir/images/*.png`` and the exact COLMAP model ``output_dir/sparse/0`` without points.
 
-    ``width`` and ``height`` are in px. The same arguments give the same bytes, whatever ``threads`` is. ``progress`` is
-    called with (views done, all views). Raises `InputError` for fewer than 3 views or images below 16 px.
+    ``width`` and ``height`` are in px. The same arguments give the same bytes, whatever ``threads`` is. ``progress``
+    counts views. Raises `InputError` for fewer than 3 views or images below 16 px.
     """
     from gsbench.scene.colmap import write_model  # pycolmap is needed for writing alone
 
@@ -55,8 +55,7 @@ def render_courtyard(
 
     with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
         for done, _ in enumerate(pool.map(work, cameras.items()), start=1):
-            if progress is not None:
-                progress(done, views)
+            progress("courtyard", done, views)
     write_model(output_dir / "sparse" / "0", cameras)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from gsbench.pipeline.components import select_device
+from gsbench.train.device import select_device
 
 
 @pytest.fixture

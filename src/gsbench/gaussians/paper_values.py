@@ -1,0 +1,27 @@
+"""Values that papers and their code give, which several parts of gsbench take as defaults. Loads no torch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+VOLUME_THRESHOLD = 0.03  # V_th of the paper, in the units of its COLMAP models, cubed
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's learning rates; the defaults are those of the 2023 code of 3DGS (late-2024 code: 0.025 for opacity)."""
+
+    position_initial: float = 1.6e-4  # times the scene extent
+    position_final: float = 1.6e-6  # times the scene extent
+    position_steps: int = 30_000  # the position rate falls log-linearly over so many iterations
+    sh_dc: float = 2.5e-3
+    sh_rest: float = 2.5e-3 / 20
+    opacity: float = 0.05
+    scale: float = 5e-3
+    rotation: float = 1e-3
+
+    def position(self, step: int) -> float:
+        """The log-linear schedule, without the factor of the scene extent."""
+        t = min(max(step / self.position_steps, 0.0), 1.0)
+        return math.exp((1 - t) * math.log(self.position_initial) + t * math.log(self.position_final))

@@ -1,0 +1,49 @@
+"""A trial on its way from a command line to its results, with what is made of it on the way, each once.
+
+Loads no torch before a part is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gsbench.config.compose import Composed
+from gsbench.runs.trial_files import TrialPaths
+
+if TYPE_CHECKING:
+    from gsbench.pipeline.parts import Parts
+
+
+class Trial(Composed):
+    """A composed trial: it knows where its files lie, and keeps its parts from the first check until it has run."""
+
+    @classmethod
+    def of(cls, composed: Composed) -> Trial:
+        """The trial of a composition."""
+        return cls(composed.values, composed.yaml, composed.overrides, composed.job)
+
+    @cached_property
+    def paths(self) -> TrialPaths:
+        """Where its files lie."""
+        return TrialPaths.of(self.values)
+
+    @property
+    def folder(self) -> Path:
+        """The trial's own folder."""
+        return self.paths.folder
+
+    @cached_property
+    def parts(self) -> Parts:
+        """What its configuration describes, as objects."""
+        from gsbench.pipeline.parts import Parts
+
+        return Parts(self.values)
+
+
+def drop_parts(trials: Iterable[Trial]) -> None:
+    """Let go of the parts of trials that have run, or that another process runs: they hold memory."""
+    for trial in trials:
+        vars(trial).pop("parts", None)

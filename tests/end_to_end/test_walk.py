@@ -1,0 +1,103 @@
+"""How a setting travels: a trial is composed, built and checked once, and V_th takes few doors from YAML to rule.
+
+The way is what the call stacks say at the moments when the value is composed, checked and used: from one to the next,
+up to the frame that they share and down again. A crossing is a step from one folder of gsbench to another.
+"""
+
+from __future__ import annotations
+
+import inspect
+import itertools
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+
+import gsbench
+from gsbench import settings
+from gsbench.cli import run
+from gsbench.config import compose
+from gsbench.densify import Volumetric
+from gsbench.gaussians.trainable import TrainableGaussians
+from tests.end_to_end.conftest import SMALL
+
+PACKAGE = Path(gsbench.__file__).parent
+MAX_CROSSINGS = 18
+KEY = "densify.volume_threshold"
+TRIAL = [
+    *SMALL, "train.iterations=4", "train.densify_start=1", "train.densify_interval=2", "train.densify_stop=4",
+    "scene.views=9", "scene.width=48", "scene.height=36", "init.count=200", "raster=reference", "eval.lpips=[]",
+    "eval.flip=false", "eval.maps=false", "tracking=none", "device=cpu", "densify=volumetric", f"{KEY}=1e-9",
+]  # fmt: skip
+Frame = tuple[int, str]  # its identity while it lives, and its file below gsbench/
+
+
+def stack() -> list[Frame]:
+    """The living frames of gsbench, from the outermost in."""
+    frames = [(id(entry.frame), Path(entry.filename)) for entry in reversed(inspect.stack(0))]
+    return [(number, path.relative_to(PACKAGE).as_posix()) for number, path in frames if path.is_relative_to(PACKAGE)]
+
+
+def way(stacks: list[list[Frame]]) -> list[str]:
+    """The files that one passes from the end of each stack to the end of the next."""
+    passed = stacks[0][-1:]
+    for here, there in itertools.pairwise(stacks):
+        shared = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(here, there, strict=False)))
+        passed += [*reversed(here[max(0, shared - 1) : -1]), *there[shared:]]
+    return [file for file, _ in itertools.groupby(file for _, file in passed)]
+
+
+def crossings(files: list[str]) -> int:
+    """How often a way from ``conf/`` over these files leaves a folder below gsbench."""
+    folders = ["conf", *(file.partition("/")[0] for file in files)]
+    return sum(one != other for one, other in itertools.pairwise(folders))
+
+
+def test_a_way_is_counted_by_its_folders() -> None:
+    outer, inner = [(1, "app/a.py"), (2, "config/b.py")], [(1, "app/a.py"), (3, "app/c.py"), (4, "launch/d.py")]
+    assert way([outer, inner]) == ["config/b.py", "app/a.py", "app/c.py", "launch/d.py"]
+    assert crossings(way([outer, inner])) == 3  # conf, config, app, launch
+
+
+@pytest.mark.end_to_end
+def test_from_the_yaml_to_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stacks: list[list[Frame]] = []
+    calls: Counter[str] = Counter()
+
+    def watch(owner: Any, name: str, counts: Callable[..., bool] = lambda *given: True) -> None:
+        """Count the calls of ``owner.name`` whose arguments count, and note the stack at the first."""
+        real = getattr(owner, name)
+
+        def watched(*given: Any, **named: Any) -> Any:
+            if counts(*given):
+                calls[name] += 1
+                if calls[name] == 1:
+                    stacks.append(
+                        [*stack(), (0, Path(inspect.getfile(inspect.unwrap(real))).relative_to(PACKAGE).as_posix())]
+                    )
+            return real(*given, **named)
+
+        monkeypatch.setattr(owner, name, watched)
+
+    compositions = 0
+    compose_job = ConfigLoaderImpl.load_sweep_config
+
+    def counted(*given: Any) -> Any:
+        nonlocal compositions
+        compositions += 1
+        return compose_job(*given)
+
+    monkeypatch.setattr(ConfigLoaderImpl, "load_sweep_config", counted)
+    watch(compose, "settle")
+    watch(settings, "_converted", lambda value, field, cls, key: key == KEY)
+    watch(Volumetric, "split_by_volume")
+    watch(TrainableGaussians, "edit", lambda *given: calls["split_by_volume"] > 0)
+    assert run(["-m", *TRIAL, f"runs={tmp_path}"]) == 0
+    assert compositions == calls["settle"] == 1
+    assert calls["_converted"] == 1  # one build, one check
+    assert len(stacks) == 4
+    passed = way(stacks)
+    assert crossings(passed) <= MAX_CROSSINGS, "\n".join(passed)

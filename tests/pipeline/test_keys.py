@@ -1,0 +1,38 @@
+"""Under which keys the results of one known trial lie in the store: a key that moves throws stored results away."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gsbench.config.compose import compose_one
+from gsbench.pipeline.parts import Parts
+from gsbench.pipeline.steps import init as init_module
+from gsbench.pipeline.wiring import TrialSteps
+from gsbench.runs.hashing import config_hash
+from gsbench.runs.store import Store
+from gsbench.scene.types import Capture
+
+WORDS = [
+    "scene=garden", "scene.path=photos", "init=random", "densify=volumetric", "densify.volume_threshold=0.05",
+    "eval.lpips=[]", "eval.flip=false", "raster=cpu", "device=cpu", "threads=1", "seed=3",
+]  # fmt: skip
+BARE = Capture("garden", Path("photos"), ("a.jpg", "b.jpg", "c.jpg"), ("a.jpg",), None, False, "0" * 64)
+KEYS = [
+    ("config", "829d41d8682f8e0ab480d40763b896e350b8d976d9e067920f049be019c6b979"),
+    ("init", "974e9139210e7e6ef41a8ec7b4f58645d4493ac8e8a413880403cad374ed9df4"),  # of the cameras
+    ("init", "c37f77392d25080252dd1ef80d5eb8cf9e7441e0778f5fb3a9eb1e0285416a16"),
+    ("train", "aa6038a98a2ff7183f53d10888f73b82b5585a9135988124200c3fb32436918f"),
+    ("ground_truth", "ffebc31a202d233f2dd1c9af264a7e3e5cef988a8f4a5914c840336f97149d37"),
+    ("evaluate", "73dfdb288b4ddf8d4e3019e32fe31fb763cd68c9501deb160bf0ad61fab31de3"),
+]
+
+
+def test_the_keys_of_a_known_trial_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A photographs' trial without cameras: so the keys of the cameras that stand in for them are seen as well."""
+    monkeypatch.setattr(init_module, "version", lambda package: "4.0.0")
+    values = compose_one(WORDS).values
+    trial = TrialSteps(Parts(values), Store(tmp_path / "store"), lambda options, made: BARE)
+    keys = [("config", config_hash(values)), *((step.stage.name, step.key) for step in trial.steps())]
+    assert keys == KEYS
