@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from gsbench.config.trust import check_permissions
 from gsbench.densify import Densifier
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.metric import Metric
@@ -36,6 +37,7 @@ class Parts:
     """
 
     def __init__(self, values: dict[str, Any]) -> None:
+        check_permissions(values)  # whatever file they came from
         self.values = values
         self.seed: int = values["seed"]
         self._allowed: list[str] = values["allow_targets"]
