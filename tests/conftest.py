@@ -34,3 +34,10 @@ def shared_weights(shared: Path) -> Path:
     if not (shared / "weights").is_dir():
         pytest.skip(f"needs the weights in {shared / 'weights'}")
     return shared / "weights"
+
+
+@pytest.fixture(autouse=True)
+def _own_search_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The program, called within a test, tells its children where not to import from; not those of the next."""
+    monkeypatch.setenv("PYTHONSAFEPATH", "")  # so that it is known here, and put back at the end
+    monkeypatch.delenv("PYTHONSAFEPATH")

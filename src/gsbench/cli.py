@@ -14,7 +14,8 @@ from pathlib import Path
 from gsbench import __version__
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder
-from gsbench.logs import set_up_logging
+from gsbench.logs import printable_output, set_up_logging
+from gsbench.system.own_modules import SAFE_PATH
 from gsbench.verbs.table import VERBS
 from gsbench.words import closest
 
@@ -24,13 +25,16 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells count
 
 def main() -> None:
     """Entry point of the console script."""
-    sys.exit(run(sys.argv[1:]))
+    with printable_output():
+        code = run(sys.argv[1:])
+    sys.exit(code)
 
 
 def run(argv: list[str]) -> int:
     """Run the command line ``argv``; returns the exit code and prints errors as one line."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: its idle threads must not spin beside ours
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    os.environ.setdefault(*SAFE_PATH)  # for all Python processes that we start, whoever starts them for us
     set_up_logging()
     try:
         if argv and argv[0] in ("help", "--help", "-h"):

@@ -3,16 +3,56 @@
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Protocol, TextIO
+from typing import Any, Protocol, TextIO
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from gsbench.words import printable
+
 LOGGER = logging.getLogger("gsbench")
+
+
+class _Printable(logging.Formatter):
+    """What is logged may quote anybody's file or program; no terminal that shows it obeys it."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
+
+
+class PrintableStream:
+    """A text stream of the program's in which everything is `printable`; ``raw`` is the stream as it was."""
+
+    def __init__(self, raw: TextIO) -> None:
+        self.raw = raw
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.raw, name)
+
+    def write(self, text: str) -> int:
+        self.raw.write(printable(text))
+        return len(text)
+
+    def writelines(self, lines: Sequence[str]) -> None:
+        for line in lines:
+            self.write(line)
+
+
+@contextmanager
+def printable_output() -> Iterator[None]:
+    """Let what the block prints, and what the libraries that it calls print, be `printable`."""
+    out, err = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = PrintableStream(out), PrintableStream(err)
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = out, err
 
 
 class _People(logging.StreamHandler[TextIO]):
@@ -29,7 +69,7 @@ def set_up_logging() -> None:
     """Show what gsbench logs, from INFO on, on stderr."""
     if not LOGGER.handlers:
         handler = _People()
-        handler.setFormatter(logging.Formatter("%(message)s"))
+        handler.setFormatter(_Printable("%(message)s"))
         LOGGER.addHandler(handler)
         LOGGER.setLevel(logging.DEBUG)
         LOGGER.propagate = False
@@ -53,7 +93,7 @@ def log_to(path: Path) -> Iterator[None]:
     """Write everything that gsbench logs within the block, tracebacks included, to ``path`` as well."""
     handler = _QuietFileHandler(path, encoding="utf-8")
     handler.setLevel(logging.DEBUG)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    handler.setFormatter(_Printable("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     LOGGER.addHandler(handler)
     try:
         yield
@@ -84,7 +124,7 @@ class Report(Protocol):
 @contextmanager
 def progress(title: str) -> Iterator[Report]:
     """Show progress of the work called ``title`` while the block runs."""
-    console = Console(stderr=True)
+    console = Console(file=getattr(sys.stderr, "raw", sys.stderr))  # which may obey: it draws a bar
     if not console.is_terminal:
         yield _lines(title)
         return
@@ -94,7 +134,11 @@ def progress(title: str) -> Iterator[Report]:
 
         def report(phase: str, done: int, total: int | None, note: str = "") -> None:
             bar.update(
-                task, description=f"{title}: {phase}", completed=done, total=total, note=note or f"{done}/{total}"
+                task,
+                description=f"{title}: {phase}",
+                completed=done,
+                total=total,
+                note=escape(printable(note)) or f"{done}/{total}",
             )
 
         yield report

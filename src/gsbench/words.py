@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 MAX_NAMED = 3  # names that an error or warning lists before it only counts
+# What a terminal obeys in place of showing: control characters, but for line feed and tab; line separators; marks that
+# turn the direction of writing (UAX #9); halves of characters, which names of files may have.
+OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def counted(count: int, noun: str) -> str:
@@ -58,6 +62,16 @@ def is_path(value: str) -> bool:
         return value.strip() != "" and value.isprintable() and bool(Path(value).expanduser())
     except RuntimeError:
         return False
+
+
+def printable(text: str) -> str:
+    """``text`` with its control characters written out, so that a terminal shows them and obeys none.
+
+    Examples:
+        >>> printable("red \\x1b[31m")
+        'red \\\\x1b[31m'
+    """
+    return OBEYED.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text.replace("\r\n", "\n"))
 
 
 def some_of(names: Sequence[str]) -> str:

@@ -163,3 +163,18 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     assert run(["check", str(path)]) == 0
     assert ((home / "claims.md").read_text(), (home / "claims.html").read_text()) == first
     assert read_plans(home) == [plan]
+
+
+@pytest.mark.parametrize("key", ["allow_targets", "+allow_targets"])
+def test_a_file_of_claims_allows_no_code(tmp_path: Path, key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stranger's claims may name a class; only the one who types may let it run."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "stranger.py").write_text("from gsbench.densify import ADC\n\n\nclass Mine(ADC):\n    pass\n")
+    with pytest.raises(InputError, match=r"no file can allow code to run: type allow_targets=\[…\]"):
+        parse_claims(content() | {"settings": {key: ["stranger"]}})
+    arms = {"adc": None, "volumetric": {"densify": "adc", "densify._target_": "stranger.Mine", "densify.name": "mine"}}
+    file = parse_claims(content() | {"arms": arms})
+    with pytest.raises(InputError, match=r"stranger\.Mine is not gsbench's own"):
+        prepare(file, tmp_path, lambda trial, metric: "")
+    check = prepare(file, tmp_path, lambda trial, metric: "", ["allow_targets=[stranger]"])
+    assert check.trials(check.questions, 1)[1].values["densify"]["_target_"] == "stranger.Mine"

@@ -43,14 +43,13 @@ class Note(Callback):
 """
 EXPERIMENT = """# @package _global_
 name: ${hydra:job.name}-${hydra:runtime.choices.densify}
-allow_targets: [notes]
 hydra:
   mode: MULTIRUN
   verbose: true
   output_subdir: hydra
   job:
     env_set:
-      GSBENCH_NOTE: set
+      OMP_NUM_THREADS: "1"
   sweep:
     dir: of_hydra
     subdir: ${hydra.job.num}
@@ -73,7 +72,7 @@ def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path, launc
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     (tmp_path / "conf" / "experiment" / "own.yaml").write_text(EXPERIMENT)
     (tmp_path / "notes.py").write_text(CALLBACK)
-    words = ["--config-dir", "conf", "+experiment=own", *TINY, f"launch={launch}"]
+    words = ["--config-dir", "conf", "+experiment=own", *TINY, f"launch={launch}", "allow_targets=[notes]"]
     listed = gsbench(*words, "--dry-run", GSBENCH_RUNS="runs", timeout=SECONDS)
     assert "2 trials: 2 missing" in listed.stdout, listed.stderr
     assert not (tmp_path / "notes.txt").exists()  # where nothing runs, no callback is called
@@ -111,6 +110,22 @@ def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, launc
     written = [path.stat().st_mtime_ns for path in results]
     assert gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS).returncode == 0
     assert [path.stat().st_mtime_ns for path in results] == written  # nothing is done twice
+
+
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+def test_a_callback_of_yours_is_found_in_the_processes_of_another_launcher(
+    gsbench: Run, tmp_path: Path, launcher: str
+) -> None:
+    package = f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher"
+    if find_spec(package) is None:
+        pytest.skip(f"needs {package} (extra dev)")
+    (tmp_path / "notes.py").write_text(CALLBACK)
+    own = ["+hydra.callbacks.note={_target_: notes.Note, path: notes.txt}", "allow_targets=[notes]"]
+    words = ["-m", *TINY, f"hydra/launcher={launcher}", "name=x", "seed=0,1", *own]
+    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
+    assert done.returncode == 0, done.stderr
+    notes = (tmp_path / "notes.txt").read_text().splitlines()
+    assert {"sweep begins", "0 begins with seed 0", "1 begins with seed 1", "sweep ends"} <= set(notes)
 
 
 def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(gsbench: Run, tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def test_placeholders() -> None:
 
 
 def test_yaml_of_the_original_code_hands_our_schedule_on() -> None:
-    words = ["densify=external/3dgs", "densify.options.code=/code", "densify.version='1'", "allow_targets=[python]"]
+    words = ["densify=external/3dgs", "densify.options.code=/code", "densify.version='1'", "allow_targets=[python,git]"]
     command = composed(*words, "train=paper", "train.densify_stop=9000")["densify"]["command"]
     assert str(command[command.index("--densify_until_iter") + 1]) == "9000"
     assert str(command[command.index("--opacity_lr") + 1]) == "0.05"

@@ -16,7 +16,7 @@ from gsbench.app.command import launch, run_trials
 from gsbench.app.hydra_app import compose_trials
 from gsbench.config.command_words import GROUPS, options, parse
 from gsbench.config.compose import Composed, compose_one
-from gsbench.config.schema import check_target
+from gsbench.config.trust import check_target
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError, explain_storage
 from gsbench.launch import serial
@@ -99,7 +99,7 @@ def experiment(name: str) -> list[Composed]:
     return compose_trials([f"+experiment={name}"])
 
 
-PROGRAM = ["densify.version=1.0", "allow_targets=[mine,python,brush,opensplat,bash]"]
+PROGRAM = ["densify.version=1.0", "allow_targets=[mine,python,git,brush,opensplat,bash]"]
 WITH_CODE = [*PROGRAM, "densify.options.code=/code"]
 NEEDED = {  # what a YAML leaves to its user
     ("train", "none"): ["densify=none"],
@@ -241,7 +241,7 @@ def test_own_and_allowed_targets_pass() -> None:
     check_target("mine.sub.Class", "densify", ["mine"])
     check_target("mine.sub.Class", "densify", ["mine."])
     check_target("mine.sub.Class", "densify", ["mine.sub.Class"])
-    with pytest.raises(InputError, match=r"allow_targets=\[minefield\]"):
+    with pytest.raises(InputError, match=r"allow_targets=\[mine,minefield\]"):
         check_target("minefield.Class", "densify", ["mine"])
 
 

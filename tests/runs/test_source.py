@@ -56,6 +56,7 @@ def test_own_classes_are_found_at_any_depth(own: Path) -> None:
 
 def test_the_file_of_another_folder_is_found_whatever_this_process_has_imported(own: Path, tmp_path: Path) -> None:
     importlib.import_module("own_code")
+    sys.path.remove(str(tmp_path))  # what Python itself finds is found first
     other = tmp_path / "elsewhere"
     (other / "inner").mkdir(parents=True)
     for place in (other / "own_code.py", other / "inner" / "own_code.py"):

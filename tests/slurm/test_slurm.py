@@ -180,7 +180,7 @@ def test_submitted_and_left_status_and_retry_do_the_rest(place: Path, environmen
     assert listing.returncode == 1
     assert "it is broken" in listing.stdout
     (place / "broken").unlink()
-    again = gsbench(place, environment, "retry", "cluster")
+    again = gsbench(place, environment, "retry", "cluster", "allow_targets=[slow]")
     assert again.returncode == 0, again.stderr
     assert re.fullmatch(r"Slurm job \d+: 1 trial; see gsbench status cluster\n", again.stdout)
     assert again.stdout.split()[2].rstrip(":") != array
@@ -197,7 +197,8 @@ def test_job_that_was_cancelled_is_missing_and_can_be_run_elsewhere(place: Path,
     subprocess.run(["scancel", job], check=True)
     wait_for_states(place, environment, slow="missing")
     assert f"Slurm job {job} has ended, log: " in gsbench(place, environment, "status", "cluster").stdout
-    again = gsbench(place, environment, "retry", "cluster", "launch=serial")  # which knows no launch.wait
+    words = ["launch=serial", "allow_targets=[slow]"]  # which knows no launch.wait
+    again = gsbench(place, environment, "retry", "cluster", *words)
     assert again.returncode == 0, again.stderr
     assert states(place, environment) == {"slow": "done"}
 

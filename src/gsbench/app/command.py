@@ -15,7 +15,6 @@ from gsbench.launch.batch import run_batch
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.plan import describe_plan
 from gsbench.launch.preflight import check_components, missing_folders, need_no_check
-from gsbench.runs.source import import_from_here
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +24,6 @@ def launch(argv: list[str]) -> int:
 
     Raises InputError for a configuration that does not compose or hold together, and for a single trial's bad input.
     """
-    import_from_here()
     words, multirun, dry_run = parse(argv)
     task = Task(list_trials, look_only=True) if dry_run else Task(run_batch)
     run_app(words, multirun, task)

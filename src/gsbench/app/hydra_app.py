@@ -13,19 +13,17 @@ from collections.abc import Sequence
 from hydra._internal.callbacks import Callbacks
 from hydra.core.plugins import Plugins
 from hydra.types import HydraContext, RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from gsbench.app.grids import grids_aside
 from gsbench.app.task import OWN, StopAfterListing, Task
 from gsbench.config.command_words import check_words, is_sweep
 from gsbench.config.compose import Composed, compose_master, composing, explained, ready_trial
+from gsbench.config.hydra_guard import load_callbacks
 from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, start, words_of
-from gsbench.config.schema import check_target
 from gsbench.errors import InputError
 from gsbench.launch.outcome import Outcome
 from gsbench.logs import show_details
-
-HYDRAS_CALLBACKS = "hydra.experimental.callbacks"
 
 
 def run_app(words: Sequence[str], multirun: bool, task: Task) -> None:
@@ -44,6 +42,8 @@ def run_app(words: Sequence[str], multirun: bool, task: Task) -> None:
             _check(master, multirun, task.look_only)
         show_details(master.hydra.verbose)
         with explained(words):  # a callback that cannot be made
+            if not task.look_only:
+                load_callbacks(master)
             context = HydraContext(hydra.config_loader, Callbacks(None if task.look_only else master))
         try:
             (_multirun if multirun else _run)(context, start(master, RunMode(1 + multirun)), words, task)
@@ -89,10 +89,6 @@ def _check(master: DictConfig, multirun: bool, look_only: bool) -> None:
             "hydra.job.chdir=true: trials run where the command was given, from where paths are meant; "
             "${hydra:runtime.output_dir} names Hydra's folder"
         )
-    for group in ("hydra/job_logging", "hydra/hydra_logging"):
-        if choices[group] != "none":
-            reason = f"gsbench does not read {group}: log.txt in a trial's folder holds everything"
-            raise InputError(f"{group}={choices[group]}: {reason}")
     if not multirun and hydra.mode is None and (hydra.sweeper.get("params") or hydra.sweeper.get("grids")):
         raise InputError("hydra.sweeper lists values: add -m to run a trial for each, or hydra.mode=RUN for one")
     if not multirun and launcher != OWN:
@@ -103,6 +99,3 @@ def _check(master: DictConfig, multirun: bool, look_only: bool) -> None:
         raise InputError(f"hydra/sweeper={sweeper} does not say beforehand what hydra/launcher={launcher} will run")
     if sweeper != OWN and not master.launch.wait:
         raise InputError(f"hydra/sweeper={sweeper} learns from results, so launch.wait must be true")
-    allowed = [HYDRAS_CALLBACKS, *master.allow_targets]
-    for name, callback in (hydra.callbacks or {}).items():
-        check_target(OmegaConf.select(callback, "_target_"), f"hydra.callbacks.{name}", allowed)

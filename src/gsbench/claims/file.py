@@ -43,6 +43,7 @@ from gsbench.words import closest
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,60}")
 KEY = re.compile(r"[+]?\w+([./]\w+)*")  # of a setting
+PERMISSIONS = "allow_targets"
 GIVEN_BY_CHECK = ("name", "seed", "runs", "eval.primary")  # settings that the plan sets by itself
 UNTOUCHED = ("says", "where")  # of a claim: words that may be mended without another plan
 NO_SIZE = "the whole of a claim hangs on it: 0.005, or 10% of the baseline's value"
@@ -250,8 +251,10 @@ def _check_settings(settings: Mapping[str, Any], where: str) -> None:
     for key, value in settings.items():
         if not isinstance(key, str) or not KEY.fullmatch(key):
             raise InputError(f"{where}: {key!r} is no setting such as scene.max_size")
-        if key in GIVEN_BY_CHECK:
+        if key.lstrip("+~") in GIVEN_BY_CHECK:
             raise InputError(f"{where}: {key} is set by the plan itself: leave it out")
+        if key.lstrip("+~") == PERMISSIONS:
+            raise InputError(f"{where}: no file can allow code to run: type {PERMISSIONS}=[…] after the file's name")
         if isinstance(value, dict):
             raise InputError(f"{where}.{key} must be one value: write nested settings with dots, as {key}.NAME: …")
 

@@ -117,8 +117,10 @@ class Check:
         return found
 
 
-def prepare(file: ClaimsFile, runs: Path, lacking: Lacking) -> Check:
+def prepare(file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequence[str] = ()) -> Check:
     """Compose the first trial of every scene and arm of every claim; ``lacking`` says what cannot be had here.
+
+    ``permissions`` are words such as ``allow_targets=[mine]`` that were typed: a file of claims can give none.
 
     Raises InputError, naming claim, scene and arm, for settings that do not compose.
     """
@@ -131,7 +133,7 @@ def prepare(file: ClaimsFile, runs: Path, lacking: Lacking) -> Check:
         for scene in () if claim.not_testable else file.scenes_of(claim):
             reason = ""
             for arm in (claim.baseline, claim.arm):
-                words = (*file.words(claim, scene, arm), f"name={file.name}", "seed=0")
+                words = (*file.words(claim, scene, arm), f"name={file.name}", "seed=0", *permissions)
                 if words not in known:
                     known[words] = _composed(words, runs, f"claim {claim.id}, scene {scene}, arm {arm}")
                 first[claim.id, scene, arm] = known[words]

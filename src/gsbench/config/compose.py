@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -17,12 +18,14 @@ from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gsbench.config.command_words import GROUPS, check_words, is_sweep, options
+from gsbench.config.hydra_guard import GuardedLoader, typed_permissions
 from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, number_job, words_of
 from gsbench.config.old_names import know_old_names
 from gsbench.config.schema import Config, check, check_values, plain, register_schemas
 from gsbench.errors import InputError
 from gsbench.settings import checked
 from gsbench.system.install import conf_dir
+from gsbench.system.own_modules import import_only
 from gsbench.words import closest
 
 MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood
@@ -56,16 +59,28 @@ def composing() -> Iterator[Hydra]:
             hydra = GlobalHydra.instance().hydra
             assert hydra is not None
             know_old_names(hydra.config_loader)
+            _guard(hydra)
             yield hydra
     finally:
         HydraConfig.instance().cfg = None
 
 
 def compose_master(hydra: Hydra, words: Sequence[str], mode: RunMode = RunMode.RUN) -> DictConfig:
-    """What Hydra makes of ``words``, with its own settings in the node ``hydra``. Raises InputError, one line."""
+    """What Hydra makes of ``words``, with its own settings in the node ``hydra``. Raises InputError, one line.
+
+    From here on the modules are found that ``words`` allow: they are what somebody has typed.
+    """
+    _guard(hydra, words)
     with explained(words), warnings.catch_warnings():
         warnings.filterwarnings("error", message=r".* is not available\.", module="hydra")  # a folder to search in
         return hydra.compose_config(CONFIG_NAME, list(words), run_mode=mode)
+
+
+def _guard(hydra: Hydra, words: Sequence[str] = ()) -> None:
+    """Let ``hydra`` compose only what cannot make anything run that ``words`` do not allow."""
+    allowed, path = typed_permissions(words), hydra.config_loader.get_search_path()
+    hydra.config_loader = GuardedLoader(path, allowed, os.getcwd())
+    import_only(allowed)
 
 
 def compose_jobs(

@@ -19,19 +19,16 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
+from gsbench.config.trust import check_permissions, is_external
 from gsbench.errors import InputError
 from gsbench.eval.options import EvalConfig
-from gsbench.external.placeholders import program_of
 from gsbench.raster.options import RasterConfig
 from gsbench.runs.layout import IN_RUNS
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import MISSING, Address, FolderName, PathName, TargetName, check_settings, checked, is_folder_name
 from gsbench.train.options import TrainConfig
-from gsbench.words import closest
 
-ALLOWED_TARGETS = ("gsbench.",)  # a ``_target_`` is code: only these prefixes, and those in ``allow_targets``
 NO_DENSIFIER = "gsbench.densify.NoDensifier"
-EXTERNAL = "gsbench.densify.External"  # another program trains
 MAX_SEED = 2**63 - 1  # torch's generators take no larger one
 
 
@@ -108,7 +105,7 @@ class Config:
     device: DeviceName = "auto"
     threads: PositiveInt | Literal["auto"] = "auto"
     runs: PathName = MISSING
-    allow_targets: list[str] = field(default_factory=list)  # further prefixes for _target_
+    allow_targets: list[str] = field(default_factory=list)  # what the command line allows to run; no file can say it
     scene: SceneConfig = field(default_factory=SceneConfig)
     init: Any = MISSING
     densify: Any = MISSING
@@ -176,12 +173,9 @@ def check(config: DictConfig) -> None:
         raise InputError(f"eval.at names iteration {late[0]}, and train.iterations is {config.train.iterations}")
     if config.train.iterations == 0 and config.densify.get("_target_") != NO_DENSIFIER:
         raise InputError("train.iterations=0 trains nothing, so nothing grows: add densify=none")
-    if config.densify.get("_target_") == EXTERNAL:
+    if is_external(config.densify):
         check_external(config)
-    for group in (*COMPONENTS, *(["raster"] if config.raster._target_ is not None else [])):
-        check_target(config[group].get("_target_"), group, config.allow_targets)
-    for name, options in config.eval.extra.items():
-        check_target(options["_target_"], f"eval.extra.{name}", config.allow_targets)
+    check_permissions(plain(config))
 
 
 def require_values(values: Mapping[str, Any], group: str) -> None:
@@ -225,33 +219,14 @@ def _convert(node: DictConfig, schema: type, given: Mapping[str, Any], group: st
             node[key] = value
 
 
-def check_target(target: str | None, group: str, allowed: list[str]) -> None:
-    """Refuse a ``_target_`` outside gsbench and the prefixes that the user allowed: importing it would run its code."""
-    if not target:
-        raise InputError(f"{group} names no _target_: the class to use")
-    if not any(
-        target == prefix or target.startswith(prefix.rstrip(".") + ".") for prefix in (*ALLOWED_TARGETS, *allowed)
-    ):
-        prefix = target.split(".")[0]
-        raise InputError(
-            f"{group}._target_={target} is not gsbench's own{closest(prefix, allowed)}; if you trust that code, "
-            f"add allow_targets=[{prefix}]"
-        )
-
-
 def check_external(config: DictConfig) -> None:
-    """What another program can be asked for, and whether the user allowed it to run."""
+    """What another program can be asked for."""
     settings = _group(config, "densify")
     require_values(settings, "densify")
     if config.eval.at:
         raise InputError("eval.at: another program's model is seen at its end only: leave eval.at empty")
     if config.train.max_seconds is not None:
         raise InputError("train.max_seconds: another program cannot be stopped early: give it fewer train.iterations")
-    program = program_of(settings["command"], settings["options"] or {})
-    if program not in config.allow_targets:
-        raise InputError(
-            f"densify={settings['name']} runs the program {program!r}; if you trust it, add allow_targets=[{program}]"
-        )
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

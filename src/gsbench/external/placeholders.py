@@ -24,9 +24,9 @@ def words_of(command: Command, key: str) -> list[str]:
     return words
 
 
-def program_of(command: Command, options: Mapping[str, object]) -> str:
-    """The program that the setting ``densify.command`` runs: its first word, in which ``options`` may stand."""
-    return fill(words_of(command, "densify.command")[0], options, "densify.command")
+def program_of(command: Command, options: Mapping[str, object], key: str = "densify.command") -> str:
+    """The program that the setting ``key`` runs: its first word, in which ``options`` may stand."""
+    return fill(words_of(command, key)[0], options, key)
 
 
 def names_in(texts: Iterable[str]) -> set[str]:

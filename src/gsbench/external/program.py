@@ -1,4 +1,4 @@
-"""Another program, run to its end or to a limit of time: in a process group of its own, of which nothing is left."""
+"""Another program, run to its end or to a limit of time, of which nothing is left running."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def run_program(
 ) -> Ended:
     """Run ``command`` in ``folder`` with ``environment``, its output in the file ``log``; ``limit`` is in seconds.
 
-    Its process group ends with it, with the limit, and with gsbench, however that ends. Raises `TrainingError`, with
-    the last words of the log, unless the program ends well and in time.
+    All that it started ends with it, with the limit, and with gsbench, however that ends; daemons do so on Linux.
+    Raises `TrainingError`, with the last words of the log, unless the program ends well and in time.
     """
     name = Path(command[0]).name
     try:
@@ -79,7 +79,7 @@ def watch(command: Sequence[str], folder: Path, environment: Mapping[str, str], 
 def _stop(program: subprocess.Popen[bytes]) -> int:
     """Ask the whole group to end; who does not heed it is killed when this process has ended."""
     if hasattr(os, "killpg"):
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # this process is of the group
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # this process is of the group, and so is its supervisor
         os.killpg(0, signal.SIGTERM)
     else:
         program.terminate()

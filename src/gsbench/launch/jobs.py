@@ -26,6 +26,7 @@ from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.queue import forget_submission
 from gsbench.runs.trial_files import TrialPaths, find_finished
 from gsbench.system.install import install_command
+from gsbench.system.own_modules import import_only, importable
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
 from gsbench.system.stopping import Stopped, stop_on_signals
 
@@ -46,11 +47,13 @@ class TrialJob:
     values: dict[str, Any]
     yaml: str
     path: list[str]  # sys.path of the submitting process
+    own: tuple[list[str], str]  # the user's modules that it may import, and where they lie
     visible_gpus: str | None  # its CUDA_VISIBLE_DEVICES
     job: HydraJob | None = None
 
     def __call__(self) -> Outcome:
         sys.path[:] = [*self.path, *(entry for entry in sys.path if entry not in self.path)]
+        import_only(*self.own)
         from gsbench.logs import set_up_logging
 
         set_up_logging()
@@ -137,7 +140,11 @@ def collect(job: Job[Outcome], folder: Path, trials: Sequence[Composed]) -> Outc
     if finished is not None:
         return outcome_of_results(folder, finished)
     if job.paths.result_pickle.exists():
-        kind, value = pickle.loads(job.paths.result_pickle.read_bytes())  # submitit's own reader would ask sacct first
+        try:
+            kind, value = _read_result(job.paths.result_pickle)
+        except Exception as error:  # noqa: BLE001 - a damaged pickle raises many kinds
+            reason = f"what it returned cannot be read ({error})"
+            return Outcome(folder, "failed", f"{reason}; log: {job.paths.stderr}")
         if isinstance(value, Outcome):
             return value
         last = str(value).strip().splitlines()[-1] if str(value).strip() else kind
@@ -147,11 +154,29 @@ def collect(job: Job[Outcome], folder: Path, trials: Sequence[Composed]) -> Outc
     )
 
 
+def _read_result(path: Path) -> tuple[str, Any]:
+    """What submitit wrote when a job ended; its own reader would ask Slurm first, and run what the file names."""
+    with path.open("rb") as stream:
+        kind, value = _Outcomes(stream).load()
+    return kind, value
+
+
+class _Outcomes(pickle.Unpickler):
+    """Reads what a job returned: its file lies in the runs folder, which may be somebody else's."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) == (Outcome.__module__, Outcome.__qualname__):
+            return Outcome
+        if module.partition(".")[0] == "pathlib" and name in ("PosixPath", "WindowsPath"):
+            return Path
+        raise pickle.UnpicklingError(f"a job's result holds {module}.{name}")
+
+
 def job_of(trial: Composed) -> TrialJob:
     """The trial as a job of the environment that this process has."""
     job = None if trial.job is None else trial.job.for_another_process()
     path = [entry for entry in sys.path if entry]
-    return TrialJob(trial.values, trial.yaml, path, os.environ.get("CUDA_VISIBLE_DEVICES"), job)
+    return TrialJob(trial.values, trial.yaml, path, importable(), os.environ.get("CUDA_VISIBLE_DEVICES"), job)
 
 
 def prepare_tracking(values: dict[str, Any]) -> None:

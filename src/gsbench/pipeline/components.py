@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import inspect
 import logging
 from collections.abc import Mapping
@@ -13,7 +12,8 @@ from typing import Any
 
 import torch
 
-from gsbench.config.schema import ALLOWED_TARGETS, EXTERNAL, check_target, require_values
+from gsbench.config.schema import require_values
+from gsbench.config.trust import EXTERNAL, check_program, check_target, homes_of, load_class, targets_in
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import facts_of
@@ -23,7 +23,7 @@ from gsbench.eval.protocol import get_protocol
 from gsbench.external.settings import External
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.runs.hashing import WITHOUT_EFFECT
-from gsbench.runs.source import has_changed_since_import, source_of
+from gsbench.runs.source import OWN, has_changed_since_import, source_of
 from gsbench.settings import checked, unknown_setting
 
 log = logging.getLogger(__name__)
@@ -45,15 +45,18 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     against the annotations. Raises InputError naming the key that is unknown or wrong.
     """
     target = values["_target_"]
-    check_target(target, group, allow_targets)
-    cls = locate(target, group)
+    for place, named in targets_in(values, tuple(group.split("."))):
+        check_target(named, ".".join(place), allow_targets, homes_of(place))
+    cls = locate(target, group, allow_targets)
+    if cls is External:
+        check_program(values, allow_targets)
     require_values(values, group)
     options = {key: value for key, value in values.items() if key not in RESERVED}
     if dataclasses.is_dataclass(cls):
         options = checked(cls, options, group)
     else:
         _check_names(cls, options, group)
-    if options and not dataclasses.is_dataclass(cls) and not target.startswith(ALLOWED_TARGETS):
+    if options and not dataclasses.is_dataclass(cls) and not target.startswith(OWN):
         raise InputError(
             f"{group}._target_={target} has options but is no dataclass: make it one, so that results are stored under "
             "their values"
@@ -65,7 +68,7 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     except (TypeError, ValueError) as error:
         raise InputError(f"{group}: {error}") from error
     except Exception as error:  # a user's class may raise anything
-        if target.startswith(ALLOWED_TARGETS):
+        if target.startswith(OWN):
             raise
         raise InputError(f"{group}: {target} cannot be made ({type(error).__name__}: {error})") from error
 
@@ -116,7 +119,7 @@ def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str,
 
 def rasterizer_inputs(rasterizer: Rasterizer) -> str | dict[str, Any]:
     """The rasterizer as it enters a stage's key: gsbench's own by name, a user's by class, source and options."""
-    if f"{type(rasterizer).__module__}.".startswith(ALLOWED_TARGETS):
+    if f"{type(rasterizer).__module__}.".startswith(OWN):
         return rasterizer.name
     return {"name": rasterizer.name} | options_of("raster", rasterizer)
 
@@ -131,17 +134,14 @@ def _check_names(cls: Any, options: dict[str, Any], group: str) -> None:
             raise InputError(unknown_setting(f"{group}.{key}", key, parameters))
 
 
-def locate(target: str, group: str) -> type:
+def locate(target: str, group: str, allow_targets: list[str]) -> type:
     """The class at the import path ``package.module.Class``, which must be one that ``group`` can use."""
-    module, _, name = MOVED.get(target, target).rpartition(".")
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except Exception as error:  # importing a user's file runs it: it may raise anything
-        raise InputError(f"{group}._target_={target} cannot be imported ({type(error).__name__}: {error})") from error
+    found = load_class(MOVED.get(target, target), group, allow_targets)
     methods = () if found is External else METHODS[group.partition(".")[0]]
     lacking = [method for method in methods if not callable(getattr(found, method, None))]
     if not isinstance(found, type) or lacking:
-        raise InputError(f"{group}._target_={target} is not a class for {group}: it has no {', '.join(lacking)}()")
+        without = f": it has no {', '.join(lacking)}()" if lacking else ""
+        raise InputError(f"{group}._target_={target} is not a class for {group}{without}")
     if has_changed_since_import(target):  # the first call also notes the file as it is now, while it is what runs
         log.warning("the file of %s has changed since it was imported: this process goes on with what it was", target)
     return found

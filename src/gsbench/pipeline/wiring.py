@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from gsbench.config.trust import check_permissions
 from gsbench.densify import Densifier
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.metric import Metric
@@ -65,6 +66,7 @@ class Parts:
     @classmethod
     def of(cls, values: dict[str, Any]) -> Parts:
         """The parts of the trial with the resolved configuration ``values``. Raises InputError naming a wrong key."""
+        check_permissions(values)
         device = select_device(values["device"])
         threads = available_threads(values["launch"]["parallel"]) if values["threads"] == "auto" else values["threads"]
         densifier = build("densify", values["densify"], values["allow_targets"])

@@ -12,6 +12,7 @@ import torch
 
 from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import compose_one
+from gsbench.config.hydra_guard import PERMISSIONS, typed_permissions
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize
 from gsbench.eval.facts import METRICS
@@ -24,6 +25,7 @@ from gsbench.pipeline.components import build_metrics, make_evaluator, select_de
 from gsbench.renders.import_renders import check_place, enter, find_place
 from gsbench.renders.reference_images import Truth, find_truth, truth_of_trial
 from gsbench.scene.readers import list_images
+from gsbench.system.own_modules import import_only
 from gsbench.system.resources import available_threads
 from gsbench.words import counted, some_of
 
@@ -57,7 +59,7 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
 
 def _truth(options: argparse.Namespace, runs: Path) -> Truth:
     """The photographs; a scene that the experiment of ``--as`` has trials of is taken as these saw it."""
-    others = [word for word in options.settings if not word.startswith("eval")]
+    others = [word for word in options.settings if not word.startswith(("eval", f"{PERMISSIONS}="))]
     experiment = runs / (options.place or "").partition(":")[0]
     if not others and options.place and not Path(options.truth).is_dir() and experiment.is_dir():
         trials = [trial for trial in read_experiment(experiment).trials if not trial.from_renders]
@@ -76,11 +78,13 @@ def _match(truth: Truth, renders: Sequence[str], by_order: bool) -> Matching:
 
 def _evaluator(truth: Truth, protocol: str | None, settings: Sequence[str]) -> Evaluator:
     """As the settings of the photographs' trial or scene say, unless the command says otherwise."""
+    allowed = typed_permissions([word for word in settings if word.startswith(f"{PERMISSIONS}=")])
+    import_only(allowed)
     config: Mapping[str, Any] = truth.config
     if any(word.startswith("eval") for word in settings):
-        config = compose_one([word for word in settings if word.startswith(("eval", "allow_targets"))]).values
+        config = compose_one([word for word in settings if word.startswith(("eval", f"{PERMISSIONS}="))]).values
     chosen = dict(config["eval"]) | ({} if protocol is None else {"protocol": protocol})
-    own = build_metrics(chosen, config.get("allow_targets", []))
+    own = build_metrics(chosen, list(allowed))
     return make_evaluator(EvalConfig(**chosen), select_device(config.get("device", "auto")), own)
 
 

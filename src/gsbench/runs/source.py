@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 import importlib
 import importlib.util
-import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,6 @@ OWN = "gsbench."  # classes below it have no hash: versions of gsbench's stages 
 SHOWN = 8  # characters of a hash that people see
 
 _as_imported: dict[str, tuple[ModuleSpec, str]] = {}  # the hash that a module's file had when it was imported
-
-
-def import_from_here() -> None:
-    """Let Python find modules in the current folder: a user's own class lies beside the user."""
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
 
 
 def source_of(target: str) -> dict[str, str]:
@@ -57,14 +50,7 @@ def source_on_disk(target: str, folder: str) -> str | None:
     What this process has imported under that name, perhaps from elsewhere, does not count.
     """
     importlib.invalidate_caches()  # the file may be younger than what a finder remembers of its folder
-    names, path, spec = target.split(".")[:-1], [folder, *sys.path], None
-    for depth in range(1, len(names) + 1):
-        name = ".".join(names[:depth])
-        found = (finder.find_spec(name, path, None) for finder in sys.meta_path)
-        spec = next((one for one in found if one is not None), None)
-        if spec is None:
-            return None
-        path = list(spec.submodule_search_locations or [])
+    spec = _find(target.split(".")[:-1], [*sys.path, folder])
     return _hash(spec.origin) if spec and spec.origin and Path(spec.origin).is_file() else None
 
 
@@ -89,8 +75,19 @@ def _hash(path: str) -> str:
 
 
 def _spec(target: str) -> ModuleSpec | None:
-    """Where Python finds, or has found, the module of a class."""
-    try:
-        return importlib.util.find_spec(target.rpartition(".")[0])
-    except (ImportError, ValueError):
-        return None
+    """Where Python finds, or has found, the module of a class. Imports nothing, no package above it either."""
+    module = target.rpartition(".")[0]
+    loaded = sys.modules.get(module)
+    return _find(module.split(".")) if loaded is None else loaded.__spec__
+
+
+def _find(names: Sequence[str], path: list[str] | None = None) -> ModuleSpec | None:
+    """The module of a dotted name, looked for from ``path`` on (default: where Python looks)."""
+    spec = None
+    for depth in range(1, len(names) + 1):
+        found = (finder.find_spec(".".join(names[:depth]), path, None) for finder in sys.meta_path)
+        spec = next((one for one in found if one is not None), None)
+        if spec is None:
+            return None
+        path = list(spec.submodule_search_locations or [])
+    return spec

@@ -74,14 +74,14 @@ def state_of(folder: Path) -> State:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """The configuration that a trial wrote; raises InputError where it cannot be read."""
+    """The configuration that a trial wrote, which allows nothing to run; raises InputError where it cannot be read."""
     try:
         values = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError) as error:
         raise InputError(f"{folder / CONFIG} cannot be read ({error})") from error
     if not isinstance(values, dict) or not isinstance(values.get("tracking"), dict):
         raise InputError(f"{folder / CONFIG} is not the configuration of a trial")
-    return values
+    return values | {"allow_targets": []}  # permission comes from the one who types
 
 
 def failure_of(folder: Path) -> str:

@@ -3,7 +3,8 @@
 The child is a fresh interpreter (never a fork, so no threads or locks are inherited) that imports only what the
 function needs: the parent's ``__main__`` is not imported again, so it works alike from a console script, a notebook,
 pytest and Hydra. The child, and every program that it started, ends when the parent does, even when the parent is
-killed; no such program outlives the function.
+killed; no such program outlives the function. On Linux that holds for daemons too; on other systems a program that
+begins a session of its own gets away (`gsbench.system.supervise`).
 """
 
 from __future__ import annotations
@@ -24,12 +25,17 @@ from pathlib import Path
 from typing import Any, BinaryIO, ParamSpec, TypeVar
 
 from gsbench.errors import GsbenchError
+from gsbench.system.own_modules import importable
+from gsbench.system.supervise import go_on_as_child
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_BOOTSTRAP = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from {module} import {name}; {name}()"
-_SECONDS_TO_END = 5.0  # patience with a child that was asked to end, before it is killed
+_BOOTSTRAP = (
+    "import json, sys; path, own = json.loads(sys.argv[1]); sys.path[:] = path; "
+    "from gsbench.system.own_modules import import_only; import_only(*own); from {module} import {name}; {name}()"
+)
+_SECONDS_TO_END = 10.0  # patience with a child that ends what it started, before it is killed
 _TAIL_LINES = 3
 _STACK_LINE = re.compile(r"^\s*(@|PC:|\*\*\* )|^\s*File |^\s*$")  # glog's crash dump, blank lines
 _REASON_LINE = re.compile(r"what\(\)|terminate called|Check failed|Error|error|free\(\)|malloc|corrupt")
@@ -79,30 +85,30 @@ def python_command(module: str, name: str, *arguments: str) -> list[str]:
 
     The function takes nothing; it finds ``arguments`` in ``sys.argv[2:]``.
     """
-    return [sys.executable, "-c", _BOOTSTRAP.format(module=module, name=name), json.dumps(sys.path), *arguments]
+    found = json.dumps([sys.path, importable()])
+    # -P: the current folder, in which a capture may lie, is no place to look in, not for json either.
+    return [sys.executable, "-P", "-c", _BOOTSTRAP.format(module=module, name=name), found, *arguments]
 
 
 def _run_child(call: Path, result: Path, output: BinaryIO) -> int:
     """Start the child, wait for it and return its exit code; end it on any exception here (Ctrl-C included)."""
     command = python_command("gsbench.system.isolate", "_child", str(call), str(result))
     # A session of its own: Ctrl-C reaches the parent only, which then ends the child: one traceback, not two.
-    # stdin is a pipe that is never written: its end of file tells the child that the parent is gone.
+    # stdin is a pipe that is never written: its end tells the child that it is to end, or that the parent is gone.
     child = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
     )
     try:
         return child.wait()
     finally:
-        if child.poll() is None:
-            child.terminate()
-            try:
-                child.wait(_SECONDS_TO_END)
-            except subprocess.TimeoutExpired:
-                child.kill()
-                child.wait()
+        assert child.stdin is not None
+        child.stdin.close()
+        try:
+            child.wait(_SECONDS_TO_END if hasattr(os, "fork") else 0)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
         _end_group(child.pid)
-        if child.stdin is not None:
-            child.stdin.close()
 
 
 def _end_group(leader: int) -> None:
@@ -115,7 +121,8 @@ def _end_group(leader: int) -> None:
 def _child() -> None:
     """The child's whole life: arguments are the paths of the pickled call and of the result to write."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    if not go_on_as_child():
+        threading.Thread(target=_exit_with_parent, daemon=True).start()
     call, result = Path(sys.argv[2]), Path(sys.argv[3])
     function, args, kwargs = pickle.loads(call.read_bytes())
     try:
@@ -131,7 +138,6 @@ def _child() -> None:
 def _exit_with_parent() -> None:
     while os.read(0, 1):
         pass
-    _end_group(os.getpid())  # this process too, which leads the group
     os._exit(1)
 
 

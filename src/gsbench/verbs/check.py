@@ -9,11 +9,12 @@ from gsbench.analysis.declaration import read_plans
 from gsbench.claims.file import direction_is_odd, read_claims
 from gsbench.claims.here import Here
 from gsbench.claims.sweep import Check, prepare, run_looks
+from gsbench.config.hydra_guard import PERMISSIONS
+from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, write_text
 from gsbench.launch.declare import declare_plan
 from gsbench.launch.plan import describe_plan
 from gsbench.launch.preflight import missing_folders
-from gsbench.runs.source import import_from_here
 from gsbench.runs.trial_files import find_finished
 from gsbench.verbs.arguments import ArgumentParser, path
 from gsbench.words import counted
@@ -29,16 +30,29 @@ def main(argv: Sequence[str], runs: Path) -> int:
         "decided, and write a page with the verdicts.",
     )
     parser.add_argument("claims", type=path, help="a YAML file, such as conf/claims/volumetric.yaml")
+    parser.add_argument(
+        "permissions",
+        nargs="*",
+        metavar="allow_targets=[MINE]",
+        help="what the claims' arms may run beside gsbench; a file of claims cannot allow it",
+    )
     parser.add_argument("--dry-run", action="store_true", help="show trials, time and what is not testable here")
     options = parser.parse_args(argv)
     file = read_claims(options.claims)
-    import_from_here()
-    check = prepare(file, runs, Here(missing_folders, download=not options.dry_run))
+    check = prepare(file, runs, Here(missing_folders, download=not options.dry_run), _permissions(options.permissions))
     if options.dry_run:
         print("\n".join(describe(check)))
         return 0
     _run(check)
     return 0
+
+
+def _permissions(words: Sequence[str]) -> Sequence[str]:
+    """The words after the file, which can only be permissions. Raises InputError for others."""
+    for word in words:
+        if word.split("=")[0] != PERMISSIONS:
+            raise InputError(f"{word}: settings of a check stand in its file of claims; here only {PERMISSIONS}=[…]")
+    return words
 
 
 def describe(check: Check) -> list[str]:

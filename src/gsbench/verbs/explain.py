@@ -8,7 +8,7 @@ from pathlib import Path
 from gsbench.analysis.explain import ADDRESS, explain_cell
 from gsbench.errors import InputError
 from gsbench.runs.layout import CONFIG, STORE
-from gsbench.runs.source import import_from_here
+from gsbench.system.own_modules import import_only
 from gsbench.verbs.arguments import ArgumentParser
 
 
@@ -33,20 +33,28 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
         description="For each stage of a trial: whether its result is in the store; if not, what differs from the most "
         "similar result that is.",
     )
-    parser.add_argument("trial", nargs="+", help="a trial's folder, or the settings of one (scene=... densify=...)")
+    parser.add_argument(
+        "trial",
+        nargs="+",
+        help="a trial's folder, with allow_targets=[mine] where it has code of yours; or the settings of one "
+        "(scene=... densify=...)",
+    )
     words = parser.parse_args(argv).trial
-    import_from_here()
     from gsbench.app.hydra_app import compose_trials
+    from gsbench.config.hydra_guard import PERMISSIONS, typed_permissions
     from gsbench.pipeline.wiring import Parts, Trial
     from gsbench.renders.import_renders import is_entered
     from gsbench.runs.explain_cache import explain_steps
     from gsbench.runs.store import Store
     from gsbench.runs.trial_files import read_config
 
-    if len(words) == 1 and (Path(words[0]) / CONFIG).exists():
-        values = read_config(Path(words[0]))
+    places = [word for word in words if not word.startswith(f"{PERMISSIONS}=")]
+    if len(places) == 1 and (Path(places[0]) / CONFIG).exists():
+        allowed = typed_permissions([word for word in words if word not in places])
+        import_only(allowed)
+        values = read_config(Path(places[0])) | {PERMISSIONS: list(allowed)}
         if is_entered(values):
-            raise InputError(f"{words[0]} was entered from renders: it has no stages")
+            raise InputError(f"{places[0]} was entered from renders: it has no stages")
     elif "=" not in words[0]:
         raise InputError(f"{words[0]} is neither a trial's folder nor a setting like key=value")
     else:

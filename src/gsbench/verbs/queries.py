@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import re
+from contextlib import suppress
 from pathlib import Path
 
-from gsbench.config.command_words import check_words, is_sweep, search_path
+from gsbench.config.command_words import check_words, is_sweep, parse_word, search_path
 from gsbench.config.compose import compose_values
+from gsbench.config.hydra_guard import check_search_path, typed_permissions
 from gsbench.config.questions import answer, has_part
 from gsbench.errors import InputError
-from gsbench.runs.source import import_from_here
 from gsbench.verbs.arguments import ArgumentParser
 
 QUERIES = ("--cfg", "-c", "--info", "-i", "--hydra-help", "--shell-completion", "-sc", "--resolve", "--package", "-p")
@@ -18,7 +20,6 @@ COMPLETION = re.compile(r"(install|uninstall|query)=(bash|zsh|fish)")
 
 def ask_hydra(argv: list[str]) -> int:
     """Let Hydra answer about the configuration; no trial is run. Raises InputError for what it would not understand."""
-    import_from_here()
     options = _parser().parse_args(argv)
     asked = [options.cfg is not None, options.info is not None, options.shell_completion, options.hydra_help]
     if sum(asked) != 1 or ((options.resolve or options.package) and options.cfg is None):
@@ -26,6 +27,7 @@ def ask_hydra(argv: list[str]) -> int:
     if options.shell_completion:
         if len(options.overrides) != 1 or not COMPLETION.fullmatch(options.overrides[0]):
             raise InputError("-sc takes install=bash or uninstall=bash, and zsh and fish likewise")
+        _check_typed(os.environ.get("COMP_LINE", ""))
     else:
         _check(options.overrides, options.config_dir, options.package)
     answer(argv)
@@ -39,6 +41,16 @@ def _check(overrides: list[str], config_dir: Path | None, package: str | None) -
     config = compose_values([*search_path([config_dir] if config_dir else [], overrides), *overrides])
     if package is not None and not has_part(config, package):
         raise InputError(f"--package {package}: there is no such part of the configuration")
+
+
+def _check_typed(line: str) -> None:
+    """Refuse to complete a line that would import a package which it does not allow."""
+    words = []
+    for word in line.split():
+        with suppress(InputError):  # half typed
+            parse_word(word)
+            words.append(word)
+    check_search_path(words, typed_permissions(words))
 
 
 def _parser() -> ArgumentParser:

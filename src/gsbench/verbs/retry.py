@@ -11,11 +11,13 @@ import yaml
 
 from gsbench.analysis.results import experiment_home
 from gsbench.config.compose import Composed, compose_one
+from gsbench.config.hydra_guard import PERMISSIONS, typed_permissions
+from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
 from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
-from gsbench.runs.source import import_from_here
 from gsbench.runs.trial_files import TrialPaths, label_of, read_config
+from gsbench.system.own_modules import import_only
 from gsbench.verbs.arguments import ArgumentParser
 
 log = logging.getLogger(__name__)
@@ -30,7 +32,11 @@ def main(argv: Sequence[str], runs: Path) -> int:
     )
     parser.add_argument("experiment")
     parser.add_argument(
-        "changes", nargs="*", default=[], metavar="KEY=VALUE", help="settings that make no other trial: launch=slurm …"
+        "changes",
+        nargs="*",
+        default=[],
+        metavar="KEY=VALUE",
+        help="settings that make no other trial: launch=slurm …; allow_targets=[mine] where trials have code of yours",
     )
     parser.add_argument("--dry-run", action="store_true", help="only list them")
     options = parser.parse_args(argv)
@@ -55,27 +61,41 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 
 def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[str]) -> Composed:
-    """The trial in ``folder``: from its planned overrides, else from the configuration that it wrote."""
-    if planned is not None and Path(planned.cwd).is_dir():
-        os.chdir(planned.cwd)  # relative paths were meant from there, and the trials are run from there
-    import_from_here()
+    """The trial in ``folder``: from its planned overrides, else from the configuration that it wrote.
+
+    Neither allows anything to run: that ``changes``, which were typed, must do again.
+    """
+    here, allowed = os.getcwd(), typed_permissions(changes)
     if planned is not None:
-        changed = {change.split("=")[0] for change in changes}
-        own = [word for word in planned.overrides if word.split("=")[0] not in changed]
+        if Path(planned.cwd).is_dir():
+            os.chdir(planned.cwd)  # relative paths were meant from there, and the trials are run from there
+        words = [word for word in planned.overrides if key_of(word) != PERMISSIONS]
+        changed = {key_of(change) for change in changes}
+        own = [word for word in words if key_of(word) not in changed]
         if any(change.startswith("launch=") and change not in planned.overrides for change in changes):
             own = [word for word in own if not word.startswith("launch.")]  # they were meant for the other launcher
+        permissions = [change for change in changes if key_of(change) == PERMISSIONS]
+        as_planned = compose_one([*words, *permissions]) if changes else None
         trial = compose_one([*own, *changes])
-        if changes and _identity(trial) != _identity(compose_one(planned.overrides)):
+        import_only(allowed, here)  # but not the modules: a stranger's plan would name a folder of the stranger's
+        if as_planned is not None and _identity(trial) != _identity(as_planned):
             raise InputError(
                 f"{' '.join(changes)} would make other trials than those of the plan: give the sweep's own command"
             )
         return Composed(trial.values | {"runs": str(runs)}, trial.yaml, trial.overrides)
-    if changes:
+    if any(key_of(change) != PERMISSIONS for change in changes):
         raise InputError(
             f"{label_of(folder)} is in no plan, so no setting of it can be changed: run it by its own command"
         )
-    values = read_config(folder) | {"runs": str(runs)}
+    import_only(allowed, here)
+    values = read_config(folder) | {"runs": str(runs), PERMISSIONS: list(allowed)}
+    check_permissions(values)
     return Composed(values, yaml.safe_dump(values, sort_keys=False), ())
+
+
+def key_of(word: str) -> str:
+    """The setting that a word of a command line is about, whatever it does with it."""
+    return word.split("=")[0].lstrip("+~")
 
 
 def _identity(trial: Composed) -> Path:

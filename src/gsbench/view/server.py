@@ -21,6 +21,7 @@ from gsbench.events import Cause
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
 from gsbench.view.picture import Layers, Picture, TrialPainter, photograph_at, side_by_side
+from gsbench.view.visitors import only_welcome_visitors
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +42,8 @@ class Viewer:
 
         self.painters = tuple(painters)
         self.views: dict[str, View] = {view.name: view for view in painters[0].trial.views}
-        self.server: Any = viser.ViserServer(host=HOST, port=port or free_port(), verbose=False)
+        with only_welcome_visitors():
+            self.server: Any = viser.ViserServer(host=HOST, port=port or free_port(), verbose=False)
         self.server.gui.configure_theme(control_layout="collapsible", show_logo=False, show_share_button=False)
         self.server.scene.set_up_direction(mean_up(painters[0].trial.views))
         self._sessions: dict[int, Session] = {}

@@ -6,6 +6,7 @@ import logging
 import os
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,6 +33,7 @@ from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_L
 from gsbench.runs.stages import EXTERNAL
 from gsbench.runs.step import Step
 from gsbench.system.machine import describe_machine
+from gsbench.system.own_modules import SAFE_PATH
 from gsbench.words import readable_time
 
 CONTRACT = 1  # raise when programs are given, or asked for, something else
@@ -126,7 +128,11 @@ def what_it_left(trainer: External, log_file: Path) -> Iterator[None]:
 
 def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str, str]:
     """The program's environment: that of gsbench without gsbench's own variables, and what the settings add."""
-    inherited = {name: value for name, value in os.environ.items() if not name.startswith(OWN_VARIABLES)}
+    inherited = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(OWN_VARIABLES) and (name, value) != SAFE_PATH  # a train.py finds the modules beside it
+    }
     return inherited | {
         name: fill(text, values, f"densify.environment.{name}") for name, text in trainer.environment.items()
     }
@@ -139,16 +145,18 @@ def check_version(trainer: External, values: Mapping[str, object], environment: 
     key = "densify.version_command"
     command = [fill(word, values, key) for word in words_of(trainer.version_command, key)]
     try:
-        done = subprocess.run(
-            command,
-            env=dict(environment),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=SECONDS_TO_TELL_VERSION,
-            check=False,
-        )
+        with tempfile.TemporaryDirectory(prefix="gsbench-version-") as empty:  # `python -c` imports from where it runs
+            done = subprocess.run(
+                command,
+                cwd=empty,
+                env=dict(environment),
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=SECONDS_TO_TELL_VERSION,
+                check=False,
+            )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise InputError(f"{key} cannot be run ({error})") from error
     said = " ".join((done.stdout + done.stderr).split())

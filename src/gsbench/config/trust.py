@@ -1,0 +1,198 @@
+"""What a configuration may make run: gsbench's own classes, and what the one who types has allowed. Loads no Hydra.
+
+Permission is what the command line says of ``allow_targets``; no file can give it. It names modules (``mine``),
+programs (``bash``) and environment variables (``PATH``). `docs/security.md` says what this protects from.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gsbench.errors import InputError
+from gsbench.external.placeholders import program_of
+from gsbench.system.own_modules import importable
+from gsbench.words import closest
+
+TARGET = "_target_"
+PACKAGE = "gsbench"
+COMPONENTS = ("init", "densify", "raster")  # groups that name one class each; `eval.extra` names any number
+EXTERNAL = "gsbench.densify.External"  # another program trains
+SHELL, SBATCH = "bash", "sbatch"  # the permissions for lines of a shell, and for unusual options of Slurm
+# Variables that a configuration may set: they choose numbers of threads and devices. No list of the dangerous ones
+# could be complete: MPLBACKEND imports a module, NUMBA_CACHE_DIR unpickles, CUDA_INJECTION64_PATH and GCONV_PATH load
+# libraries, CC names a program.
+FREE_VARIABLES = frozenset(
+    """
+    OMP_NUM_THREADS OMP_THREAD_LIMIT OMP_DYNAMIC OMP_PROC_BIND OMP_PLACES OMP_SCHEDULE OMP_STACKSIZE OMP_WAIT_POLICY
+    MKL_NUM_THREADS OPENBLAS_NUM_THREADS NUMEXPR_NUM_THREADS NUMBA_NUM_THREADS VECLIB_MAXIMUM_THREADS
+    CUDA_VISIBLE_DEVICES CUDA_DEVICE_ORDER CUDA_LAUNCH_BLOCKING CUBLAS_WORKSPACE_CONFIG PYTORCH_CUDA_ALLOC_CONF
+    HIP_VISIBLE_DEVICES ROCR_VISIBLE_DEVICES TZ
+    """.split()  # noqa: SIM905 - words are easier to read than a list of 20 quoted ones
+)
+# Options of sbatch that choose resources, of Slurm's manual. Others can run a program (task_prolog), a container, or
+# hand variables on (export).
+SBATCH_RESOURCES = frozenset(
+    """
+    account begin clusters comment constraint contiguous core_spec cores_per_socket cpu_freq cpus_per_gpu cpus_per_task
+    deadline dependency exclude exclusive gpu_bind gpu_freq gpus gpus_per_node gpus_per_socket gpus_per_task gres
+    gres_flags hint hold licenses mail_type mail_user mem mem_bind mem_per_cpu mem_per_gpu mincpus network nice nodelist
+    nodes ntasks ntasks_per_core ntasks_per_gpu ntasks_per_node ntasks_per_socket overcommit oversubscribe partition
+    prefer priority qos requeue reservation signal sockets_per_node spread_job switches thread_spec threads_per_core
+    time time_min tmp use_min_nodes wckey
+    """.split()  # noqa: SIM905
+)
+BARE = re.compile(r"[\w./+-]+")  # what needs no quotes in a list on the command line
+
+
+def is_allowed(target: str, allowed: Sequence[str]) -> bool:
+    """Whether ``target``, the import path of a class, is one of ``allowed`` or lies below it."""
+    return any(target == prefix or target.startswith(prefix.rstrip(".") + ".") for prefix in allowed)
+
+
+def to_type(missing: Sequence[str], allowed: Sequence[str]) -> str:
+    """What is to be typed so that ``missing`` is allowed beside what is: ``allow_targets=[mine,bash]``."""
+    names = [name if BARE.fullmatch(name) else repr(name) for name in dict.fromkeys([*allowed, *missing])]
+    return f"add allow_targets=[{','.join(names)}] to the command; no file can allow it"
+
+
+def check_target(target: str | None, group: str, allowed: Sequence[str], own: Sequence[str] = (PACKAGE,)) -> None:
+    """Refuse a ``_target_`` outside ``own`` and what the user ``allowed``: importing it would run its code."""
+    if not target:
+        raise InputError(f"{group} names no _target_: the class to use")
+    if is_allowed(target, (*own, *allowed)) and target != PACKAGE:
+        return
+    prefix = target.split(".")[0]
+    if prefix == PACKAGE:
+        raise InputError(f"{group}.{TARGET}={target} is not a class for {group}")
+    near = closest(prefix, allowed)
+    advice = to_type([prefix], allowed)
+    raise InputError(f"{group}.{TARGET}={target} is not gsbench's own{near}; if you trust that code, {advice}")
+
+
+def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
+    """What stands at the import path ``target``; a class must be of gsbench or of a module that the user ``allowed``.
+
+    A name that a trusted module merely imported (``mine.Popen``) is somebody else's code. Raises InputError.
+    """
+    check_target(target, group, allowed)
+    module, _, name = target.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except Exception as error:  # importing a user's file runs it: it may raise anything
+        reason = f"{type(error).__name__}: {error}{_beside(error)}"
+        raise InputError(f"{group}.{TARGET}={target} cannot be imported ({reason})") from error
+    home = f"{getattr(found, '__module__', None)}.{getattr(found, '__qualname__', name)}"
+    if isinstance(found, type) and not is_allowed(home, (PACKAGE, *allowed)):
+        advice = to_type([home.split(".")[0]], allowed)
+        raise InputError(f"{group}.{TARGET}={target} is {home}; if you trust that code, {advice}")
+    return found
+
+
+def _beside(error: Exception) -> str:
+    """The mend where a module is missing that lies in another folder, or beside an allowed one without being so."""
+    if not isinstance(error, ModuleNotFoundError):
+        return ""
+    name, (allowed, folder) = (error.name or "").split(".")[0], importable()
+    if name in allowed:
+        return f"; your modules are looked for where the command is given: {folder}"
+    if name and (Path(folder, f"{name}.py").is_file() or Path(folder, name).is_dir()):
+        return f"; it lies here, but only what allow_targets names is imported from here: add {name} there"
+    return ""
+
+
+def check_permissions(values: Mapping[str, Any]) -> None:
+    """Refuse the resolved configuration of a trial that would make run what its ``allow_targets`` does not name.
+
+    This is the last check, of plain values, whatever file or command line they came from. Raises InputError.
+    """
+    allowed = values.get("allow_targets") or []
+    for place, target in targets_in(values):
+        group = ".".join(place)
+        check_target(target, group, allowed, homes_of(place))
+    if is_external(values["densify"]):
+        check_program(values["densify"], allowed)
+    _check_launch(values["launch"], allowed)
+
+
+def targets_in(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every ``_target_`` at any depth, lists included, with the keys that lead to the mapping that has it."""
+    if isinstance(values, Mapping):
+        if values.get(TARGET) is not None:
+            yield place, values[TARGET]
+        for key, value in values.items():
+            yield from targets_in(value, (*place, str(key)))
+    elif isinstance(values, list | tuple):
+        for number, value in enumerate(values):
+            yield from targets_in(value, (*place, str(number)))
+
+
+def homes_of(place: Sequence[str]) -> tuple[str, ...]:
+    """The packages of gsbench whose classes may stand at a place of the configuration without the user's permission."""
+    if len(place) == 1 and place[0] in COMPONENTS:
+        own = f"{PACKAGE}.{place[0]}"
+        return (own, f"{PACKAGE}.external") if place[0] == "densify" else (own,)
+    if len(place) == 3 and tuple(place[:2]) == ("eval", "extra"):
+        return (f"{PACKAGE}.eval",)
+    return ()
+
+
+def is_external(densify: Mapping[str, Any]) -> bool:
+    """Whether these settings are another program's, by whatever path they name gsbench's class for it."""
+    package, _, rest = str(densify.get(TARGET)).partition(".")
+    return package == PACKAGE and rest.rpartition(".")[2] == EXTERNAL.rpartition(".")[2]
+
+
+def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
+    """Refuse another trainer whose programs or variables the user did not allow."""
+    options = settings.get("options") or {}
+    programs = [program_of(settings.get("command") or "", options)]
+    if settings.get("version_command") is not None:
+        programs.append(program_of(settings["version_command"], options, "densify.version_command"))
+    programs = [program for program in dict.fromkeys(programs) if program not in allowed]
+    variables = foreign_variables(settings.get("environment") or {}, allowed)
+    if not programs and not variables:
+        return
+    runs = [f"runs the program {' and '.join(map(repr, programs))}"] * bool(programs)
+    sets = [f"sets {shown(variables)}"] * bool(variables)
+    raise InputError(
+        f"densify={settings['name']} {' and '.join(runs + sets)}; if you trust it, "
+        + to_type([*programs, *variables], allowed)
+    )
+
+
+def foreign_variables(variables: Mapping[str, Any], allowed: Sequence[str]) -> dict[str, Any]:
+    """Those of ``variables`` that a configuration may not set: neither free, nor allowed, nor as they are already."""
+    return {
+        name: value
+        for name, value in variables.items()
+        if name not in FREE_VARIABLES and name not in allowed and value != os.environ.get(name)
+    }
+
+
+def shown(variables: Mapping[str, Any]) -> str:
+    """Variables with their values, for a message."""
+    return ", ".join(f"{name}={value!r}" for name, value in variables.items())
+
+
+def _check_launch(launch: Mapping[str, Any], allowed: Sequence[str]) -> None:
+    """Refuse lines for a shell, and what could become one in the script that Slurm runs."""
+    if launch.get("setup") and SHELL not in allowed:
+        raise InputError(
+            f"launch.setup runs {'; '.join(map(str, launch['setup']))!r} in a shell; if you trust it, "
+            + to_type([SHELL], allowed)
+        )
+    options = {str(name).replace("-", "_"): value for name, value in (launch.get("sbatch") or {}).items()}
+    if (others := sorted(options.keys() - SBATCH_RESOURCES)) and SBATCH not in allowed:
+        raise InputError(
+            f"launch.sbatch.{others[0]} chooses more than resources; if you trust it, " + to_type([SBATCH], allowed)
+        )
+    texts = {f"launch.{name}": launch.get(name) for name in ("partition", "account", "qos")}
+    texts |= {f"launch.sbatch.{name}": value for name, value in options.items()}
+    for key, value in texts.items():  # a line break would end the comment that Slurm reads, and begin a command
+        if not str(value).isprintable() or not key.isprintable():
+            raise InputError(f"{key} must be one line, got {value!r}")

@@ -1,0 +1,156 @@
+"""Other people's runs folders and trainers: what they may run is what the one who types allows, every time."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from gsbench import cli
+from gsbench.app.hydra_app import compose_trials
+from gsbench.config.compose import compose_one
+from gsbench.config.trust import check_permissions
+from gsbench.errors import InputError
+from gsbench.launch.plan import add_to_plan
+from gsbench.pipeline.components import build
+from gsbench.runs.trial_files import read_config
+from tests.strange import no_trial
+from tests.strange import place as place
+
+pytestmark = pytest.mark.usefixtures("place")
+STRANGE_TRIALS: dict[str, tuple[dict[str, Any], str]] = {
+    "a class": ({"densify": {"_target_": "bomb.Bomb"}}, "add allow_targets=[bomb] to the command"),
+    "a metric": ({"eval": {"extra": {"x": {"_target_": "bomb.Bomb"}}}}, "add allow_targets=[bomb] to the command"),
+    "a program": (
+        {"densify": {"_target_": "gsbench.densify.External", "name": "x", "command": "bash {data}", "version": "1",
+                     "result": "x.ply"}}, "add allow_targets=[bash] to the command",
+    ),
+    "a program by another path": (
+        {"densify": {"_target_": "gsbench.external.settings.External", "name": "x", "command": "bash {data}",
+                     "version": "1", "result": "x.ply"}}, "add allow_targets=[bash] to the command",
+    ),
+    "a shell": ({"launch": {"setup": ["touch exploded"]}}, "add allow_targets=[bash] to the command"),
+}  # fmt: skip
+
+
+def strange_runs(settings: dict[str, Any]) -> Path:
+    """A trial of somebody else's that failed, in no plan; its configuration allows itself everything."""
+    (trial,) = compose_trials(["name=x"])
+    values = json.loads(json.dumps(trial.values)) | {"allow_targets": ["bomb", "bash", "os", "gsbench", "bombs"]}
+    for group, own in settings.items():
+        values[group] |= own
+    folder = Path(values["runs"]) / "x" / "courtyard" / "sfm-volumetric" / "01234567-seed0"
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text(yaml.safe_dump(values))
+    (folder / "failed.json").write_text(json.dumps({"message": "no luck"}))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "words", [["retry", "x"], ["retry", "x", "--dry-run"], ["retry", "x", "allow_targets=[other]"]]
+)
+@pytest.mark.parametrize("case", STRANGE_TRIALS)
+def test_retry_runs_nothing_of_a_strange_folder_unasked(
+    case: str, words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings, said = STRANGE_TRIALS[case]
+    strange_runs(settings)
+    monkeypatch.setattr("gsbench.app.command.run_trials", no_trial)
+    assert cli.run(words) == 2
+    assert said.replace("[", "[other,") in (error := capsys.readouterr().err) or said in error
+    assert not Path("exploded").exists()
+
+
+@pytest.mark.parametrize("case", ["a class", "a metric", "a program", "a program by another path"])
+def test_explain_runs_nothing_of_a_strange_folder_unasked(case: str, capsys: pytest.CaptureFixture[str]) -> None:
+    settings, said = STRANGE_TRIALS[case]
+    folder = strange_runs(settings)
+    assert cli.run(["explain", "--stale", str(folder)]) == 2
+    assert said in capsys.readouterr().err
+    for words in (["status"], ["status", "x"], ["status", "x", "--json"], ["tables", "x"], ["report", "x"]):
+        cli.run(words)
+    assert not Path("exploded").exists()
+
+
+def test_a_configuration_that_was_read_allows_nothing() -> None:
+    folder = strange_runs({})
+    assert "bomb" in (folder / "config.yaml").read_text()
+    assert read_config(folder)["allow_targets"] == []
+
+
+def test_retry_does_what_it_is_allowed_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    strange_runs({"densify": {"_target_": "mine.Mine"}})
+    began: list[Any] = []
+    monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
+    assert cli.run(["retry", "x", "allow_targets=[mine]"]) == 0
+    assert [trial.values["allow_targets"] for trial in began] == [["mine"]]
+
+
+def test_a_plan_allows_nothing_and_names_no_folder_of_modules(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stranger's plan says what is allowed, and a folder of the stranger's whose `mine` explodes."""
+    theirs = place / "theirs"
+    theirs.mkdir()
+    (theirs / "mine.py").write_text(f"open({str(place / 'exploded')!r}, 'w')\nclass Mine: ...\n")
+    words = ["name=x", "densify=adc", "densify._target_=mine.Mine"]
+    add_to_plan(compose_trials([*words, "allow_targets=[mine]"]))
+    plan = place / "runs" / "x" / "plan.json"
+    strange = plan.read_text().replace(f'"cwd": "{place}"', f'"cwd": "{theirs}"')
+    assert str(theirs) in strange
+    assert "allow_targets=[mine]" in strange
+    plan.write_text(strange)
+    began: list[Any] = []
+    monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
+    assert cli.run(["retry", "x"]) == 2
+    assert "add allow_targets=[mine] to the command" in capsys.readouterr().err
+    monkeypatch.chdir(place)
+    assert cli.run(["retry", "x", "allow_targets=[mine]"]) == 0
+    values = began[0].values
+    assert build("densify", values["densify"], values["allow_targets"]).__class__.__module__ == "mine"
+    assert sys.modules["mine"].__file__ == str(place / "mine.py")
+    assert not (place / "exploded").exists()
+
+
+# ---- programs
+
+PROGRAM = ["densify=external", "densify.command=[python,'{data}']", "densify.result=x.ply", "densify.version='1'"]
+
+
+@pytest.mark.parametrize(
+    ("words", "missing"),
+    [
+        ([], "python"),
+        (["densify.version_command=[curl,strange]"], "python,curl"),
+        (["densify.version_command='bash -c true'"], "python,bash"),
+        (["+densify.environment.PATH=/strange"], "python,PATH"),
+        (["+densify.environment.LD_PRELOAD=/strange.so", "densify.version_command=[git]"], "python,git,LD_PRELOAD"),
+        (["densify._target_=gsbench.external.settings.External"], "python"),
+        (["densify.command=['{p}','{data}']", "+densify.options.p=/strange/python"], "/strange/python"),
+    ],
+)
+def test_every_program_and_variable_of_another_trainer_is_asked_for(words: list[str], missing: str) -> None:
+    with pytest.raises(InputError) as caught:
+        compose_one([*PROGRAM, *words])
+    assert f"add allow_targets=[{missing}] to the command" in str(caught.value)
+    values = compose_one([*PROGRAM, *words, f"allow_targets=[{missing}]"]).values
+    build("densify", values["densify"], missing.split(","))
+    for permission in missing.split(","):
+        rest = [name for name in missing.split(",") if name != permission]
+        with pytest.raises(InputError, match="allow_targets"):
+            build("densify", values["densify"], rest)
+        with pytest.raises(InputError, match="allow_targets"):
+            check_permissions(values | {"allow_targets": rest})
+
+
+def test_harmless_variables_need_no_permission() -> None:
+    compose_one([*PROGRAM, "+densify.environment.OMP_NUM_THREADS='4'", "allow_targets=[python]"])
+
+
+def test_a_version_command_cannot_hide_behind_what_is_known_later() -> None:
+    with pytest.raises(InputError, match=r"nothing is known as \{output\}"):
+        compose_one([*PROGRAM, "densify.version_command=['{output}/x']", "allow_targets=[python]"])

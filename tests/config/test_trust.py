@@ -1,0 +1,347 @@
+"""Nothing that a configuration or the current folder names is run unless the one who types allows it.
+
+Every case tries to leave a mark: a module that writes a file when it is imported, or a call that makes a folder.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsbench import cli
+from gsbench.app.hydra_app import compose_trials
+from gsbench.config.compose import compose_one
+from gsbench.config.hydra_guard import typed_permissions
+from gsbench.config.trust import SBATCH_RESOURCES, check_target, foreign_variables, load_class
+from gsbench.errors import InputError
+from gsbench.pipeline.components import build
+from gsbench.runs.source import source_of
+from gsbench.system.own_modules import import_only
+from tests.strange import BOMB, ask, experiment, no_trial
+from tests.strange import place as place
+
+pytestmark = pytest.mark.usefixtures("place")
+MKDIR = {"_target_": "os.mkdir", "path": "exploded"}
+LOG_CALLBACK = "hydra.experimental.callbacks.LogJobReturnCallback"
+
+
+def calls(**settings: Any) -> dict[str, Any]:
+    """Settings with one of Hydra's own callbacks, and beside its name what a stranger adds."""
+    return {"hydra": {"callbacks": {"x": {"_target_": LOG_CALLBACK} | settings}}}
+
+
+STRANGE: dict[str, tuple[dict[str, Any], str]] = {  # settings of a file, and a part of the line that refuses them
+    "a callback": ({"hydra": {"callbacks": {"x": MKDIR}}}, "allow_targets=[os]"),
+    "below a callback": (calls(inner=MKDIR), "allow_targets=[os]"),
+    "in a list below a callback": (
+        calls(inner=[{"a": [[MKDIR]]}]), "callbacks.x.inner.0.a.0.0."
+    ),
+    "among positional arguments": (
+        calls(_args_=[MKDIR]), "allow_targets=[os]"
+    ),
+    "a module of the folder": (
+        {"hydra": {"callbacks": {"x": {"_target_": LOG_CALLBACK, "in": {"_target_": "bomb.Bomb"}}}}},
+        "allow_targets=[bomb]",
+    ),
+    "beside Hydra's callbacks": (calls(_target_="hydra.experimental.callbacks.pickle.loads"), "allow_targets=[hydra]"),
+    "what gsbench's modules import": (
+        calls(_target_="gsbench.files.os.mkdir", path="exploded"), "is not a class for hydra.callbacks.x"
+    ),
+    "a class of gsbench in a strange place": (
+        calls(_target_="gsbench.logs._QuietFileHandler", filename="exploded"), "is not a class for hydra.callbacks.x"
+    ),
+    "below the sweeper": ({"hydra": {"sweeper": {"params": {"in": MKDIR}}}}, "sweeper.params.in._target_=os.mkdir"),
+    "beside the sweeper's settings": ({"hydra": {"sweeper": {"grids": [MKDIR]}}}, "hydra.sweeper.grids.0"),
+    "a sweeper": ({"hydra": {"sweeper": {"_target_": "hydra_plugins.bomb.Bomb"}}}, "no sweeper that is installed"),
+    "a launcher": ({"hydra": {"launcher": {"_target_": "hydra_plugins.gsbench.os.mkdir"}}}, "no launcher that is"),
+    "a launcher in a copy": (
+        calls(inner="${hydra.launcher}"), "copies others"
+    ),
+    "a name in parts": (
+        {"name": "mkdir", "hydra": {"callbacks": {"x": {"_target_": "os.${name}", "path": "exploded"}}}},
+        "write the name itself",
+    ),
+    "made of a text": (
+        calls(inner="${oc.create:{_target_:os.mkdir,path:exploded}}"), "${oc.create:…} is not resolved"
+    ),
+    "decoded from a text": ({"hydra": {"job": {"name": "${oc.decode:'1'}"}}}, "${oc.decode:…} is not resolved"),
+    "a resolver with a made name": ({"hydra": {"job": {"name": "${oc.${name}:1}"}}}, "is not resolved"),
+    "an alias for a component": ({"hydra": {"callbacks": {"x": "${densify}"}}}, "write the settings"),
+    "a partial object": (
+        calls(_partial_=True), "_partial_: gsbench makes no"
+    ),
+    "a copy for logging": ({"hydra": {"job_logging": "${train}"}}, "hydra.job_logging=${train}: write the settings"),
+    "help": ({"hydra": {"help": {"_target_": "bomb.Bomb"}}}, "_target_ is not a setting"),
+    "logging": (
+        {"hydra": {"job_logging": {"handlers": {"x": {"class": "bomb.Bomb"}}, "root": {"handlers": ["x"]}}}},
+        "does not read hydra/job_logging",
+    ),
+    "logging by a factory": (
+        {"hydra": {"hydra_logging": {"formatters": {"x": {"()": "bomb.Bomb"}}}}}, "does not read hydra/hydra_logging"
+    ),
+    "a densifier": ({"densify": {"_target_": "bomb.Bomb"}}, "allow_targets=[bomb]"),
+    "a package": ({"densify": {"_target_": "bombs.Bomb"}}, "allow_targets=[bombs]"),
+    "a module of a package": ({"densify": {"_target_": "bombs.one.Bomb"}}, "allow_targets=[bombs]"),
+    "a densifier that allows itself": (
+        {"allow_targets": ["bomb"], "densify": {"_target_": "bomb.Bomb"}}, "no file can allow it"
+    ),
+    "a callback that allows itself": (
+        {"allow_targets": ["os"], "hydra": {"callbacks": {"x": MKDIR}}}, "no file can allow it"
+    ),
+    "below a densifier": ({"densify": {"inner": [{"_target_": "bomb.Bomb"}]}}, "densify.inner.0._target_=bomb.Bomb"),
+    "another group's class": ({"densify": {"_target_": "gsbench.init.Random"}}, "is not a class for densify"),
+    "an import of a densifier's module": (
+        {"densify": {"_target_": "gsbench.densify.adc.torch.load"}}, "cannot be imported"
+    ),
+    "a metric": ({"eval": {"extra": {"mine": {"_target_": "bomb.Bomb"}}}}, "allow_targets=[bomb]"),
+    "below a metric": (
+        {"eval": {"extra": {"mine": {"_target_": "gsbench.eval.X", "in": {"_target_": "bomb.Bomb"}}}}}, "[bomb]"
+    ),
+    "a place that nobody reads": ({"launch": {"sbatch": {"_target_": "bomb.Bomb"}}}, "allow_targets=[bomb]"),
+    "lines of a shell": ({"launch": {"name": "slurm", "setup": ["touch exploded"]}}, "allow_targets=[bash]"),
+    "an option of sbatch": ({"launch": {"name": "slurm", "sbatch": {"task-prolog": "x"}}}, "allow_targets=[sbatch]"),
+    "a line break for sbatch": ({"launch": {"name": "slurm", "qos": "x\ntouch exploded\n"}}, "must be one line"),
+    "a line break in an option": (
+        {"launch": {"name": "slurm", "sbatch": {"comment": "x\ntouch exploded\n"}}}, "must be one line"
+    ),
+    "a line break in a name": ({"launch": {"name": "slurm", "sbatch": {"x\ntouch exploded\n": 1}}}, "launch.sbatch"),
+}  # fmt: skip
+MODES = {"run": [], "dry run": ["--dry-run"], "question": ["--cfg", "job"], "info": ["--info", "config"]}
+
+
+@pytest.mark.parametrize("mode", ["run", "dry run"])
+@pytest.mark.parametrize("case", STRANGE)
+def test_what_a_file_names_is_not_run(
+    case: str, mode: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings, said = STRANGE[case]
+    assert said in ask([*experiment(settings), *MODES[mode]], capsys, monkeypatch)
+    assert not Path("exploded").exists()
+
+
+@pytest.mark.parametrize("mode", ["question", "info"])
+@pytest.mark.parametrize("case", ["a callback", "made of a text", "a module of a package", "logging", "a launcher"])
+def test_nor_where_somebody_only_asks(
+    case: str, mode: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings, said = STRANGE[case]
+    assert said in ask([*experiment(settings), *MODES[mode]], capsys, monkeypatch)
+    assert not Path("exploded").exists()
+
+
+JOBS: dict[str, tuple[dict[str, Any], str]] = {  # the words that a file's sweep gives its jobs
+    "a callback": ({"+hydra.callbacks.x._target_": "os.mkdir"}, "allow_targets=[os]"),
+    "a search path": ({"hydra.searchpath": "[pkg://bombs]"}, "allow_targets=[bombs]"),
+    "a variable": ({"+hydra.job.env_set.PYTHONPATH": "/strange"}, "allow_targets=[PYTHONPATH]"),
+    "a class": ({"densify._target_": "bomb.Bomb"}, "allow_targets=[bomb]"),
+    "a permission": ({"allow_targets": "[bomb]", "densify._target_": "bomb.Bomb"}, "allow_targets=[bomb]"),
+    "a resolver": ({"densify.name": "${oc.decode:x}"}, "is not resolved"),
+}
+
+
+@pytest.mark.parametrize(
+    ("sweeper", "place_of_words"),
+    [("gsbench", "params"), ("gsbench", "grids"), ("basic", "params"), ("optuna", "params")],  # one joins grids
+)
+@pytest.mark.parametrize("case", JOBS)
+def test_nor_what_only_the_jobs_of_a_sweep_say(
+    case: str,
+    sweeper: str,
+    place_of_words: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    words, said = JOBS[case]
+    words = words | {"seed": "0,1"}
+    if sweeper == "optuna":
+        pytest.importorskip("optuna")
+        words |= {"densify.volume_threshold": "0.01,0.02"}
+    node = {"params": words} if place_of_words == "params" else {"grids": [words]}
+    run = [*experiment({"hydra": {"mode": "MULTIRUN", "sweeper": node}}), f"hydra/sweeper={sweeper}"]
+    assert said in ask(run, capsys, monkeypatch)
+    assert not Path("exploded").exists()
+
+
+def test_nor_in_the_jobs_of_another_launcher(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a sweeper and a launcher of others, Hydra composes the jobs, by the loader that gsbench gave it."""
+    words = {"hydra.searchpath": "[pkg://bombs]", "seed": "0,1"}
+    run = experiment({"hydra": {"mode": "MULTIRUN", "sweeper": {"params": words}}})
+    monkeypatch.setattr("gsbench.app.command.run_batch", no_trial)
+    cli.run([*run, "hydra/sweeper=basic", "hydra/launcher=basic"])
+    assert "imports a package" in capsys.readouterr().err
+    assert not Path("exploded").exists()
+
+
+VARIABLES = """
+PATH PYTHONPATH PYTHONSTARTUP PYTHONHOME PYTHONUSERBASE PYTHONINSPECT LD_PRELOAD LD_LIBRARY_PATH LD_AUDIT
+DYLD_INSERT_LIBRARIES GIT_SSH_COMMAND GIT_CONFIG_GLOBAL GIT_EXTERNAL_DIFF BASH_ENV ENV NUMBA_CACHE_DIR MPLBACKEND
+MPLCONFIGDIR NUMBA_ENABLE_CUDASIM TRITON_CACHE_DIR TRITON_PTXAS_PATH TORCH_EXTENSIONS_DIR TORCH_HOME CC CXX CUDA_HOME
+TORCHINDUCTOR_CACHE_DIR CUDA_INJECTION64_PATH OMP_TOOL_LIBRARIES GCONV_PATH HOME TMPDIR SHELL BROWSER
+MLFLOW_TRACKING_URI MLFLOW_PLUGIN SSL_CERT_FILE HTTPS_PROXY IFS PERL5LIB NODE_OPTIONS JAVA_TOOL_OPTIONS GSBENCH_RUNS
+GSBENCH_WEIGHTS path
+"""
+
+
+@pytest.mark.parametrize("name", VARIABLES.split())
+def test_a_file_sets_no_variable_that_could_start_code(name: str) -> None:
+    run = experiment({"hydra": {"job": {"env_set": {name: "/strange"}}}})
+    with pytest.raises(InputError, match=rf"{name}='/strange'.*allow_targets=\[{name}\]"):
+        compose_trials(["hydra.searchpath=[conf]", *run[2:]])
+
+
+def test_variables_that_choose_threads_and_devices_may_be_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    harmless = {"OMP_NUM_THREADS": "2", "CUDA_VISIBLE_DEVICES": "1"}
+    compose_trials(["hydra.searchpath=[conf]", *experiment({"hydra": {"job": {"env_set": harmless}}})[2:]])
+    compose_trials(["+hydra.job.env_set.MINE=1", "allow_targets=[MINE]"])
+    monkeypatch.setenv("MINE", "as it is")
+    compose_trials(["hydra.job.env_copy=[PATH,MINE]"])  # Hydra's own way to hand variables on sets what is set
+    assert foreign_variables({"MINE": "as it is", "PATH": "other"}, []) == {"PATH": "other"}
+
+
+def test_variables_cannot_come_as_a_copy(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = {"launch": {"sbatch": {"PYTHONPATH": "/strange"}}, "hydra": {"job": {"env_set": "${launch.sbatch}"}}}
+    line = ask(experiment(settings), capsys, monkeypatch)
+    assert "hydra.job.env_set=${launch.sbatch}: write the settings themselves" in line
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("hydra.searchpath=[pkg://bombs]", "allow_targets=[bombs]"),
+        ("hydra.searchpath=[file://conf,pkg://bombs/sub]", "allow_targets=[bombs]"),
+        ("hydra.searchpath=[nosuch://bombs]", "neither a folder"),
+        ("hydra.searchpath=[pkg://gsbench_other]", "allow_targets=[gsbench_other]"),
+    ],
+)
+@pytest.mark.parametrize("mode", MODES)
+def test_a_search_path_imports_nothing(
+    word: str, said: str, mode: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("conf").mkdir()
+    assert said in ask([*MODES[mode], word], capsys, monkeypatch)
+    assert not Path("exploded").exists()
+
+
+def test_nor_does_completion(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = "gsbench hydra.searchpath=[pkg://bombs] densify="
+    monkeypatch.setenv("COMP_LINE", line)
+    cli.run(["completion", "words", line])
+    assert cli.run(["-sc", "query=bash"]) == 2
+    assert not Path("exploded").exists()
+
+
+def test_a_search_path_that_was_allowed_is_read(place: Path) -> None:
+    (place / "bombs" / "scene").mkdir()
+    (place / "bombs" / "scene" / "own.yaml").write_text("defaults: [courtyard, _self_]\nname: own\n")
+    words = ["hydra.searchpath=[pkg://bombs]", "scene=own", "allow_targets=[bombs]"]
+    assert compose_trials(words)[0].values["scene"]["name"] == "own"
+
+
+# ---- whose permission, and what it means
+
+
+@pytest.mark.parametrize(
+    "word", ["allow_targets=os", "allow_targets=[[os]]", "allow_targets={os: 1}", "allow_targets=['${name}']",
+             "allow_targets=[null]", "allow_targets=[1]", "allow_targets=['']"],
+)  # fmt: skip
+def test_permissions_are_typed_as_names(word: str) -> None:
+    with pytest.raises(InputError, match="a list of names"):
+        typed_permissions([word])
+
+
+def test_the_last_permission_counts() -> None:
+    assert typed_permissions(["allow_targets=[a]", "seed=1", "++allow_targets=[b,c.D]"]) == ("b", "c.D")
+    assert typed_permissions(["seed=1"]) == ()
+
+
+def test_what_is_typed_is_allowed_in_files_too(capsys: pytest.CaptureFixture[str]) -> None:
+    run = experiment({"allow_targets": ["os"], "densify": {"_target_": "mine.Mine"}})
+    (trial,) = compose_trials(["hydra.searchpath=[conf]", *run[2:], "allow_targets=[mine]"])
+    assert trial.values["allow_targets"] == ["mine"]  # and not what the file says
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [
+        ("mine.os.mkdir", "cannot be imported"),
+        ("mine.os", "is not a class for densify"),
+        ("mine.Popen", r"is subprocess\.Popen.*allow_targets=\[mine,subprocess\]"),
+    ],
+)
+def test_trust_in_a_module_is_no_trust_in_what_it_imports(target: str, said: str) -> None:
+    import_only(["mine"])
+    with pytest.raises(InputError, match=said):
+        build("densify", {"_target_": target, "name": "x"}, ["mine"])
+
+
+def test_trust_in_a_module_extends_to_gsbenchs_classes_in_it() -> None:
+    import_only(["mine"])
+    assert load_class("mine.ADC", "densify", ["mine"]).__module__.startswith("gsbench.")
+    assert load_class("mine.Mine", "densify", ["mine"]).__name__ == "Mine"
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"_target_": "mine.Popen", "args": "true"}, "is subprocess.Popen"),
+        ({"_target_": "mine.Mine"}, "is not a class of hydra.experimental.callback.Callback"),
+        ({"_target_": "mine.Calls", "in": {"_target_": "mine.Popen"}}, "is subprocess.Popen"),
+        ({"_target_": "mine.Calls", "in": {"_target_": "mine.os.mkdir"}}, "cannot be imported"),
+        ({"size": 3}, "hydra.callbacks.x names no _target_"),
+    ],
+)
+def test_callbacks_are_classes_of_the_allowed_module(
+    settings: dict[str, Any], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = [*experiment({"hydra": {"callbacks": {"x": settings}}}), "allow_targets=[mine]"]
+    assert said in ask(run, capsys, monkeypatch)
+
+
+def test_an_allowed_callback_is_made(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    nested = {"_target_": "mine.Calls", "in": {"_target_": "mine.Calls"}, "_recursive_": True, "_convert_": "all"}
+    run = [*experiment({"hydra": {"callbacks": {"x": nested}}}), "allow_targets=[mine]"]
+    assert "the trials began" in ask(run, capsys, monkeypatch)
+
+
+def test_only_allowed_modules_of_the_folder_are_found_and_behind_what_is_installed(place: Path) -> None:
+    (place / "yaml.py").write_text(BOMB)
+    (place / "json").mkdir()
+    (place / "json" / "__init__.py").write_text(BOMB)
+    (place / "mine.py").write_text("import helper\nclass Mine:\n    pass\n")
+    (place / "helper.py").write_text("")
+    import_only(["mine", "yaml", "json"])
+    with pytest.raises(
+        InputError, match=r"it lies here, but only what allow_targets names is imported from here: add helper"
+    ):
+        load_class("mine.Mine", "densify", ["mine"])
+    import_only(["mine", "helper", "yaml", "json"])
+    assert load_class("mine.Mine", "densify", ["mine"])
+    assert Path(str(importlib.util.find_spec("yaml").origin)) != place / "yaml.py"  # type: ignore[union-attr]
+    assert importlib.util.find_spec("bomb") is None
+    assert not Path("exploded").exists()
+
+
+def test_looking_for_a_users_source_imports_nothing(place: Path) -> None:
+    (place / "bombs" / "sub.py").write_text("class Sub: ...\n")
+    import_only(["bombs"])
+    assert source_of("bombs.sub.Sub")["source"]
+    assert not Path("exploded").exists()
+
+
+# ---- names
+
+
+@pytest.mark.parametrize("target", ["os.system", "gsbench_evil.X", "minefield.X", "", None])
+def test_prefixes_end_at_dots(target: str | None) -> None:
+    with pytest.raises(InputError):
+        check_target(target, "densify", ["mine", "mine.sub."])
+
+
+def test_options_of_slurm_that_choose_resources_need_no_permission() -> None:
+    assert not SBATCH_RESOURCES & {"wrap", "export", "export_file", "container", "bcast", "chdir", "get_user_env"}
+    compose_one(["launch=slurm", "launch.sbatch={constraint: a100, mail-user: me}"])

@@ -1,0 +1,99 @@
+"""Whole trials in a folder that holds a module for every name that anything imports; none of them may be imported."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from tests.end_to_end.test_hydra import TINY
+
+pytestmark = pytest.mark.end_to_end
+SECONDS = 900
+BOMB = "with open({mark!r}, 'a') as stream:\n    stream.write(__name__ + '\\n')\n"
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    """A folder with bombs of all names of the standard library and of everything that is installed."""
+    folder, mark = tmp_path / "capture", tmp_path / "exploded"
+    folder.mkdir()
+    names = {*sys.stdlib_module_names, *importlib.metadata.packages_distributions(), "plyfile", "sitecustomize"}
+    for name in names:
+        if name.isidentifier():
+            (folder / f"{name}.py").write_text(BOMB.format(mark=str(mark)))
+    (folder / "hydra_plugins.py").unlink(missing_ok=True)
+    (folder / "hydra_plugins").mkdir()  # a namespace, which Hydra imports as a whole
+    (folder / "hydra_plugins" / "extra.py").write_text(BOMB.format(mark=str(mark)))
+    (tmp_path / "gsbench").write_text("from gsbench.cli import main\nmain()\n")  # the console script, as pip writes it
+    return folder
+
+
+def gsbench(folder: Path, *words: str, start: Sequence[str] = ("../gsbench",)) -> subprocess.CompletedProcess[str]:
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(("GSBENCH_", "MLFLOW_", "PYTHON"))}
+    environment = kept | {"GSBENCH_RUNS": str(folder.parent / "runs"), "TORCH_HOME": str(folder.parent / "hub")}
+    command = [sys.executable, *start, *words]
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=SECONDS, check=False
+    )
+
+
+def test_no_module_of_the_current_folder_is_imported(capture: Path) -> None:
+    own = "from gsbench.densify import NoDensifier\nclass Own(NoDensifier):\n    pass\n"
+    (capture / "own.py").write_text(own)
+    allowed = ["densify._target_=own.Own", "allow_targets=[own,yaml]"]  # what is installed comes before what lies here
+    tracked = [word for word in TINY if word != "tracking=none"]
+    for words in (
+        ["--help"],
+        ["--cfg", "job"],
+        ["-m", *tracked, *allowed, "name=one", "seed=0,1", "launch=local", "launch.parallel=2"],
+        ["tables", "one"],
+        ["status", "one"],
+    ):
+        done = gsbench(capture, *words)
+        assert done.returncode == 0, done.stderr
+        assert not (capture.parent / "exploded").exists(), (words, (capture.parent / "exploded").read_text())
+    assert len(list((capture.parent / "runs" / "one").rglob("results.json"))) == 2
+
+
+def test_nor_by_a_process_of_its_own(capture: Path) -> None:
+    imports = "import posixpath; from gsbench.system.isolate import run_isolated"
+    code = f"{imports}; print(run_isolated(posixpath.basename, 'a/b'))"
+    done = gsbench(capture, start=("-P", "-c", code))
+    assert (done.stdout, done.stderr) == ("b\n", "")
+    assert not (capture.parent / "exploded").exists(), (capture.parent / "exploded").read_text()
+
+
+def test_nor_by_python_m_but_for_what_python_imports_before_it_comes_to_gsbench(capture: Path) -> None:
+    code = "import runpy, sys; print(*sys.modules)"
+    before = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True).stdout
+    for name in {name.split(".")[0] for name in before.split()} | {"gsbench"}:
+        (capture / f"{name}.py").unlink(missing_ok=True)
+    for words in (["--help"], ["--cfg", "job"], ["seed=1", "--dry-run"]):
+        done = gsbench(capture, *words, start=("-m", "gsbench.cli"))
+        assert done.returncode == 0, done.stderr
+    assert not (capture.parent / "exploded").exists(), (capture.parent / "exploded").read_text()
+
+
+def test_nor_by_another_trainer_that_tells_its_version(capture: Path) -> None:
+    """``python -c`` imports from where it runs, so its version is asked for in an empty folder."""
+    (capture.parent / "train.py").write_text("import beside, sys; sys.exit('Error: trained ' + beside.WHAT)")
+    (capture.parent / "beside.py").write_text("WHAT = 'with what lies beside it'")  # as many trainers have
+    words = [
+        "densify=external",
+        f"densify.command=['{sys.executable}','{capture.parent / 'train.py'}','{{data}}']",
+        f"densify.version_command=['{sys.executable}','-c','import plyfile_absent as p']",
+        "densify.version=plyfile_absent",
+        "densify.result=x.ply",
+        f"allow_targets=['{sys.executable}']",
+    ]
+    (capture / "plyfile_absent.py").write_text(BOMB.format(mark=str(capture.parent / "exploded")))
+    small = [word for word in TINY if not word.startswith("densify")]
+    done = gsbench(capture, *small, *words, "name=three")
+    assert "Error: trained with what lies beside it" in done.stderr
+    assert not (capture.parent / "exploded").exists()

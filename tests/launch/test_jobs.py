@@ -1,0 +1,65 @@
+"""What a job returned is read from a file of the runs folder, and nothing that such a file names is run."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from gsbench.config.compose import compose_one
+from gsbench.launch.jobs import collect
+from gsbench.launch.outcome import Outcome
+from gsbench.runs.trial_files import TrialPaths
+
+
+class Bomb:
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self.mark),)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    return tmp_path
+
+
+def collected(folder: Path, returned: Any) -> Outcome:
+    trial = compose_one(["name=x"])
+    result = folder / "1_0_result.pkl"
+    result.write_bytes(pickle.dumps(returned))
+    job: Any = SimpleNamespace(paths=SimpleNamespace(result_pickle=result, stderr=folder / "log"))
+    return collect(job, TrialPaths.of(trial.values).folder, [trial])
+
+
+def test_an_outcome_comes_back(folder: Path) -> None:
+    outcome = Outcome(folder / "trial", "failed", "no luck", bad_input=True, metrics={"psnr": 1.5})
+    assert collected(folder, ("success", outcome)) == outcome
+
+
+def test_an_error_is_its_last_line(folder: Path) -> None:
+    outcome = collected(folder, ("error", "Traceback\nRuntimeError: no luck"))
+    assert (outcome.status, outcome.message) == ("failed", f"RuntimeError: no luck; log: {folder / 'log'}")
+
+
+@pytest.mark.parametrize("wrap", [lambda bomb: bomb, lambda bomb: ("success", bomb), lambda bomb: ("error", [bomb])])
+def test_nothing_is_run(folder: Path, wrap: Any) -> None:
+    outcome = collected(folder, wrap(Bomb(folder / "exploded")))
+    assert outcome.status == "failed"
+    assert "cannot be read" in outcome.message
+    assert not (folder / "exploded").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"no pickle", b"\x80\x05."])
+def test_what_cannot_be_read_is_said(folder: Path, content: bytes) -> None:
+    trial = compose_one(["name=x"])
+    (folder / "r.pkl").write_bytes(content)
+    job: Any = SimpleNamespace(paths=SimpleNamespace(result_pickle=folder / "r.pkl", stderr=folder / "log"))
+    outcome = collect(job, TrialPaths.of(trial.values).folder, [trial])
+    assert "cannot be read" in outcome.message

@@ -1,0 +1,72 @@
+"""A place where a user types, with files of a stranger's: modules that leave a mark when they are imported."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from gsbench import cli
+from gsbench.errors import InputError
+from gsbench.system.own_modules import import_only
+
+BOMB = "from pathlib import Path\nPath('exploded').touch()\nclass Bomb:\n    pass\n"
+MINE = """
+import os
+from subprocess import Popen
+
+from gsbench.densify import ADC
+from hydra.experimental.callback import Callback
+
+class Mine(ADC):
+    pass
+
+class Calls(Callback):
+    def __init__(self, **rest):
+        self.rest = rest
+"""
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The folder where the user types: it holds modules that were never allowed, and `mine`."""
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+    (tmp_path / "bomb.py").write_text(BOMB)
+    (tmp_path / "bombs").mkdir()
+    (tmp_path / "bombs" / "__init__.py").write_text(BOMB)
+    (tmp_path / "bombs" / "one.yaml").write_text("name: one\n")
+    (tmp_path / "mine.py").write_text(MINE)
+    (tmp_path / "hydra_plugins").mkdir()  # Hydra imports whatever it finds below this name
+    (tmp_path / "hydra_plugins" / "bomb.py").write_text(BOMB)
+    for module in ("bomb", "bombs", "mine", "helper"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    yield tmp_path
+    import_only([])
+
+
+def no_trial(trials: Any) -> Any:
+    """In the place of what runs trials."""
+    raise InputError("the trials began")
+
+
+def ask(words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> str:
+    """The one line with which a command is refused."""
+    monkeypatch.setattr("gsbench.app.command.run_batch", no_trial)
+    monkeypatch.setattr("gsbench.app.command.list_trials", no_trial)
+    assert cli.run(words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+def experiment(settings: dict[str, Any]) -> list[str]:
+    """The words that run an experiment from a stranger's file."""
+    folder = Path("conf/experiment")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "strange.yaml").write_text("# @package _global_\n" + yaml.safe_dump(settings))
+    return ["--config-dir", "conf", "+experiment=strange"]

@@ -1,0 +1,94 @@
+"""No process outlives the function that started it, however it was started: daemons included, on Linux."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from gsbench.errors import TrainingError
+from gsbench.external.program import run_program
+from tests.processes import heed_interrupts
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="daemons get away where nobody can adopt orphans")
+PATIENCE = 60.0  # seconds within which what never comes is told from a slow machine
+
+# A daemon as in Stevens: forked twice, in a session of its own, with an empty environment. It notes its process id.
+DAEMON = """
+import os, sys, time
+def daemon(mark, code="import time; time.sleep(600)"):
+    if os.fork() == 0:
+        os.setsid()
+        if os.fork() == 0:
+            os.setsid()
+            os.closerange(0, 3)
+            with open(mark + ".new", "w") as stream:
+                stream.write(str(os.getpid()))
+            os.rename(mark + ".new", mark)
+            os.execve(sys.executable, [sys.executable, "-c", code], {})
+        os._exit(0)
+    os.wait()
+    while not os.path.exists(mark):
+        time.sleep(0.01)
+"""
+SIGNALS = "import signal, time; [signal.signal(s, signal.SIG_IGN) for s in (1, 2, 15)]; time.sleep(600)"
+FORKS = "import os, time; [os.fork() for _ in range(4)]; time.sleep(600)"
+
+
+def is_gone(mark: Path) -> bool:
+    """Whether the process whose id stands in ``mark`` ends within our patience."""
+    pid, deadline = int(mark.read_text()), time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        try:
+            if psutil.Process(pid).status() == psutil.STATUS_ZOMBIE:
+                return True
+        except psutil.NoSuchProcess:
+            return True
+        time.sleep(0.05)
+    os.kill(pid, signal.SIGKILL)
+    return False
+
+
+@pytest.mark.parametrize(
+    "code", ["import time; time.sleep(600)", SIGNALS, FORKS], ids=["sleeps", "heeds none", "forks"]
+)
+@pytest.mark.parametrize("end", ["", "raise SystemExit(3)", "os.kill(os.getpid(), 9)", "time.sleep(600)"])
+def test_a_daemon_of_a_trainer_ends_with_it(tmp_path: Path, end: str, code: str) -> None:
+    program = f"{DAEMON}\ndaemon('mark', {code!r})\n{end}"
+    try:
+        command = [sys.executable, "-c", program]
+        run_program(command, tmp_path / "log", tmp_path, dict(os.environ), 2.0 if "sleep" in end else None)
+        assert not end
+    except TrainingError:
+        assert end
+    assert is_gone(tmp_path / "mark")
+    names = [process.info["cmdline"] for process in psutil.process_iter(["cmdline"])]
+    assert [sys.executable, "-c", FORKS] not in names
+
+
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_daemon_ends_with_gsbench_however_that_ends(tmp_path: Path, sign: signal.Signals) -> None:
+    (tmp_path / "main.py").write_text(
+        textwrap.dedent(f"""
+        import os, sys
+        from pathlib import Path
+        from gsbench.external.program import run_program
+        program = {DAEMON!r} + "\\ndaemon('mark')\\ntime.sleep(600)"
+        here = Path({str(tmp_path)!r})
+        run_program([sys.executable, "-c", program], here / "log", here, dict(os.environ), None)
+        """)
+    )
+    parent = subprocess.Popen([sys.executable, str(tmp_path / "main.py")], preexec_fn=heed_interrupts)
+    deadline = time.monotonic() + PATIENCE
+    while not (tmp_path / "mark").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    parent.send_signal(sign)
+    parent.wait(PATIENCE)
+    assert is_gone(tmp_path / "mark")

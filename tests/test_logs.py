@@ -1,0 +1,105 @@
+"""What is shown and logged holds nothing that a terminal obeys, whoever wrote it."""
+
+from __future__ import annotations
+
+import io
+import logging
+import sys
+import unicodedata
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsbench import cli
+from gsbench.errors import InputError
+from gsbench.logs import LOGGER, log_to, printable_output
+from gsbench.words import printable
+
+OBEYED = [
+    "\x1b[2J",
+    "\x1b]0;title\x07",
+    "\x9b31m",
+    "\x07",
+    "\x08",
+    "\x7f",
+    "safe\rfake",
+    "\u202egnp.exe",
+    "\u2066x",
+    "\x90q",
+]
+
+TURNING = set("LRE RLE LRO RLO PDF LRI RLI FSI PDI".split())  # noqa: SIM905
+
+
+@pytest.mark.parametrize("text", OBEYED)
+def test_control_characters_are_written_out(text: str) -> None:
+    shown = printable(f"a {text} b")
+    assert shown.isprintable()
+    assert shown.encode("ascii").decode("unicode_escape") == f"a {text} b"
+
+
+@given(st.text(st.characters(exclude_categories=[])))
+def test_nothing_that_a_terminal_obeys_is_left_and_nothing_else_is_changed(text: str) -> None:
+    shown = printable(text)
+    assert not [c for c in shown if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and c not in "\n\t"]
+    assert not [
+        c
+        for c in shown
+        if unicodedata.bidirectional(c) in ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
+    ]
+    assert printable(shown) == shown
+    if all(c.isprintable() or c in "\n\t" for c in text) and not set(text) & set("\u061c\u200e\u200f"):
+        assert shown == text
+    shown.encode()  # half characters, as names of files may have, cannot be
+
+
+def test_words_of_all_languages_stay() -> None:
+    for text in ("größe 大きさ حجم 🏔️👩‍🔬", "a\tb\nc"):
+        assert printable(text) == text
+
+
+@pytest.mark.parametrize("text", OBEYED)
+def test_neither_what_is_printed_nor_what_is_logged_reaches_a_terminal_as_it_is(
+    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(argv: list[str]) -> int:
+        LOGGER.info("said: %s", text)
+        print("printed:", text)
+        with log_to(tmp_path / "log.txt"):
+            try:
+                raise ValueError(text)
+            except ValueError:
+                LOGGER.warning("raised", exc_info=True)
+        raise InputError(f"refused: {text}")
+
+    monkeypatch.setattr(LOGGER, "handlers", [])
+    monkeypatch.setattr("gsbench.cli._trials", fail)
+    monkeypatch.setattr(sys, "argv", ["gsbench", "seed=1"])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 2
+    said = capsys.readouterr()
+    for shown in (said.out, said.err, (tmp_path / "log.txt").read_text()):
+        assert [c for c in shown if not c.isprintable() and c != "\n"] == []
+    assert "refused: " in said.err
+    assert "Traceback" in (tmp_path / "log.txt").read_text()
+    for handler in list(LOGGER.handlers):
+        LOGGER.removeHandler(handler)
+
+
+def test_streams_come_back_and_stay_streams(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
+    monkeypatch.setattr(sys, "stdout", stream)
+    with printable_output():
+        print("\x1b[31m", flush=True)
+        sys.stdout.writelines(["a\x07", "b"])
+        assert not sys.stdout.isatty()
+    with suppress(KeyError), printable_output():
+        raise KeyError
+    stream.flush()
+    assert sys.stdout is stream
+    assert stream.buffer.getvalue() == b"\\x1b[31m\na\\x07b"  # type: ignore[attr-defined]
+    assert logging.getLogger("gsbench") is LOGGER

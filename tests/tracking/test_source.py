@@ -1,0 +1,65 @@
+"""What a run's tags say of the code, and that git starts nothing that a capture's own repository names."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from gsbench.tracking.source import source_tags
+
+MARK = "#!/bin/sh\ntouch '{mark}'\ncat\n"
+
+
+@pytest.fixture
+def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A repository with one commit, in which a file was changed since; the current folder."""
+    for name, value in {"GIT_CONFIG_GLOBAL": "/dev/null", "GIT_CONFIG_NOSYSTEM": "1", "HOME": str(tmp_path)}.items():
+        monkeypatch.setenv(name, value)
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    (folder / "a.txt").write_text("one")
+    git("init", "-q")
+    git("-c", "user.name=x", "-c", "user.email=x@y", "add", ".")
+    git("-c", "user.name=x", "-c", "user.email=x@y", "commit", "-qm", "one")
+    (tmp_path / "run.sh").write_text(MARK.format(mark=tmp_path / "exploded"))
+    (tmp_path / "run.sh").chmod(0o755)
+    return folder
+
+
+def git(*words: str) -> str:
+    return subprocess.run(["git", *words], check=True, capture_output=True, text=True).stdout.strip()
+
+
+def test_commit_and_changes_are_told(repository: Path) -> None:
+    assert source_tags("x")["mlflow.source.git.commit"] == git("rev-parse", "HEAD")
+    assert source_tags("x")["mlflow.source.git.dirty"] == "false"
+    (repository / "a.txt").write_text("two")
+    assert source_tags("x")["mlflow.source.git.dirty"] == "true"
+
+
+@pytest.mark.parametrize("setting", ["core.fsmonitor", "filter.x.clean", "filter.x.process", "Filter.y.CLEAN"])
+def test_git_starts_nothing_that_a_capture_names(repository: Path, tmp_path: Path, setting: str) -> None:
+    name = setting.split(".")[1]
+    (repository / ".gitattributes").write_text(f"*.txt filter={name}\n")
+    (repository / "a.txt").write_text("two")
+    os.utime(repository / "a.txt", (1, 1))
+    git("config", setting, str(tmp_path / "run.sh"))
+    subprocess.run(["git", "status"], capture_output=True, check=False, timeout=60)
+    assert (tmp_path / "exploded").exists()  # git alone would start it
+    (tmp_path / "exploded").unlink()
+    os.utime(repository / "a.txt", (2, 2))
+    assert source_tags("x")["mlflow.source.git.commit"] == git("rev-parse", "HEAD")
+    assert not (tmp_path / "exploded").exists()
+
+
+def test_nor_hooks(repository: Path, tmp_path: Path) -> None:
+    hook = repository / ".git" / "hooks" / "post-index-change"
+    hook.write_text(MARK.format(mark=tmp_path / "exploded"))
+    hook.chmod(0o755)
+    os.utime(repository / "a.txt", (3, 3))
+    source_tags("x")
+    assert not (tmp_path / "exploded").exists()

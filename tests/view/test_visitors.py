@@ -1,0 +1,90 @@
+"""Which requests the viewer answers: those of its own page and of programs, and of no other web page."""
+
+from __future__ import annotations
+
+import http.client
+import types
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from gsbench.errors import GsbenchError
+from gsbench.view.visitors import is_welcome, only_welcome_visitors
+
+WELCOME = [
+    (["127.0.0.1:8080"], []),
+    (["127.0.0.1:8080"], ["http://127.0.0.1:8080"]),
+    (["localhost:9000"], ["http://localhost:9000"]),  # a port that ssh forwards
+    (["[::1]:8080"], ["http://[::1]:8080"]),
+]
+UNWELCOME = [
+    (["127.0.0.1:8080"], ["https://strange.example"]),  # a page of the web
+    (["127.0.0.1:8080"], ["null"]),  # a page of a file, or in a sandbox
+    (["127.0.0.1:8080"], ["http://127.0.0.1:3000"]),  # a page of another program of this machine
+    (["127.0.0.1:8080"], ["http://127.0.0.1:8080.strange.example"]),
+    (["127.0.0.1:8080"], ["http://strange.example#http://127.0.0.1:8080"]),
+    (["strange.example:8080"], ["http://strange.example:8080"]),  # DNS rebinding: the page's own name leads here
+    (["strange.example:8080"], []),
+    (["127.0.0.1.strange.example"], []),
+    (["localhost.strange.example"], []),
+    (["strange.example@127.0.0.1:8080"], ["http://strange.example"]),
+    (["127.0.0.1:8080@strange.example"], []),
+    ([""], []),
+    ([], []),
+    (["127.0.0.1:8080", "strange.example"], []),
+    (["127.0.0.1:8080"], ["http://127.0.0.1:8080", "https://strange.example"]),
+    (["[::1"], []),
+    (["0.0.0.0:8080"], ["http://0.0.0.0:8080"]),  # which some browsers take for this machine
+]
+
+
+@pytest.mark.parametrize(("hosts", "origins"), WELCOME)
+def test_its_own_page_and_programs_are_welcome(hosts: list[str], origins: list[str]) -> None:
+    assert is_welcome(hosts, origins)
+
+
+@pytest.mark.parametrize(("hosts", "origins"), UNWELCOME)
+def test_no_other_page_is(hosts: list[str], origins: list[str]) -> None:
+    assert not is_welcome(hosts, origins)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Any]:
+    viser = pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
+    with only_welcome_visitors():
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
+
+
+def answer(server: Any, hosts: list[str], origins: list[str], upgrade: bool) -> int:
+    """The status that a server gives to a request with these headers."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=60)
+    connection.putrequest("GET", "/", skip_host=True)
+    for host in hosts:
+        connection.putheader("Host", host)
+    for origin in origins:
+        connection.putheader("Origin", origin)
+    if upgrade:
+        headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
+        for name, value in (headers | {"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ=="}).items():
+            connection.putheader(name, value)
+    connection.endheaders()
+    status = connection.getresponse().status
+    connection.close()
+    return status
+
+
+@pytest.mark.parametrize("upgrade", [False, True], ids=["page", "connection"])
+def test_the_server_itself_answers_so(server: Any, upgrade: bool) -> None:
+    for hosts, origins in WELCOME:
+        assert answer(server, hosts, origins, upgrade) == (101 if upgrade else 200)
+    for hosts, origins in UNWELCOME:
+        assert answer(server, hosts, origins, upgrade) in (400, 403), (hosts, origins)
+
+
+def test_a_server_that_was_started_otherwise_is_not_trusted() -> None:
+    pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
+    with pytest.raises(GsbenchError, match="cannot be kept from strange web pages"), only_welcome_visitors():
+        types.SimpleNamespace()
