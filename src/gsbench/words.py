@@ -67,8 +67,9 @@ def is_path(value: str) -> bool:
 def printable(text: str) -> str:
     """``text`` with its control characters written out, so that a terminal shows them and obeys none.
 
-    >>> printable("red \\x1b[31m")
-    'red \\\\x1b[31m'
+    Examples:
+        >>> printable("red \\x1b[31m")
+        'red \\\\x1b[31m'
     """
     return OBEYED.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text.replace("\r\n", "\n"))
 

@@ -29,6 +29,7 @@ def holders(runs: Path) -> dict[str, int]:
     return found
 
 
+@pytest.mark.slow
 def test_one_killed_trial_harms_no_other_and_the_next_command_mends_it(
     environment: dict[str, str], tmp_path: Path
 ) -> None:

@@ -25,6 +25,7 @@ QUICK = ["train.iterations=20", "eval.lpips=[]", "eval.flip=false", "tracking=no
 OWN = ["densify=adc", "densify._target_=mine.Mine", "allow_targets=[mine]", "densify.name=mine", "name=edited"]
 
 
+@pytest.mark.slow
 def test_an_edited_densifier_is_never_averaged_with_what_it_was(
     gsbench: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -108,10 +108,10 @@ PROGRAM = ["densify.version=1.0", "allow_targets=[mine,python,git,brush,openspla
 WITH_CODE = [*PROGRAM, "densify.options.code=/code"]
 NEEDED = {  # what a YAML leaves to its user
     ("train", "none"): ["densify=none"],
-    ("densify", "external"): [*PROGRAM, "densify.command=[mine]", "densify.result=mine.ply"],
-    ("densify", "3dgs"): WITH_CODE,
-    ("densify", "gsplat"): WITH_CODE,
-    **{("densify", name): PROGRAM for name in ("brush", "nerfstudio", "opensplat")},
+    ("densify", "external/program"): [*PROGRAM, "densify.command=[mine]", "densify.result=mine.ply"],
+    ("densify", "external/3dgs"): WITH_CODE,
+    ("densify", "external/gsplat"): WITH_CODE,
+    **{("densify", f"external/{name}"): PROGRAM for name in ("brush", "nerfstudio", "opensplat")},
 }
 
 
@@ -123,7 +123,8 @@ def test_every_yaml_composes(group: str) -> None:
             assert len(compose_trials([f"+experiment={name}", "scene=courtyard"])) >= 2  # not the paper's 13 scenes
         else:
             (trial,) = compose_trials([f"{group}={name}", "scene.path=/somewhere", *NEEDED.get((group, name), [])])
-            assert trial.values[group]["name"] == name
+            expected = "external" if name == "external/program" else name.rpartition("/")[2]
+            assert trial.values[group]["name"] == expected
 
 
 def test_paper_experiments_have_the_papers_trials_and_share_them() -> None:
