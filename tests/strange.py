@@ -12,7 +12,7 @@ import yaml
 
 from gsbench import cli
 from gsbench.errors import InputError
-from gsbench.system.own_modules import import_only
+from gsbench.system.own_modules import allowed_modules
 
 BOMB = "from pathlib import Path\nPath('exploded').touch()\nclass Bomb:\n    pass\n"
 MINE = """
@@ -47,7 +47,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     for module in ("bomb", "bombs", "mine", "helper"):
         monkeypatch.delitem(sys.modules, module, raising=False)
     yield tmp_path
-    import_only([])
+    allowed_modules().clear()
 
 
 def no_trial(trials: Any) -> Any:

@@ -146,7 +146,7 @@ def test_retry_runs_the_unfinished_with_their_own_settings(
 def test_retry_of_a_trial_without_a_plan_takes_its_own_configuration(runs: Path) -> None:
     folders = make_experiment(runs)
     (runs / "x" / "plan.json").unlink()
-    again = retry.recompose(folders[1], None, runs, [])
+    again = retry.recompose(folders[1], None, runs, [], str(runs.parent))
     assert TrialPaths.of(again.values).folder == folders[1]
     assert again.values == compose_one(["name=x", "densify=adc", "seed=1"]).values
 

@@ -97,8 +97,8 @@ def test_a_plan_allows_nothing_and_names_no_folder_of_modules(
     theirs = place / "theirs"
     theirs.mkdir()
     (theirs / "mine.py").write_text(f"open({str(place / 'exploded')!r}, 'w')\nclass Mine: ...\n")
-    words = ["name=x", "densify=adc", "densify._target_=mine.Mine"]
-    add_to_plan(compose_trials([*words, "allow_targets=[mine]"]))
+    words = ["name=x", "densify=adc", "densify._target_=mine.Mine", "seed=0,1"]
+    add_to_plan(compose_trials([*words, "allow_targets=[mine]"], multirun=True))
     plan = place / "runs" / "x" / "plan.json"
     strange = plan.read_text().replace(f'"cwd": "{place}"', f'"cwd": "{theirs}"')
     assert str(theirs) in strange

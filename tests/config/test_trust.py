@@ -19,7 +19,7 @@ from gsbench.config.trust import SBATCH_RESOURCES, check_target, foreign_variabl
 from gsbench.errors import InputError
 from gsbench.pipeline.components import build
 from gsbench.runs.source import source_of
-from gsbench.system.own_modules import import_only
+from gsbench.system.own_modules import allow_modules
 from tests.strange import BOMB, ask, experiment, no_trial
 from tests.strange import place as place
 
@@ -53,7 +53,9 @@ STRANGE: dict[str, tuple[dict[str, Any], str]] = {  # settings of a file, and a 
     "a class of gsbench in a strange place": (
         calls(_target_="gsbench.logs._QuietFileHandler", filename="exploded"), "is not a class for hydra.callbacks.x"
     ),
-    "below the sweeper": ({"hydra": {"sweeper": {"params": {"in": MKDIR}}}}, "sweeper.params.in._target_=os.mkdir"),
+    "below the sweeper": (
+        {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"in": MKDIR}}}}, "sweeper.params.in._target_=os.mkdir"
+    ),
     "beside the sweeper's settings": ({"hydra": {"sweeper": {"grids": [MKDIR]}}}, "hydra.sweeper.grids.0"),
     "a sweeper": ({"hydra": {"sweeper": {"_target_": "hydra_plugins.bomb.Bomb"}}}, "no sweeper that is installed"),
     "a launcher": ({"hydra": {"launcher": {"_target_": "hydra_plugins.gsbench.os.mkdir"}}}, "no launcher that is"),
@@ -274,13 +276,13 @@ def test_what_is_typed_is_allowed_in_files_too(capsys: pytest.CaptureFixture[str
     ],
 )
 def test_trust_in_a_module_is_no_trust_in_what_it_imports(target: str, said: str) -> None:
-    import_only(["mine"])
+    allow_modules(["mine"])
     with pytest.raises(InputError, match=said):
         build("densify", {"_target_": target, "name": "x"}, ["mine"])
 
 
 def test_trust_in_a_module_extends_to_gsbenchs_classes_in_it() -> None:
-    import_only(["mine"])
+    allow_modules(["mine"])
     assert load_class("mine.ADC", "densify", ["mine"]).__module__.startswith("gsbench.")
     assert load_class("mine.Mine", "densify", ["mine"]).__name__ == "Mine"
 
@@ -314,12 +316,12 @@ def test_only_allowed_modules_of_the_folder_are_found_and_behind_what_is_install
     (place / "json" / "__init__.py").write_text(BOMB)
     (place / "mine.py").write_text("import helper\nclass Mine:\n    pass\n")
     (place / "helper.py").write_text("")
-    import_only(["mine", "yaml", "json"])
+    allow_modules(["mine", "yaml", "json"])
     with pytest.raises(
         InputError, match=r"it lies here, but only what allow_targets names is imported from here: add helper"
     ):
         load_class("mine.Mine", "densify", ["mine"])
-    import_only(["mine", "helper", "yaml", "json"])
+    allow_modules(["mine", "helper", "yaml", "json"])
     assert load_class("mine.Mine", "densify", ["mine"])
     assert Path(str(importlib.util.find_spec("yaml").origin)) != place / "yaml.py"  # type: ignore[union-attr]
     assert importlib.util.find_spec("bomb") is None
@@ -328,7 +330,7 @@ def test_only_allowed_modules_of_the_folder_are_found_and_behind_what_is_install
 
 def test_looking_for_a_users_source_imports_nothing(place: Path) -> None:
     (place / "bombs" / "sub.py").write_text("class Sub: ...\n")
-    import_only(["bombs"])
+    allow_modules(["bombs"])
     assert source_of("bombs.sub.Sub")["source"]
     assert not Path("exploded").exists()
 

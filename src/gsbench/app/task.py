@@ -24,7 +24,7 @@ from gsbench.launch.batch import begin_for_another_launcher
 from gsbench.launch.outcome import Outcome, objective, outcome_of_error
 from gsbench.launch.trial import Trial
 from gsbench.logs import set_up_logging
-from gsbench.system.own_modules import import_only
+from gsbench.system.own_modules import allow_modules
 
 OWN = "gsbench"  # the names of gsbench's own launcher and sweeper
 
@@ -49,7 +49,7 @@ class Task:
 
     def __call__(self, config: DictConfig) -> float | None:
         """One trial, as other launchers call it, perhaps in a process of its own; raises GsbenchError if it failed."""
-        import_only(config.allow_targets)
+        allow_modules(config.allow_targets)
         set_up_logging()
         for_hydra, words = words_of(HydraConfig.get().overrides)
         (outcome,) = self.handle([Trial.of(ready_trial(config, [*for_hydra, *words]))])

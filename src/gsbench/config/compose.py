@@ -26,7 +26,7 @@ from gsbench.config.schema import Config, check, check_values, plain, register_s
 from gsbench.errors import InputError
 from gsbench.settings import checked
 from gsbench.system.install import conf_dir
-from gsbench.system.own_modules import import_only
+from gsbench.system.own_modules import allow_modules
 from gsbench.words import closest
 
 MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood
@@ -72,6 +72,7 @@ def compose_master(hydra: Hydra, words: Sequence[str], mode: RunMode = RunMode.R
     From here on the modules are found that ``words`` allow: they are what somebody has typed.
     """
     _guard(hydra, words)
+    allow_modules(typed_permissions(words))
     with explained(words), warnings.catch_warnings():
         warnings.filterwarnings("error", message=r".* is not available\.", module="hydra")  # a folder to search in
         return hydra.compose_config(CONFIG_NAME, list(words), run_mode=mode)
@@ -79,9 +80,8 @@ def compose_master(hydra: Hydra, words: Sequence[str], mode: RunMode = RunMode.R
 
 def _guard(hydra: Hydra, words: Sequence[str] = ()) -> None:
     """Let ``hydra`` compose only what cannot make anything run that ``words`` do not allow."""
-    allowed, path = typed_permissions(words), hydra.config_loader.get_search_path()
-    hydra.config_loader = GuardedLoader(path, allowed, os.getcwd())
-    import_only(allowed)
+    path = hydra.config_loader.get_search_path()
+    hydra.config_loader = GuardedLoader(path, typed_permissions(words), os.getcwd())
 
 
 def compose_jobs(

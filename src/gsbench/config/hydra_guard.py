@@ -39,7 +39,7 @@ from gsbench.config.trust import (
     to_type,
 )
 from gsbench.errors import InputError
-from gsbench.system.own_modules import import_only
+from gsbench.system.own_modules import allow_modules
 
 PERMISSIONS = "allow_targets"
 SPECIAL_KEYS = ("_partial_", "_recursive_", "_convert_", "_args_")  # what Hydra reads beside _target_
@@ -83,7 +83,7 @@ class GuardedLoader(ConfigLoaderImpl):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        import_only(self.allowed, self.folder)
+        allow_modules(self.allowed, self.folder)
 
     def load_configuration(
         self,

@@ -15,7 +15,7 @@ from typing import Any
 
 from gsbench.errors import InputError
 from gsbench.external.placeholders import program_of
-from gsbench.system.own_modules import importable
+from gsbench.system.own_modules import allowed_modules
 from gsbench.words import closest
 
 TARGET = "_target_"
@@ -97,10 +97,10 @@ def _beside(error: Exception) -> str:
     """The mend where a module is missing that lies in another folder, or beside an allowed one without being so."""
     if not isinstance(error, ModuleNotFoundError):
         return ""
-    name, (allowed, folder) = (error.name or "").split(".")[0], importable()
-    if name in allowed:
-        return f"; your modules are looked for where the command is given: {folder}"
-    if name and (Path(folder, f"{name}.py").is_file() or Path(folder, name).is_dir()):
+    name, known = (error.name or "").split(".")[0], allowed_modules()
+    if name in known:
+        return f"; your modules are looked for where the command is given: {known[name]}"
+    if name and any(Path(place, f"{name}.py").is_file() or Path(place, name).is_dir() for place in known.values()):
         return f"; it lies here, but only what allow_targets names is imported from here: add {name} there"
     return ""
 

@@ -28,7 +28,7 @@ from gsbench.runs.finished import Done, find_finished
 from gsbench.runs.layout import JOBS
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.system.install import install_command
-from gsbench.system.own_modules import import_only, importable
+from gsbench.system.own_modules import allowed_modules, take_over
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
 from gsbench.system.stopping import Stopped, stop_on_signals
 
@@ -49,13 +49,13 @@ class TrialJob:
     values: dict[str, Any]
     yaml: str
     path: list[str]  # sys.path of the submitting process
-    own: tuple[list[str], str]  # the user's modules that it may import, and where they lie
+    own: dict[str, str]  # the user's modules that it may import, and where they lie
     visible_gpus: str | None  # its CUDA_VISIBLE_DEVICES
     job: HydraJob | None = None
 
     def __call__(self) -> Outcome:
         sys.path[:] = [*self.path, *(entry for entry in sys.path if entry not in self.path)]
-        import_only(*self.own)
+        take_over(self.own)
         from gsbench.logs import set_up_logging
 
         set_up_logging()
@@ -178,7 +178,7 @@ def job_of(trial: Trial) -> TrialJob:
     """The trial as a job of the environment that this process has."""
     job = None if trial.job is None else trial.job.for_another_process()
     path = [entry for entry in sys.path if entry]
-    return TrialJob(trial.values, trial.yaml, path, importable(), os.environ.get("CUDA_VISIBLE_DEVICES"), job)
+    return TrialJob(trial.values, trial.yaml, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"), job)
 
 
 def prepare_tracking(values: dict[str, Any]) -> None:

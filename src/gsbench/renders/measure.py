@@ -25,7 +25,7 @@ from gsbench.pipeline.components import build_metrics, make_evaluator
 from gsbench.renders.import_renders import check_place, enter, find_place
 from gsbench.renders.reference_images import Truth, find_truth, truth_of_trial
 from gsbench.scene.readers import list_images
-from gsbench.system.own_modules import import_only
+from gsbench.system.own_modules import allow_modules
 from gsbench.system.resources import available_threads
 from gsbench.train.device import select_device
 from gsbench.words import counted, some_of
@@ -80,7 +80,7 @@ def _match(truth: Truth, renders: Sequence[str], by_order: bool) -> Matching:
 def _evaluator(truth: Truth, protocol: str | None, settings: Sequence[str]) -> Evaluator:
     """As the settings of the photographs' trial or scene say, unless the command says otherwise."""
     allowed = typed_permissions([word for word in settings if word.startswith(f"{PERMISSIONS}=")])
-    import_only(allowed)
+    allow_modules(allowed)
     config: Mapping[str, Any] = truth.config
     if any(word.startswith("eval") for word in settings):
         config = compose_one([word for word in settings if word.startswith(("eval", f"{PERMISSIONS}="))]).values

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, ParamSpec, TypeVar
 
 from gsbench.errors import GsbenchError
-from gsbench.system.own_modules import importable
+from gsbench.system.own_modules import allowed_modules
 from gsbench.system.supervise import go_on_as_child
 
 P = ParamSpec("P")
@@ -33,7 +33,7 @@ R = TypeVar("R")
 
 _BOOTSTRAP = (
     "import json, sys; path, own = json.loads(sys.argv[1]); sys.path[:] = path; "
-    "from gsbench.system.own_modules import import_only; import_only(*own); from {module} import {name}; {name}()"
+    "from gsbench.system.own_modules import take_over; take_over(own); from {module} import {name}; {name}()"
 )
 _SECONDS_TO_END = 10.0  # patience with a child that ends what it started, before it is killed
 _TAIL_LINES = 3
@@ -63,7 +63,9 @@ def run_isolated(
     """
     what = what or function.__name__
     if function.__module__ == "__main__" or "<" in function.__qualname__:
-        raise ValueError(f"run_isolated: {function.__qualname__} must be a top-level function of an importable module")
+        raise ValueError(
+            f"run_isolated: {function.__qualname__} must be a top-level function of an allowed_modules module"
+        )
     with tempfile.TemporaryDirectory(prefix="gsbench-isolate-") as folder:
         call, result = Path(folder, "call.pickle"), Path(folder, "result.pickle")
         call.write_bytes(pickle.dumps((function, args, kwargs)))
@@ -85,7 +87,7 @@ def python_command(module: str, name: str, *arguments: str) -> list[str]:
 
     The function takes nothing; it finds ``arguments`` in ``sys.argv[2:]``.
     """
-    found = json.dumps([sys.path, importable()])
+    found = json.dumps([sys.path, allowed_modules()])
     # -P: the current folder, in which a capture may lie, is no place to look in, not for json either.
     return [sys.executable, "-P", "-c", _BOOTSTRAP.format(module=module, name=name), found, *arguments]
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
@@ -17,30 +17,34 @@ SAFE_PATH = ("PYTHONSAFEPATH", "gsbench")
 
 
 class AllowedModules(MetaPathFinder):
-    """Finds modules by ``names`` in ``folder``, and nothing else there."""
+    """Finds modules by their names in the folders of ``folders``, and nothing else there."""
 
     def __init__(self) -> None:
-        self.folder, self.names = "", frozenset[str]()
+        self.folders: dict[str, str] = {}
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if path is not None or fullname not in self.names:
+        if path is not None or fullname not in self.folders:
             return None
-        return PathFinder.find_spec(fullname, [self.folder], target)
+        return PathFinder.find_spec(fullname, [self.folders[fullname]], target)
 
 
-_allowed_modules = AllowedModules()  # one, since Python has one list of finders
+_allowed = AllowedModules()  # one, since Python has one list of finders
 
 
-def import_only(allowed: Sequence[str], folder: str | None = None) -> None:
-    """Let Python find, in ``folder`` (default: the current one), the modules of ``allow_targets``, and no others."""
-    _allowed_modules.folder = folder or os.getcwd()
-    _allowed_modules.names = frozenset(name.split(".")[0] for name in allowed)
-    if _allowed_modules not in sys.meta_path:
-        sys.meta_path.append(_allowed_modules)
+def allow_modules(allowed: Sequence[str], folder: str | None = None) -> None:
+    """Let Python find the modules of ``allow_targets`` in ``folder`` (default: the current one)."""
+    take_over(dict.fromkeys((name.split(".")[0] for name in allowed), folder or os.getcwd()))
 
 
-def importable() -> tuple[list[str], str]:
-    """The names and the folder that `import_only` was given last, for another process."""
-    return sorted(_allowed_modules.names), _allowed_modules.folder
+def allowed_modules() -> dict[str, str]:
+    """The modules that were allowed in this process, and the folder of each."""
+    return _allowed.folders
+
+
+def take_over(folders: Mapping[str, str]) -> None:
+    """Allow what another process has allowed (`allowed_modules`)."""
+    _allowed.folders |= folders
+    if _allowed not in sys.meta_path:
+        sys.meta_path.append(_allowed)

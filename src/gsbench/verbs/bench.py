@@ -11,7 +11,7 @@ from typing import Any
 from gsbench.errors import InputError
 from gsbench.raster.executors import AUTO, EXECUTORS
 from gsbench.scene.sizes import MIN_SIZE
-from gsbench.system.own_modules import import_only
+from gsbench.system.own_modules import allow_modules
 from gsbench.verbs.arguments import ArgumentParser, path
 
 COLUMNS = (  # of the table
@@ -74,7 +74,7 @@ def main(argv: Sequence[str], _runs: Path | None = None) -> int:
     rasters = options.raster.split(",")
     if AUTO in rasters:
         raise InputError(f"--raster {AUTO} is a choice among executors: name those to time")
-    import_only([raster for raster in rasters if "." in raster])  # named here by the one who types
+    allow_modules([raster for raster in rasters if "." in raster])  # named here by the one who types
 
     from gsbench.bench import run_bench
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from gsbench.analysis.explain import ADDRESS, explain_cell
 from gsbench.errors import InputError
 from gsbench.runs.layout import CONFIG, STORE
-from gsbench.system.own_modules import import_only
+from gsbench.system.own_modules import allow_modules
 from gsbench.verbs.arguments import ArgumentParser
 
 
@@ -52,7 +52,7 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
     places = [word for word in words if not word.startswith(f"{PERMISSIONS}=")]
     if len(places) == 1 and (Path(places[0]) / CONFIG).exists():
         allowed = typed_permissions([word for word in words if word not in places])
-        import_only(allowed)
+        allow_modules(allowed)
         values = read_config(Path(places[0])) | {PERMISSIONS: list(allowed)}
         if is_entered(values):
             raise InputError(f"{places[0]} was entered from renders: it has no stages")

@@ -18,7 +18,7 @@ from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.launch.trial import Trial
 from gsbench.runs.trial_files import TrialPaths, label_of, read_config
-from gsbench.system.own_modules import import_only
+from gsbench.system.own_modules import allow_modules
 from gsbench.verbs.arguments import ArgumentParser
 
 log = logging.getLogger(__name__)
@@ -49,7 +49,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
         print(f"nothing to retry: all trials of {options.experiment} are done, running or queued")
         return 0
     planned = {trial.folder: trial for trial in read_plan(home)}
-    trials = [recompose(folder, planned.get(folder), runs, options.changes) for folder in unfinished]
+    here = os.getcwd()
+    trials = [recompose(folder, planned.get(folder), runs, options.changes, here) for folder in unfinished]
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
@@ -61,12 +62,12 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return code
 
 
-def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[str]) -> Trial:
+def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[str], here: str) -> Trial:
     """The trial in ``folder``: from its planned overrides, else from the configuration that it wrote.
 
-    Neither allows anything to run: that ``changes``, which were typed, must do again.
+    Neither allows anything to run: that ``changes``, which were typed ``here``, must do again.
     """
-    here, allowed = os.getcwd(), typed_permissions(changes)
+    allowed = typed_permissions(changes)
     if planned is not None:
         if Path(planned.cwd).is_dir():
             os.chdir(planned.cwd)  # relative paths were meant from there, and the trials are run from there
@@ -78,7 +79,7 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
         permissions = [change for change in changes if key_of(change) == PERMISSIONS]
         as_planned = compose_one([*words, *permissions]) if changes else None
         trial = compose_one([*own, *changes])
-        import_only(allowed, here)  # but not the modules: a stranger's plan would name a folder of the stranger's
+        allow_modules(allowed, here)  # but not the modules: a stranger's plan would name a folder of the stranger's
         if as_planned is not None and _identity(trial) != _identity(as_planned):
             raise InputError(
                 f"{' '.join(changes)} would make other trials than those of the plan: give the sweep's own command"
@@ -88,7 +89,7 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
         raise InputError(
             f"{label_of(folder)} is in no plan, so no setting of it can be changed: run it by its own command"
         )
-    import_only(allowed, here)
+    allow_modules(allowed, here)
     values = read_config(folder) | {"runs": str(runs), PERMISSIONS: list(allowed)}
     check_permissions(values)
     return Trial(values, yaml.safe_dump(values, sort_keys=False), ())
