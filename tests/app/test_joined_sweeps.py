@@ -17,12 +17,12 @@ from gsbench.runs.trial_files import TrialPaths
 
 # Trials of `threshold` as they were named when it was one grid with a threshold of a million in place of the baseline.
 KNOWN = {
-    "sfm-volumetric-0.001/92bf8234-seed0",
-    "sfm-volumetric-0.003/f3d951b7-seed1",
-    "sfm-volumetric-0.01/0ec006c5-seed2",
-    "sfm-volumetric-0.03/e48bb87c-seed0",
-    "sfm-volumetric-0.1/de1096b7-seed1",
-    "sfm-volumetric-0.3/89c52e53-seed2",
+    "sfm-volumetric-0.001/6b9596e4-seed0",
+    "sfm-volumetric-0.003/2584584f-seed1",
+    "sfm-volumetric-0.01/9829154a-seed2",
+    "sfm-volumetric-0.03/334ab02a-seed0",
+    "sfm-volumetric-0.1/7534912c-seed1",
+    "sfm-volumetric-0.3/f16e7a5e-seed2",
 }
 
 

@@ -138,7 +138,7 @@ def test_stopping_when_decided_contradicts_no_finding_about_lpips(name: str) -> 
     """
     frame = findings.read(name)
     for arm in sorted(set(frame.arm) - {"adc"}):
-        paired = findings.pair(frame, arm, "lpips_squeeze")
+        paired = findings.pair(frame, arm, "lpips_squeeze", "adc")
         rows = [matrix[:, 0] for matrix in paired.differences]
         alone, shared = (decide(rows, Design(len(rows), (2, 3), alpha), 0.005, -1) for alpha in (0.05, 0.01))
         better = compare(paired, -1).verdict == "better"

@@ -51,7 +51,7 @@ command: ["{{python}}", {TRAINER}, --data, "{{data}}", --output, "{{output}}", -
 result: renders/*.png
 """
 QUICK = ["init=random", "init.count=2000", "train.iterations=40", "train.densify_start=500", "tracking=none",
-         "eval.lpips=[squeeze]", "eval.download=false", f"allow_targets=['{sys.executable}']"]  # fmt: skip
+         "eval.lpips=[squeeze]", "eval.download=false", f"allow_targets=['{sys.executable}',PAINTER]"]  # fmt: skip
 COURTYARD = ["scene.views=12", "scene.width=96", "scene.height=72", *QUICK]
 
 
@@ -308,7 +308,10 @@ def test_it_ends_with_gsbench(hanging: tuple[subprocess.Popen[str], list[int]], 
     ("words", "said"),
     [
         (["allow_targets=[]"], "if you trust it, add allow_targets=["),
-        (["densify.options.python=no-such-program", "allow_targets=[no-such-program]"], "no program 'no-such-program'"),
+        (
+            ["densify.options.python=no-such-program", "allow_targets=[no-such-program,PAINTER]"],
+            "no program 'no-such-program'",
+        ),
         (["densify.command='{python} {date}'"], "nothing is known as {date}; did you mean data?"),
         (["densify.command='{python} x'"], "has no {data}"),
         (["densify.version=???"], "densify.version is not set"),

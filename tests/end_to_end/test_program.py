@@ -139,7 +139,7 @@ def test_wheel_runs_a_trial_outside_the_checkout(environment: dict[str, str], tm
         check=True,
     )
     clean = {key: value for key, value in environment.items() if key != "PYTHONPATH"}  # not the checkout's modules
-    where = "import gsbench, gsbench.config.schema as c; print(gsbench.__file__); print(c.conf_dir())"
+    where = "import gsbench, gsbench.system.install as c; print(gsbench.__file__); print(c.conf_dir())"
     found = subprocess.run([python, "-c", where], cwd=tmp_path, env=clean, capture_output=True, text=True, check=True)
     assert all(line.startswith(str(packages)) for line in found.stdout.split())
     hint = "from gsbench.system.install import install_command; print(install_command('view'))"

@@ -13,7 +13,7 @@ import pytest
 from gsbench.config.compose import compose_one
 from gsbench.launch.jobs import collect
 from gsbench.launch.outcome import Outcome
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.launch.trial import Trial
 
 
 class Bomb:
@@ -31,11 +31,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def collected(folder: Path, returned: Any) -> Outcome:
-    trial = compose_one(["name=x"])
+    trial = Trial.of(compose_one(["name=x"]))
     result = folder / "1_0_result.pkl"
     result.write_bytes(pickle.dumps(returned))
     job: Any = SimpleNamespace(paths=SimpleNamespace(result_pickle=result, stderr=folder / "log"))
-    return collect(job, TrialPaths.of(trial.values).folder, [trial])
+    return collect(job, trial.folder, [trial])
 
 
 def test_an_outcome_comes_back(folder: Path) -> None:
@@ -58,8 +58,8 @@ def test_nothing_is_run(folder: Path, wrap: Any) -> None:
 
 @pytest.mark.parametrize("content", [b"", b"no pickle", b"\x80\x05."])
 def test_what_cannot_be_read_is_said(folder: Path, content: bytes) -> None:
-    trial = compose_one(["name=x"])
+    trial = Trial.of(compose_one(["name=x"]))
     (folder / "r.pkl").write_bytes(content)
     job: Any = SimpleNamespace(paths=SimpleNamespace(result_pickle=folder / "r.pkl", stderr=folder / "log"))
-    outcome = collect(job, TrialPaths.of(trial.values).folder, [trial])
+    outcome = collect(job, trial.folder, [trial])
     assert "cannot be read" in outcome.message

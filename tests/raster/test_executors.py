@@ -32,7 +32,7 @@ def installed(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
 def test_facts_agree_with_the_class(executor: Executor) -> None:
     if executor.name == "triton" and not executor.is_installed:
         pytest.skip("Triton has no wheels for this system")
-    kind = locate(executor.target, "raster")
+    kind = locate(executor.target, "raster", [])
     assert kind.name == executor.name
     assert ("threads" in kind.__init__.__code__.co_varnames) == executor.takes_threads
     assert (executor.package is None) == (executor.install == "")

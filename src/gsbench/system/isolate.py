@@ -63,9 +63,7 @@ def run_isolated(
     """
     what = what or function.__name__
     if function.__module__ == "__main__" or "<" in function.__qualname__:
-        raise ValueError(
-            f"run_isolated: {function.__qualname__} must be a top-level function of an importable module"
-        )
+        raise ValueError(f"run_isolated: {function.__qualname__} must be a top-level function of an importable module")
     with tempfile.TemporaryDirectory(prefix="gsbench-isolate-") as folder:
         call, result = Path(folder, "call.pickle"), Path(folder, "result.pickle")
         call.write_bytes(pickle.dumps((function, args, kwargs)))
