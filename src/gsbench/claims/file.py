@@ -35,6 +35,7 @@ from annotated_types import Ge, Interval, MinLen, Predicate, doc
 from gsbench.analysis.statistics import ALPHA
 from gsbench.claims.measures import find_measure, measure_names
 from gsbench.claims.sequential import FIRST_LOOK, MOST_ALPHA, Design, plan_looks
+from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.eval.facts import find
 from gsbench.runs.hashing import sha256_of
@@ -43,7 +44,6 @@ from gsbench.words import closest
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,60}")
 KEY = re.compile(r"[+]?\w+([./]\w+)*")  # of a setting
-PERMISSIONS = "allow_targets"
 GIVEN_BY_CHECK = ("name", "seed", "runs", "eval.primary")  # settings that the plan sets by itself
 UNTOUCHED = ("says", "where")  # of a claim: words that may be mended without another plan
 NO_SIZE = "the whole of a claim hangs on it: 0.005, or 10% of the baseline's value"

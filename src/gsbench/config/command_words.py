@@ -70,7 +70,7 @@ def check_words(words: Sequence[str]) -> None:
         override = parse_word(word)
         key = override.get_key_element().lstrip("+~")
         if key.startswith(("hydra.", "hydra/")):
-            continue  # Hydra's own settings: what of them cannot be is said of the whole (launch/hydra_app.py)
+            continue  # Hydra's own settings: what of them cannot be is said of the whole (app/hydra_app.py)
         elif key == "experiment" or key.startswith(("experiment/", "experiment@", "experiment.")):
             _check_experiment_word(word, override)
         elif "@" in key:

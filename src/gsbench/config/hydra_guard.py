@@ -27,6 +27,7 @@ from omegaconf.grammar_parser import parse
 from gsbench.config.command_words import parse_word
 from gsbench.config.trust import (
     PACKAGE,
+    PERMISSIONS,
     SHELL,
     TARGET,
     check_target,
@@ -41,7 +42,6 @@ from gsbench.config.trust import (
 from gsbench.errors import InputError
 from gsbench.system.own_modules import allow_modules
 
-PERMISSIONS = "allow_targets"
 SPECIAL_KEYS = ("_partial_", "_recursive_", "_convert_", "_args_")  # what Hydra reads beside _target_
 OF_CALLBACKS = SPECIAL_KEYS[1:]
 HYDRAS_CALLBACKS = tuple(

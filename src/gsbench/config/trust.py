@@ -19,6 +19,7 @@ from gsbench.system.own_modules import allowed_modules
 from gsbench.words import closest
 
 TARGET = "_target_"
+PERMISSIONS = "allow_targets"  # the setting that says what may run; it counts on the command line only
 PACKAGE = "gsbench"
 COMPONENTS = ("init", "densify", "raster")  # groups that name one class each; `eval.extra` names any number
 EXTERNAL = "gsbench.densify.External"  # another program trains
@@ -110,7 +111,7 @@ def check_permissions(values: Mapping[str, Any]) -> None:
 
     This is the last check, of plain values, whatever file or command line they came from. Raises InputError.
     """
-    allowed = values.get("allow_targets") or []
+    allowed = values.get(PERMISSIONS) or []
     for place, target in targets_in(values):
         group = ".".join(place)
         check_target(target, group, allowed, homes_of(place))

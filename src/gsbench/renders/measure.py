@@ -12,7 +12,8 @@ import torch
 
 from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import compose_one
-from gsbench.config.hydra_guard import PERMISSIONS, typed_permissions
+from gsbench.config.hydra_guard import typed_permissions
+from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize
 from gsbench.eval.facts import METRICS

@@ -8,7 +8,7 @@ from pathlib import Path
 from gsbench.claims.file import direction_is_odd, read_claims
 from gsbench.claims.here import Here
 from gsbench.claims.sweep import Check, prepare, run_looks
-from gsbench.config.hydra_guard import PERMISSIONS
+from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, write_text
 from gsbench.launch.declare import declare_plan

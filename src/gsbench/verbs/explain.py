@@ -41,7 +41,8 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
     )
     words = parser.parse_args(argv).trial
     from gsbench.app.hydra_app import compose_trials
-    from gsbench.config.hydra_guard import PERMISSIONS, typed_permissions
+    from gsbench.config.hydra_guard import typed_permissions
+    from gsbench.config.trust import PERMISSIONS
     from gsbench.pipeline.parts import Parts
     from gsbench.pipeline.wiring import TrialSteps
     from gsbench.renders.import_renders import is_entered

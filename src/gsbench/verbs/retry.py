@@ -11,8 +11,8 @@ import yaml
 
 from gsbench.analysis.results import experiment_home
 from gsbench.config.compose import Composed, compose_one
-from gsbench.config.hydra_guard import PERMISSIONS, typed_permissions
-from gsbench.config.trust import check_permissions
+from gsbench.config.hydra_guard import typed_permissions
+from gsbench.config.trust import PERMISSIONS, check_permissions
 from gsbench.errors import InputError
 from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
