@@ -81,6 +81,21 @@ def test_needles_keep_their_gradients() -> None:
     assert (errors[0] - errors[1]).abs().max() < 2e-5 * errors[1].abs().max()
 
 
+def test_turning_a_ball_has_no_gradient() -> None:
+    """Not even a rounding error: Adam would turn 1e-13 into a full step. What is nearly a ball has a true one."""
+    for stretch in (0.0, 0.01):
+        gaussians = MANY.gaussians()
+        gaussians.log_scales[:] = gaussians.log_scales[:, :1]
+        gaussians.log_scales[:, 1] += stretch
+        found = []
+        for rasterizer, dtype in ((CpuRasterizer(threads=1), torch.float32), (ReferenceRasterizer(), torch.float64)):
+            leaves = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
+            rasterizer.render(leaves, MANY.camera(), 3, BLACK.to(dtype)).image.square().sum().backward()
+            found.append(leaves.quaternions.grad.double())
+        assert bool(found[0].any()) == (stretch > 0)
+        assert (found[0] - found[1]).abs().max() < 1e-3 * found[1].abs().max() + 1e-12
+
+
 def test_renders_may_be_differentiated_late_and_twice() -> None:
     """Two graphs at once, in the opposite order, and one of them twice: none may use the memory of another."""
     rasterizer = CpuRasterizer(threads=1)
