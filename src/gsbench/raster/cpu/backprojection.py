@@ -172,8 +172,8 @@ def backproject_shard(
             absolute_y = load(sums, at.SUM_ABS_Y * LANES)
             scatter(g_absolute, indices, 2, 1, absolute_y * (0.5 * v.height))
 
-        # M = N S, N = A R: d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U = [[1, shear], [0, 1]], G the second
-        # moments of h over (t, dy). The first row of U M is short for a needle: U N comes first.
+        # M = N S, N = A R: d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U = [[1, shear], [0, 1]], G the
+        # second moments of h over (t, dy). The first row of U M is short for a needle: U N comes first.
         q00 = a * a * load(sums, at.SUM_H_TT * LANES)
         q01 = a * e * load(sums, at.SUM_H_TY * LANES)
         q11 = e * e * load(sums, at.SUM_H_YY * LANES)
@@ -185,9 +185,9 @@ def backproject_shard(
         scatter(g_log_scales, indices, 3, 1, (u0[1] * g0[1] + n1[1] * g1[1]) * variances[1])
         scatter(g_log_scales, indices, 3, 2, (u0[2] * g0[2] + n1[2] * g1[2]) * variances[2])
 
-        # Turned by small angles w about its own axes, R S^2 R^T changes by a commutator: the gradient at w has differences
-        # of variances as factors. Taken first, they make that of a ball 0, where the rounding of terms that cancel would
-        # become full steps of Adam. The quaternion moves by q (0, w) / 2.
+        # Turned by small angles w about its own axes, R S^2 R^T changes by a commutator: the gradient at w has
+        # differences of variances as factors. Taken first, they make that of a ball 0, where the rounding of terms that
+        # cancel would become full steps of Adam. The quaternion moves by q (0, w) / 2.
         w_x = (u0[1] * g0[2] + n1[1] * g1[2]) * _difference(scales[1], scales[2])
         w_y = (u0[2] * g0[0] + n1[2] * g1[0]) * _difference(scales[2], scales[0])
         w_z = (u0[0] * g0[1] + n1[0] * g1[1]) * _difference(scales[0], scales[1])
