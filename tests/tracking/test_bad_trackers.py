@@ -19,6 +19,7 @@ import pytest
 
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.tracking import connect, mirror_trial, prepare
+from gsbench.tracking.client import SETTINGS
 from tests.end_to_end.conftest import SMALL
 from tests.processes import heed_interrupts
 from tests.tracking.helpers import (
@@ -177,8 +178,16 @@ def tracker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         )
 
 
-def test_a_tracker_may_go_at_any_moment(tracker: tuple[Gate, str], tmp_path: Path) -> None:
-    """It is taken away early, late and in between; each time ``sync`` completes one run, with each value once."""
+def test_a_tracker_may_go_at_any_moment(
+    tracker: tuple[Gate, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is taken away early, late and in between; each time ``sync`` completes one run, with each value once.
+
+    A transaction that was cut off, of which the database never hears again, keeps nobody from its rows for long.
+    """
+    seconds = SETTINGS["PGOPTIONS"].replace("60s", "3s")
+    assert seconds != SETTINGS["PGOPTIONS"]
+    monkeypatch.setenv("PGOPTIONS", seconds)
     gate, uri = tracker
     prepare(options(uri, patience=SECONDS), tmp_path, "tracked")
     gate.passed = 0
