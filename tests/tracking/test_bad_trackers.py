@@ -79,7 +79,14 @@ def check_complete(runs: Path, name: str, code: int, errors: str) -> None:
     assert json.loads(results.read_text())["status"] == "complete"
 
 
-@pytest.mark.parametrize("kind", ["never answers", "answers after a minute", "refuses", "hangs up", "postgresql"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "never answers",
+        "refuses",
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("answers after a minute", "hangs up", "postgresql")),
+    ],
+)
 def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
     with ExitStack() as stack:
         port = free_port()
@@ -95,7 +102,10 @@ def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
     check_complete(runs, name, program.returncode, errors)
 
 
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "signum",
+    [signal.SIGINT, *(pytest.param(signum, marks=pytest.mark.slow) for signum in (signal.SIGTERM, signal.SIGKILL))],
+)
 def test_nothing_is_left_of_a_trial_that_is_ended_while_its_tracker_hangs(signum: int, runs: Path) -> None:
     name = f"ended_by_{signum}"
     with Listener() as tracker:
