@@ -46,7 +46,7 @@ DeviceName = Annotated[
 
 @dataclass
 class ComponentConfig:
-    """What ``init`` and ``densify`` have in common; their other keys are the options of the class."""
+    """Keys that ``init`` and ``densify`` have in common; their other keys are the options of the class."""
 
     name: FolderName
     _target_: TargetName
@@ -220,7 +220,7 @@ def _convert(node: DictConfig, schema: type, given: Mapping[str, Any], group: st
 
 
 def check_external(config: DictConfig) -> None:
-    """What another program can be asked for."""
+    """Check what another program is asked for; raises InputError for what it cannot give."""
     settings = _group(config, "densify")
     require_values(settings, "densify")
     if config.eval.at:

@@ -1,4 +1,4 @@
-"""From configuration to objects: components, evaluators and devices, with errors that name the key."""
+"""Objects of a configuration: components, evaluators and devices, with errors that name the key."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ SOG = (
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: 0 if the file, or folder, was written."""
+    """Run the verb: 0 if the file, or folder, was written."""
     parser = ArgumentParser(
         prog="gsbench export",
         description="Write a trained model for other programs; `gsbench export init TRIAL --out DIR` copies the COLMAP "

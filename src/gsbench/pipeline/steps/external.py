@@ -138,7 +138,7 @@ def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str,
 
 
 def check_version(trainer: External, values: Mapping[str, object], environment: Mapping[str, str]) -> str | None:
-    """What ``densify.version_command`` prints, in one line; raises `InputError` unless it contains the version."""
+    """Run ``densify.version_command`` and return its line; raises `InputError` unless that contains the version."""
     if trainer.version_command is None:
         return None
     key = "densify.version_command"
