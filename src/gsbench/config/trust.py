@@ -22,7 +22,7 @@ TARGET = "_target_"
 PERMISSIONS = "allow_targets"  # the setting that says what may run; it counts on the command line only
 PACKAGE = "gsbench"
 COMPONENTS = ("init", "densify", "raster")  # groups that name one class each; `eval.extra` names any number
-EXTERNAL = "gsbench.densify.External"  # another program trains
+EXTERNAL = ("gsbench.densify.External", "gsbench.external.settings.External")  # names of the class: another program
 SHELL, SBATCH = "bash", "sbatch"  # the permissions for lines of a shell, and for unusual options of Slurm
 # Variables that a configuration may set: they choose numbers of threads and devices. No list of the dangerous ones
 # could be complete: MPLBACKEND imports a module, NUMBA_CACHE_DIR unpickles, CUDA_INJECTION64_PATH and GCONV_PATH load
@@ -143,9 +143,8 @@ def homes_of(place: Sequence[str]) -> tuple[str, ...]:
 
 
 def is_external(densify: Mapping[str, Any]) -> bool:
-    """Return whether these settings are another program's, by whatever path they name gsbench's class for it."""
-    package, _, rest = str(densify.get(TARGET)).partition(".")
-    return package == PACKAGE and rest.rpartition(".")[2] == EXTERNAL.rpartition(".")[2]
+    """Return whether these settings are another program's; by a path other than `EXTERNAL` nothing builds the class."""
+    return densify.get(TARGET) in EXTERNAL
 
 
 def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
