@@ -1,4 +1,4 @@
-"""gsbench: does an idea help 3D Gaussian Splatting? Photographs in; tables, statistics and pictures out."""
+"""gsbench tests whether an idea helps 3D Gaussian Splatting. Photographs in; tables, statistics and pictures out."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""What a refinement did, and why a Gaussian exists: the one table of both. Loads no torch."""
+"""Table of what refinements do, and of the causes of Gaussians. Loads no torch."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import ClassVar
 
 
 class Cause(IntEnum):
-    """Why a Gaussian exists: the number in ``lineage.npz``, words, and a colour (r, g, b) for pictures.
+    """Cause of a Gaussian's existence: the number in ``lineage.npz``, words, and a colour (r, g, b) for pictures.
 
     The colours are those of Okabe and Ito (2008), which colour-blind people can tell apart.
     """
@@ -32,7 +32,7 @@ class Cause(IntEnum):
 
     @property
     def key(self) -> str:
-        """Its name in result files."""
+        """The name of the cause in result files."""
         return self.name.lower()
 
 
@@ -73,7 +73,7 @@ class RefineEvent:
     cull: float | None = None
 
     def balances(self) -> bool:
-        """Whether the counts explain ``after``."""
+        """Return whether the counts explain ``after``."""
         grown = sum(getattr(self, name) for name in self.GROWN)
         return self.after == self.before + grown - sum(getattr(self, name) for name in self.PRUNED)
 

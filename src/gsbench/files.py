@@ -20,7 +20,7 @@ CHUNK = 1 << 20
 TEMPORARY = re.compile(r"^\..+\.tmp(-\d+)?$")  # how gsbench names a file that it is still writing
 FULL = (errno.ENOSPC, errno.EDQUOT)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
-# What libraries say without an error number when a write is cut short: numpy's tofile, torch's zip writer, SQLite.
+# Messages of libraries, without an error number, when a write is cut short: numpy's tofile, torch's zip writer, SQLite.
 FULL_TEXT = re.compile(
     r"No space left|requested and \d+ written|PytorchStreamWriter failed|unexpected pos|disk is full"
 )
@@ -28,7 +28,7 @@ NEARLY_NOTHING = 64 * 1024  # bytes free: with less, any failed write is a full 
 
 
 class DiskFullError(GsbenchError):
-    """The disk of the runs folder is full: no trial can go on (exit code 1)."""
+    """Error of a full disk of the runs folder: no trial can go on (exit code 1)."""
 
 
 @contextmanager

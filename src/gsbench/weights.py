@@ -28,7 +28,7 @@ SAFETENSORS_SUFFIX = ".safetensors"
 
 
 class MissingWeights(InputError):  # noqa: N818  it says what is the matter
-    """A weights file lies nowhere and cannot be downloaded, or what lies there is not that file."""
+    """Error of a weights file that lies nowhere and cannot be downloaded, or is not the one that is wanted."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def find_weights(spec: WeightsFile, folder: Path | None = None, download: bool =
 
 
 def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, download: bool = True) -> list[Path]:
-    """As `find_weights` for several files; one error names all that are missing."""
+    """Find several files as `find_weights` does; one error names all that are missing."""
     folders = _search_folders(folder)
     found = {spec: _find_local(spec, folders) for spec in specs}
     missing = [spec for spec, path in found.items() if path is None]

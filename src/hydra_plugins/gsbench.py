@@ -1,4 +1,4 @@
-"""By these names Hydra finds gsbench's launcher and sweepers; what they do stands in ``gsbench.launch``.
+"""Plug-ins by which Hydra finds gsbench's launcher and sweepers; what they do stands in ``gsbench.launch``.
 
 Hydra imports this file at every start, of any Hydra app in the same environment, so it imports Hydra alone.
 """
@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 
 class GsbenchLauncher(Launcher):
-    """Gets all trials of a sweep at once, and runs them as the settings below ``launch`` say."""
+    """Launcher that gets all trials of a sweep at once, and runs them as the settings below ``launch`` say."""
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         self.context, self.task, self.config = hydra_context, task_function, config

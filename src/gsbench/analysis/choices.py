@@ -1,6 +1,6 @@
-"""Our choices where a paper is silent or chose otherwise: one line each, below a table of differences from it.
+"""Settings that a paper leaves open, or in which gsbench differs from it: one line each, below a table of differences.
 
-What we chose is read from the trials' recorded configurations; what the paper says stands with its numbers, as
+The values of gsbench are read from the trials' recorded configurations; what the paper says stands with its numbers, as
 ``setup`` of its YAML. A choice of which that says nothing is not shown, nor one in which both agree.
 """
 
@@ -27,7 +27,7 @@ ORDERS = {
 
 @dataclass(frozen=True)
 class PaperChoice:
-    """What a paper says of one choice, in words that follow "the paper"; ``value`` is set where it states all of it."""
+    """Words of a paper on one setting, to be read after "the paper"; ``value`` is set where it states all of it."""
 
     words: str
     value: str | None = None

@@ -1,4 +1,4 @@
-"""Which metric a verdict was declared to be about (``eval.primary``), when, and which results were there before.
+"""Declaration of the metric that a verdict is about (``eval.primary``): its time, and the results that came before it.
 
 `gsbench.runs.declaration` keeps the record; a trial's ``results.json`` says when it was measured (``measured``).
 """
@@ -32,11 +32,11 @@ class ActiveDeclaration:
 
     @property
     def beforehand(self) -> bool:
-        """Whether no result was there yet: only then does the metric stand for itself."""
+        """Return whether no result was there yet: only then does the metric stand for itself."""
         return not self.seen
 
     def sentences(self, name: str) -> list[str]:
-        """What a reader must know of the declaration of the metric called ``name``."""
+        """Sentences that a reader must know of the declaration of the metric called ``name``."""
         when = self.declaration.when
         if self.beforehand:
             lines = [
@@ -66,6 +66,6 @@ def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration |
 
 
 def measured(trial: TrialResult) -> float:
-    """When the trial's metrics were there, Unix time; of results that do not say it, when they were written."""
+    """The Unix time at which the trial's metrics were there; of results that do not say it, that of the file."""
     moment = unix_time(trial.data.get("measured"))
     return trial.finished if moment is None else moment

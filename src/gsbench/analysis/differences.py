@@ -1,4 +1,4 @@
-"""In what trials differ: the conditions, the settings, and the versions of the code that made them."""
+"""Differences between trials: the conditions, the settings, and the versions of the code that made them."""
 
 from __future__ import annotations
 

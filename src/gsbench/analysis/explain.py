@@ -1,4 +1,4 @@
-"""How one number of a table came about."""
+"""Origin of one number of a table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""On which machines trials ran and from which clouds they started: what may differ though settings are equal."""
+"""Machines that trials ran on and clouds that they started from, which may differ though settings are equal."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def cloud_lines(trials: Sequence[TrialResult]) -> list[str]:
-    """For each scene and initialiser: the hashes of the clouds that its trials started from, and their points."""
+    """List, for each scene and initialiser, the hashes of the clouds that its trials started from, and their points."""
     lines = []
     for (scene, init), group in sorted(by_key(trials, lambda trial: (trial.scene, trial.init)).items()):
         clouds = by_key(group, lambda trial: (cloud_of(trial), _init_key(trial), trial.data.get("num_init_points")))

@@ -1,4 +1,4 @@
-"""What a table can show of a trial: metrics, counts and costs, with their names, directions and formats."""
+"""Quantities that a table can show of a trial: metrics, counts and costs, with their names, directions and formats."""
 
 from __future__ import annotations
 

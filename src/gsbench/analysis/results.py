@@ -51,7 +51,7 @@ class TrialResult:
 
     @property
     def arm(self) -> Arm:
-        """What is compared: the initialiser, and the densifier with its variant."""
+        """The name of the compared arm: the initialiser, and the densifier with its variant."""
         return self.init, f"{self.densify} {self.variant}".strip()
 
     @property
@@ -82,11 +82,11 @@ class TrialResult:
 
     @property
     def finished(self) -> float:
-        """When the trial was finished, Unix time."""
+        """The Unix time at which the trial was finished."""
         return (self.path / RESULTS).stat().st_mtime
 
     def conditions(self) -> dict[str, str]:
-        """What trials must share before their numbers may be averaged, as comparable text, as far as it is known."""
+        """The known conditions that trials must share before their numbers may be averaged, as comparable text."""
         known = {
             "protocol": str(self.data["protocol"]),
             "resolution": _size_text(self.data.get("resolution")),
@@ -102,12 +102,12 @@ class TrialResult:
 
     @property
     def from_renders(self) -> bool:
-        """Whether another program's renders were measured, whose model was not seen."""
+        """Return whether renders of another program were measured, without a model."""
         return self.data.get("evaluated_from") == FROM_RENDERS
 
     @property
     def made_elsewhere(self) -> bool:
-        """Whether another program made the model or the renders, in a time and with a budget that nobody knows."""
+        """Return whether another program made the model or the renders, so that time and budget are unknown."""
         return self.data.get("evaluated_from") in (FROM_MODEL, FROM_RENDERS) and not self.program
 
     @property
@@ -119,7 +119,7 @@ class TrialResult:
 
     @property
     def budget_acted(self) -> bool:
-        """Whether the trial's budget may have changed it: a cap that refused or steers, or a limit of time."""
+        """Return whether the trial's budget may have changed it: a cap that refused or steers, or a limit of time."""
         if self.made_elsewhere or self.program:
             return False
         budget, events = self.data.get("budget"), self.data.get("events")
@@ -131,7 +131,7 @@ class TrialResult:
 
 @dataclass(frozen=True)
 class Experiment:
-    """All of an experiment that can be used, and one line for each trial folder that cannot."""
+    """Trials of an experiment that can be used, and one line for each trial folder that cannot."""
 
     name: str
     folder: Path
@@ -156,7 +156,7 @@ def load_experiment(runs_dir: Path, name: str) -> Experiment:
 
 
 def read_experiment(folder: Path) -> Experiment:
-    """Every trial of the experiment in ``folder``, which may have none yet."""
+    """Read every trial of the experiment in ``folder``, which may have none yet."""
     runs_dir = folder.parent
     trials: list[TrialResult] = []
     warnings: list[str] = []

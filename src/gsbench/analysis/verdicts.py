@@ -108,7 +108,7 @@ def declared_quantity(trials: Sequence[TrialResult], declared: ActiveDeclaration
 
 
 def declared_lines(declared: ActiveDeclaration, judged: dict[Pair, ArmVerdicts]) -> list[str]:
-    """What was declared, and the verdict on it for each pair of arms, for the notes below a table."""
+    """Lines below a table that say what was declared, and the verdict on it for each pair of arms."""
     quantity = next(iter(judged.values())).declared if judged else None
     lines = declared.sentences(declared.metric if quantity is None else quantity.name)
     for (first, second), one in judged.items():
@@ -121,7 +121,7 @@ def declared_lines(declared: ActiveDeclaration, judged: dict[Pair, ArmVerdicts])
 
 
 def families(judged: Sequence[ArmVerdicts]) -> list[str]:
-    """How many tests each family had, and how it was adjusted; nothing where nothing was declared."""
+    """Lines that say how many tests each family had, and how it was adjusted; empty where nothing was declared."""
     sizes: dict[Role, int] = {}
     for one in judged:
         sizes |= {verdict.role: verdict.comparison.family for verdict in one.verdicts if verdict.role}

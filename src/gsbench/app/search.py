@@ -66,14 +66,14 @@ class SearchSettings:
 
     @property
     def direction(self) -> int:
-        """+1: more is better; -1: less is better; 0: not known."""
+        """The direction of the metric: +1 where more is better, -1 where less is, 0 where that is not known."""
         facts = find(self.metric)
         return facts.direction if facts else 0
 
 
 @dataclass(frozen=True)
 class Space:
-    """What is searched: the words that stay, the distribution of each searched key, and the seeds."""
+    """Space of a search: the words that stay, the distribution of each searched key, and the seeds."""
 
     fixed: tuple[str, ...]
     searched: Mapping[str, BaseDistribution]

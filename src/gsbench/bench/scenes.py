@@ -1,4 +1,4 @@
-"""What is timed: synthetic Gaussians, the same for one count on every machine, or a trained model; and its camera."""
+"""Scenes to be timed: synthetic Gaussians, equal for one count on every machine, or a trained model; and its camera."""
 
 from __future__ import annotations
 
@@ -29,8 +29,9 @@ INITIAL_OPACITY = 0.1  # 3DGS
 
 
 def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
-    """Meant to resemble a trained model without being fitted to one: ``count`` Gaussians, many small and flat, few
-    large, opacities of all kinds. They fill the view of `frontal_camera` and a margin, a few of them outside."""
+    """Make ``count`` Gaussians like those of a trained model: many small and flat, few large, opacities of all kinds.
+    They fill the view of `frontal_camera` and a margin, a few of them outside.
+    """
     generator = _generator(count, seed)
     depth = FIRST_DEPTH * torch.exp(torch.rand(count, generator=generator) * math.log(DEPTH_RATIO))  # [N]
     slopes = (torch.rand(count, 2, generator=generator) - 0.5) * torch.tensor([1.4, 1.05])  # [N, 2] x/z, y/z
@@ -48,8 +49,9 @@ def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
 
 
 def random_gaussians(count: int, seed: int = SEED) -> Gaussians:
-    """As a training begins: ``count`` faint balls of equal size, as large as they are apart, in a box before
-    `frontal_camera`."""
+    """Make the Gaussians of a training's begin: ``count`` faint balls of equal size, as large as they are apart, in a
+    box before `frontal_camera`.
+    """
     generator = _generator(count, seed)
     means = BOX_SIDE * (torch.rand(count, 3, generator=generator) - 0.5)
     means[:, 2] += BOX_DEPTH

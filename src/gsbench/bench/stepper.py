@@ -33,7 +33,7 @@ NOWHERE = Path("/nonexistent")  # a folder that is named and never used: no snap
 
 @dataclass(frozen=True)
 class Setting:
-    """What is timed."""
+    """Conditions of a measurement."""
 
     scene: str  # of `bench.scenes.SCENES`
     width: int  # px
@@ -105,7 +105,7 @@ class Stepper:
         return steps / (self._now() - begin)
 
     def waits(self) -> Counter[str] | None:
-        """What made the host wait for the device in one whole training step; None for the peer and on a CPU."""
+        """Calls that made the host wait for the device in one whole training step; None for the peer and on a CPU."""
         if self.is_peer or self.device.type == "cpu":
             return None
         self.trainer.losses.settle()
@@ -120,7 +120,7 @@ class Stepper:
 
 
 def device_of(raster: str) -> torch.device:
-    """Where ``raster`` is timed: on a GPU if it runs on nothing else, or is a user's own class and there is one."""
+    """The device on which ``raster`` is timed: a GPU if it needs one, or is a user's own class and there is one."""
     if raster == PEER:
         return torch.device("cpu")
     if "." in raster:

@@ -1,4 +1,4 @@
-"""What a claim may be about: any metric of a trial, its counts and times, and its error where photographs are textured.
+"""Measures that a claim may be about: a trial's metrics, counts, times, and error where photographs are textured.
 
 Every measure is one number of a trial. Counts and times are compared as ratios, metrics as differences or as ratios.
 """
@@ -61,7 +61,7 @@ REGIONS = {TEXTURED: Measure(TEXTURED, "error in textured parts (levels)", textu
 
 
 def measure_names() -> tuple[str, ...]:
-    """What the ``metric`` of a claim may be, apart from a user's own."""
+    """The names that the ``metric`` of a claim may have, apart from a user's own."""
     return (*known_keys(), *REGIONS, *COSTS)
 
 

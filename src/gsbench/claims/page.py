@@ -37,7 +37,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """What both formats show."""
+    """Content of the verdicts' page, for both formats."""
 
     title: str
     lines: tuple[str, ...]

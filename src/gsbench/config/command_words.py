@@ -48,7 +48,7 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
 
 
 def search_path(folders: Sequence[Path], overrides: Sequence[str]) -> list[str]:
-    """What ``--config-dir`` means to Hydra."""
+    """The entries of Hydra's search path that ``--config-dir`` stands for."""
     if not folders:
         return []
     if len(folders) > 1 or any(word.startswith("hydra.searchpath=") for word in overrides):
@@ -112,7 +112,7 @@ def check_single(words: Sequence[str], mend: str) -> None:
 
 
 def is_sweep(word: str) -> bool:
-    """Whether a word lists several values."""
+    """Return whether a word lists several values."""
     return bool(parse_word(word).is_sweep_override())
 
 

@@ -67,7 +67,7 @@ def composing() -> Iterator[Hydra]:
 
 
 def compose_master(hydra: Hydra, words: Sequence[str], mode: RunMode = RunMode.RUN) -> DictConfig:
-    """What Hydra makes of ``words``, with its own settings in the node ``hydra``. Raises InputError, one line.
+    """Compose the configuration of ``words``, with Hydra's settings in the node ``hydra``; raises InputError, one line.
 
     From here on the modules are found that ``words`` allow: they are what somebody has typed.
     """
@@ -138,7 +138,7 @@ def ready_trial(config: DictConfig, overrides: Sequence[str], job: HydraJob | No
 
 
 def settle(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
-    """What ``config`` says of the trial, checked: a copy without Hydra's own node ``hydra``."""
+    """Check ``config`` and return the trial's part of it: a copy without Hydra's own node ``hydra``."""
     with explained(overrides):  # such as an interpolation that leads nowhere
         trial = _without_hydra(config)
         check(trial)

@@ -58,7 +58,7 @@ SHELL_SETTINGS = ("setup", "python", "srun_args", "additional_parameters")  # of
 
 
 def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
-    """What the words of a command line allow: those of ``allow_targets=[…]``, the last if it stands there twice."""
+    """The names that a command line allows: those of ``allow_targets=[…]``, the last if it stands there twice."""
     found: tuple[str, ...] = ()
     for word in words:
         override = parse_word(word)

@@ -1,4 +1,4 @@
-"""What Hydra itself is asked about the configuration: to show it, and what the Tab key may offer."""
+"""Questions to Hydra about the configuration: to show it, and to complete its words."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def answer(argv: Sequence[str]) -> None:
 
 
 def has_part(config: DictConfig, key: str) -> bool:
-    """Whether there is a part ``key``, with dots, of a configuration."""
+    """Return whether a configuration has the part ``key``, with dots."""
     return OmegaConf.select(config, key) is not None
 
 

@@ -1,4 +1,4 @@
-"""What is known of every metric before it is computed, as one table that everything asks. Loads no torch.
+"""Facts of every metric that are known before it is computed, in one table. Loads no torch.
 
 A metric of your own needs no entry here: ``eval.extra.NAME._target_=mine.MyMetric`` (docs/metric.md).
 """
@@ -150,12 +150,12 @@ def known_keys() -> tuple[str, ...]:
 
 
 def lpips_variants() -> tuple[str, ...]:
-    """What ``eval.lpips`` may list."""
+    """The values that ``eval.lpips`` may list."""
     return tuple(facts.key.removeprefix(LPIPS) for facts in METRICS if facts.key.startswith(LPIPS))
 
 
 def further_keys() -> tuple[str, ...]:
-    """What ``eval.more`` may list."""
+    """The values that ``eval.more`` may list."""
     return tuple(facts.key for facts in METRICS if facts.setting == MORE)
 
 
@@ -183,7 +183,7 @@ def facts_of(key: str, metric: object) -> MetricFacts:
 
 
 def to_record(facts: MetricFacts) -> dict[str, Any]:
-    """What results keep of a user's metric, so that tables need not import its class."""
+    """The facts that results keep of a user's metric, so that tables need not import its class."""
     kept = ("label", "direction", "decimals", "unit", "worthwhile")
     return {name: value for name, value in asdict(facts).items() if name in kept}
 

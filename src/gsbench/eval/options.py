@@ -21,7 +21,7 @@ TAKEN_NAMES = (*known_keys(), "view", "lpips")  # of metrics, and what else a ta
 
 
 def are_different(values: list[Any]) -> bool:
-    """Whether no value stands twice in a list."""
+    """Return whether no value stands twice in a list."""
     return len(set(values)) == len(values)
 
 

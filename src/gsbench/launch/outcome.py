@@ -1,4 +1,4 @@
-"""How a trial ended, as plain values that travel between processes."""
+"""End of a trial, as plain values that travel between processes."""
 
 from __future__ import annotations
 
@@ -50,5 +50,5 @@ def outcome_of_error(folder: Path, error: Exception) -> Outcome:
 
 
 def objective(metrics: Mapping[str, float]) -> float | None:
-    """What a trial with these metrics returns to Hydra's sweepers and callbacks."""
+    """The values that a trial with these metrics returns to Hydra's sweepers and callbacks."""
     return metrics.get(OBJECTIVE)

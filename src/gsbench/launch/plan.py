@@ -113,7 +113,7 @@ class Estimate:
 
 
 class Estimator:
-    """Tells a trial's time from finished ones: most alike first (same scene and densifier), per iteration."""
+    """Estimate of a trial's time from finished ones: most alike first (same scene and densifier), per iteration."""
 
     def __init__(self, runs: Path) -> None:
         self.finished: list[dict[str, Any]] = []

@@ -1,4 +1,4 @@
-"""What Slurm was given, by a note in a trial's folder, and what it still has, by its queue. Loads no torch."""
+"""Jobs that Slurm was given, by notes in trials' folders, and those that it still has, by its queue. Loads no torch."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class QueuedJob:
 
     @property
     def waits(self) -> bool:
-        """Whether it has not begun, or not begun again."""
+        """Return whether the job has not begun, or not begun again."""
         return self.state in WAITING
 
     @property
@@ -64,7 +64,7 @@ def read_submission(folder: Path) -> Submission | None:
 
 
 def forget_submission(folder: Path) -> None:
-    """The job of the trial in ``folder`` has ended."""
+    """Record that the job of the trial in ``folder`` has ended."""
     (folder / SUBMITTED).unlink(missing_ok=True)
 
 

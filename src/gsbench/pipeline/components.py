@@ -1,4 +1,4 @@
-"""From configuration to objects: components, evaluators and devices, with errors that name the key."""
+"""Objects of a configuration: components, evaluators and devices, with errors that name the key."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from gsbench.config.schema import require_values
-from gsbench.config.trust import EXTERNAL, check_program, check_target, homes_of, load_class, targets_in
+from gsbench.config.trust import check_program, check_target, homes_of, is_external, load_class, targets_in
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import facts_of
@@ -28,7 +28,6 @@ from gsbench.settings import checked, unknown_setting
 
 log = logging.getLogger(__name__)
 
-MOVED = {EXTERNAL: "gsbench.external.settings.External"}  # how configurations name a class, and where it stands
 RESERVED = ("_target_", "name")  # keys of a group that are not options of its class
 METHODS = {
     "init": ("needs_reference", "content", "run"),
@@ -48,9 +47,10 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     target = values["_target_"]
     for place, named in targets_in(values, tuple(group.split("."))):
         check_target(named, ".".join(place), allow_targets, homes_of(place))
-    cls = locate(target, group, allow_targets)
-    if cls is External:
+    external = group == "densify" and is_external(values)
+    if external:
         check_program(values, allow_targets)
+    cls = External if external else locate(target, group, allow_targets)
     require_values(values, group)
     options = {key: value for key, value in values.items() if key not in RESERVED}
     own = target.startswith(OWN)
@@ -144,9 +144,8 @@ def _check_names(cls: Any, options: dict[str, Any], group: str) -> None:
 
 def locate(target: str, group: str, allow_targets: list[str]) -> type:
     """The class at the import path ``package.module.Class``, which must be one that ``group`` can use."""
-    found = load_class(MOVED.get(target, target), group, allow_targets)
-    methods = () if found is External else METHODS[group.partition(".")[0]]
-    lacking = [method for method in methods if not callable(getattr(found, method, None))]
+    found = load_class(target, group, allow_targets)
+    lacking = [method for method in METHODS[group.partition(".")[0]] if not callable(getattr(found, method, None))]
     if not isinstance(found, type) or lacking:
         without = f": it has no {', '.join(lacking)}()" if lacking else ""
         raise InputError(f"{group}._target_={target} is not a class for {group}{without}")

@@ -1,4 +1,4 @@
-"""What ``results.json`` of a finished trial holds, from the results of its steps."""
+"""Content of a finished trial's ``results.json``, from the results of its steps."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from gsbench.runs.store import Entry
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.scene.types import Scene
 
-# What an evaluation has beside metrics, and its name in results: of the unavailable metrics those that may still come;
-# how a user's own metrics are to be read; metrics at earlier iterations.
+# Parts of an evaluation beside metrics, and their names in results: the unavailable metrics that may still come; how a
+# user's own metrics are to be read; metrics at earlier iterations.
 EVALUATED = {"awaited": "awaited", "facts": "metric_facts", "at": "metrics_at"}
 PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")  # on whose versions a result depends
 

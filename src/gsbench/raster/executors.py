@@ -20,7 +20,7 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class Executor:
-    """What is known of an executor before it is loaded."""
+    """Facts of an executor that are known before it is loaded."""
 
     name: str  # as in ``raster=NAME``, in results and in tables
     target: str  # import path of its class
@@ -33,14 +33,14 @@ class Executor:
 
     @property
     def is_installed(self) -> bool:
-        """Whether its package can be found; nothing is imported."""
+        """Return whether the executor's package can be found; nothing is imported."""
         return self.package is None or importlib.util.find_spec(self.package) is not None
 
     def runs_on(self, device_type: str) -> bool:
         return not self.devices or device_type in self.devices
 
     def obstacle(self, device_type: str) -> str | None:
-        """Why it cannot run here on a device of this type and what to do about it; None if it can."""
+        """The reason why it cannot run here on a device of this type, and what to do about it; None if it can."""
         if not self.runs_on(device_type):
             needed = " or ".join(self.devices)
             others = ", ".join(other.name for other in EXECUTORS if other.runs_on(device_type))
@@ -82,12 +82,12 @@ EXECUTORS = (
         has_footprint=False,
     ),
 )
-# What ``auto`` takes: the first that is installed. Other types of devices have the reference alone.
+# Executors that ``auto`` takes: the first that is installed. Other types of devices have the reference alone.
 PREFERRED = {"cpu": ("cpu",), "cuda": ("triton", "gsplat")}
 
 
 def names() -> tuple[str, ...]:
-    """What ``raster=`` accepts."""
+    """The names that ``raster=`` accepts."""
     return (AUTO, *(executor.name for executor in EXECUTORS))
 
 

@@ -62,7 +62,7 @@ class GsplatRasterizer:
         background: Tensor,
         absolute_gradient: bool = False,
     ) -> RenderOutput:
-        """See ``raster.base.Rasterizer``; raises ValueError naming the parameter that cannot be used."""
+        """Render as ``raster.base.Rasterizer`` says; raises ValueError naming the parameter that cannot be used."""
         check_settings(gaussians, camera, sh_degree, background)
         points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         absolute = torch.zeros_like(points) if absolute_gradient else None

@@ -35,7 +35,7 @@ KEPT_GROUPS = ("scene", "eval", "tracking", "launch")  # of the configuration: w
 
 @dataclass(frozen=True)
 class Place:
-    """Where renders are to stand: an experiment, a scene, an arm (initialiser and densifier), a seed."""
+    """Place of renders among the results: an experiment, a scene, an arm (initialiser and densifier), a seed."""
 
     experiment: str
     scene: str
@@ -83,7 +83,7 @@ def check_place(place: Place, truth: Truth, runs: Path) -> None:
 
 
 def is_entered(config: Mapping[str, Any]) -> bool:
-    """Whether ``config`` is that of a trial that was entered here."""
+    """Return whether ``config`` is that of a trial made of imported renders."""
     return config["densify"].get("evaluated_from") == FROM_RENDERS
 
 

@@ -65,7 +65,7 @@ def find_truth(place: str, settings: Sequence[str], runs: Path) -> Truth:
 
 
 def truth_of_trial(trial: TrialResult) -> Truth:
-    """What a finished trial was tested on, under the names and in the order of its own evaluation."""
+    """The reference images of a finished trial, under the names and in the order of its own evaluation."""
     photographs = {view: trial.path / GROUND_TRUTH / png_name(view) for view in read_views(trial)}
     width, height = trial.data["resolution"]
     data = str(trial.data["hashes"]["data"])

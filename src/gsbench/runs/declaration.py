@@ -22,7 +22,7 @@ STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
 
 @dataclass(frozen=True)
 class Declaration:
-    """The metric ``metric`` was declared at ``time`` (Unix, whole seconds)."""
+    """Declaration of ``metric`` at ``time`` (Unix, whole seconds)."""
 
     time: int
     metric: str
@@ -38,7 +38,7 @@ class Declaration:
 
 @dataclass(frozen=True)
 class DeclaredPlan:
-    """The plan of claims with this hash, all that decides about their verdicts, was written down at ``time``."""
+    """Plan of claims with this hash, all that decides about their verdicts, as written down at ``time``."""
 
     time: int
     hash: str
@@ -46,7 +46,7 @@ class DeclaredPlan:
 
     @property
     def when(self) -> str:
-        """As that of a `Declaration`."""
+        """The time, as that of a `Declaration`."""
         return _readable(self.time)
 
     def to_record(self) -> dict[str, Any]:
@@ -54,7 +54,7 @@ class DeclaredPlan:
 
 
 def read_declarations(folder: Path, repeated: Iterable[object] = ()) -> list[Declaration]:
-    """Every declaration for the experiment in ``folder``, the oldest first.
+    """Read every declaration for the experiment in ``folder``, the oldest first.
 
     Those that only results of its trials record are ``repeated``.
     """
@@ -64,7 +64,7 @@ def read_declarations(folder: Path, repeated: Iterable[object] = ()) -> list[Dec
 
 
 def read_plans(folder: Path) -> list[DeclaredPlan]:
-    """Every plan of claims that was declared for the experiment in ``folder``, the oldest first."""
+    """Read every plan of claims that was declared for the experiment in ``folder``, the oldest first."""
     found = [_plan_from_record(record) for record in read_json_lines(folder / DECLARED)]
     return sorted((plan for plan in found if plan is not None), key=lambda plan: plan.time)
 

@@ -1,4 +1,4 @@
-"""Which steps of a trial are in the store, and why the others are not."""
+"""Report on the steps of a trial that are in the store, and on why the others are not."""
 
 from __future__ import annotations
 

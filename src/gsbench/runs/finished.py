@@ -1,4 +1,4 @@
-"""Whether a trial's results still hold: what they were made of is written down, and compared later. Loads no torch."""
+"""Test whether a trial's results still hold: what they were made of is recorded, and compared later. Loads no torch."""
 
 from __future__ import annotations
 
@@ -24,14 +24,16 @@ Cause = Literal["unfinished", "configuration", "record", "stage", "package", "fi
 
 @dataclass(frozen=True)
 class Done:
-    """A trial is done, and nothing that it was made of has changed; ``results`` is what ``results.json`` holds."""
+    """State of a trial that is done and still holds; ``results`` is what ``results.json`` holds."""
 
     results: dict[str, Any]
 
 
 @dataclass(frozen=True)
 class NotDone:
-    """A trial has to be run or checked; ``reason`` says in words which file, stage, package or metric is the cause."""
+    """State of a trial that has to be run or checked; ``reason`` says in words which file, stage, package or metric is
+    the cause.
+    """
 
     cause: Cause
     reason: str
@@ -65,7 +67,7 @@ def record_inputs(
 def find_finished(
     values: dict[str, Any], unavailable_now: Callable[[dict[str, Any]], Collection[str]] = lambda options: ()
 ) -> Done | NotDone:
-    """Whether the trial with the resolved configuration ``values`` is done and nothing that it was made of has changed.
+    """Tell whether the trial with the resolved configuration ``values`` is done and nothing it was made of has changed.
 
     Quick, since files are compared by size and time of change. A trial that lacks a metric for want of weights is done
     only if ``unavailable_now``, called with the ``eval`` settings, says that it would lack it again.

@@ -1,4 +1,4 @@
-"""What of a configuration determines a result, and its hash. Loads neither Hydra nor torch."""
+"""Parts of a configuration that determine a result, and their hash. Loads neither Hydra nor torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``results.json`` says of a trial that gsbench did not train itself."""
+"""Keys of ``results.json`` for a trial that gsbench did not train itself."""
 
 from __future__ import annotations
 

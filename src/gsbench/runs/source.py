@@ -1,4 +1,4 @@
-"""Which version of a user's own code made a result: the hash of the file that defines a class. Loads no torch."""
+"""Version of a user's own code behind a result: the hash of the file that defines a class. Loads no torch."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def source_of(target: str) -> dict[str, str]:
 
 
 def has_changed_since_import(target: str) -> bool:
-    """Whether the file of a class is no longer the one that this process has imported, and therefore runs."""
+    """Return whether the file of a class is no longer the one that this process has imported, and therefore runs."""
     spec, source = _spec(target), source_of(target)
     return bool(source) and spec is not None and _hash(str(spec.origin)) != source["source"]
 

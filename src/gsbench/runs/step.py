@@ -40,5 +40,5 @@ class Step:
 
     @cached_property
     def key(self) -> str:
-        """What its result is stored under."""
+        """The key under which the step's result is stored."""
         return self.stage.key(self.inputs)

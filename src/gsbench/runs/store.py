@@ -47,15 +47,15 @@ class Store:
         self.root, self.on_build = root, on_build
 
     def folder(self, stage: Stage, key: str) -> Path:
-        """Where the finished result of ``stage`` under ``key`` lies."""
+        """The folder of the finished result of ``stage`` under ``key``."""
         return self.root / stage.name / key
 
     def path(self, step: Step) -> Path:
-        """Where the result of ``step`` lies once it is finished."""
+        """The folder of the result of ``step`` once it is finished."""
         return self.folder(step.stage, step.key)
 
     def partial(self, stage: Stage, key: str) -> Path:
-        """Where it is built."""
+        """The folder in which the result of ``step`` is built."""
         return self.root / stage.name / f".{key}.partial"
 
     def find(self, step: Step) -> Entry | None:

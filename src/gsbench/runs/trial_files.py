@@ -23,7 +23,7 @@ State = Literal["done", "running", "failed", "partial", "missing"]
 
 @dataclass(frozen=True)
 class TrialPaths:
-    """Where a trial's files lie."""
+    """Paths of a trial's files."""
 
     runs: Path
     folder: Path
@@ -58,7 +58,7 @@ def label_of(folder: Path) -> str:
 
 
 def state_of(folder: Path) -> State:
-    """How far a trial is, from its folder alone."""
+    """The state of a trial, from its folder alone."""
     if is_held(folder / LOCK):
         return "running"
     if read_object(folder / RESULTS).get("status") == "complete":
@@ -80,7 +80,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def failure_of(folder: Path) -> str:
-    """Why a trial failed, in one line."""
+    """The reason why a trial failed, in one line."""
     record = read_object(folder / FAILED)
     text = str(record.get("message") or record.get("error") or "failed.json cannot be read").strip()
     return text.splitlines()[0] if text else "no reason was given"

@@ -93,7 +93,7 @@ def check_size(path: Path, size: tuple[int, int], camera_size: tuple[int, int]) 
 
 
 def same_up_to_rounding(size: tuple[int, int], reference: tuple[int, int]) -> bool:
-    """Whether one common scale takes ``reference`` to ``size`` with every side off by at most one pixel."""
+    """Return whether one common scale takes ``reference`` to ``size`` with every side off by at most one pixel."""
     (width, height), (reference_width, reference_height) = size, reference
     lowest = max((width - 1) / reference_width, (height - 1) / reference_height)
     highest = min((width + 1) / reference_width, (height + 1) / reference_height)

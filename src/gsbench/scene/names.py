@@ -1,4 +1,4 @@
-"""Which image names mean which files, which images are kept, and which are held out."""
+"""Names of images: the files that they mean, and the choice of images to keep and to hold out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MIN_IMAGES = 3
 
 
 def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
-    """For each wanted image name the file that it means, for those that have one.
+    """Find the file that each wanted image name means, for those that have one.
 
     The same name wins; else the one file with the same path but for its extension (``images_4/a.png`` for ``a.JPG``). A
     name that several files fit, or a file that several names claim, stays without a match.
@@ -38,7 +38,7 @@ def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
 
 
 def select_images(names: Sequence[str], max_images: int) -> list[str]:
-    """At most ``max_images`` of the names, evenly spaced: the k-th of m is the one at index ``k * n // m``.
+    """Select at most ``max_images`` of the names, evenly spaced: the k-th of m is the one at index ``k * n // m``.
 
     The first is always kept, and a closed ring of views stays evenly spaced. This comes before the split.
 

@@ -97,7 +97,7 @@ def existing_folder(name: str, path: Path | str) -> Path:
 
 
 def missing_folder(name: str, root: Path) -> str:
-    """What is wrong with the folder ``root`` of the scene ``name``, which is not there."""
+    """Explain that the folder ``root`` of the scene ``name`` is not there, and what to do about it."""
     return f"scene {name}: the folder {root} {'is a file' if root.exists() else 'does not exist'}"
 
 

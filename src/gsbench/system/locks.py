@@ -25,7 +25,7 @@ SECONDS_BETWEEN_TRIES = 0.25
 
 
 class BusyError(Exception):
-    """Another process holds the lock."""
+    """Error of a lock that another process holds."""
 
 
 @contextmanager
@@ -55,7 +55,7 @@ def hold(path: Path, what: str, wait: bool = True) -> Iterator[None]:
 
 
 def is_held(path: Path) -> bool:
-    """Whether a process holds the lock ``path``; needs no right to write."""
+    """Return whether a process holds the lock ``path``; needs no right to write."""
     if fcntl is None:
         lock = FileLock(path)
         try:
@@ -80,7 +80,7 @@ def is_held(path: Path) -> bool:
 
 
 def read_holder(path: Path) -> dict[str, Any]:
-    """What the holder of the lock ``path`` wrote about itself: host, pid, since (s), Slurm job; empty if nothing."""
+    """Read what the holder of the lock ``path`` wrote: host, pid, since (s), Slurm job; empty if nothing."""
     try:
         content = json.loads(_holder_file(path).read_text())
     except (OSError, ValueError):

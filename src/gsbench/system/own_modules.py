@@ -1,4 +1,4 @@
-"""Where Python finds a user's own modules: by the names that were allowed, in one folder, behind what is installed.
+"""Import of a user's own modules: by the names that were allowed, in one folder, behind what is installed.
 
 The current folder as such is no place of Python's here: a capture may hold a ``plyfile.py``.
 """

@@ -1,4 +1,4 @@
-"""What runs in the mirror's own process: it follows a trial's files until the trial, or its process, is gone.
+"""Follower of a trial's files until the trial, or its process, is gone; runs in the mirror's own process.
 
 The files are the truth: what a trial is, how far it has come and how it ended is read there. The end of the input
 says that it has ended.

@@ -48,7 +48,7 @@ class MlflowSink:
         self._monitor: Any = None
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """See `gsbench.tracking.sink.Sink`; a deleted run, and one in another tracker, is as none."""
+        """Open the run (see `gsbench.tracking.sink.Sink`); a deleted one, and one in another tracker, count as none."""
         state = self._known(state, results) or self._create_run()
         self.run_id, self._started = state["run_id"], state["started"]
         if state["complete"] is None:

@@ -1,4 +1,4 @@
-"""What the files of a trial say, in the terms of a tracker: names, settings, curves, results, pictures."""
+"""Record of a trial, read from its files, in the terms of a tracker: names, settings, curves, results, pictures."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ class TrialRecord:
         return self.folder.relative_to(self.runs).as_posix()
 
     def tags(self) -> dict[str, str]:
-        """What the trial is found by."""
+        """The tags by which the trial is found."""
         names = {group: self.values[group]["name"] for group in ("scene", "init", "densify")}
         return {"kind": "trial", **names, "seed": str(self.values["seed"]), "folder": self.path}
 
     def params(self) -> dict[str, str]:
-        """Every setting that has a value, by its dotted key; the arm is first in charts."""
+        """The settings that have a value, by their dotted keys; the arm is first in charts."""
         return {"arm": self.arm} | {key: str(value) for key, value in flatten(self.values).items() if str(value)}
 
     def sweep(self) -> dict[str, Any]:
@@ -61,7 +61,7 @@ class TrialRecord:
         return found if isinstance(found, dict) else {}
 
     def results(self) -> dict[str, Any]:
-        """What ``results.json`` holds; empty where there is none."""
+        """The content of ``results.json``; empty where there is none."""
         return read_object(self.folder / layout.RESULTS)
 
     def results_hash(self) -> str | None:
@@ -70,7 +70,7 @@ class TrialRecord:
         return sha256_of(results) if results else None
 
     def curves(self, logged: dict[str, int]) -> Iterator[tuple[str, int, list[Point]]]:
-        """For each file of curves its name, its newest iteration, and what it says of those after ``logged[name]``."""
+        """Read each file of curves: its name, its newest iteration, and its points after ``logged[name]``."""
         building = read_object(self.folder / layout.BUILDING)  # a training in progress writes elsewhere
         sources = [Path(str(building.get("folder")))] if building.get("stage") == TRAIN.name else []
         for name, prefix in CURVES.items():
@@ -86,7 +86,7 @@ class TrialRecord:
                 yield name, records[-1]["step"], points
 
     def summary(self, images: int, with_model: bool) -> Summary:
-        """What is shown of the finished trial, with ``images`` test views at most, and the model if ``with_model``."""
+        """The summary of the finished trial, with ``images`` test views at most, and the model if ``with_model``."""
         results = self.results()
         step, seconds = results["iterations"], float(results["seconds"].get("train", results["iterations"] / 1000))
         numbers = dict(results["metrics"]) | {

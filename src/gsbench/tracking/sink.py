@@ -1,4 +1,4 @@
-"""What a tracker has to take so that trials are mirrored there."""
+"""Contract of a tracker to which trials are mirrored."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ class Point:
 
 @dataclass(frozen=True)
 class Summary:
-    """What is shown of a complete trial: final numbers, tags, pictures of the test views by name, other files by
-    folder ("" for none)."""
+    """Summary of a complete trial: final numbers, tags, pictures of the test views by name, other files by
+    folder ("" for none).
+    """
 
     points: Sequence[Point]
     tags: dict[str, str]

@@ -1,4 +1,4 @@
-"""Who started a trial, from which program and which state of the code: the tags by which MLflow knows them."""
+"""Tags by which MLflow knows who started a trial, from which program and which state of the code."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ class TensorBoardSink:
         self._writer: Any = None
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """See `gsbench.tracking.sink.Sink`."""
+        """Open the run as `gsbench.tracking.sink.Sink` says."""
         if self._folder.is_dir() and state.get("complete") is not None and state["complete"] == results:
             return state
         from torch.utils.tensorboard import SummaryWriter

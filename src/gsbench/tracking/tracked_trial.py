@@ -33,7 +33,7 @@ class TrackedTrial:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the run shows the present results."""
+        """Return whether the run shows the present results."""
         return self.state["complete"] is not None and self.state["complete"] == self.record.results_hash()
 
     def add_curves(self) -> None:

@@ -26,7 +26,7 @@ class WandbSink:
         self._run: Any = None
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """See `gsbench.tracking.sink.Sink`. A run that shows former results stays beside the new one."""
+        """Open the run (see `gsbench.tracking.sink.Sink`). One that shows former results stays beside the new one."""
         if state.get("complete") is not None:
             if state["complete"] == results:
                 return state

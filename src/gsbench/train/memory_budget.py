@@ -1,4 +1,4 @@
-"""Whether a training fits into the memory of its device: an estimate before it starts, and advice when it does not."""
+"""Memory budget of a training on its device: an estimate before it starts, and advice when it does not fit."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ log = logging.getLogger(__name__)
 
 
 def training_bytes(gaussians: int, pixels: int) -> int:
-    """About what a training of so many Gaussians holds at once, in images of so many pixels."""
+    """Estimate the bytes that a training of so many Gaussians holds at once, in images of so many pixels."""
     return gaussians * (BYTES_OF_MODEL + BYTES_OF_WORK) + pixels * BYTES_OF_PIXEL
 
 
 def free_bytes(device: torch.device) -> int | None:
-    """What torch can still take of the memory of a GPU; None for a CPU, whose memory others give back when asked."""
+    """The bytes that torch can still take of a GPU's memory; None for a CPU, whose memory others give back."""
     if device.type != "cuda":
         return None
     free, _ = torch.cuda.mem_get_info(device)

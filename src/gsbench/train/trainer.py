@@ -45,7 +45,7 @@ STREAMS = ("cameras", "densify")  # every random draw of a training belongs to o
 
 @dataclass(frozen=True)
 class Status:
-    """What a progress bar shows."""
+    """Values that a progress bar shows."""
 
     step: int
     loss: float
@@ -68,7 +68,7 @@ class CameraOrder:
 
     @property
     def following(self) -> int | None:
-        """What `next` will give, or None where that is not drawn yet."""
+        """The camera that `next` will give, or None where that is not drawn yet."""
         return self.remaining[-1] if self.remaining else None
 
 
@@ -167,7 +167,7 @@ class Trainer:
                     break
 
     def iterate(self, folder: Path) -> RefineEvent | None:
-        """One iteration in 3DGS's order: rates, SH degree, render, backward, statistics, refinement, optimiser step.
+        """Run one iteration in 3DGS's order: rates, SH degree, render, backward, statistics, refinement, Adam.
 
         Its losses go to ``losses``, perhaps later; ``folder`` takes the snapshots. Raises TrainingError where a
         parameter is out of range or no Gaussian is left.
@@ -275,7 +275,7 @@ def sh_degree_at(options: TrainConfig, step: int) -> int:
 
 
 def learning_rates(options: TrainConfig) -> LearningRates:
-    """Those among the settings of a training."""
+    """The learning rates among the settings of a training."""
     return LearningRates(**{field.name: getattr(options, field.name) for field in fields(LearningRates)})
 
 

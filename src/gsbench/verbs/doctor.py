@@ -42,7 +42,7 @@ class Finding:
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: 1 if something is bad."""
+    """Run the verb: 1 if something is bad."""
     parser = ArgumentParser(prog="gsbench doctor", description="Check this machine and say what is missing.")
     parser.add_argument(
         "--store", action="store_true", help="also read every stored result whole and name damaged ones"
@@ -141,7 +141,7 @@ def check_packages() -> Iterator[Finding]:
 
 
 def check_triton() -> Iterator[Finding]:
-    """What raster=triton compiles with at its first run on a GPU."""
+    """Check the compiler that raster=triton needs at its first run on a GPU."""
     from gsbench.raster.triton.toolchain import missing_tools
 
     installed = _version("triton")
@@ -155,7 +155,7 @@ def check_triton() -> Iterator[Finding]:
 
 
 def check_kernels() -> Iterator[Finding]:
-    """Where the CPU's compiled kernels are kept; without such a place every start compiles anew."""
+    """Check the place of the CPU's compiled kernels; without one every start compiles anew."""
     from gsbench.raster.cpu.jit import TEMPORARY_PREFIX, cache_base
 
     place = cache_base()
@@ -167,7 +167,7 @@ def check_kernels() -> Iterator[Finding]:
 
 
 def check_executors() -> Iterator[Finding]:
-    """Which rasterizers run here, and which is taken if none is chosen."""
+    """Check which rasterizers run here, and which is taken if none is chosen."""
     import torch
 
     here = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -250,7 +250,7 @@ def check_weights() -> Iterator[Finding]:
 
 
 def check_store(runs: Path) -> Iterator[Finding]:
-    """Every stored result, read whole."""
+    """Check every stored result by reading it whole."""
     from gsbench.runs.stages import STAGES
     from gsbench.runs.store import read_manifest
 

@@ -10,7 +10,7 @@ from gsbench.verbs.arguments import ArgumentParser
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: 0 if every photograph was measured."""
+    """Run the verb: 0 if every photograph was measured."""
     options = _parser().parse_intermixed_args(argv)
     from gsbench.renders.measure import measure_renders
 

@@ -13,7 +13,7 @@ from gsbench.verbs.arguments import ArgumentParser
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb; raises InputError for bad input."""
+    """Run the verb; raises InputError for bad input."""
     if "--stale" in argv:
         return _stale([word for word in argv if word != "--stale"], runs)
     parser = ArgumentParser(

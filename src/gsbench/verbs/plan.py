@@ -29,7 +29,7 @@ MOST_SHOWN = 5  # designs
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb; raises InputError for bad input."""
+    """Run the verb; raises InputError for bad input."""
     parser = ArgumentParser(
         prog="gsbench plan",
         description="From an experiment's trials: the scenes and seeds that resolve a difference with 80 % power.",

@@ -16,7 +16,7 @@ FILE_SUFFIXES = (".html", ".htm")
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb; raises InputError for bad input."""
+    """Run the verb; raises InputError for bad input."""
     from gsbench.analysis.report.build import build_report  # here, for a quick answer to --help
 
     parser = ArgumentParser(prog="gsbench report", description="One HTML file with the evidence of an experiment.")

@@ -24,7 +24,7 @@ PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsiste
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb; raises InputError for bad input."""
+    """Run the verb; raises InputError for bad input."""
     options = _parser().parse_args(argv)
     if options.experiment == PAPER_NOTES and not (runs / PAPER_NOTES).exists():
         print("\n".join(f"- {line}" for line in inconsistencies(load_paper())))

@@ -1,4 +1,4 @@
-"""What the viewer needs of a trial, read from its folder and from the initial model in the store."""
+"""Trials as the viewer needs them, read from their folders and from the initial models in the store."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ class SearchPart:
 
 
 def search_part(home: Path) -> SearchPart | None:
-    """What the search in an experiment's folder found; None where there was none, or its file cannot be read."""
+    """The report's part on the search of an experiment; None where there was none, or its file cannot be read."""
     record = read_object(home / SEARCH)
     try:
         return _part(record) if record else None

@@ -1,4 +1,4 @@
-"""What the report says and draws, section by section, from result files only."""
+"""Sections of the report, each made from result files only."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ CURVES = (  # key of metrics.jsonl, title, y axis
 
 @dataclass(frozen=True)
 class Versus:
-    """Everything about one pair of arms."""
+    """All results about one pair of arms."""
 
     first: Arm
     second: Arm

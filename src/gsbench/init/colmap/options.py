@@ -28,7 +28,7 @@ MIN_DETECTION_SIZE = 32  # px: below it no detector finds anything
 
 @dataclass(frozen=True)
 class DatabaseTask:
-    """What is to be filled: the database with cameras and images in it, and the pairs of images to be matched.
+    """Database to be filled, with cameras and images in it, and the pairs of images to be matched.
 
     ``images`` is a folder with the same names as the capture's in which COLMAP can read every file.
     """
@@ -87,7 +87,7 @@ class ColmapOptions(ABC):
 
     @property
     def takes_reference_cameras(self) -> bool:
-        """Whether the cameras (intrinsics at least) are the reference's where there is one."""
+        """Return whether the cameras (intrinsics at least) are the reference's where there is one."""
         return self.poses == "shared" or self.intrinsics == "reference"
 
     def select_images(self, capture: Capture, reference: pycolmap.Reconstruction | None) -> list[str]:

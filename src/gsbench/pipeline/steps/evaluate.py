@@ -172,7 +172,7 @@ def _write_metrics(
 
 
 def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
-    """What results keep of an evaluation: the means, what is missing and why, and the facts of a user's metrics."""
+    """Summary of an evaluation: the means, what is missing and why, and the facts of a user's metrics."""
     summary: dict[str, Any] = {
         "metrics": summarize(per_view, evaluator.unavailable),
         "unavailable": evaluator.unavailable,
@@ -184,7 +184,7 @@ def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]
 
 
 def write_maps(folder: Path, scene: Scene, init: Path, gaussians: Gaussians, rasterizer: Rasterizer) -> None:
-    """One ``<view>.npz`` for each test view (see ``view_maps``)."""
+    """Write one ``<view>.npz`` for each test view (see ``view_maps``)."""
     folder.mkdir(exist_ok=True)
     points = cKDTree(read_cloud(init / MODEL_FOLDER).points)
     for view in scene.test:
@@ -204,7 +204,7 @@ def draw_figures(folder: Path, renders: Path, scene: Scene, training: Path, gaus
 
 
 def write_per_view(path: Path, per_view: Mapping[str, Mapping[str, float]]) -> None:
-    """One row a view, in order; a metric that a view lacks is left empty."""
+    """Write one row for each view, in order; a metric that a view lacks is left empty."""
     names = sorted({name for row in per_view.values() for name in row})
     with path.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, ["view", *names])

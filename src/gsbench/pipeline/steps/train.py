@@ -84,8 +84,9 @@ def train_step(
 
 
 def initial_gaussians(init: Path, device: torch.device) -> Gaussians:
-    """What the training starts from: the Gaussians that the initialiser left in the folder ``init``, or one for each of
-    its points."""
+    """The Gaussians that training starts from: those that the initialiser left in the folder ``init``, or one for each
+    of its points.
+    """
     if (init / GAUSSIANS_FILE).exists():
         return read_ply(init / GAUSSIANS_FILE, device)
     cloud = read_cloud(init / MODEL_FOLDER)

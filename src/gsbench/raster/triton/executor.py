@@ -53,7 +53,7 @@ class TritonRasterizer:
         background: Tensor,
         absolute_gradient: bool = False,
     ) -> RenderOutput:
-        """See ``raster.base.Rasterizer``. Raises ValueError naming the parameter that cannot be used."""
+        """Render as ``raster.base.Rasterizer`` says. Raises ValueError naming the parameter that cannot be used."""
         check_settings(gaussians, camera, sh_degree, background)
         if gaussians.means.dtype != torch.float32:
             raise ValueError(f"means: raster=triton needs float32, got {gaussians.means.dtype}")

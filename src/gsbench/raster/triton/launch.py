@@ -1,4 +1,4 @@
-"""How the kernels are started."""
+"""Start of the kernels."""
 
 from __future__ import annotations
 

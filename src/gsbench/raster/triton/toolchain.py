@@ -1,4 +1,4 @@
-"""What Triton needs when it first runs on a machine: it compiles the piece of C that starts its kernels."""
+"""Tools that Triton needs when it first runs on a machine: it compiles the piece of C that starts its kernels."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ log = logging.getLogger(__name__)
 
 
 def missing_tools() -> list[str]:
-    """What is not here of a C compiler and Python's headers, each with the package that has it. Loads neither torch nor
-    Triton."""
+    """List what is missing of a C compiler and Python's headers, each with the package that has it. Loads neither torch
+    nor Triton.
+    """
     missing = []
     compiler = os.environ.get("CC")
     found = shutil.which(compiler.split()[0]) if compiler else shutil.which("gcc") or shutil.which("clang")
