@@ -59,7 +59,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         if is_init:
-            export_init(trial.path.parents[3] / STORE / "init" / trial.data["hashes"]["init"], out)
+            export_init(trial.path.parents[3] / STORE / "init" / trial.record.hashes["init"], out)
         else:
             export_model(model_file(trial), options.to or _format_of(out), out)
     except OSError as error:
