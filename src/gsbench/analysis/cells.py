@@ -47,7 +47,7 @@ class Cell:
 def field_value(trial: TrialResult, name: str) -> str:
     """A field of a trial, or a dotted key of its configuration, as text; raises ``InputError`` where it has none."""
     if name in TRIAL_FIELDS:
-        return str(trial.data[name])
+        return str(getattr(trial.record, name))
     if name in trial.config:
         return str(trial.config[name])
     raise InputError(

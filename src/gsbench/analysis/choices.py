@@ -169,13 +169,13 @@ def _images(trial: TrialResult) -> str:
 
 def _sizes(trials: Sequence[TrialResult]) -> str:
     """`` at 400×300 px``, or the smallest and the largest."""
-    sizes = sorted({tuple(size) for trial in trials if (size := trial.data.get("resolution"))}, key=math.prod)
+    sizes = sorted({tuple(size) for trial in trials if (size := trial.record.resolution)}, key=math.prod)
     shown = [f"{width}×{height}" for width, height in dict.fromkeys([*sizes[:1], *sizes[-1:]])]
     return f", {' to '.join(shown)} px" if shown else ""
 
 
 def _lpips(trial: TrialResult) -> str:
-    protocol = PROTOCOLS.get(str(trial.data["protocol"]).rsplit("-", 1)[0], PAPER)
+    protocol = PROTOCOLS.get(trial.record.protocol.rsplit("-", 1)[0], PAPER)
     facts = find(f"{LPIPS}{protocol.lpips}")
     assert facts is not None
     return f"net {facts.options['net']}, fed [{'0' if facts.options['raw'] else '−1'}, 1]"
@@ -188,7 +188,7 @@ TOPICS = (
     Topic("networks", "Matching networks", _networks),
     Topic("cap", "Cap of Gaussians", _cap),
     Topic("opacity", "Learning rate of opacity", lambda trial: str(trial.config["train.opacity"])),
-    Topic("iterations", "Iterations", lambda trial: str(trial.data["iterations"])),
+    Topic("iterations", "Iterations", lambda trial: str(trial.record.iterations)),
     Topic("images", "Images", _images, _sizes),
     Topic("hold_out", "Held out", _hold_out),
     Topic("selection", "Images of a large scene", _selection),

@@ -57,7 +57,7 @@ class ActiveDeclaration:
 
 def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration | None:
     """The declaration that holds for the experiment in ``folder`` with these trials: the latest; None without any."""
-    declared = read_declarations(folder, (trial.data.get("declared") for trial in trials))
+    declared = read_declarations(folder, (trial.record.declared for trial in trials))
     if not declared:
         return None
     latest = declared[-1]
@@ -67,5 +67,5 @@ def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration |
 
 def measured(trial: TrialResult) -> float:
     """The Unix time at which the trial's metrics were there; of results that do not say it, that of the file."""
-    moment = unix_time(trial.data.get("measured"))
+    moment = None if trial.record.measured is None else unix_time(trial.record.measured)
     return trial.finished if moment is None else moment

@@ -97,26 +97,26 @@ def _baseline_lines(experiment: Experiment, trial: TrialResult) -> list[str]:
 
 def _trial_lines(trial: TrialResult, shown: Quantity) -> list[str]:
     value = shown.read(trial)
-    data = trial.data
+    record = trial.record
     text = "n/a" if value is None else f"{value:.6g}"
     if trial.from_renders and not trial.program:
-        counts = ", ".join(f"{key} {value}" for key, value in data.get("renders", {}).items())
+        counts = ", ".join(f"{key} {value}" for key, value in record.renders.items())
     elif trial.from_renders:
         counts = "its own renders"
     else:
-        counts = f"{data['num_gaussians']:,} Gaussians from {data.get('num_init_points') or 0:,} points"
+        counts = f"{record.num_gaussians or 0:,} Gaussians from {record.num_init_points or 0:,} points"
     lines = [
         f"  seed {trial.seed}: {text}",
         f"    folder    {trial.path}",
-        f"    {data.get('test_views', '?')} test views, raster {data['raster']}, {counts}",
+        f"    {'?' if record.test_views is None else record.test_views} test views, raster {record.raster}, {counts}",
     ]
-    lines += [f"    {key:<9} {value}" for key, value in data.get("hashes", {}).items()]
-    if trial.program:
-        lines.append(f"    program   {data['trained_by']['version']}: {' '.join(data['trained_by']['command'])}")
+    lines += [f"    {key:<9} {value}" for key, value in record.hashes.items()]
+    if record.trained_by is not None:
+        lines.append(f"    program   {record.trained_by.version}: {' '.join(record.trained_by.command)}")
     if machine := machine_of(trial):
         lines.append(f"    machine   {machine}")
     if trial.code:
         versions = [f"{part} {short_version(version)}" for part, version in trial.code.items()]
         lines.append("    code      " + ", ".join(versions))
-    lines.append("    versions  " + ", ".join(f"{key} {value}" for key, value in data.get("versions", {}).items()))
+    lines.append("    versions  " + ", ".join(f"{key} {value}" for key, value in record.versions.items()))
     return lines

@@ -15,15 +15,14 @@ from gsbench.words import counted
 def machine_of(trial: TrialResult) -> str | None:
     """The kind of machine that trained the trial, in a phrase; None where it was not recorded."""
     try:
-        return kind_of_machine(trial.data["machine"])
-    except (KeyError, TypeError):
+        return None if trial.record.machine is None else kind_of_machine(trial.record.machine)
+    except KeyError:
         return None
 
 
 def cloud_of(trial: TrialResult) -> str | None:
     """The hash of the initial model's files (cameras, poses, points); None where it was not recorded."""
-    found = trial.data.get("hashes", {}).get("cloud")
-    return None if found is None else str(found)
+    return trial.record.hashes.get("cloud")
 
 
 def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
@@ -55,7 +54,7 @@ def cloud_lines(trials: Sequence[TrialResult]) -> list[str]:
     """List, for each scene and initialiser, the hashes of the clouds that its trials started from, and their points."""
     lines = []
     for (scene, init), group in sorted(by_key(trials, lambda trial: (trial.scene, trial.init)).items()):
-        clouds = by_key(group, lambda trial: (cloud_of(trial), _init_key(trial), trial.data.get("num_init_points")))
+        clouds = by_key(group, lambda trial: (cloud_of(trial), _init_key(trial), trial.record.num_init_points))
         parts = []
         for cloud, key, points in clouds:
             name = f"cloud {cloud[:SHOWN]}" if cloud else "cloud not recorded"
@@ -78,7 +77,7 @@ def unlike_clouds(pairs: Sequence[tuple[TrialResult, TrialResult]]) -> list[str]
 
 
 def _init_key(trial: TrialResult) -> str:
-    return str(trial.data.get("hashes", {}).get("init"))
+    return str(trial.record.hashes.get("init"))
 
 
 def _arms(trials: Sequence[TrialResult]) -> str:

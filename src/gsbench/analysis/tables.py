@@ -233,7 +233,7 @@ def _reading_notes(
     cells = grid.values()
     if any(0 < cell.count < expected or not cell.trials for cell in cells):
         notes.append(f"(k/{expected}): only k of {expected} trials have a value; —: none.")
-    protocols = {str(trial.data["protocol"]) for cell in cells for trial in cell.trials}
+    protocols = {trial.record.protocol for cell in cells for trial in cell.trials}
     notes.append(f"Protocol {', '.join(sorted(protocols))}.")
     for quantity in quantities:
         reasons = {
@@ -253,16 +253,20 @@ def _origin_notes(trials: Sequence[TrialResult]) -> list[str]:
     """Which arms gsbench did not train, and what of them it saw."""
     notes = []
     for what, origin in _BY_PROGRAM:
-        own = [trial for trial in trials if trial.program and trial.data.get("evaluated_from") == origin]
+        own = [trial for trial in trials if trial.program and trial.record.evaluated_from == origin]
         if own:
-            versions = {(f"{trial.init}-{trial.densify}", str(trial.data["trained_by"]["version"])) for trial in own}
+            versions = {
+                (f"{trial.init}-{trial.densify}", trial.record.trained_by.version)
+                for trial in own
+                if trial.record.trained_by is not None
+            }
             arms = ", ".join(f"{arm} (version {version})" for arm, version in sorted(versions))
             notes.append(f"{what} (its time is that of the whole program, its budget its own): {arms}.")
     for what, origin in (
         ("A model that another program trained, rendered here", FROM_MODEL),
         ("Renders of another program, measured as they are", FROM_RENDERS),
     ):
-        own = [trial for trial in trials if trial.made_elsewhere and trial.data["evaluated_from"] == origin]
+        own = [trial for trial in trials if trial.made_elsewhere and trial.record.evaluated_from == origin]
         if own:
             arms = ", ".join(sorted({f"{trial.init}-{trial.densify}" for trial in own}))
             notes.append(f"{what} (its conditions are not known): {arms}.")
@@ -326,8 +330,8 @@ def change_words(of_totals: float, of_scenes: float, scenes: int) -> str:
 
 
 _COSTS: dict[str, Callable[[TrialResult], float | None]] = {
-    "Gaussians": lambda trial: trial.data.get("num_gaussians"),
-    "Training time": lambda trial: trial.data["seconds"].get("train"),
+    "Gaussians": lambda trial: trial.record.num_gaussians,
+    "Training time": lambda trial: trial.record.seconds.get("train"),
 }
 
 

@@ -12,7 +12,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
@@ -25,10 +25,13 @@ from gsbench.config.command_words import check_makes_trials
 from gsbench.config.compose import explained
 from gsbench.errors import InputError
 from gsbench.eval.facts import find, known_keys
-from gsbench.files import checked_runs_folder, make_runs_folder, read_object, write_json
+from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.launch.trial import Trial
+from gsbench.parsing import DamagedError
 from gsbench.runs.hashing import config_hash, sha256_of
-from gsbench.runs.layout import RESULTS, SEARCH, SEARCH_JOURNAL
+from gsbench.runs.inputs import read_results
+from gsbench.runs.layout import SEARCH, SEARCH_JOURNAL
+from gsbench.runs.search_record import Point, SearchRecord
 from gsbench.settings import checked
 from gsbench.system.install import install_command
 from gsbench.system.locks import hold
@@ -119,8 +122,8 @@ def search(
             launch_trials(task, master, launcher, trials)
             for place, number in enumerate(batch):
                 _tell(study, number, trials[place * len(space.seeds) :][: len(space.seeds)], wanted)
-            write_json(home / SEARCH, _record(study, wanted, space))
-        write_json(home / SEARCH, _record(study, wanted, space))
+            write_json(home / SEARCH, _record(study, wanted, space).to_json())
+        write_json(home / SEARCH, _record(study, wanted, space).to_json())
     _say_best(study, wanted, home.name)
 
 
@@ -222,7 +225,7 @@ def _tell(study: Study, number: int, trials: Sequence[Trial], wanted: SearchSett
     from optuna.trial import TrialState
 
     folders = [trial.folder for trial in trials]
-    found = [read_object(folder / RESULTS).get("metrics", {}).get(wanted.metric) for folder in folders]
+    found = [_metric_of(folder, wanted.metric) for folder in folders]
     values = [value for value in found if value is not None]
     if len(values) < len(found):
         study.tell(number, state=TrialState.FAIL)
@@ -234,26 +237,34 @@ def _tell(study: Study, number: int, trials: Sequence[Trial], wanted: SearchSett
     log.info("search: point %d of %d: %s: %s", number + 1, wanted.trials, where, came)
 
 
-def _record(study: Study, wanted: SearchSettings, space: Space) -> dict[str, Any]:
+def _metric_of(folder: Path, metric: str) -> float | None:
+    try:
+        return read_results(folder)[0].metrics.get(metric)
+    except (FileNotFoundError, DamagedError):
+        return None
+
+
+def _record(study: Study, wanted: SearchSettings, space: Space) -> SearchRecord:
     """What the report shows."""
     from optuna.distributions import FloatDistribution, IntDistribution
 
-    return {
-        "metric": wanted.metric,
-        "direction": wanted.direction,
-        "wanted": wanted.trials,
-        "seeds": len(space.seeds),
-        "log": [k for k, d in space.searched.items() if isinstance(d, FloatDistribution | IntDistribution) and d.log],
-        "points": [
-            {
-                "number": trial.number,
-                "state": {"COMPLETE": "done", "FAIL": "failed"}.get(trial.state.name, "unfinished"),
-                "settings": {key: _shown(value) for key, value in trial.params.items()},
-                "value": trial.value,
-            }
+    states: dict[str, Literal["done", "failed"]] = {"COMPLETE": "done", "FAIL": "failed"}
+    return SearchRecord(
+        metric=wanted.metric,
+        direction=1 if wanted.direction > 0 else -1,
+        wanted=wanted.trials,
+        seeds=len(space.seeds),
+        log=[k for k, d in space.searched.items() if isinstance(d, FloatDistribution | IntDistribution) and d.log],
+        points=[
+            Point(
+                number=trial.number,
+                state=states.get(trial.state.name, "unfinished"),
+                settings={key: _shown(value) for key, value in trial.params.items()},
+                value=trial.value,
+            )
             for trial in study.get_trials(deepcopy=False)
         ],
-    }
+    )
 
 
 def _shown(value: Any) -> Any:

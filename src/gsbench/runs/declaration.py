@@ -8,14 +8,19 @@ own. `gsbench.analysis.declaration` judges by it.
 from __future__ import annotations
 
 import calendar
+import logging
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsbench.files import read_json_lines
+from gsbench.parsing import DamagedError, fault_of, read_bytes
+from gsbench.records import Part, iterate_rows
 from gsbench.runs.layout import DECLARED
+from gsbench.runs.trial_record import Declared
+
+log = logging.getLogger(__name__)
 
 STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
 
@@ -53,19 +58,19 @@ class DeclaredPlan:
         return {"plan": self.plan, "hash": self.hash, "time": time.strftime(STAMP, time.gmtime(self.time))}
 
 
-def read_declarations(folder: Path, repeated: Iterable[object] = ()) -> list[Declaration]:
+def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) -> list[Declaration]:
     """Read every declaration for the experiment in ``folder``, the oldest first.
 
     Those that only results of its trials record are ``repeated``.
     """
-    records = [*read_json_lines(folder / DECLARED), *repeated]
-    found = [declaration for declaration in map(_from_record, records) if declaration is not None]
+    found = [line.declaration for line in _lines(folder) if line.declaration is not None]
+    found += [declared for one in repeated if (declared := _from_record(one)) is not None]
     return sorted(dict.fromkeys(found), key=lambda declaration: declaration.time)
 
 
 def read_plans(folder: Path) -> list[DeclaredPlan]:
     """Read every plan of claims that was declared for the experiment in ``folder``, the oldest first."""
-    found = [_plan_from_record(record) for record in read_json_lines(folder / DECLARED)]
+    found = (line.declared_plan for line in _lines(folder))
     return sorted((plan for plan in found if plan is not None), key=lambda plan: plan.time)
 
 
@@ -73,22 +78,50 @@ def unix_time(text: object) -> int | None:
     """The moment that a stamp names; None for what is none."""
     try:
         return calendar.timegm(time.strptime(str(text), STAMP))
-    except ValueError:
+    except (ValueError, OverflowError):
         return None
 
 
-def _from_record(record: object) -> Declaration | None:
-    if not isinstance(record, dict) or not isinstance(record.get("metric"), str):
-        return None
-    moment = unix_time(record.get("time"))
-    return None if moment is None else Declaration(moment, record["metric"])
+@dataclass(frozen=True, kw_only=True)
+class _Line(Part):
+    """A line of ``declared.jsonl``: a metric, or a plan of claims with its hash; and when."""
+
+    time: str
+    metric: str | None = None
+    plan: dict[str, Any] | None = None
+    hash: str | None = None
+
+    def __post_init__(self) -> None:
+        if unix_time(self.time) is None:
+            raise ValueError("time is no moment")
+        if fault := fault_of(self.plan):
+            raise ValueError(f"in plan {fault}")
+
+    @property
+    def declaration(self) -> Declaration | None:
+        return None if self.metric is None else Declaration(unix_time(self.time) or 0, self.metric)
+
+    @property
+    def declared_plan(self) -> DeclaredPlan | None:
+        known = self.plan is not None and self.hash is not None
+        return DeclaredPlan(unix_time(self.time) or 0, self.hash or "", self.plan or {}) if known else None
 
 
-def _plan_from_record(record: dict[str, Any]) -> DeclaredPlan | None:
-    moment = unix_time(record.get("time"))
-    if moment is None or not isinstance(record.get("hash"), str) or not isinstance(record.get("plan"), dict):
-        return None
-    return DeclaredPlan(moment, record["hash"], record["plan"])
+def _lines(folder: Path) -> list[_Line]:
+    path = folder / DECLARED
+    try:
+        content = read_bytes(path)
+    except FileNotFoundError:
+        return []
+    except DamagedError as error:
+        log.warning("left out: %s", error)
+        return []
+    return [line for _, line in iterate_rows(content, _Line, path)]
+
+
+def _from_record(record: Declared | None) -> Declaration | None:
+    moment = None if record is None else unix_time(record.time)
+    return None if record is None or moment is None else Declaration(moment, record.metric)
 
 
 def _readable(moment: int) -> str:
