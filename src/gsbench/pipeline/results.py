@@ -29,11 +29,17 @@ PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")  # on who
 
 
 def results_of(
-    values: dict[str, Any], fingerprint: str, scene: Scene, raster: str, entries: Mapping[str, Entry]
+    values: dict[str, Any],
+    fingerprint: str,
+    scene: Scene,
+    raster: str,
+    entries: Mapping[str, Entry],
+    code: Mapping[str, str],
 ) -> dict[str, Any]:
     """The results of the trial with the configuration ``values``; ``entries`` are those of its steps, by stage.
 
-    ``fingerprint`` is that of the photographs, ``raster`` the executor that rendered.
+    ``fingerprint`` is that of the photographs, ``raster`` the executor that rendered, ``code`` the files of gsbench
+    that had a part, with their states.
     """
     init, trained, evaluated = entries[INIT.name], entries[TRAIN.name], entries[EVALUATE.name]
     training = _read(trained.path / TRAINING)
@@ -79,7 +85,12 @@ def results_of(
             "train": trained.key,
             "evaluate": evaluated.key,
         },
-        "code": {"sources": sources_of(values), "stages": {stage.name: stage.version for stage in STAGES}},
+        "code": {
+            "sources": sources_of(values),
+            "stages": {stage.name: stage.version for stage in STAGES},
+            "files": dict(sorted(code.items())),
+            **_read(trained.path / MANIFEST).get("checkout", {}),
+        },
         "machine": training["machine"],
         "versions": versions(),
     }

@@ -10,16 +10,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsbench.files import read_object, write_json
+from gsbench.runs.code import changed_files
 from gsbench.runs.hashing import config_hash, sha256_of
 from gsbench.runs.layout import INPUTS, RESULTS
 from gsbench.runs.stages import STAGES
 from gsbench.runs.store import read_manifest
 from gsbench.runs.trial_files import TrialPaths
 
-INPUTS_VERSION = 1
+INPUTS_VERSION = 2
 PYCOLMAP = "pycolmap"  # the package whose version has a part in every cloud
 
-Cause = Literal["unfinished", "configuration", "record", "stage", "package", "file", "store", "metric"]
+Cause = Literal["unfinished", "configuration", "record", "stage", "package", "file", "store", "metric", "code"]
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,8 @@ def _objections(
         made, now = record["stages"].get(name), versions.get(name)
         if made != now:
             yield NotDone("stage", f"it was made by version {made} of the stage {name}, which is now at {now}")
+    if files := changed_files(results.get("code", {}).get("files", {})):
+        yield NotDone("code", f"the code of gsbench changed in: {', '.join(files)}")
     if record["pycolmap"] != (installed := _version(PYCOLMAP)):
         yield NotDone("package", f"it was made with {PYCOLMAP} {record['pycolmap']}, and {installed} is installed")
     for path, stamp in record["sources"].items():

@@ -26,6 +26,7 @@ from gsbench.files import write_json
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.components import options_of
+from gsbench.pipeline.steps.code import step_of_code
 from gsbench.pipeline.steps.views import Views
 from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG, TRAINING
 from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
@@ -101,7 +102,7 @@ def external_step(
         }
         write_json(folder / TRAINING, summary)
 
-    return Step(EXTERNAL, inputs, build)
+    return step_of_code(EXTERNAL, inputs, build, __name__)
 
 
 def take_result(trainer: External, pattern: str, views: Views, output: Path, folder: Path) -> dict[str, Any]:
