@@ -14,6 +14,8 @@ from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import Experiment, TrialResult, load_experiment
 from gsbench.analysis.tables import format_cell
 from gsbench.errors import InputError
+from gsbench.runs.code import AS_RELEASED
+from gsbench.words import some_of
 
 ADDRESS = "EXPERIMENT:SCENE:METRIC:ARM, such as table1:garden:lpips:volumetric or demo:courtyard:psnr:sfm-adc"
 
@@ -118,5 +120,10 @@ def _trial_lines(trial: TrialResult, shown: Quantity) -> list[str]:
     if trial.code:
         versions = [f"{part} {short_version(version)}" for part, version in trial.code.items()]
         lines.append("    code      " + ", ".join(versions))
+    if record.code.commit:
+        lines.append(f"    commit    {record.code.commit}{', edited' if record.code.edited else ''}")
+    files = [name.removeprefix("gsbench's ") for name, state in trial.files.items() if state != AS_RELEASED]
+    if files and len(files) < len(trial.files):  # else it was before the first release
+        lines.append(f"    edited    since the last release: {some_of(files)}")
     lines.append("    versions  " + ", ".join(f"{key} {value}" for key, value in record.versions.items()))
     return lines

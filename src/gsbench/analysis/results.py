@@ -141,13 +141,18 @@ class TrialResult:
     def code(self) -> dict[str, str]:
         """The versions of the code that made the trial; empty for what another program made.
 
-        ``code of <class>`` is the hash of the file that defines a user's own class, ``stage <name>`` the version of
+        ``code of <class>`` is the hash of the files that a user's own class needs, ``stage <name>`` the version of
         one of gsbench's stages.
         """
         code = self.record.code
         return {f"code of {target}": digest for target, digest in code.sources.items()} | {
             f"stage {name}": str(version) for name, version in code.stages.items()
         }
+
+    @cached_property
+    def files(self) -> dict[str, str]:
+        """The files of gsbench that had a part in the trial, with their states then (`gsbench.runs.code`)."""
+        return {f"gsbench's {file}": str(state) for file, state in self.record.code.files.items()}
 
     @property
     def finished(self) -> float:

@@ -30,15 +30,21 @@ PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")  # on who
 
 
 def results_of(
-    values: dict[str, Any], fingerprint: str, scene: Scene, raster: str, entries: Mapping[str, Entry]
+    values: dict[str, Any],
+    fingerprint: str,
+    scene: Scene,
+    raster: str,
+    entries: Mapping[str, Entry],
+    code: Mapping[str, str],
 ) -> TrialRecord:
     """The results of the trial with the configuration ``values``; ``entries`` are those of its steps, by stage.
 
-    ``fingerprint`` is that of the photographs, ``raster`` the executor that rendered.
+    ``fingerprint`` is that of the photographs, ``raster`` the executor that rendered, ``code`` the files of gsbench
+    that had a part, with their states.
     """
     init, trained, evaluated = entries[INIT.name], entries[TRAIN.name], entries[EVALUATE.name]
     training, evaluation = read_training(trained.path), read_evaluation(evaluated.path)
-    manifest = read_manifest(evaluated.path)
+    manifest, checkout = read_manifest(evaluated.path), read_manifest(trained.path).checkout
     events = read_curve(trained.path / EVENTS)
     sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]}, reverse=True)
     results = TrialRecord(
@@ -82,7 +88,13 @@ def results_of(
             "train": trained.key,
             "evaluate": evaluated.key,
         },
-        code=Code(sources=sources_of(values), stages={stage.name: stage.version for stage in STAGES}),
+        code=Code(
+            sources=sources_of(values),
+            stages={stage.name: stage.version for stage in STAGES},
+            files=dict(sorted(code.items())),
+            commit=checkout.get("commit"),
+            edited=checkout.get("edited", False),
+        ),
         machine=training.machine,
         versions=versions(),
         evaluated_from=training.evaluated_from,

@@ -13,7 +13,7 @@ from typing import Any
 import pycolmap  # noqa: F401 - here, so that what its import does to signals can be undone
 import torch
 
-from gsbench.errors import GsbenchError
+from gsbench.errors import GsbenchError, TrainingError
 from gsbench.files import link_or_copy, remove_temporaries, storage_errors, write_json, write_text
 from gsbench.init.base import PICTURE_FILE, REPORT_FILE
 from gsbench.logs import log_to
@@ -21,6 +21,7 @@ from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.results import results_of
 from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs import layout
+from gsbench.runs.code import WIRING, state_of
 from gsbench.runs.finished import Done, find_finished
 from gsbench.runs.inputs import write_finished
 from gsbench.runs.layout import BUILDING, CONFIG, FAILED, LOG
@@ -67,6 +68,11 @@ def _recorded_failures(values: dict[str, Any], paths: TrialPaths) -> Iterator[No
     try:
         with storage_errors(paths.runs):
             yield
+    except SystemExit as ended:  # whose exit code might be that of a success
+        error = TrainingError(f"code of the trial ended the process (exit code {ended.code}) instead of returning")
+        error.__cause__ = ended
+        _record_failure(error, values, paths)
+        raise error from ended
     except Exception as error:
         _record_failure(error, values, paths)
         raise
@@ -97,14 +103,16 @@ def _run(parts: Parts, config_yaml: str, paths: TrialPaths) -> TrialRecord:
         (paths.folder / FAILED).unlink(missing_ok=True)
         trial = TrialSteps(parts, store)
     entries: dict[str, Entry] = {}
+    code = {file: state_of(file) for file in WIRING}
     with mirror, _recorded_failures(values, paths):
         for step in trial.steps():
             entries[step.stage.name] = entry = store.get(step)
+            code |= step.code
             if step.stage is INIT:
                 link_or_copy(entry.path / REPORT_FILE, paths.folder / layout.INIT_REPORT)
         scene = trial.views.scene
         log.info("%s: %d training and %d test views", paths.label, len(scene.train), len(scene.test))
-        results = results_of(values, trial.capture.fingerprint, scene, parts.rasterizer.name, entries)
+        results = results_of(values, trial.capture.fingerprint, scene, parts.rasterizer.name, entries, code)
         published = _publish(paths.folder, entries)
         made_of = {stage.name: entries[stage.name].path for stage in (INIT, TRAIN, GROUND_TRUTH, EVALUATE)}
         again = write_finished(paths.folder, values, results, source_files(trial.capture, store), made_of, published)

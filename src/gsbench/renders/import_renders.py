@@ -22,9 +22,10 @@ from gsbench.files import atomic, file_sha256, write_text
 from gsbench.pipeline.results import versions
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.renders.reference_images import Truth
+from gsbench.runs.code import files_of
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.inputs import write_finished
-from gsbench.runs.layout import CONFIG, GROUND_TRUTH, PER_VIEW, RENDERS
+from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, PER_VIEW, RENDERS
 from gsbench.runs.origin import FROM_RENDERS, RENDERS_ALONE
 from gsbench.runs.stages import EVALUATE
 from gsbench.runs.trial_record import Code, TrialRecord
@@ -32,6 +33,10 @@ from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
 from gsbench.settings import is_folder_name
 
+MEASURING = [
+    ("gsbench.renders.measure", None),
+    ("gsbench.eval.evaluator", None),
+]  # what makes an entered trial's numbers
 KEPT_GROUPS = ("scene", "eval", "tracking", "launch")  # of the configuration: what is true of renders too
 
 
@@ -56,6 +61,14 @@ def find_place(word: str, scene: str | None, seed: int, truth: Truth, runs: Path
     where = scene or truth.scene
     if not is_folder_name(experiment) or not is_folder_name(arm):
         raise InputError(f"--as {word} is not EXPERIMENT:ARM, such as table1:sfm-mine")
+    if experiment.casefold() in IN_RUNS:
+        raise InputError(f"--as {word}: {experiment} is gsbench's own folder of {runs}: name an experiment")
+    if seed < 0:
+        raise InputError(f"--seed {seed}: must be 0 or more")
+    if scene is not None and not is_folder_name(scene):
+        raise InputError(f"--scene {scene}: must be a plain folder name")
+    if scene is not None and truth.scene not in (None, scene):
+        raise InputError(f"--scene {scene}: the photographs are {truth.what}, of the scene {truth.scene}: leave it out")
     if where is None:
         raise InputError("--as: a folder of photographs has no scene's name: give it with --scene")
     init, dash, name = arm.partition("-")
@@ -159,7 +172,7 @@ def _results(
         resolution=truth.resolution,
         renders=dict(source),
         hashes={"config": identity, "data": truth.data},
-        code=Code(stages={EVALUATE.name: EVALUATE.version}),
+        code=Code(stages={EVALUATE.name: EVALUATE.version}, files=files_of(MEASURING)),
         versions=versions(),
     )
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsbench.parsing import DamagedError
+from gsbench.runs.code import changed_files
 from gsbench.runs.hashing import config_hash
 from gsbench.runs.inputs import (
     INPUTS_VERSION,
@@ -25,7 +26,7 @@ from gsbench.runs.store import read_manifest
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.runs.trial_record import TrialRecord, UnfinishedError
 
-Cause = Literal["unfinished", "configuration", "record", "stage", "package", "file", "store", "metric"]
+Cause = Literal["unfinished", "configuration", "record", "stage", "package", "file", "store", "metric", "code"]
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,8 @@ def _objections(folder: Path, values: dict[str, Any], results: TrialRecord, inpu
         made, now = inputs.stages.get(name), versions.get(name)
         if made != now:
             yield NotDone("stage", f"it was made by version {made} of the stage {name}, which is now at {now}")
+    if files := changed_files(results.code.files):
+        yield NotDone("code", f"the code of gsbench changed in: {', '.join(files)}")
     if inputs.pycolmap != (installed := version_of(PYCOLMAP)):
         yield NotDone("package", f"it was made with {PYCOLMAP} {inputs.pycolmap}, and {installed} is installed")
     for path, stamp in inputs.sources.items():

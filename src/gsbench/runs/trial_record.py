@@ -29,10 +29,17 @@ class Budget(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class Code(Part):
-    """The versions of the code: sha256 of the files of a user's classes, versions of gsbench's stages."""
+    """The versions of the code: sha256 of the files of a user's classes, versions of gsbench's stages.
+
+    ``files`` are those of gsbench that had a part, with their states (`gsbench.runs.code`); ``commit`` is that of the
+    checkout that trained, ``edited`` says whether files that git follows had changed.
+    """
 
     sources: dict[str, str] = field(default_factory=dict)
     stages: dict[str, int] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
+    commit: str | None = None
+    edited: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

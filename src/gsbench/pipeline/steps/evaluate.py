@@ -25,6 +25,7 @@ from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.logs import progress
 from gsbench.pipeline.components import options_of, rasterizer_inputs
+from gsbench.pipeline.steps.code import step_of_code
 from gsbench.pipeline.steps.figures import draw_ellipsoids
 from gsbench.pipeline.steps.maps import view_maps
 from gsbench.pipeline.steps.model_metrics import (
@@ -113,7 +114,7 @@ def evaluate_step(
             found.append(measure_flicker(rasterizer, gaussians, scene, color))
         _write_metrics(folder, evaluator, per_view, found, at)
 
-    return Step(EVALUATE, inputs, build)
+    return step_of_code(EVALUATE, inputs, build, __name__, (rasterizer, *evaluator.extra.values()))
 
 
 def measure_step(
@@ -140,7 +141,7 @@ def measure_step(
         unknown = nothing_known(geometry, flicker, "another program's renders are known, not its model")
         _write_metrics(folder, evaluator, per_view, [unknown])
 
-    return Step(EVALUATE, inputs, build)
+    return step_of_code(EVALUATE, inputs, build, __name__, tuple(evaluator.extra.values()))
 
 
 def _further_metrics(evaluator: Evaluator) -> dict[str, Any]:
