@@ -59,6 +59,11 @@ class Versus:
         return f"{arm_name(self.second)} against {arm_name(self.first)}"
 
     @property
+    def beyond(self) -> bool:
+        """Whether there are scenes enough to ask about scenes like these."""
+        return any(verdict.comparison.beyond is not None for verdict in self.verdicts)
+
+    @property
     def tests(self) -> list[str]:
         """``declared: exact sign flips of 9 pairs of trials, on these scenes`` and the like; without the role where all
         verdicts come from one test."""
@@ -96,7 +101,7 @@ def compare_arms(
         verdicts,
         _headline(judged, first, second),
         _secondary(judged),
-        tuple(_by_scene([verdict for verdict in verdicts if verdict.role in ("", "declared")])),
+        tuple(_by_scene([verdict for verdict in verdicts if verdict.role in ("one of all", "declared")])),
         tuple(_costs(own, first, second)),
         tuple(_forest(verdict) for verdict in verdicts),
         tuple(regions),
@@ -237,14 +242,15 @@ def _headline(judged: ArmVerdicts, first: Arm, second: Arm) -> str:
     if all(verdict.comparison.p is None for verdict in verdicts):
         return f"{against}: no verdict, one trial of each on {scope}; run more seeds."
     if judged.declared is None:
-        return f"{against}, on {scope}: {_in_words(verdicts)}."
+        return f"{against}, on {scope}: {_in_words(verdicts)}.{_beyond(verdicts)}"
     if judged.missing:
         return (
             f"{against}: no verdict, since {judged.declared.name}, which was declared, has no value ({judged.missing})."
         )
     if verdicts[0].role != "declared":
-        return f"{against}, on {scope}, all metrics adjusted for their number: {_in_words(verdicts)}."
-    return f"{against}, on {scope}: {_in_words(verdicts[:1])}, which was declared beforehand."
+        adjusted = ", all metrics adjusted for their number"
+        return f"{against}, on {scope}{adjusted}: {_in_words(verdicts)}.{_beyond(verdicts)}"
+    return f"{against}, on {scope}: {_in_words(verdicts[:1])}, which was declared beforehand.{_beyond(verdicts[:1])}"
 
 
 def _secondary(judged: ArmVerdicts) -> str:
@@ -267,15 +273,27 @@ def _in_words(verdicts: Sequence[Verdict]) -> str:
     return "; ".join(words)
 
 
+def _beyond(verdicts: Sequence[Verdict]) -> str:
+    """`` It holds for scenes like these in PSNR; not shown for scenes like these in SSIM.`` of what was decided."""
+    words = []
+    for holds, opening in ((True, "it holds"), (False, "not shown")):
+        found = [(v.quantity.name, v.comparison) for v in verdicts if v.comparison.verdict != "no evidence"]
+        names = [name for name, one in found if one.beyond is not None and one.beyond.holds == holds]
+        if names:
+            words.append(f"{opening} for scenes like these in {', '.join(names)}")
+    text = "; ".join(words)
+    return f" {text[0].upper()}{text[1:]}." if text else ""
+
+
 def _by_scene(verdicts: Sequence[Verdict]) -> list[str]:
-    """For each metric in which single scenes are decided (p below 5 % after Holm), a line that names them.
+    """For each metric in which single scenes are decided (p below 5 %, adjusted), a line that names them.
 
     A mean over scenes that disagree hides both sides of what was found.
     """
     lines = []
     for verdict in verdicts:
         scenes = verdict.comparison.scenes
-        decided = [scene for scene in scenes if scene.p_holm is not None and scene.p_holm < ALPHA]
+        decided = [scene for scene in scenes if scene.p_family is not None and scene.p_family < ALPHA]
         better = [scene.scene for scene in decided if scene.mean * verdict.quantity.direction > 0]
         worse = [scene.scene for scene in decided if scene.mean * verdict.quantity.direction < 0]
         found = [f"{word} on {', '.join(names)}" for word, names in (("better", better), ("worse", worse)) if names]
