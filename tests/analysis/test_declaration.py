@@ -183,6 +183,106 @@ def test_trials_remember_a_declaration_whose_record_is_gone(tmp_path: Path) -> N
     assert read_declarations(tmp_path / "nothing") == []
 
 
+# --- which trials were declared with it
+
+
+def declare_trials(runs: Path, *records: tuple[str, dict[str, list[int]]], metric: str = "lpips_vgg_raw") -> None:
+    lines = [json.dumps({"metric": metric, "time": moment, "trials": trials}) + "\n" for moment, trials in records]
+    (runs / "exp" / "declared.jsonl").write_text("".join(lines))
+
+
+def planned(seeds: list[int], arms: tuple[str, ...] = ("adc", "volumetric")) -> dict[str, list[int]]:
+    return {f"{scene}/sfm-{arm}/c0ffee00": seeds for scene in ("courtyard", "garden") for arm in arms}
+
+
+def test_declared_trials_keep_the_metrics_place(tmp_path: Path) -> None:
+    experiment = declared_experiment(tmp_path, effect=CLEAR)
+    declare_trials(tmp_path, (EARLY, planned([0, 1, 2])))
+    found = standing(experiment.folder, experiment.trials)
+    assert found is not None
+    assert found.beforehand
+    assert len(found.sentences("LPIPS")) == 1
+    declare_trials(tmp_path, (EARLY, planned([0])), ("2020-01-02T00:00:00Z", planned([0, 1, 2])))
+    found = standing(experiment.folder, experiment.trials)  # added while no result was there
+    assert found is not None
+    assert found.beforehand
+    assert found.declaration.when == "2020-01-01 00:00 UTC"
+
+
+WHOLE = planned([0, 1, 2])
+
+
+@pytest.mark.parametrize(
+    ("trials", "words"),
+    [
+        (planned([0, 1]), "4 of the 12 trials were added when results were there (seed 2)"),
+        (planned([0]), "8 of the 12 trials were added when results were there (seeds 1 and 2)"),
+        (planned([0, 1, 2], ("adc",)), "6 of the 12 trials were added when results were there (arm sfm-volumetric)"),
+        ({key: seeds for key, seeds in WHOLE.items() if "garden" not in key}, "were there (scene garden)"),
+        (WHOLE | {"garden/sfm-adc/c0ffee00": [0, 1]}, "1 of the 12 trials were added when results were there (further"),
+        ({key.replace("c0ff", "aaaa"): seeds for key, seeds in WHOLE.items()}, "(arms sfm-adc and sfm-volumetric)"),
+        ({}, "12 of the 12 trials were added"),
+    ],
+)
+@pytest.mark.parametrize("recorded", [True, False], ids=["by a command", "past the record"])
+def test_trials_that_were_added_after_results_cost_the_metric_its_place(
+    tmp_path: Path, trials: dict[str, list[int]], words: str, recorded: bool
+) -> None:
+    """Whether a later command wrote its additions down, or trials were brought in past it."""
+    experiment = declared_experiment(tmp_path, effect=CLEAR, views=3)
+    declare_trials(tmp_path, (EARLY, trials), *([(LATE, WHOLE)] if recorded else []))
+    (one,) = judged(experiment)
+    assert {(verdict.role, verdict.comparison.family) for verdict in one.verdicts} == {("one of all", 4)}
+    assert any(words in note for note in build_table(experiment).notes)
+
+
+def test_the_report_says_what_was_added(tmp_path: Path) -> None:
+    experiment = declared_experiment(tmp_path, effect=CLEAR, views=3)
+    declare_trials(tmp_path, (EARLY, planned([0, 1])))
+    page = build_report(experiment)
+    assert "4 of the 12 trials were added when results were there (seed 2)" in page
+    assert "which was declared beforehand" not in page
+    assert "All metrics of all pairs of arms are one family, 4 tests adjusted by Holm." in page
+
+
+def test_declared_trials_that_are_missing_are_said(tmp_path: Path) -> None:
+    experiment = declared_experiment(tmp_path, effect=CLEAR)
+    declare_trials(tmp_path, (EARLY, planned([0, 1, 2, 3])))
+    found = standing(experiment.folder, experiment.trials)
+    assert found is not None
+    assert found.beforehand
+    assert any("4 of the 16 declared trials are not there yet" in line for line in found.sentences("LPIPS"))
+
+
+def test_a_record_that_was_deleted_and_written_anew_does_not_hide_what_was_added(tmp_path: Path) -> None:
+    """The trials repeat that the metric was declared, and not with which trials."""
+    for path in write_runs(tmp_path, Plan(effect=CLEAR)):
+        data = json.loads((path / "results.json").read_text())
+        measured = EARLY if path.name.endswith(("seed0", "seed1")) else "2021-01-01T00:00:00Z"
+        declared = {"metric": "lpips_vgg_raw", "time": "2019-01-01T00:00:00Z"}
+        (path / "results.json").write_text(json.dumps(data | {"measured": measured, "declared": declared}))
+    declare_trials(tmp_path, ("2020-06-01T00:00:00Z", planned([0, 1, 2])))
+    experiment = load_experiment(tmp_path, "exp")
+    found = standing(experiment.folder, experiment.trials)
+    assert found is not None
+    assert len(found.added) == 4
+    assert not found.beforehand
+
+
+def test_records_without_trials_and_damaged_ones_are_read(tmp_path: Path) -> None:
+    """Those of earlier versions declare a metric alone."""
+    experiment = declared_experiment(tmp_path, ("psnr", EARLY))
+    found = standing(experiment.folder, experiment.trials)
+    assert found is not None
+    assert found.beforehand
+    for trials in ({"a": [0]}, {"a/b/c/d": [0]}, {"a/b/c": 3, "a/b/d": ["x"]}):
+        declare_trials(tmp_path, (EARLY, trials), metric="psnr")  # type: ignore[arg-type]
+        found = standing(experiment.folder, experiment.trials)
+        assert found is not None
+        assert len(found.added) == 12
+        assert found.sentences("PSNR")
+
+
 # --- simulated sweeps without any difference
 
 SIMULATIONS = 100

@@ -137,10 +137,9 @@ def families(judged: Sequence[ArmVerdicts]) -> list[str]:
         )
     if "one of all" in sizes:
         number = counted(sizes["one of all"], "test")
-        lines.append(
-            "No metric was declared beforehand (eval.primary): all metrics of all pairs of arms are one family, "
-            f"{number} adjusted by Holm."
-        )
+        none = any(one.declared is None for one in judged)
+        opening = "No metric was declared beforehand (eval.primary): all" if none else "All"
+        lines.append(f"{opening} metrics of all pairs of arms are one family, {number} adjusted by Holm.")
     return lines
 
 

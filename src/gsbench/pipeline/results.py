@@ -109,7 +109,7 @@ def _declared(values: dict[str, Any]) -> dict[str, Any]:
     home = TrialPaths.of(values).home
     metric = values["eval"].get("primary")
     said = [declaration for declaration in read_declarations(home) if declaration.metric == metric]
-    return {"declared": said[-1].to_record()} if said else {}
+    return {"declared": said[-1].summary()} if said else {}
 
 
 def _without_training(results: dict[str, Any]) -> dict[str, Any]:

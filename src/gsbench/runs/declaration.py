@@ -1,4 +1,4 @@
-"""The record of which metric an experiment's verdict was declared to be about (``eval.primary``), and when.
+"""The record of the metric that an experiment's verdict was declared to be about (``eval.primary``): trials and time.
 
 Every change of the declaration is a line of ``<runs>/<experiment>/declared.jsonl``, written when a command is given; a
 trial's ``results.json`` repeats what stood when it was run. Plans of claims stand in the same file, each a line of its
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import calendar
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,20 +20,37 @@ from gsbench.runs.layout import DECLARED
 STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
 
 
+Planned = Mapping[str, tuple[int, ...]]  # seeds by scene, arm and hash of the configuration (`trial_key`)
+
+
+def trial_key(scene: str, arm: str, config_hash: str) -> str:
+    """What tells a trial from others of its experiment but for the seed: ``garden/sfm-adc/3fa9c1d2``."""
+    return f"{scene}/{arm}/{config_hash}"
+
+
 @dataclass(frozen=True)
 class Declaration:
-    """The metric ``metric`` was declared at ``time`` (Unix, whole seconds)."""
+    """The metric ``metric`` was declared at ``time`` (Unix, whole seconds), with all ``trials`` that were to be run.
+
+    ``trials`` is None where they are not known: in what a trial repeats, and in records of earlier versions.
+    """
 
     time: int
     metric: str
+    trials: Planned | None = field(default=None, compare=False, repr=False)
 
     @property
     def when(self) -> str:
         """``2026-11-21 20:05 UTC``"""
         return _readable(self.time)
 
-    def to_record(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
+        """What a trial repeats of it: all but the trials."""
         return {"metric": self.metric, "time": time.strftime(STAMP, time.gmtime(self.time))}
+
+    def to_record(self) -> dict[str, Any]:
+        trials = {} if self.trials is None else {"trials": {key: list(seeds) for key, seeds in self.trials.items()}}
+        return self.summary() | trials
 
 
 @dataclass(frozen=True)
@@ -58,9 +75,10 @@ def read_declarations(folder: Path, repeated: Iterable[object] = ()) -> list[Dec
 
     Those that only results of its trials record are ``repeated``.
     """
-    records = [*read_json_lines(folder / DECLARED), *repeated]
+    records = [*repeated, *read_json_lines(folder / DECLARED)]
     found = [declaration for declaration in map(_from_record, records) if declaration is not None]
-    return sorted(dict.fromkeys(found), key=lambda declaration: declaration.time)
+    last = {one: one for one in found}  # of one metric and second the last, which the file says in full
+    return sorted(last.values(), key=lambda declaration: declaration.time)
 
 
 def read_plans(folder: Path) -> list[DeclaredPlan]:
@@ -81,7 +99,17 @@ def _from_record(record: object) -> Declaration | None:
     if not isinstance(record, dict) or not isinstance(record.get("metric"), str):
         return None
     moment = unix_time(record.get("time"))
-    return None if moment is None else Declaration(moment, record["metric"])
+    return None if moment is None else Declaration(moment, record["metric"], _planned(record.get("trials")))
+
+
+def _planned(trials: object) -> Planned | None:
+    if not isinstance(trials, dict):
+        return None
+    return {
+        str(key): tuple(seed for seed in seeds if isinstance(seed, int))
+        for key, seeds in trials.items()
+        if isinstance(seeds, list) and str(key).count("/") == 2
+    }
 
 
 def _plan_from_record(record: dict[str, Any]) -> DeclaredPlan | None:
