@@ -68,6 +68,7 @@ class Table:
     rows: tuple[Row, ...]
     notes: tuple[str, ...] = ()
     keys: tuple[tuple[str, str], ...] = field(default=(), repr=False)  # (quantity, arm) of each column
+    wrapped: bool = False  # cells hold text that may need several lines on paper
 
 
 def build_table(
@@ -281,17 +282,17 @@ def _declared_notes(experiment: Experiment) -> list[str]:
         return []
     from gsbench.analysis.verdicts import declared_lines, judge  # here, for a quick start of what needs no test
 
-    trials, pairs = _pairs(experiment)
+    trials, pairs = compared_pairs(experiment)
     return declared_lines(declared, judge(trials, pairs, ViewCache(), declared))
 
 
 def _attribution_notes(experiment: Experiment) -> list[str]:
     """For each pair of arms that differ in more than one ingredient, in which, and what would isolate one."""
-    trials, pairs = _pairs(experiment)
+    trials, pairs = compared_pairs(experiment)
     return [sentence for pair in pairs if (sentence := attribution_sentence(attribute(trials, *pair), *pair))]
 
 
-def _pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
+def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
     """The experiment's trials as arms, and the pairs of arms that are compared."""
     trials = with_variants(experiment.trials)
     arms = sorted({trial.arm for trial in trials})

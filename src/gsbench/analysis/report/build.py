@@ -71,6 +71,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         gaps=tradeoff_gaps(trials, baseline),
         agreements=agreements(trials),
         arm_name=arm_name,
+        to_html=to_html,
         training=training_charts(trials, arms),
         events=event_charts(trials, arms),
         volumes=volumes,

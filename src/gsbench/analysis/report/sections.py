@@ -11,6 +11,7 @@ from gsbench.analysis.attribution import attribute, attribution_sentence
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import short_version
 from gsbench.analysis.errors_by_region import MAP_PROPERTIES, RegionErrors, errors_by_region
+from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.origins import machine_of, unlike_clouds
 from gsbench.analysis.pairing import ViewCache, arm_name, pair_trials
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart, short_number
@@ -18,7 +19,7 @@ from gsbench.analysis.report.crops import Crop, choose_crops
 from gsbench.analysis.report.headlines import by_scene_lines, headline, secondary
 from gsbench.analysis.report.volumes import share_above, volume_histogram
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.tables import change_words, cost_change
+from gsbench.analysis.tables import Table, change_words, cost_change
 from gsbench.analysis.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve
 from gsbench.analysis.verdicts import ArmVerdicts, Verdict, judge
 from gsbench.errors import InputError
@@ -47,6 +48,7 @@ class Versus:
     verdicts: tuple[Verdict, ...]
     headline: str
     attribution: str  # in which ingredients the arms differ, where these are several
+    fairness: Table
     secondary: str  # what else was found, where a metric was declared
     by_scene: tuple[str, ...]
     costs: tuple[str, ...]
@@ -103,6 +105,7 @@ def compare_arms(
         verdicts,
         headline(judged, first, second),
         attribution_sentence(attribute(trials, first, second), first, second),
+        fairness_table(trials, first, second),
         secondary(judged),
         tuple(by_scene_lines([verdict for verdict in verdicts if verdict.role in ("one of all", "declared")])),
         tuple(_costs(own, first, second)),
