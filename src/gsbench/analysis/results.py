@@ -191,6 +191,11 @@ class TrialResult:
         return "" if self.record.trained_by is None else self.record.trained_by.program
 
     @property
+    def trainer_version(self) -> str:
+        """The version of that program; "" where there is none."""
+        return "" if self.record.trained_by is None else self.record.trained_by.version
+
+    @property
     def budget_acted(self) -> bool:
         """Return whether the trial's budget may have changed it: a cap that refused or steers, or a limit of time."""
         if self.made_elsewhere or self.program:

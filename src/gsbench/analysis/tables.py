@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
+from gsbench.analysis.attribution import attribute, attribution_sentence
 from gsbench.analysis.cells import (
     Cell,
     best_cells,
@@ -24,9 +25,9 @@ from gsbench.analysis.cells import (
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.origins import cloud_notes, machine_notes
-from gsbench.analysis.pairing import BASELINE, ViewCache, choose_pairs
+from gsbench.analysis.pairing import BASELINE, ViewCache, choose_pairs, controls_of
 from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.analysis.results import Arm, Experiment, TrialResult
 from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 from gsbench.words import counted, signed
 
@@ -67,6 +68,7 @@ class Table:
     rows: tuple[Row, ...]
     notes: tuple[str, ...] = ()
     keys: tuple[tuple[str, str], ...] = field(default=(), repr=False)  # (quantity, arm) of each column
+    wrapped: bool = False  # cells hold text that may need several lines on paper
 
 
 def build_table(
@@ -127,6 +129,7 @@ def build_table(
     notes += _reading_notes(grid, quantities, expected, "scene" in fields) + _origin_notes(trials)
     notes += (
         _declared_notes(experiment)
+        + _attribution_notes(experiment)
         + _cost_notes(trials)
         + machine_notes(trials)
         + cloud_notes(trials)
@@ -283,9 +286,21 @@ def _declared_notes(experiment: Experiment) -> list[str]:
         return []
     from gsbench.analysis.verdicts import declared_lines, judge  # here, for a quick start of what needs no test
 
-    trials = with_variants(experiment.trials)
-    pairs = choose_pairs(sorted({trial.arm for trial in trials}))
+    trials, pairs = compared_pairs(experiment)
     return declared_lines(declared, judge(trials, pairs, ViewCache(), declared))
+
+
+def _attribution_notes(experiment: Experiment) -> list[str]:
+    """For each pair of arms that differ in more than one ingredient, in which, and what would isolate one."""
+    trials, pairs = compared_pairs(experiment)
+    return [sentence for pair in pairs if (sentence := attribution_sentence(attribute(trials, *pair), *pair))]
+
+
+def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
+    """The experiment's trials as arms, and the pairs of arms that are compared."""
+    trials = with_variants(experiment.trials)
+    arms = sorted({trial.arm for trial in trials})
+    return trials, choose_pairs(arms, controls=controls_of(trials)) if arms else []
 
 
 def _cost_notes(trials: Sequence[TrialResult]) -> list[str]:

@@ -13,7 +13,7 @@ from pydantic import PositiveInt
 from gsbench.errors import InputError
 from gsbench.eval.facts import FLICKER, GEOMETRY, LPIPS, MORE, find, further_keys, known_keys, lpips_variants
 from gsbench.eval.protocol import PROTOCOLS
-from gsbench.settings import MISSING, PathName, check_settings
+from gsbench.settings import MISSING, FolderName, PathName, check_settings
 from gsbench.words import closest
 
 METRIC_NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -29,6 +29,7 @@ ProtocolName = Annotated[
     str, Predicate(lambda name: name in PROTOCOLS), doc(" or ".join(f"'{name}'" for name in PROTOCOLS))
 ]
 AT_RULE = "a list of different iterations, at which the test views are measured beside the last"
+CONTROLS_RULE = "a mapping {ARM: ARM} of names of densifiers: whom else, beside the baseline, an arm is held against"
 LPIPS_RULE = f"a list of {', '.join(lpips_variants())}, each at most once"
 LpipsVariant = Annotated[str, Predicate(lambda name: name in lpips_variants())]
 MORE_RULE = f"a list of {', '.join(further_keys())}, each at most once"
@@ -47,6 +48,7 @@ class EvalConfig:
     extra: dict[str, Any] = field(default_factory=dict)  # metrics of your own: {name: {_target_: mine.MyMetric}}
     at: Annotated[list[PositiveInt], Predicate(are_different), doc(AT_RULE)] = field(default_factory=list)
     primary: str | None = None  # the metric of the verdict, declared before results are seen; null: none was
+    controls: Annotated[dict[str, FolderName], doc(CONTROLS_RULE)] = field(default_factory=dict)  # {longaxis: absgrad}
     maps: bool = False  # keep maps of depth, volume and distance to the initial cloud: where an arm helps
     geometry: bool = False  # measure depths and surfaces of the model, and what floats in front of them
     flicker: bool = False  # measure how neighbouring renders of a camera path differ

@@ -124,7 +124,7 @@ def _declared(values: dict[str, Any]) -> Declared | None:
     home = TrialPaths.of(values).home
     metric = values["eval"].get("primary")
     said = [declaration for declaration in read_declarations(home) if declaration.metric == metric]
-    return Declared(**said[-1].to_record()) if said else None
+    return said[-1].summary() if said else None
 
 
 def _without_training(results: TrialRecord) -> TrialRecord:

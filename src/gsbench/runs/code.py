@@ -32,8 +32,8 @@ DIGEST_CHARACTERS = 16
 # the user's words is in the keys as it is.
 WITHOUT_PART = frozenset(
     """
-    analysis app bench claims cli config datasets errors launch logs parsing records renders runs settings system tracking
-    verbs view words
+    analysis app bench claims cli config datasets errors launch logs parsing records renders runs settings system
+    tracking verbs view words
     """.split()  # noqa: SIM905 - words are easier to read than a list of quoted ones
 )
 # What puts a trial together: a part in each, and followed no further, since it knows parts of every kind.

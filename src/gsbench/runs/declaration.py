@@ -1,4 +1,4 @@
-"""The record of which metric an experiment's verdict was declared to be about (``eval.primary``), and when.
+"""The record of the metric that an experiment's verdict was declared to be about (``eval.primary``): trials and time.
 
 Every change of the declaration is a line of ``<runs>/<experiment>/declared.jsonl``, written when a command is given; a
 trial's ``results.json`` repeats what stood when it was run. Plans of claims stand in the same file, each a line of its
@@ -10,13 +10,15 @@ from __future__ import annotations
 import calendar
 import logging
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from gsbench.parsing import DamagedError, fault_of, read_bytes
-from gsbench.records import Part, iterate_rows
+from gsbench.records import Count, Part, iterate_rows
 from gsbench.runs.layout import DECLARED
 from gsbench.runs.trial_record import Declared
 
@@ -25,20 +27,38 @@ log = logging.getLogger(__name__)
 STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
 
 
+TrialKey = Annotated[str, Field(pattern=r"^[^/]*/[^/]*/[^/]*$")]
+Planned = Mapping[str, tuple[int, ...]]  # seeds by scene, arm and hash of the configuration (`trial_key`)
+
+
+def trial_key(scene: str, arm: str, config_hash: str) -> str:
+    """The name that tells a trial from others of its experiment but for the seed: ``garden/sfm-adc/3fa9c1d2``."""
+    return f"{scene}/{arm}/{config_hash}"
+
+
 @dataclass(frozen=True)
 class Declaration:
-    """Declaration of ``metric`` at ``time`` (Unix, whole seconds)."""
+    """The metric ``metric``, declared at ``time`` (Unix, whole seconds) with all ``trials`` that were to be run.
+
+    ``trials`` is None where they are not known: in what a trial repeats, and in records of earlier versions.
+    """
 
     time: int
     metric: str
+    trials: Planned | None = field(default=None, compare=False, repr=False)
 
     @property
     def when(self) -> str:
         """``2026-11-21 20:05 UTC``"""
         return _readable(self.time)
 
+    def summary(self) -> Declared:
+        """The part that a trial repeats: all but the trials."""
+        return Declared(metric=self.metric, time=time.strftime(STAMP, time.gmtime(self.time)))
+
     def to_record(self) -> dict[str, Any]:
-        return {"metric": self.metric, "time": time.strftime(STAMP, time.gmtime(self.time))}
+        trials = {} if self.trials is None else {"trials": {key: list(seeds) for key, seeds in self.trials.items()}}
+        return self.summary().to_json() | trials
 
 
 @dataclass(frozen=True)
@@ -63,9 +83,10 @@ def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) ->
 
     Those that only results of its trials record are ``repeated``.
     """
-    found = [line.declaration for line in _lines(folder) if line.declaration is not None]
-    found += [declared for one in repeated if (declared := _from_record(one)) is not None]
-    return sorted(dict.fromkeys(found), key=lambda declaration: declaration.time)
+    found = [declared for one in repeated if (declared := _from_record(one)) is not None]
+    found += [line.declaration for line in _lines(folder) if line.declaration is not None]
+    last = {one: one for one in found}  # of one metric and second the last, which the file says in full
+    return sorted(last.values(), key=lambda declaration: declaration.time)
 
 
 def read_plans(folder: Path) -> list[DeclaredPlan]:
@@ -84,10 +105,11 @@ def unix_time(text: object) -> int | None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Line(Part):
-    """A line of ``declared.jsonl``: a metric, or a plan of claims with its hash; and when."""
+    """A line of ``declared.jsonl``: a metric with its trials' seeds, or a plan of claims with its hash; and when."""
 
     time: str
     metric: str | None = None
+    trials: dict[TrialKey, tuple[Count, ...]] | None = None
     plan: dict[str, Any] | None = None
     hash: str | None = None
 
@@ -99,7 +121,7 @@ class _Line(Part):
 
     @property
     def declaration(self) -> Declaration | None:
-        return None if self.metric is None else Declaration(unix_time(self.time) or 0, self.metric)
+        return None if self.metric is None else Declaration(unix_time(self.time) or 0, self.metric, self.trials)
 
     @property
     def declared_plan(self) -> DeclaredPlan | None:

@@ -10,7 +10,7 @@ from typing import Any
 from gsbench.runs.source import source_of
 
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")  # options that cannot change a result
-DECLARED = {"eval": ("primary",)}  # settings of a group that say how results will be read, whatever they are
+DECLARED = {"eval": ("primary", "controls")}  # settings of a group that say how results will be read, whatever they are
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
 
 

@@ -12,7 +12,7 @@ from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.errors_by_region import read_image
 from gsbench.analysis.origins import cloud_lines
-from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs
+from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs, controls_of
 from gsbench.analysis.paper import inconsistencies, load_paper
 from gsbench.analysis.paper_tables import layout_of, paper_tables
 from gsbench.analysis.report.crops import data_uri
@@ -41,7 +41,8 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
     views = ViewCache()
     declared = standing(experiment.folder, trials)
     search = search_part(experiment.folder)
-    pairs = [] if search else choose_pairs(arms, baseline)  # among points that were chosen by results no test holds
+    # Among points of a search, which were chosen by results, no test holds.
+    pairs = [] if search else choose_pairs(arms, baseline, controls_of(trials))
     judged = judge(trials, pairs, views, declared)
     versus = [compare_arms(trials, *pair, views, own) for pair, own in judged.items()]
     quantity = next((one.declared for one in judged.values() if one.declared is not None), None)
@@ -70,6 +71,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         gaps=tradeoff_gaps(trials, baseline),
         agreements=agreements(trials),
         arm_name=arm_name,
+        to_html=to_html,
         training=training_charts(trials, arms),
         events=event_charts(trials, arms),
         volumes=volumes,
