@@ -22,7 +22,7 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import get_protocol
 from gsbench.external.settings import External
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
-from gsbench.runs.hashing import WITHOUT_EFFECT
+from gsbench.runs.hashing import WITHOUT_EFFECT, as_before
 from gsbench.runs.source import OWN, has_changed_since_import, source_of
 from gsbench.settings import checked, unknown_setting
 
@@ -164,7 +164,7 @@ def options_of(group: str, component: Any) -> dict[str, Any]:
         fields = [
             field.name for field in dataclasses.fields(component) if field.init and field.name not in WITHOUT_EFFECT
         ]
-        values |= {name: _plain(getattr(component, name)) for name in fields}
+        values |= as_before(group, {name: _plain(getattr(component, name)) for name in fields})
     return values
 
 

@@ -20,7 +20,7 @@ from gsbench.runs.source import sources_of
 from gsbench.runs.stages import EVALUATE, INIT, STAGES, TRAIN
 from gsbench.runs.store import Entry
 from gsbench.runs.trial_files import TrialPaths
-from gsbench.scene.types import Scene
+from gsbench.scene.types import Capture, Scene
 
 # What an evaluation has beside metrics, and its name in results: of the unavailable metrics those that may still come;
 # how a user's own metrics are to be read; metrics at earlier iterations.
@@ -29,11 +29,11 @@ PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")  # on who
 
 
 def results_of(
-    values: dict[str, Any], fingerprint: str, scene: Scene, raster: str, entries: Mapping[str, Entry]
+    values: dict[str, Any], capture: Capture, scene: Scene, raster: str, entries: Mapping[str, Entry]
 ) -> dict[str, Any]:
     """The results of the trial with the configuration ``values``; ``entries`` are those of its steps, by stage.
 
-    ``fingerprint`` is that of the photographs, ``raster`` the executor that rendered.
+    ``capture`` are the photographs, ``raster`` the executor that rendered.
     """
     init, trained, evaluated = entries[INIT.name], entries[TRAIN.name], entries[EVALUATE.name]
     training = _read(trained.path / TRAINING)
@@ -68,12 +68,13 @@ def results_of(
         },
         "train_views": len(scene.train),
         "test_views": len(scene.test),
+        "held_out": capture.held_out,
         "resolution": list(sizes[0]),
         "events": sum_events(events),
         "init_report": _read(init.path / REPORT_FILE),
         "hashes": {
             "config": config_hash(values),
-            "data": fingerprint,
+            "data": capture.fingerprint,
             "init": init.key,
             "cloud": cloud_hash(init.path),
             "train": trained.key,

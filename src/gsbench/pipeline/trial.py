@@ -102,7 +102,7 @@ def _run(parts: Parts, config_yaml: str, paths: TrialPaths) -> dict[str, Any]:
                 link_or_copy(entry.path / REPORT_FILE, paths.folder / layout.INIT_REPORT)
         scene = trial.views.scene
         log.info("%s: %d training and %d test views", paths.label, len(scene.train), len(scene.test))
-        results = results_of(values, trial.capture.fingerprint, scene, parts.rasterizer.name, entries)
+        results = results_of(values, trial.capture, scene, parts.rasterizer.name, entries)
         again = read_object(paths.folder / RESULTS) == results
         published = _publish(paths.folder, entries)
         made_of = {stage.name: entries[stage.name].path for stage in (INIT, TRAIN, GROUND_TRUTH, EVALUATE)}
