@@ -101,6 +101,12 @@ def search(
         space = read_space(OverridesParser.create(context.config_loader).parse_overrides(list(words)))
     lowest = {key: _lowest(distribution) for key, distribution in space.searched.items()}
     first = trials_of_jobs(context, master, space.jobs(lowest))
+    unseen = all(trial.values["scene"]["validation"] for trial in first)
+    if not unseen:
+        log.warning(
+            "this search is judged by the test views, so that they choose its best and cannot test it any more: "
+            "scene.validation=true puts them away and judges by other views"
+        )
     if task.look_only:
         seeds = counted(len(space.seeds), "seed")
         print(
@@ -119,8 +125,8 @@ def search(
             launch_trials(task, master, launcher, trials)
             for place, number in enumerate(batch):
                 _tell(study, number, trials[place * len(space.seeds) :][: len(space.seeds)], wanted)
-            write_json(home / SEARCH, _record(study, wanted, space))
-        write_json(home / SEARCH, _record(study, wanted, space))
+            write_json(home / SEARCH, _record(study, wanted, space, unseen))
+        write_json(home / SEARCH, _record(study, wanted, space, unseen))
     _say_best(study, wanted, home.name)
 
 
@@ -234,8 +240,8 @@ def _tell(study: Study, number: int, trials: Sequence[Trial], wanted: SearchSett
     log.info("search: point %d of %d: %s: %s", number + 1, wanted.trials, where, came)
 
 
-def _record(study: Study, wanted: SearchSettings, space: Space) -> dict[str, Any]:
-    """What the report shows."""
+def _record(study: Study, wanted: SearchSettings, space: Space, unseen: bool) -> dict[str, Any]:
+    """What the report shows; ``unseen`` says that no point saw a test view."""
     from optuna.distributions import FloatDistribution, IntDistribution
 
     return {
@@ -243,6 +249,7 @@ def _record(study: Study, wanted: SearchSettings, space: Space) -> dict[str, Any
         "direction": wanted.direction,
         "wanted": wanted.trials,
         "seeds": len(space.seeds),
+        "validation": unseen,
         "log": [k for k, d in space.searched.items() if isinstance(d, FloatDistribution | IntDistribution) and d.log],
         "points": [
             {

@@ -45,7 +45,9 @@ def _part(record: Mapping[str, Any]) -> SearchPart:
         return SearchPart(f"{count}; none has a result yet.", [])
     best = max(done, key=lambda point: sign * point["value"])
     where = ", ".join(f"{key} = {value}" for key, value in best["settings"].items())
-    line = f"Best {name}: {best['value']:.{decimals}f} at {where} (point {best['number'] + 1}). {count}."
+    line = (
+        f"Best {name}: {best['value']:.{decimals}f} at {where} (point {best['number'] + 1}). {count}. {_judged(record)}"
+    )
     so_far: list[tuple[float, float]] = []
     for point in done:
         known = so_far[-1][1] if so_far else point["value"]
@@ -55,6 +57,12 @@ def _part(record: Mapping[str, Any]) -> SearchPart:
     charts = [line_chart("The search", history, "point", name, dots=True)]
     charts += [_by_setting(key, done, name, key in record["log"], best) for key in best["settings"]]
     return SearchPart(line, [chart for chart in charts if chart])
+
+
+def _judged(record: Mapping[str, Any]) -> str:
+    if record.get("validation"):
+        return "Judged by validation views; no test view was looked at."
+    return "Judged by the test views, which are therefore no test of it (scene.validation=true judges by others)."
 
 
 def _by_setting(
