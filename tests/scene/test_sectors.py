@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsbench.scene.camera import Camera
+from gsbench.scene.columns import ANGLE, DISTANCE
 from gsbench.scene.courtyard.render import ring_camera
-from gsbench.scene.nearness import ANGLE, DISTANCE, nearness
+from gsbench.scene.nearness import nearness
 from gsbench.scene.sectors import arrange, sector_of
 
 

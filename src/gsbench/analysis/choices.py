@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gsbench.analysis.origins import machine_of
-from gsbench.analysis.results import TrialResult
+from gsbench.analysis.results import BY_LISTS, TrialResult
 from gsbench.eval.facts import LPIPS, find
 from gsbench.eval.protocol import PAPER, PROTOCOLS
 
@@ -125,8 +125,8 @@ def _cap(trial: TrialResult) -> str:
 
 
 def _hold_out(trial: TrialResult) -> str:
-    config = trial.config
-    return "by lists" if config.get("scene.test_list") else f"every {config['scene.test_every']}th image"
+    every = f"every {trial.config['scene.test_every']}th image"
+    return {"every_nth": every, BY_LISTS: "by lists"}.get(trial.split, trial.split)
 
 
 def _selection(trial: TrialResult) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult
-from gsbench.runs.declaration import Declaration, read_declarations, unix_time
+from gsbench.runs.declaration import Declaration, metric_and_question, read_declarations, unix_time
 from gsbench.words import counted
 
 
@@ -28,7 +28,12 @@ class ActiveDeclaration:
 
     @property
     def metric(self) -> str:
-        return self.declaration.metric
+        return metric_and_question(self.declaration.metric)[0]
+
+    @property
+    def question(self) -> str:
+        """The one question that the verdict is about: interpolation or extrapolation; "" for all that were asked."""
+        return metric_and_question(self.declaration.metric)[1]
 
     @property
     def beforehand(self) -> bool:
@@ -38,6 +43,7 @@ class ActiveDeclaration:
     def sentences(self, name: str) -> list[str]:
         """What a reader must know of the declaration of the metric called ``name``."""
         when = self.declaration.when
+        name += f" at {self.question}" if self.question else ""
         if self.beforehand:
             lines = [
                 f"{name} was declared beforehand (eval.primary, {when}), before any of the {self._all()} was measured."

@@ -20,13 +20,15 @@ from typing import Any
 import yaml
 
 from gsbench.errors import InputError
-from gsbench.runs.hashing import flatten
+from gsbench.runs.declaration import QUESTIONS
+from gsbench.runs.hashing import BEFORE, flatten
 from gsbench.runs.layout import CONFIG, FAILED, IN_RUNS, PER_VIEW, RESULTS
 from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 
 TRIAL_FOLDER = re.compile(r"(?P<hash>[0-9a-f]{8})-seed(?P<seed>\d+)")
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
 
+BY_LISTS = "list"  # of scene.split
 Arm = tuple[str, str]  # initialiser, densifier
 
 TEXT_KEYS = ("experiment", "scene", "init", "densify", "raster", "protocol")
@@ -92,6 +94,8 @@ class TrialResult:
             "resolution": _size_text(self.data.get("resolution")),
             "data": str(self.data.get("hashes", {}).get("data")),
         }
+        if self.split:
+            known["split"] = self.split
         if not self.from_renders:
             known["raster"] = str(self.data["raster"])
         if not self.made_elsewhere:
@@ -99,6 +103,19 @@ class TrialResult:
         if not self.made_elsewhere and not self.program:
             known["budget"] = canonical(self.data.get("budget"))
         return known
+
+    @property
+    def split(self) -> str:
+        """Which views are held out, as short text; "" where it was not recorded, nor is the configuration known."""
+        if "split" in self.data:
+            return str(self.data["split"])
+        return "" if "scene.name" not in self.config else split_text(self.config)
+
+    @property
+    def question(self) -> str:
+        """What the held-out views ask of a model: interpolation or extrapolation; "" where lists hold them out."""
+        kind = re.split("[ ,]", self.split, maxsplit=1)[0]
+        return QUESTIONS.get(kind, "")
 
     @property
     def from_renders(self) -> bool:
@@ -251,6 +268,23 @@ def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
                 f"{path} does not average to the {key} of its trial ({mean:.6g}, not {expected:.6g}): damaged"
             )
     return views
+
+
+def setting(config: Mapping[str, Any], key: str) -> Any:
+    """A setting of a configuration with dotted keys; of one older than the setting, what it was before there was it."""
+    return config.get(key, BEFORE.get(key))
+
+
+def split_text(config: Mapping[str, Any]) -> str:
+    """``every_nth``, ``sector 0 of 8`` or ``list``, and whether it is matched, or for validation."""
+    text, sectors = str(setting(config, "scene.split")), setting(config, "scene.sectors")
+    if text == "sector":
+        text = f"sector {setting(config, 'scene.sector')} of {sectors}"
+    if config.get("scene.train_list") or config.get("scene.test_list"):
+        text = BY_LISTS
+    elif setting(config, "scene.match_views"):
+        text += ", matched" if text.startswith("sector") else f", matched with {sectors}"
+    return f"{text}, validation" if setting(config, "scene.validation") else text
 
 
 def canonical(value: object) -> str:

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from gsbench import __version__
+from gsbench.analysis.results import split_text
 from gsbench.events import sum_events
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.runs.declaration import read_declarations
-from gsbench.runs.hashing import config_hash, sha256_of
+from gsbench.runs.hashing import config_hash, flatten, sha256_of
 from gsbench.runs.layout import EVENTS, MANIFEST, METRICS, TRAINING
 from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS, MADE_ELSEWHERE, RENDERS_ALONE
 from gsbench.runs.source import sources_of
@@ -68,6 +69,7 @@ def results_of(
         },
         "train_views": len(scene.train),
         "test_views": len(scene.test),
+        "split": split_text(flatten(values)),
         "held_out": capture.held_out,
         "resolution": list(sizes[0]),
         "events": sum_events(events),

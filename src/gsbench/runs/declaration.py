@@ -17,12 +17,15 @@ from typing import Any
 from gsbench.files import read_json_lines
 from gsbench.runs.layout import DECLARED
 
+INTERPOLATION, EXTRAPOLATION = "interpolation", "extrapolation"
+QUESTIONS = {"every_nth": INTERPOLATION, "sector": EXTRAPOLATION}  # what a split (scene.split) asks of a model
+AT = "@"  # psnr@extrapolation
 STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
 
 
 @dataclass(frozen=True)
 class Declaration:
-    """The metric ``metric`` was declared at ``time`` (Unix, whole seconds)."""
+    """The metric ``metric``, perhaps of one question, was declared at ``time`` (Unix, whole seconds)."""
 
     time: int
     metric: str
@@ -51,6 +54,19 @@ class DeclaredPlan:
 
     def to_record(self) -> dict[str, Any]:
         return {"plan": self.plan, "hash": self.hash, "time": time.strftime(STAMP, time.gmtime(self.time))}
+
+
+def metric_and_question(primary: str) -> tuple[str, str]:
+    """The metric that ``eval.primary`` names, and the question that it is about; "" for all that were asked.
+
+    Examples:
+        >>> metric_and_question("psnr@extrapolation")
+        ('psnr', 'extrapolation')
+        >>> metric_and_question("psnr")
+        ('psnr', '')
+    """
+    metric, _, question = primary.partition(AT)
+    return metric, question
 
 
 def read_declarations(folder: Path, repeated: Iterable[object] = ()) -> list[Declaration]:

@@ -17,6 +17,7 @@ LATER: dict[str, dict[str, Any]] = {
     "scene": {"split": "every_nth", "sector": 0, "sectors": 8, "match_views": False, "validation": False},
     "init": {"points_from": "all"},
 }
+BEFORE = {f"{group}.{name}": value for group, values in LATER.items() for name, value in values.items()}
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
 
 

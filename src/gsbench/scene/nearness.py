@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.scene.camera import Camera
-
-ANGLE, DISTANCE = "angle_to_nearest", "distance_to_nearest"  # columns of per_view.csv
+from gsbench.scene.columns import ANGLE, DISTANCE
 
 Array = NDArray[np.float64]
 
