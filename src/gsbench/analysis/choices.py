@@ -14,7 +14,7 @@ from typing import Any
 from gsbench.analysis.origins import machine_of
 from gsbench.analysis.results import BY_LISTS, TrialResult
 from gsbench.eval.facts import LPIPS, find
-from gsbench.eval.protocol import PAPER, PROTOCOLS
+from gsbench.eval.protocol import PAPER, protocol_of
 
 NOT_RECORDED = "not recorded"
 PLACES = {"sampled": "drawn from the parent's density", "parent_mean": "the parent's mean"}
@@ -175,7 +175,7 @@ def _sizes(trials: Sequence[TrialResult]) -> str:
 
 
 def _lpips(trial: TrialResult) -> str:
-    protocol = PROTOCOLS.get(str(trial.data["protocol"]).rsplit("-", 1)[0], PAPER)
+    protocol = protocol_of(str(trial.data["protocol"])) or PAPER
     facts = find(f"{LPIPS}{protocol.lpips}")
     assert facts is not None
     return f"net {facts.options['net']}, fed [{'0' if facts.options['raw'] else '−1'}, 1]"

@@ -27,6 +27,7 @@ from gsbench.analysis.origins import cloud_notes, held_out_notes, machine_notes,
 from gsbench.analysis.pairing import BASELINE, ViewCache, choose_pairs
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.analysis.translations import TRANSLATED, translation_notes
 from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 from gsbench.words import counted, signed
 
@@ -133,6 +134,7 @@ def build_table(
     notes += (
         _declared_notes(experiment)
         + _cost_notes(trials)
+        + translation_notes(trials)
         + held_out_notes(trials)
         + points_notes(trials)
         + machine_notes(trials)
@@ -289,7 +291,7 @@ def _declared_notes(experiment: Experiment) -> list[str]:
     Which trials a table shows has no say in it, so that nobody can choose a verdict by choosing trials.
     """
     declared = standing(experiment.folder, experiment.trials)
-    if declared is None:
+    if declared is None or any(TRANSLATED in trial.data for trial in experiment.trials):
         return []
     from gsbench.analysis.verdicts import declared_lines, judge  # here, for a quick start of what needs no test
 

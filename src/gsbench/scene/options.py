@@ -25,7 +25,7 @@ class SceneConfig:
     sparse: PathName | None = None  # model folder below path; null: sparse/0 or sparse
     downscale: PositiveInt = 1  # divide both sides by it
     max_size: Annotated[int, Ge(MIN_SIZE)] | None = None  # longest side, px; never enlarges
-    resample: Literal["lanczos", "area"] = "lanczos"
+    resample: Literal["lanczos", "area", "bicubic"] = "lanczos"
     max_images: Annotated[int, Ge(3)] = 200  # evenly spaced over the sorted names
     test_every: Annotated[int, Ge(2)] = TEST_EVERY  # every 8th sorted name is held out
     split: SplitName = (
