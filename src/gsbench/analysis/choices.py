@@ -14,7 +14,8 @@ from typing import Any
 from gsbench.analysis.origins import machine_of
 from gsbench.analysis.results import TrialResult
 from gsbench.eval.facts import LPIPS, find
-from gsbench.eval.protocol import PAPER, PROTOCOLS
+from gsbench.eval.protocol import PAPER, protocol_of
+from gsbench.runs.splits import BY_LISTS
 
 NOT_RECORDED = "not recorded"
 PLACES = {"sampled": "drawn from the parent's density", "parent_mean": "the parent's mean"}
@@ -125,8 +126,8 @@ def _cap(trial: TrialResult) -> str:
 
 
 def _hold_out(trial: TrialResult) -> str:
-    config = trial.config
-    return "by lists" if config.get("scene.test_list") else f"every {config['scene.test_every']}th image"
+    every = f"every {trial.config['scene.test_every']}th image"
+    return {"every_nth": every, BY_LISTS: "by lists"}.get(trial.split, trial.split)
 
 
 def _selection(trial: TrialResult) -> str:
@@ -175,7 +176,7 @@ def _sizes(trials: Sequence[TrialResult]) -> str:
 
 
 def _lpips(trial: TrialResult) -> str:
-    protocol = PROTOCOLS.get(trial.record.protocol.rsplit("-", 1)[0], PAPER)
+    protocol = protocol_of(trial.record.protocol) or PAPER
     facts = find(f"{LPIPS}{protocol.lpips}")
     assert facts is not None
     return f"net {facts.options['net']}, fed [{'0' if facts.options['raw'] else '−1'}, 1]"

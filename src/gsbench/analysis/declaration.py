@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult
-from gsbench.runs.declaration import Declaration, read_declarations, trial_key, unix_time
+from gsbench.runs.declaration import Declaration, metric_and_question, read_declarations, trial_key, unix_time
 from gsbench.words import counted, listed
 
 
@@ -33,16 +33,22 @@ class ActiveDeclaration:
 
     @property
     def metric(self) -> str:
-        return self.declaration.metric
+        return metric_and_question(self.declaration.metric)[0]
+
+    @property
+    def question(self) -> str:
+        """The one question that the verdict is about: interpolation or extrapolation; "" for all that were asked."""
+        return metric_and_question(self.declaration.metric)[1]
 
     @property
     def beforehand(self) -> bool:
-        """Return whether metric and trials were fixed before any result was there; only then the metric stands alone."""
+        """Return whether metric and trials were fixed before any result: only then the metric stands alone."""
         return not self.seen and not self.added
 
     def sentences(self, name: str) -> list[str]:
         """Sentences that a reader must know of the declaration of the metric called ``name``."""
         when = self.declaration.when
+        name += f" at {self.question}" if self.question else ""
         if self.seen:
             lines = [
                 f"{name} was declared when results were there (eval.primary, {when}): {len(self.seen)} of "

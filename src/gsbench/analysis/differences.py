@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from gsbench.analysis.results import TrialResult, canonical
 from gsbench.runs.source import SHOWN
+from gsbench.runs.splits import setting
 from gsbench.words import counted
 
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
@@ -41,7 +42,7 @@ def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
     if len({trial.config_hash for trial in trials}) == 1:
         return {}
     keys = {key for trial in trials for key in trial.config if not key.startswith(IGNORED_SETTINGS)}
-    values = {key: sorted({canonical(trial.config.get(key)) for trial in trials}) for key in sorted(keys)}
+    values = {key: sorted({canonical(setting(trial.config, key)) for trial in trials}) for key in sorted(keys)}
     return {key: found for key, found in values.items() if len(found) > 1}
 
 

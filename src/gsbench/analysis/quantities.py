@@ -9,7 +9,7 @@ from functools import partial
 from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS, find, from_record, known_keys
-from gsbench.eval.protocol import PAPER, PROTOCOLS
+from gsbench.eval.protocol import PAPER, protocol_of
 
 MILLION, THOUSAND, MINUTE = 1e6, 1e3, 60.0
 
@@ -122,8 +122,8 @@ def _value_at(key: str, step: str, trial: TrialResult) -> float | None:
 
 def _protocol_lpips(trial: TrialResult) -> str:
     """What the trial's protocol means by LPIPS."""
-    name = trial.record.protocol.rsplit("-", 1)[0]  # without its version
-    return f"{LPIPS}{PROTOCOLS.get(name, PAPER).lpips}"
+    protocol = protocol_of(trial.record.protocol) or PAPER
+    return f"{LPIPS}{protocol.lpips or PAPER.lpips}"
 
 
 def _total_seconds(trial: TrialResult) -> float | None:

@@ -22,11 +22,14 @@ from typing import Any
 from gsbench.errors import InputError
 from gsbench.parsing import DamagedError, one_line, read_yaml
 from gsbench.records import MOST
+from gsbench.runs.declaration import QUESTIONS
 from gsbench.runs.hashing import NOT_HASHED, flatten
 from gsbench.runs.inputs import read_results, read_settings, read_unchanged
 from gsbench.runs.layout import CONFIG, FAILED, IN_RUNS, PER_VIEW, RESULTS
 from gsbench.runs.origin import FROM_RENDERS
 from gsbench.runs.rows import read_curve
+from gsbench.runs.splits import split_text
+from gsbench.runs.translation_record import Translation
 from gsbench.runs.trial_files import failure_of
 from gsbench.runs.trial_record import TrialRecord, UnfinishedError
 
@@ -80,6 +83,8 @@ class TrialResult:
     variant: str = ""  # the swept settings that tell this trial from others of its initialiser and densifier
     digests: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
     settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
+    translation: Translation | None = None  # of the metrics, where they are those of another protocol
+    translated_from: str = ""  # the trial's own protocol then
 
     @property
     def experiment(self) -> str:
@@ -166,6 +171,8 @@ class TrialResult:
             "resolution": _size_text(self.record.resolution),
             "data": str(self.record.hashes.get("data")),
         }
+        if self.split:
+            known["split"] = self.split
         if not self.from_renders:
             known["raster"] = self.record.raster
         if not self.made_elsewhere:
@@ -173,6 +180,19 @@ class TrialResult:
         if not self.made_elsewhere and not self.program:
             known["budget"] = "null" if self.record.budget is None else canonical(asdict(self.record.budget))
         return known
+
+    @property
+    def split(self) -> str:
+        """Which views are held out, as short text; "" where it was not recorded, nor is the configuration known."""
+        if self.record.split:
+            return self.record.split
+        return "" if "scene.name" not in self.config else split_text(self.config)
+
+    @property
+    def question(self) -> str:
+        """What the held-out views ask of a model: interpolation or extrapolation; "" where lists hold them out."""
+        kind = re.split("[ ,]", self.split, maxsplit=1)[0]
+        return QUESTIONS.get(kind, "")
 
     @property
     def from_renders(self) -> bool:

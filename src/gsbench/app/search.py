@@ -104,6 +104,12 @@ def search(
         space = read_space(OverridesParser.create(context.config_loader).parse_overrides(list(words)))
     lowest = {key: _lowest(distribution) for key, distribution in space.searched.items()}
     first = trials_of_jobs(context, master, space.jobs(lowest))
+    unseen = all(trial.values["scene"]["validation"] for trial in first)
+    if not unseen:
+        log.warning(
+            "this search is judged by the test views, so that they choose its best and cannot test it any more: "
+            "scene.validation=true puts them away and judges by other views"
+        )
     if task.look_only:
         seeds = counted(len(space.seeds), "seed")
         print(
@@ -122,8 +128,8 @@ def search(
             launch_trials(task, master, launcher, trials)
             for place, number in enumerate(batch):
                 _tell(study, number, trials[place * len(space.seeds) :][: len(space.seeds)], wanted)
-            write_json(home / SEARCH, _record(study, wanted, space).to_json())
-        write_json(home / SEARCH, _record(study, wanted, space).to_json())
+            write_json(home / SEARCH, _record(study, wanted, space, unseen).to_json())
+        write_json(home / SEARCH, _record(study, wanted, space, unseen).to_json())
     _say_best(study, wanted, home.name)
 
 
@@ -244,8 +250,8 @@ def _metric_of(folder: Path, metric: str) -> float | None:
         return None
 
 
-def _record(study: Study, wanted: SearchSettings, space: Space) -> SearchRecord:
-    """What the report shows."""
+def _record(study: Study, wanted: SearchSettings, space: Space, unseen: bool) -> SearchRecord:
+    """The record that the report shows; ``unseen`` says that no point saw a test view."""
     from optuna.distributions import FloatDistribution, IntDistribution
 
     states: dict[str, Literal["done", "failed"]] = {"COMPLETE": "done", "FAIL": "failed"}
@@ -254,6 +260,7 @@ def _record(study: Study, wanted: SearchSettings, space: Space) -> SearchRecord:
         direction=1 if wanted.direction > 0 else -1,
         wanted=wanted.trials,
         seeds=len(space.seeds),
+        validation=unseen,
         log=[k for k, d in space.searched.items() if isinstance(d, FloatDistribution | IntDistribution) and d.log],
         points=[
             Point(

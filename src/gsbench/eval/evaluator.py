@@ -79,6 +79,8 @@ class Evaluator:
         render holds a non-finite value.
         """
         image, target = self._prepare(render), self._prepare(ground_truth)  # [H, W, 3]
+        if border := self.protocol.crop:
+            image, target = (x[border:-border, border:-border] for x in (image, target))
         values = {}
         for key, metric in self._metrics.items():
             if key in self.unavailable:

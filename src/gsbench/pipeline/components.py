@@ -23,7 +23,8 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import get_protocol
 from gsbench.external.settings import External
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
-from gsbench.runs.hashing import WITHOUT_EFFECT
+from gsbench.runs.declaration import metric_and_question
+from gsbench.runs.hashing import WITHOUT_EFFECT, as_before
 from gsbench.runs.source import OWN, has_changed_since_import, source_of, unseen_imports
 from gsbench.settings import checked, unknown_setting
 
@@ -118,10 +119,11 @@ def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str,
     metrics: dict[str, Metric] = {}
     for name, options in values.get("extra", {}).items():
         metrics[name] = build(f"eval.extra.{name}", options, allow_targets)
-        if facts_of(name, metrics[name]).direction == 0 and values.get("primary") == name:
+        primary = values.get("primary") or ""
+        if facts_of(name, metrics[name]).direction == 0 and metric_and_question(primary)[0] == name:
             raise InputError(
-                f"eval.primary={name}: {options['_target_']} does not say whether more or less is better (direction), "
-                "so no verdict can be about it"
+                f"eval.primary={primary}: {options['_target_']} does not say whether more or less is better "
+                "(direction), so no verdict can be about it"
             )
     return metrics
 
@@ -170,7 +172,7 @@ def options_of(group: str, component: Any) -> dict[str, Any]:
         fields = [
             field.name for field in dataclasses.fields(component) if field.init and field.name not in WITHOUT_EFFECT
         ]
-        values |= {name: _plain(getattr(component, name)) for name in fields}
+        values |= as_before(group, {name: _plain(getattr(component, name)) for name in fields})
     return values
 
 

@@ -14,24 +14,25 @@ from gsbench.events import sum_events
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.parsing import read_json
 from gsbench.runs.declaration import read_declarations
-from gsbench.runs.hashing import config_hash, sha256_of
+from gsbench.runs.hashing import config_hash, flatten, sha256_of
 from gsbench.runs.layout import EVENTS
 from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS, MADE_ELSEWHERE, RENDERS_ALONE
 from gsbench.runs.rows import read_curve
 from gsbench.runs.source import sources_of
+from gsbench.runs.splits import split_text
 from gsbench.runs.stage_records import Training, read_evaluation, read_training
 from gsbench.runs.stages import EVALUATE, INIT, STAGES, TRAIN
 from gsbench.runs.store import Entry, read_manifest
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.runs.trial_record import Budget, Code, Declared, Trainer, TrialRecord
-from gsbench.scene.types import Scene
+from gsbench.scene.types import Capture, Scene
 
 PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")  # on whose versions a result depends
 
 
 def results_of(
     values: dict[str, Any],
-    fingerprint: str,
+    capture: Capture,
     scene: Scene,
     raster: str,
     entries: Mapping[str, Entry],
@@ -39,8 +40,8 @@ def results_of(
 ) -> TrialRecord:
     """The results of the trial with the configuration ``values``; ``entries`` are those of its steps, by stage.
 
-    ``fingerprint`` is that of the photographs, ``raster`` the executor that rendered, ``code`` the files of gsbench
-    that had a part, with their states.
+    ``capture`` are the photographs, ``raster`` the executor that rendered, ``code`` the files of gsbench that had a
+    part, with their states.
     """
     init, trained, evaluated = entries[INIT.name], entries[TRAIN.name], entries[EVALUATE.name]
     training, evaluation = read_training(trained.path), read_evaluation(evaluated.path)
@@ -77,12 +78,14 @@ def results_of(
         ),
         train_views=len(scene.train),
         test_views=len(scene.test),
+        split=split_text(flatten(values)),
+        held_out=capture.held_out,
         resolution=sizes[0],
         events=sum_events(events),
         init_report=read_json(init.path / REPORT_FILE),
         hashes={
             "config": config_hash(values),
-            "data": fingerprint,
+            "data": capture.fingerprint,
             "init": init.key,
             "cloud": cloud_hash(init.path),
             "train": trained.key,

@@ -112,7 +112,7 @@ def _run(parts: Parts, config_yaml: str, paths: TrialPaths) -> TrialRecord:
                 link_or_copy(entry.path / REPORT_FILE, paths.folder / layout.INIT_REPORT)
         scene = trial.views.scene
         log.info("%s: %d training and %d test views", paths.label, len(scene.train), len(scene.test))
-        results = results_of(values, trial.capture.fingerprint, scene, parts.rasterizer.name, entries, code)
+        results = results_of(values, trial.capture, scene, parts.rasterizer.name, entries, code)
         published = _publish(paths.folder, entries)
         made_of = {stage.name: entries[stage.name].path for stage in (INIT, TRAIN, GROUND_TRUTH, EVALUATE)}
         again = write_finished(paths.folder, values, results, source_files(trial.capture, store), made_of, published)

@@ -24,6 +24,9 @@ from gsbench.runs.trial_record import Declared
 
 log = logging.getLogger(__name__)
 
+INTERPOLATION, EXTRAPOLATION = "interpolation", "extrapolation"
+QUESTIONS = {"every_nth": INTERPOLATION, "sector": EXTRAPOLATION}  # what a split (scene.split) asks of a model
+AT = "@"  # psnr@extrapolation
 STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
 
 
@@ -38,7 +41,8 @@ def trial_key(scene: str, arm: str, config_hash: str) -> str:
 
 @dataclass(frozen=True)
 class Declaration:
-    """The metric ``metric``, declared at ``time`` (Unix, whole seconds) with all ``trials`` that were to be run.
+    """The metric ``metric``, perhaps of one question, declared at ``time`` (Unix, whole seconds) with all ``trials``
+    that were to be run.
 
     ``trials`` is None where they are not known: in what a trial repeats, and in records of earlier versions.
     """
@@ -76,6 +80,19 @@ class DeclaredPlan:
 
     def to_record(self) -> dict[str, Any]:
         return {"plan": self.plan, "hash": self.hash, "time": time.strftime(STAMP, time.gmtime(self.time))}
+
+
+def metric_and_question(primary: str) -> tuple[str, str]:
+    """The metric that ``eval.primary`` names, and the question that it is about; "" for all that were asked.
+
+    Examples:
+        >>> metric_and_question("psnr@extrapolation")
+        ('psnr', 'extrapolation')
+        >>> metric_and_question("psnr")
+        ('psnr', '')
+    """
+    metric, _, question = primary.partition(AT)
+    return metric, question
 
 
 def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) -> list[Declaration]:

@@ -28,6 +28,7 @@ class SearchRecord(Part):
     direction: Literal[-1, 1]
     wanted: Count
     seeds: Count
+    validation: bool = False  # whether validation views judged its points, so that none saw a test view
     log: list[str]
     points: list[Point]
 

@@ -116,6 +116,8 @@ class TrialRecord(Part):
     budget: Budget | None = None
     train_views: Count | None = None
     test_views: Count | None = None
+    split: str = ""  # the views that are held out, as short text (`gsbench.runs.splits`)
+    held_out: str = ""  # the same in a sentence
     resolution: tuple[Count, Count] | None = None
     events: dict[str, Count] = field(default_factory=dict)  # totals of the refinements, by cause
     init_report: dict[str, Any] = field(default_factory=dict)

@@ -16,6 +16,7 @@ from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs
 from gsbench.analysis.paper import inconsistencies, load_paper
 from gsbench.analysis.paper_tables import layout_of, paper_tables
 from gsbench.analysis.report.crops import data_uri
+from gsbench.analysis.report.question_charts import question_part
 from gsbench.analysis.report.search_charts import search_part
 from gsbench.analysis.report.sections import (
     compare_arms,
@@ -44,6 +45,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
     # Among points of a search, which were chosen by results, no test holds.
     pairs = [] if search else choose_pairs(arms, baseline, controls_of(trials))
     judged = judge(trials, pairs, views, declared)
+    questions = question_part(trials, judged, views)
     versus = [compare_arms(trials, *pair, views, own) for pair, own in judged.items()]
     quantity = next((one.declared for one in judged.values() if one.declared is not None), None)
     layout = layout_of(experiment.name)
@@ -66,6 +68,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         tables=[to_html(table) for table in tables],
         contradictions=[] if layout is None else inconsistencies(load_paper()),
         search=search,
+        questions=questions,
         sweeps=[] if search else sweep_charts(trials),
         tradeoffs=tradeoff_charts(trials),
         gaps=tradeoff_gaps(trials, baseline),

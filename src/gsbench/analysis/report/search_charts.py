@@ -49,7 +49,7 @@ def _part(record: SearchRecord) -> SearchPart:
         return SearchPart(f"{count}; none has a result yet.", [])
     best, highest = max(done, key=lambda pair: sign * pair[1])
     where = ", ".join(f"{key} = {value}" for key, value in best.settings.items())
-    line = f"Best {name}: {highest:.{decimals}f} at {where} (point {best.number + 1}). {count}."
+    line = f"Best {name}: {highest:.{decimals}f} at {where} (point {best.number + 1}). {count}. {_judged(record)}"
     so_far: list[tuple[float, float]] = []
     for point, found in done:
         known = so_far[-1][1] if so_far else found
@@ -59,6 +59,12 @@ def _part(record: SearchRecord) -> SearchPart:
     charts = [line_chart("The search", history, "point", name, dots=True)]
     charts += [_by_setting(key, done, name, key in record.log, best) for key in best.settings]
     return SearchPart(line, [chart for chart in charts if chart])
+
+
+def _judged(record: SearchRecord) -> str:
+    if record.validation:
+        return "Judged by validation views; no test view was looked at."
+    return "Judged by the test views, which are therefore no test of it (scene.validation=true judges by others)."
 
 
 def _by_setting(key: str, done: Sequence[tuple[Point, float]], name: str, log_scale: bool, best: Point) -> str:

@@ -33,12 +33,7 @@ def capture_step(options: SceneConfig) -> Step | None:
 
 def read_capture(options: SceneConfig, made: Path | None) -> Capture:
     """The photographs of ``options``, selected and split; ``made`` is the folder that ``capture_step`` filled."""
-    selection: dict[str, Any] = {
-        "max_images": options.max_images,
-        "test_every": options.test_every,
-        "train_list": options.train_list,
-        "test_list": options.test_list,
-    }
+    selection: dict[str, Any] = {"max_images": options.max_images, "split": options.split_rule}
     if made is not None:
         return read_colmap(options.name, made, exact_poses=True, **selection)
     path = Path(str(options.path)).expanduser()

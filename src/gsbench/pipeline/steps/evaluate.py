@@ -43,6 +43,7 @@ from gsbench.runs.step import Step
 from gsbench.runs.trial_record import Earlier
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
+from gsbench.scene.nearness import nearness
 from gsbench.scene.types import Scene
 from gsbench.train.trainer import snapshot_file
 
@@ -112,7 +113,7 @@ def evaluate_step(
             found.append(measure_geometry(rasterizer, gaussians, views))
         if flicker:
             found.append(measure_flicker(rasterizer, gaussians, scene, color))
-        _write_metrics(folder, evaluator, per_view, found, at)
+        _write_metrics(folder, evaluator, per_view, found, scene, at)
 
     return step_of_code(EVALUATE, inputs, build, __name__, (rasterizer, *evaluator.extra.values()))
 
@@ -139,7 +140,7 @@ def measure_step(
                 )
                 report("views", done, len(scene.test))
         unknown = nothing_known(geometry, flicker, "another program's renders are known, not its model")
-        _write_metrics(folder, evaluator, per_view, [unknown])
+        _write_metrics(folder, evaluator, per_view, [unknown], scene)
 
     return step_of_code(EVALUATE, inputs, build, __name__, tuple(evaluator.extra.values()))
 
@@ -161,14 +162,18 @@ def _write_metrics(
     evaluator: Evaluator,
     per_view: Mapping[str, Mapping[str, float]],
     of_model: Sequence[ModelMetrics],
+    scene: Scene,
     at: Mapping[str, Earlier] = MappingProxyType({}),
 ) -> None:
-    """Write the metrics of images and of the model, by view and as means."""
+    """Write the metrics of images and of the model, by view and as means; views with their nearest training views."""
     rows = {view: dict(row) for view, row in per_view.items()}
     for found in of_model:
         for view, row in found.per_view.items():
             rows[view] |= row
-    write_per_view(folder / PER_VIEW, rows)
+    cameras, training = ([view.camera for view in views] for views in (scene.test, scene.train))
+    near = nearness(cameras, training, scene.extent)
+    places = {view.name: place for view, place in zip(scene.test, near, strict=True)}  # no metrics: they are in no mean
+    write_per_view(folder / PER_VIEW, {view: row | places.get(view, {}) for view, row in rows.items()})
     summary = replace(summary_of(evaluator, rows), at=dict(at))
     for found in of_model:
         summary = replace(summary, unavailable=summary.unavailable | found.unavailable)
