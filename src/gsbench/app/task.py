@@ -101,12 +101,20 @@ def sweep(
             for of_grid in words_of_grids(params, task.grids, words)
             for point in grid(parser.parse_overrides(of_grid))
         ]
-    return launch_trials(task, master, launcher, trials_of_jobs(context, master, jobs))
+    trials = trials_of_jobs(context, master, jobs)
+    if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
+        from gsbench.app.until_decided import sweep_until_decided
+
+        return sweep_until_decided(task, master, launcher, trials)
+    return launch_trials(task, master, launcher, trials)
 
 
-def launch_trials(task: Task, master: DictConfig, launcher: Launcher, trials: Sequence[Trial]) -> Sequence[JobReturn]:
+def launch_trials(
+    task: Task, master: DictConfig, launcher: Launcher, trials: Sequence[Trial], first: int | None = None
+) -> Sequence[JobReturn]:
     """Run trials that a sweeper of gsbench's has composed, by any launcher.
 
+    ``first`` is the number of the first job, by which Hydra's launchers name folders; by default the trial's own.
     Another launcher than gsbench's gets them after a look at all, so that what is refused is refused before any work.
     """
     name = master.hydra.runtime.choices["hydra/launcher"]
@@ -115,7 +123,9 @@ def launch_trials(task: Task, master: DictConfig, launcher: Launcher, trials: Se
     begin_for_another_launcher(trials)
     jobs = [trial.job for trial in trials if trial.job is not None]
     try:
-        returned = launcher.launch([list(job.words) for job in jobs], initial_job_idx=jobs[0].number or 0)
+        returned = launcher.launch(
+            [list(job.words) for job in jobs], initial_job_idx=(jobs[0].number or 0) if first is None else first
+        )
     except GsbenchError:
         raise
     except Exception as error:

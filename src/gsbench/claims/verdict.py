@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from gsbench.analysis.declaration import measured
 from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.results import TrialResult
 from gsbench.analysis.statistics import Interval
-from gsbench.claims.file import Claim, ClaimsFile
+from gsbench.claims.file import Claim
 from gsbench.claims.measures import Measure, find_measure, read_measure
 from gsbench.claims.sequential import Decision, Design, decide
 from gsbench.errors import InputError
@@ -27,6 +27,12 @@ ALLOWED_TO_DIFFER = ("budget",)  # of two arms' conditions: a claim may be about
 
 PairKey = tuple[str, int]  # scene, seed
 Pair = tuple[TrialResult, TrialResult]  # baseline, arm
+
+
+class Planner(Protocol):
+    """What plans the looks at a claim: a file of claims, or a sweep."""
+
+    def design(self, claim: Claim, scenes: int, sharing: int) -> Design: ...
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,7 @@ class Verdict:
 
 def judge_claim(
     claim: Claim,
-    file: ClaimsFile,
+    planner: Planner,
     pairs: Mapping[PairKey, Pair],
     scenes: Sequence[str],
     sharing: int = 1,
@@ -70,7 +76,7 @@ def judge_claim(
 ) -> Verdict:
     """The verdict of a claim from its pairs of trials by scene and seed.
 
-    ``scenes`` are those that can be run here, ``sharing`` is how many tests share the file's error rate. Where trials
+    ``scenes`` are those that can be run here, ``sharing`` is how many tests share the error rate. Where trials
     were measured before ``declared_at`` (Unix time), when the plan was written down, the claim's metric is one of all
     that were measured, and has its part of the error rate alone.
     """
@@ -91,7 +97,7 @@ def judge_claim(
             f"{counted(late, 'trial')} had been measured before this plan was declared: the metric is one of "
             f"{len(names)} that could have been chosen, which share the error rate"
         )
-    design = file.design(claim, len(scenes), sharing)
+    design = planner.design(claim, len(scenes), sharing)
     rows = [_unbroken(scene, differences, design.looks[-1]) for scene in scenes]  # [S] of [K]
     decision = decide(rows, design, claim.effect.margin, claim.sign)
     seen = {(scene, seed) for scene in scenes for seed in range(decision.seeds)}

@@ -1,4 +1,4 @@
-"""Writing down which metric, or which plan of claims, a command declares before its trials run. Loads no torch."""
+"""Writing down which metric, or which plan of looks, a command declares before its trials run. Loads no torch."""
 
 from __future__ import annotations
 
@@ -61,7 +61,10 @@ def declare(metrics: Mapping[Path, str | None]) -> None:
 
 
 def declare_plan(home: Path, plan: Mapping[str, Any], plan_hash: str) -> DeclaredPlan:
-    """Add a plan of claims to the record of the experiment in ``home``, unless it is the latest there; what stands."""
+    """Add a plan, of claims or of a sweep's looks, to the record of the experiment in ``home``; what stands there.
+
+    One that is the latest there already stands with its time.
+    """
     home.mkdir(parents=True, exist_ok=True)
     with hold(home / f".{DECLARED}.lock", "the declarations"):
         known = read_plans(home)
@@ -70,7 +73,9 @@ def declare_plan(home: Path, plan: Mapping[str, Any], plan_hash: str) -> Declare
         declared = DeclaredPlan(int(time.time()), plan_hash, dict(plan))
         _write(home, read_declarations(home), [*known, declared])
     if known:
-        log.warning("%s: another plan of claims was declared before, and the page will say so", home.name)
+        log.warning(
+            "%s: another plan was declared before: trials that were measured under it count as looked at", home.name
+        )
     return declared
 
 
