@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext
 from omegaconf import DictConfig
 
-from gsbench.app.grids import words_of_grids
 from gsbench.config.command_words import check_sweep
-from gsbench.config.compose import compose_jobs, explained, ready_trial
+from gsbench.config.compose import compose_jobs, ready_trial
 from gsbench.config.hydra_job import words_of
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.batch import begin_for_another_launcher
@@ -80,33 +78,6 @@ def trials_of_jobs(
 ) -> list[Trial]:
     """The trials of a sweep's jobs, whose numbers begin at ``first``."""
     return [Trial.of(composed) for composed in compose_jobs(context, master, jobs, first)]
-
-
-def sweep(
-    task: Task,
-    context: HydraContext,
-    master: DictConfig,
-    launcher: Launcher,
-    params: Mapping[str, Any],
-    words: Sequence[str],
-) -> Sequence[JobReturn]:
-    """What gsbench's sweeper does with the words of a sweep: all points of its grids at once.
-
-    ``params`` are the settings and values of ``hydra.sweeper.params``.
-    """
-    parser = OverridesParser.create(context.config_loader)
-    with explained(words):
-        jobs = [
-            point
-            for of_grid in words_of_grids(params, task.grids, words)
-            for point in grid(parser.parse_overrides(of_grid))
-        ]
-    trials = trials_of_jobs(context, master, jobs)
-    if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
-        from gsbench.app.until_decided import sweep_until_decided
-
-        return sweep_until_decided(task, master, launcher, trials)
-    return launch_trials(task, master, launcher, trials)
 
 
 def launch_trials(
