@@ -15,6 +15,7 @@ Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 IGNORED_SETTINGS = (
     *("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path"),
     "eval.primary",
+    "densify.switches",
 )
 CODE = "code of "  # how the keys of ``TrialResult.code`` start that are a user's own classes
 

@@ -29,7 +29,7 @@ from gsbench.settings import checked, unknown_setting
 log = logging.getLogger(__name__)
 
 MOVED = {EXTERNAL: "gsbench.external.settings.External"}  # how configurations name a class, and where it stands
-RESERVED = ("_target_", "name")  # keys of a group that are not options of its class
+RESERVED = ("_target_", "name", "switches")  # keys of a group that are not options of its class
 METHODS = {
     "init": ("needs_reference", "content", "run"),
     "densify": ("prepare", "begin", "observe", "refine", "after_step"),

@@ -10,7 +10,8 @@ from typing import Any
 from gsbench.runs.source import source_of
 
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")  # options that cannot change a result
-DECLARED = {"eval": ("primary",)}  # settings of a group that say how results will be read, whatever they are
+# Settings of a group that say how results will be read, or what may be varied, whatever they are.
+DECLARED = {"eval": ("primary",), "densify": ("switches",)}
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
 
 

@@ -15,6 +15,7 @@ VERBS = {
     "report": ("gsbench.verbs.report", "one HTML file with the evidence of an experiment"),
     "check": ("gsbench.verbs.check", "test the claims of a paper, written in a file: supported, refuted or undecided"),
     "plan": ("gsbench.verbs.plan", "how many scenes and seeds resolve a difference, and what the hours at hand do"),
+    "ablate": ("gsbench.verbs.ablate", "which part of a densifier carries its gain: its switches in all combinations"),
     "explain": ("gsbench.verbs.explain", "how a table's number came about; with --stale, why a stage is computed anew"),
     "status": ("gsbench.verbs.status", "what an experiment has done, runs, failed and misses"),
     "retry": ("gsbench.verbs.retry", "run what failed, was stopped or is missing of an experiment"),
