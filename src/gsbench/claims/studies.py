@@ -53,9 +53,13 @@ class Found:
     trials: frozenset[str] = frozenset()
 
 
-def read_source(path: Path, wanted: Wanted) -> Found:
-    """The studies in ``path``, one for each protocol; raises InputError, one line, where there is none."""
-    return _read_nerfbaselines(path, wanted) if path.is_dir() else _read_archive(path, wanted)
+def read_source(path: Path, wanted: Wanted, name: str = "") -> Found:
+    """The studies in ``path``, one for each protocol, called ``name`` (default: as the file).
+
+    Raises InputError, one line, where there is none.
+    """
+    read = _read_nerfbaselines if path.is_dir() else _read_archive
+    return read(path, wanted, name or path.stem)
 
 
 def standard_error(differences: Sequence[Array]) -> tuple[float, float]:
@@ -68,25 +72,27 @@ def standard_error(differences: Sequence[Array]) -> tuple[float, float]:
     return float(units.mean()), error
 
 
-def _read_archive(path: Path, wanted: Wanted) -> Found:
+def _read_archive(path: Path, wanted: Wanted, name: str) -> Found:
     with tempfile.TemporaryDirectory() as folder:
         trials = with_variants(unpack_archive(path, Path(folder)).trials)
         views = ViewCache()
         studies, notes = [], []
-        for protocol in sorted({str(trial.data["protocol"]) for trial in trials}):
+        protocols = sorted({str(trial.data["protocol"]) for trial in trials})
+        for protocol in protocols:
             own = [trial for trial in trials if trial.data["protocol"] == protocol]
-            for first, second in _pairs(own, wanted, path):
+            pairs = _pairs(own, wanted, path)
+            for first, second in pairs:
+                told_apart = [protocol] * (len(protocols) > 1) + [first[0]] * (len(pairs) > 1)
+                label = f"{name} ({', '.join(told_apart)})" if told_apart else name
                 paired = pair_arms(own, first, second, wanted.metric, views)
-                name = path.stem if len({t.data["protocol"] for t in trials}) == 1 else f"{path.stem} ({protocol})"
-                mean, error = standard_error([matrix.mean(axis=1) for matrix in paired.differences])
-                several = f": {arm_name(second)}" if len(_pairs(own, wanted, path)) > 1 else ""
-                studies.append(Study(name + several, mean, error, _conditions(protocol, wanted.metric)))
-                pairs = sum(len(matrix) for matrix in paired.differences)
+                effect = standard_error([matrix.mean(axis=1) for matrix in paired.differences])
+                studies.append(Study(label, *effect, _conditions(protocol, wanted.metric)))
+                count = sum(len(matrix) for matrix in paired.differences)
                 notes.append(
-                    f"{name + several}: {arm_name(second)} against {arm_name(first)}, {pairs} pairs of trials on "
+                    f"{label}: {arm_name(second)} against {arm_name(first)}, {count} pairs of trials on "
                     f"{', '.join(paired.scenes)}; {_size(own)}"
                 )
-                notes += [f"{name + several}: left out, {line}" for line in paired.left_out]
+                notes += [f"{label}: left out, {line}" for line in paired.left_out]
         return Found(tuple(studies), tuple(notes), frozenset(map(_mark, trials)))
 
 
@@ -145,7 +151,7 @@ class _Result:
     mark: str
 
 
-def _read_nerfbaselines(folder: Path, wanted: Wanted) -> Found:
+def _read_nerfbaselines(folder: Path, wanted: Wanted, name: str) -> Found:
     """The files anywhere below ``folder``: one study for each protocol and data set, whose pairs are its scenes."""
     key = NERFBASELINES_METRICS.get(wanted.metric)
     if key is None:
@@ -165,9 +171,9 @@ def _read_nerfbaselines(folder: Path, wanted: Wanted) -> Found:
             continue
         differences = [np.array([sides[1][scene].metrics[key] - sides[0][scene].metrics[key]]) for scene in scenes]
         several = len({one.protocol for one in results}) > 1
-        name = f"{folder.name} ({protocol})" if several else folder.name
-        studies.append(Study(name, *standard_error(differences), _conditions(protocol, wanted.metric)))
-        notes.append(f"{name}: {len(scenes)} scenes ({', '.join(scenes)}), one training each; {protocol}")
+        label = f"{name} ({protocol})" if several else name
+        studies.append(Study(label, *standard_error(differences), _conditions(protocol, wanted.metric)))
+        notes.append(f"{label}: {len(scenes)} scenes ({', '.join(scenes)}), one training each; {protocol}")
     if not studies:
         reason = f"; {notes[0]}" if notes else ""
         raise InputError(

@@ -39,7 +39,7 @@ class Planner(Protocol):
 class Verdict:
     """One claim's verdict.
 
-    ``decision`` is None where nothing could be tested. ``baselines`` is the baseline's mean in the measure's own unit.
+    ``decision`` is None where nothing could be tested, as where the arms are one and the same at this size. ``baselines`` is the baseline's mean in the measure's own unit.
     ``trials`` are those that the decision rests on, pair by pair; ``notes`` say what was left out and why.
     ``beforehand``: none of them was measured before the plan was declared.
     """
@@ -89,6 +89,13 @@ def judge_claim(
     differences, bases, faults = _differences(claim, pairs, measure)
     if pairs and not differences:
         return Verdict(claim, NOT_TESTABLE, faults[0], measure, notes=tuple(faults[1:]))
+    if pairs and all(map(_is_equal, pairs.values())):
+        reason = (
+            f"both arms of {counted(len(pairs), 'pair')} of trials are equal to the last bit: what they differ in never "
+            "acted at this size"
+        )
+        trials = tuple(trial for key in sorted(pairs) for trial in pairs[key])
+        return Verdict(claim, NOT_TESTABLE, reason, measure, trials=trials, notes=tuple(faults))
     late = 0 if declared_at is None else sum(measured(trial) < declared_at for trial in both)
     if late:
         names = {name for trial in both for name in trial.metrics} | {claim.metric}
@@ -113,6 +120,15 @@ def judge_claim(
         tuple(trial for key in sorted(seen) for trial in pairs[key]),
         tuple(faults),
         not late,
+    )
+
+
+def _is_equal(pair: Pair) -> bool:
+    """Whether the two models are one and the same, as far as numbers tell."""
+    one, other = pair
+    return bool(one.metrics) and all(
+        a == b
+        for a, b in ((one.metrics, other.metrics), (one.data.get("num_gaussians"), other.data.get("num_gaussians")))
     )
 
 

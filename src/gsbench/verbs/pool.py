@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
@@ -59,9 +60,10 @@ def pool_sources(
     """
     studies, notes, faults = [], list[str](), list[str]()
     seen: dict[str, Path] = {}
+    names_of = Counter(source.stem for source in sources)
     for source in sources:
         try:
-            found = read_source(source, wanted)
+            found = read_source(source, wanted, source.stem if names_of[source.stem] == 1 else str(source))
         except InputError as error:
             faults.append(f"left out: {error}")
             continue
