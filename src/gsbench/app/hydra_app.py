@@ -97,5 +97,11 @@ def _check(master: DictConfig, multirun: bool, look_only: bool) -> None:
         raise InputError(f"hydra/launcher={launcher} and launch={master.launch.name} are two launchers: choose one")
     if look_only and launcher != OWN and sweeper != OWN:
         raise InputError(f"hydra/sweeper={sweeper} does not say beforehand what hydra/launcher={launcher} will run")
+    if master.launch.stop_when_decided and not multirun:
+        raise InputError("launch.stop_when_decided adds seeds to a sweep: add -m, two densifiers and seed=0,1,2,3")
+    if master.launch.stop_when_decided and sweeper != OWN:
+        raise InputError(
+            f"hydra/sweeper={sweeper} chooses by itself what to run: leave it or launch.stop_when_decided out"
+        )
     if sweeper != OWN and not master.launch.wait:
         raise InputError(f"hydra/sweeper={sweeper} learns from results, so launch.wait must be true")

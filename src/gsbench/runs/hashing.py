@@ -10,7 +10,8 @@ from typing import Any
 from gsbench.runs.source import source_of
 
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")  # options that cannot change a result
-DECLARED = {"eval": ("primary", "controls")}  # settings of a group that say how results will be read, whatever they are
+# Settings of a group that say how results will be read, or what may be varied, whatever they are.
+DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",)}
 # Settings that are younger than results that people keep, with the value at which all is as it was before them: at
 # that value they have no part in a hash or key, and a configuration without them means it.
 LATER: dict[str, dict[str, Any]] = {
