@@ -42,6 +42,17 @@ def test_values_and_gradients_match_the_reference(library: ModuleType) -> None:
     assert (output.radii - expected.radii)[both].abs().max() <= 1  # ceil may fall either way
 
 
+def test_the_two_versions_of_gsplat_give_the_same(library: ModuleType) -> None:
+    (image, gradients), (expected, references) = (
+        render_with_gradients(GsplatRasterizer(library=version), FAINT, torch.float32)
+        for version in (library.head(), library)
+    )
+    assert library.calls.count("spherical_harmonics of 1.6") == library.calls.count("spherical_harmonics") == 1
+    assert (image.image - expected.image).abs().max() < 1e-6
+    for name, reference in references.items():
+        assert (gradients[name] - reference).abs().max() <= 1e-5 * reference.abs().max(), name
+
+
 def test_late_and_repeated_backward_without_the_absolute_gradient(library: ModuleType) -> None:
     rasterizer = GsplatRasterizer(library=library)
     leaves = FAINT.gaussians().map(lambda tensor: tensor.float().requires_grad_())
