@@ -20,6 +20,7 @@ from gsbench.raster.triton.composite import composite, decomposite
 from gsbench.raster.triton.footprint import cover, sum_cover
 from gsbench.raster.triton.launch import launch, launch_grid
 from gsbench.raster.triton.layout import BLOCK_PIXELS, RECORD, ROW, TILE, Grid, View, make_grid, make_view
+from gsbench.raster.triton.memory import UNITS_AT_FIRST
 from gsbench.raster.triton.projection import project
 from gsbench.raster.triton.toolchain import load_driver
 from gsbench.raster.triton.workspace import Workspace, WorkspacePool
@@ -27,7 +28,6 @@ from gsbench.raster.validate import check_settings, raise_for_values
 from gsbench.scene.camera import Camera
 
 MAX_INT16, MAX_INT32 = 2**15 - 1, 2**31 - 1
-UNITS_AT_FIRST = 2  # rows of blocks that a Gaussian has, before it is known
 
 
 class TritonRasterizer:
