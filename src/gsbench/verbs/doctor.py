@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from gsbench.datasets.catalog import DATA_VARIABLE, data_dir, read_catalog
-from gsbench.raster.executors import EXECUTORS, resolve
+from gsbench.raster.executors import EXECUTORS, find, resolve
 from gsbench.runs.layout import DATABASE, STORE
 from gsbench.system.install import install_command
 from gsbench.system.resources import available_threads, installed_gpus
@@ -147,7 +147,9 @@ def check_triton() -> Iterator[Finding]:
     installed = _version("triton")
     if installed is None:  # torch for CUDA would have brought it along
         return
-    if missing := missing_tools():
+    if old := find("triton").too_old():
+        yield Finding("note", "triton", f"raster=triton {old}")
+    elif missing := missing_tools():
         yield Finding("note", "triton", f"{installed}; at its first run on a GPU it needs {' and '.join(missing)}")
     else:
         text = f"{installed}; the C compiler and Python.h that it needs at its first run on a GPU are here"
