@@ -259,7 +259,8 @@ def _keys_below(parent: str, overrides: Sequence[str]) -> list[str]:
         except Exception:  # noqa: BLE001 - the choices may be what is wrong
             config = hydra.compose_config(CONFIG_NAME, [], RunMode.RUN)
     node = OmegaConf.select(config, parent) if parent else config
-    return [str(key) for key in node if key != "hydra"] if isinstance(node, DictConfig) else []
+    hidden = "_target_" if parent.startswith("hydra") else "hydra"  # a plug-in is chosen by its name
+    return [str(key) for key in node if key != hidden] if isinstance(node, DictConfig) else []
 
 
 def options_text(folders: Sequence[Path] = ()) -> str:
