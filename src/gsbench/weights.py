@@ -6,6 +6,7 @@ in the torch hub cache; if it lies nowhere it is downloaded into that cache. Not
 
 from __future__ import annotations
 
+import logging
 import os
 import urllib.request
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,8 @@ from gsbench.words import readable_bytes
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+log = logging.getLogger(__name__)
 
 WEIGHTS_VARIABLE = "GSBENCH_WEIGHTS"
 DOWNLOAD_TIMEOUT_SECONDS = 10.0  # of inactivity: without a network the answer must come at once
@@ -184,6 +187,7 @@ def _download(spec: WeightsFile, folder: Path) -> Path:
             progress("weights") as report,
         ):
             size = int(source.headers.get("Content-Length") or 0) or None
+            log.info("downloading %s (%s) from %s to %s", target.name, readable_bytes(size), spec.url, folder)
             while piece := source.read(CHUNK):
                 file.write(piece)
                 report(target.name, file.tell(), size, f"{readable_bytes(file.tell())} of {readable_bytes(size)}")

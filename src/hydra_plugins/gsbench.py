@@ -64,7 +64,10 @@ class OptunaSweeper(GsbenchSweeper):
 
 LAUNCHER = {"_target_": "hydra_plugins.gsbench.GsbenchLauncher"}
 SWEEPER = {"_target_": "hydra_plugins.gsbench.GsbenchSweeper", "params": {}, "grids": []}
-SEARCH = {"metric": "psnr", "trials": 20, "seed": 0, "at_once": 1, "params": {}}  # gsbench.app.search
+SEARCH = {  # gsbench.app.search; the last two are other names of n_trials and n_jobs
+    **{"metric": "psnr", "direction": None, "n_trials": 20, "n_jobs": 1, "seed": 0, "params": {}},
+    **{"trials": None, "at_once": None},
+}
 ConfigStore.instance().store(group="hydra/launcher", name="gsbench", node=LAUNCHER, provider="gsbench")
 ConfigStore.instance().store(group="hydra/sweeper", name="gsbench", node=SWEEPER, provider="gsbench")
 ConfigStore.instance().store(

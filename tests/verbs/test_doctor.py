@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ import torch
 from gsbench.raster.cpu import jit
 from gsbench.verbs import doctor
 from gsbench.verbs.doctor import Finding
+from tests.conftest import ROOT
 
 GB = 10**9
 
@@ -48,6 +50,12 @@ def test_gpus_with_their_memory(gpus: SimpleNamespace, monkeypatch: pytest.Monke
     assert all(verdict == "note" and "older than Triton" in text for verdict, text in said(doctor.check_gpu()))
     monkeypatch.setattr(torch.version, "hip", "7.0")
     assert all(verdict == "note" and "never tested" in text for verdict, text in said(doctor.check_gpu()))
+
+
+def test_every_extra_is_known() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = set(project["optional-dependencies"]) - {"dev", "docs"}
+    assert {extra for _, extra in doctor.OPTIONAL.values()} == extras
 
 
 def test_no_gpu_and_why(no_gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,10 +44,10 @@ AT = "@"  # psnr@7000 is the PSNR at iteration 7000 (eval.at)
 
 
 def choose_quantities(trials: Iterable[TrialResult], names: Iterable[str] | None = None) -> list[Quantity]:
-    """The quantities by name; by default all metrics that some trial has, the protocol's LPIPS, and the main costs."""
+    """The quantities by name; by default all metrics that some trial has, LPIPS as it was asked for, and main costs."""
     trials = list(trials)
     if names is None:
-        wanted = {_protocol_lpips(trial) for trial in trials}
+        wanted = {key for trial in trials for key in _lpips_asked_for(trial)}
         names = [*metric_keys(trials, wanted), "gaussians", "train_time"]
     return [quantity(name, trials) for name in names]
 
@@ -124,6 +124,13 @@ def _protocol_lpips(trial: TrialResult) -> str:
     """What the trial's protocol means by LPIPS."""
     protocol = protocol_of(trial.record.protocol) or PAPER
     return f"{LPIPS}{protocol.lpips or PAPER.lpips}"
+
+
+def _lpips_asked_for(trial: TrialResult) -> list[str]:
+    """What the trial's protocol means by LPIPS, unless its configuration asks for other variants alone."""
+    protocols, setting = _protocol_lpips(trial), trial.config.get("eval.lpips")
+    asked = [f"{LPIPS}{variant}" for variant in setting] if isinstance(setting, list) else []
+    return asked if asked and protocols not in asked else [protocols]
 
 
 def _total_seconds(trial: TrialResult) -> float | None:

@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsbench.config.command_words import parse
 from gsbench.config.compose import composing
+from gsbench.config.hydra_internals import VERSION_BASE
 from gsbench.config.hydra_job import CONFIG_NAME
 from gsbench.config.schema import register_schemas
 from gsbench.errors import InputError
@@ -32,7 +33,7 @@ def answer(argv: Sequence[str]) -> None:
     saved = sys.argv
     sys.argv = ["gsbench", *argv]
     try:
-        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=CONFIG_NAME)(task)()
+        hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=CONFIG_NAME)(task)()
     finally:
         sys.argv = saved
 

@@ -143,6 +143,7 @@ COMPONENTS = ("init", "densify")  # groups whose keys are the options of a class
 Check = Callable[[type, Mapping[str, Any], str], dict[str, Any]]
 
 
+@cache
 def register_schemas() -> None:
     """Make the schemas known to Hydra, the groups' under ``schema/`` so that they are not offered as options."""
     store = ConfigStore.instance()
@@ -242,7 +243,8 @@ def _convert(node: DictConfig, schema: type, given: Mapping[str, Any], group: st
         if name not in given and name != "_target_" and name not in GROUP_SCHEMAS and name not in COMPONENTS:
             raise InputError(f"{prefix}{name} has been taken away: give it a value instead")
     for key, value in check_group(schema, given, group).items():
-        value = list(value) if isinstance(value, tuple) else value
+        if isinstance(value, tuple) and isinstance(given[key], list):  # OmegaConf 2.3 knows no tuples, 2.4 does
+            value = list(value)
         if repr(value) != repr(given[key]):
             node[key] = value
 

@@ -27,8 +27,11 @@ TRITON_CAPABILITY = (8, 0)  # "NVIDIA GPUs (Compute Capability 8.0+)", in Triton
 OPTIONAL = {  # package -> what needs it, and the extra that brings it
     "transformers": ("init=dim", "dim"),
     "gsplat": ("raster=gsplat and export --to compressed", "gsplat"),
+    "optuna": ("hydra/sweeper=optuna", "search"),
     "submitit": ("launch=local and launch=slurm", "slurm"),
+    "tensorboard": ("tracking=tensorboard", "tensorboard"),
     "viser": ("gsbench view", "view"),
+    "wandb": ("tracking=wandb", "wandb"),
 }
 
 

@@ -105,14 +105,17 @@ def build_report(
 
 
 def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
-    """(caption, data URI) of the pictures that trials left for the report; one seed of each scene and arm."""
-    found = []
+    """(caption, data URI) of the pictures that trials left for the report; one seed of each scene and arm.
+
+    A picture that several arms of a scene share, such as that of their initial cloud, is there once.
+    """
+    found: dict[tuple[str, str, str], list[str]] = {}  # by name, scene and picture: the arms and seeds
     for group in by_key(trials, lambda trial: (trial.scene, trial.arm)).values():
         trial = group[0]
         for path in sorted((trial.path / FIGURES).glob("*.png")):
-            caption = f"{path.stem.replace('_', ' ')}: {trial.scene}, {trial.init}-{trial.densify}, seed {trial.seed}"
-            found.append((caption, data_uri(read_image(path))))
-    return found
+            key = path.stem.replace("_", " "), trial.scene, data_uri(read_image(path))
+            found.setdefault(key, []).append(f"{trial.init}-{trial.densify}, seed {trial.seed}")
+    return [(f"{name}: {scene}, {'; '.join(arms)}", uri) for (name, scene, uri), arms in found.items()]
 
 
 def _resource(name: str) -> str:
