@@ -51,7 +51,7 @@ def arrange(cameras: Sequence[Camera]) -> Arrangement:
         order = np.roll(order, -(widest + 1))
     return Arrangement(
         tuple(int(index) for index in order),
-        f"by azimuth around the scene's up and centre, since the cameras surround it, with gaps up to {gap:.0f} degrees",
+        f"by azimuth around the scene's up and centre, as the cameras surround it (gaps up to {gap:.0f} degrees)",
     )
 
 

@@ -61,7 +61,7 @@ def angle_charts(trials: Sequence[TrialResult], views: ViewCache) -> list[str]:
 
 
 def binned(points: Sequence[tuple[float, float]], most: int = MOST_POINTS) -> list[tuple[float, float]]:
-    """Means of (x, y) in at most ``most`` bins of x, in order, filled alike; what is one when rounded stays together."""
+    """Means of (x, y) in at most ``most`` bins of x, in order, filled alike; what rounds to one stays together."""
     alike: dict[int, list[tuple[float, float]]] = defaultdict(list)
     for x, y in points:
         alike[round(x)].append((x, y))
