@@ -211,7 +211,7 @@ class TrainableGaussians:
         return next(group for group in self.optimizer.param_groups if group["name"] == name)
 
     def state_dict(self) -> dict[str, object]:
-        """Everything that a resumed training needs, sharing memory with this object: save it before the next step.
+        """The state that a resumed training needs, sharing memory with this object: save it before the next step.
 
         Saving changes nothing: harmonics that are behind are saved as they are, with what they have missed.
         """

@@ -74,7 +74,7 @@ class CpuRasterizer:
         background: Tensor,
         absolute_gradient: bool = False,
     ) -> RenderOutput:
-        """See ``raster.base.Rasterizer``. Raises ValueError naming the parameter that cannot be used."""
+        """Render as ``raster.base.Rasterizer`` says. Raises ValueError naming the parameter that cannot be used."""
         return self._render(gaussians, None, camera, sh_degree, background, absolute_gradient)
 
     def render_deferred(
@@ -86,7 +86,7 @@ class CpuRasterizer:
         background: Tensor,
         absolute_gradient: bool = False,
     ) -> RenderOutput:
-        """See ``raster.base.DeferringRasterizer``."""
+        """Render as ``raster.base.DeferringRasterizer`` says."""
         return self._render(gaussians, harmonics, camera, sh_degree, background, absolute_gradient)
 
     def _render(

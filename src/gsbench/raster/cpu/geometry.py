@@ -32,7 +32,7 @@ def rotation_matrix(w: Any, x: Any, y: Any, z: Any) -> Any:
 
 @inlined
 def from_camera(mean: Any, v: Any) -> Any:
-    """From the camera centre to the mean, in world axes.
+    """The vector from the camera centre to the mean, in world axes.
 
     Everything goes through this difference: rotating it loses no digits however far the scene is from its origin.
     """
@@ -95,7 +95,7 @@ def gather_quaternions(quaternions: Any, indices: Any) -> Any:
 
 @inlined
 def spread(m0: Any, m1: Any, blur: Any) -> Any:
-    """For the rows of M: xx, xy, yy of the covariance C = M M^T + blur I, and a = yy / det C.
+    """Spread of the rows of M: xx, xy, yy of the covariance C = M M^T + blur I, and a = yy / det C.
 
     1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows; dividing a row by the square
     root of yy first gives 1/a without cancellation and without overflow.
@@ -110,6 +110,6 @@ def spread(m0: Any, m1: Any, blur: Any) -> Any:
 
 @inlined
 def normalized(offset: Any) -> Any:
-    """``offset`` with length 1, and the inverse of its length."""
+    """Scale ``offset`` to length 1; with the inverse of its length."""
     inverse = 1 / square_root(dot(offset, offset))
     return scaled(offset, (inverse, inverse, inverse)), inverse
