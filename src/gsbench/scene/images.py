@@ -36,9 +36,12 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def exif_orientation(path: Path) -> int:
-    """The EXIF orientation tag, 1 (upright) where there is none."""
+    """The EXIF orientation tag, 1 (upright) where there is none that can be read."""
     with _open(path) as image:
-        return int(image.getexif().get(EXIF_ORIENTATION, 1))
+        try:
+            return int(image.getexif().get(EXIF_ORIENTATION, 1))
+        except Exception:  # noqa: BLE001 - as in `_open`; the pixels may be sound
+            return 1
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
