@@ -378,3 +378,20 @@ def test_doctor_on_a_runs_folder(runs: Path, monkeypatch: pytest.MonkeyPatch) ->
     first, last = doctor.check_store(runs)
     assert "model differs" in first.text
     assert last.text.startswith("0 results")
+
+
+def test_a_stop_while_a_native_module_is_imported_is_told_as_a_stop(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(argv: list[str]) -> int:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:  # as pybind11 and numpy do
+            raise ImportError("initialization failed") from error
+
+    monkeypatch.setattr(cli, "_trials", stopped)
+    assert cli.run(["seed=1"]) == 130
+    assert capsys.readouterr().err == "gsbench: stopped; the same command goes on from here\n"
+    monkeypatch.setattr(cli, "_trials", lambda argv: importlib.import_module("nosuch_module"))
+    with pytest.raises(ModuleNotFoundError):
+        cli.run(["seed=1"])
