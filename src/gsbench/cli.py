@@ -13,7 +13,7 @@ from pathlib import Path
 
 from gsbench import __version__
 from gsbench.errors import GsbenchError, InputError
-from gsbench.files import checked_runs_folder
+from gsbench.files import checked_runs_folder, storage_errors
 from gsbench.logs import printable_output, set_up_logging
 from gsbench.system.own_modules import SAFE_PATH
 from gsbench.verbs.table import VERBS
@@ -92,7 +92,9 @@ def _verb(name: str, argv: list[str]) -> int:
             f"(verbs: {', '.join(VERBS)})"
         )
     main_function: Callable[[list[str], Path], int] = importlib.import_module(VERBS[name][0]).main
-    return main_function(argv, runs_dir())
+    runs = runs_dir()
+    with storage_errors(runs):
+        return main_function(argv, runs)
 
 
 def _trials(argv: list[str]) -> int:

@@ -17,6 +17,7 @@ from gsbench.analysis.cells import (
     best_cells,
     by_key,
     check_averageable,
+    check_fields,
     field_value,
     make_cell,
     swept_settings,
@@ -99,6 +100,7 @@ def build_table(
         rows = (*DEFAULT_ROWS, *(key for key in swept if key not in columns))
     quantities = choose_quantities(trials, metrics)
     fields = (*rows, *columns)
+    check_fields(trials, fields)
     groups = by_key(trials, lambda trial: tuple(field_value(trial, name) for name in fields))
     for key, group in groups.items():
         check_averageable(group, " ".join(f"{name}={value}" for name, value in zip(fields, key, strict=True)))
