@@ -15,6 +15,7 @@ from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.analysis.shipped import resolved, shipped_arms
 from gsbench.analysis.tables import build_table
+from gsbench.runs.hashing import config_hash
 from tests.analysis.synthetic import write_arms
 from tests.conftest import ROOT
 
@@ -159,6 +160,11 @@ def test_controls_are_held_against_their_arms(tmp_path: Path) -> None:
         (varied[0], varied[4]),
         (varied[1], varied[5]),
     ]
+
+
+def test_naming_a_control_makes_no_other_trial() -> None:
+    with_control = {"eval": {"lpips": [], "controls": {"longaxis": "absgrad"}}, "densify": {"name": "adc"}}
+    assert config_hash(with_control) == config_hash({"eval": {"lpips": []}, "densify": {"name": "adc"}})
 
 
 def test_experiments_list_the_control_of_every_mixed_arm() -> None:
