@@ -9,6 +9,7 @@ from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.pairing import ViewCache, choose_pairs, controls_of
 from gsbench.analysis.results import Arm, Experiment, TrialResult
+from gsbench.runs.layout import SEARCH
 from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 
 _BY_PROGRAM = (
@@ -58,7 +59,9 @@ def attribution_notes(experiment: Experiment) -> list[str]:
 
 
 def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
-    """The experiment's trials as arms, and the pairs of arms that are compared."""
+    """The experiment's trials as arms, and the pairs of arms that are compared: none among the points of a search."""
     trials = with_variants(experiment.trials)
+    if (experiment.folder / SEARCH).exists():
+        return trials, []
     arms = sorted({trial.arm for trial in trials})
     return trials, choose_pairs(arms, controls=controls_of(trials)) if arms else []
