@@ -39,8 +39,9 @@ class Planner(Protocol):
 class Verdict:
     """One claim's verdict.
 
-    ``decision`` is None where nothing could be tested, as where the arms are one and the same at this size. ``baselines`` is the baseline's mean in the measure's own unit.
-    ``trials`` are those that the decision rests on, pair by pair; ``notes`` say what was left out and why.
+    ``decision`` is None where nothing could be tested, as where the arms are one and the same at this size.
+    ``baseline`` is the baseline's mean in the measure's own unit. ``trials`` are those that the decision rests on,
+    pair by pair; ``notes`` say what was left out and why.
     ``beforehand``: none of them was measured before the plan was declared.
     """
 
@@ -91,8 +92,8 @@ def judge_claim(
         return Verdict(claim, NOT_TESTABLE, faults[0], measure, notes=tuple(faults[1:]))
     if pairs and all(map(_is_equal, pairs.values())):
         reason = (
-            f"both arms of {counted(len(pairs), 'pair')} of trials are equal to the last bit: what they differ in never "
-            "acted at this size"
+            f"both arms of {counted(len(pairs), 'pair')} of trials are equal to the last bit: what they differ in "
+            "never acted at this size"
         )
         trials = tuple(trial for key in sorted(pairs) for trial in pairs[key])
         return Verdict(claim, NOT_TESTABLE, reason, measure, trials=trials, notes=tuple(faults))
