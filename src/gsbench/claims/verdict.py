@@ -40,8 +40,8 @@ class Verdict:
     """One claim's verdict.
 
     ``decision`` is None where nothing could be tested, as where the arms are one and the same at this size.
-    ``baselines`` is the baseline's mean in the measure's own unit.
-    ``trials`` are those that the decision rests on, pair by pair; ``notes`` say what was left out and why.
+    ``baseline`` is the baseline's mean in the measure's own unit. ``trials`` are those that the decision rests on,
+    pair by pair; ``notes`` say what was left out and why.
     ``beforehand``: none of them was measured before the plan was declared.
     """
 
