@@ -1,8 +1,9 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-# Two files of tests at a time, each in a process of its own: half the time, and no test that needs another to have run.
-PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+# Two files of tests at a time, each in a process of its own, in the order of their names (else those with few tests, which
+# run the whole program, come last): half the time, and no test that needs another to have run.
+PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 # Each library that chooses its instructions by the processor, told to choose the plainest. Compiled kernels keep a cache

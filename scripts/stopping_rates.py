@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from gsbench.analysis.statistics import ALPHA, MIN_SCENES, POWER, t_power
+from gsbench.analysis.power import POWER, t_power
+from gsbench.analysis.statistics import ALPHA, MIN_SCENES
 from gsbench.claims.sequential import Decision, Design, decide, most_seeds, plan_looks
 
 PAGE = Path(__file__).parents[1] / "docs" / "verdict.md"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from enum import IntEnum
 from typing import ClassVar
@@ -79,7 +81,7 @@ class RefineEvent:
 
     def as_dict(self) -> dict[str, object]:
         """The record as written to ``events.jsonl``."""
-        return {key: value for key, value in asdict(self).items() if value is not None}
+        return {key: value for key, value in asdict(self).items() if value is not None and math.isfinite(value)}
 
     @staticmethod
     def count_names() -> tuple[str, ...]:
@@ -88,6 +90,6 @@ class RefineEvent:
         return tuple(name for name in names if name not in ("step", "before", "after"))
 
 
-def sum_events(events: list[dict[str, object]]) -> dict[str, int]:
+def sum_events(events: Sequence[Mapping[str, object]]) -> dict[str, int]:
     """Totals by cause over the records of ``events.jsonl``."""
     return {name: sum(int(event.get(name, 0)) for event in events) for name in RefineEvent.count_names()}  # type: ignore[call-overload]

@@ -71,29 +71,6 @@ def link_or_copy(source: Path, target: Path) -> None:
             shutil.copyfile(source, temporary)
 
 
-def read_object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; empty where there is none that can be read."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
-def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """The objects of a JSON-lines file up to the first damaged line, as a killed writer leaves it; [] if absent."""
-    rows: list[dict[str, Any]] = []
-    try:
-        with path.open(encoding="utf-8") as file:
-            for line in file:
-                row = json.loads(line)
-                if isinstance(row, dict):
-                    rows.append(row)
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError):
-        pass
-    return rows
-
-
 def sync_to_disk(path: Path) -> None:
     """Wait until a file or folder is on the disk, where the system can say so."""
     with suppress(OSError):

@@ -74,6 +74,11 @@ def printable(text: str) -> str:
     return OBEYED.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text.replace("\r\n", "\n"))
 
 
+def listed(names: Sequence[str]) -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
+
+
 def some_of(names: Sequence[str]) -> str:
     """The first few names and the count of the others, for messages."""
     more = len(names) - MAX_NAMED

@@ -202,7 +202,7 @@ def test_costs_are_averaged_by_both_rules(make_experiment: Make, tmp_path: Path)
         one_trial(tmp_path, 0, psnr=20.0, _scene=scene, _num_gaussians=volumetric, _densify="volumetric")
     trials = load_experiment(tmp_path, "exp").trials
     arms = [[trial for trial in trials if trial.densify == name] for name in ("adc", "volumetric")]
-    change = cost_change(*arms, lambda trial: trial.data["num_gaussians"])
+    change = cost_change(*arms, lambda trial: trial.record.num_gaussians)
     assert change == pytest.approx((5 / 4 - 1, 0.5, 2))  # totals 4M -> 5M; ratios 2 and 1
     notes = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"]).notes
     assert any("+25.0% as a ratio of totals, +50.0% as the mean of 2 scenes" in note for note in notes)

@@ -187,3 +187,17 @@ def test_a_dry_run_trains_nothing(runs: Path, trials: Trials, capsys: pytest.Cap
     assert cli.run([*COMMAND, "--dry-run"]) == 0
     assert "a search of 12 points with 2 seeds each" in capsys.readouterr().out
     assert not trials.trained
+
+
+def test_a_search_says_which_views_judge_it(runs: Path, trials: Trials, caplog: pytest.LogCaptureFixture) -> None:
+    assert cli.run([*COMMAND, "hydra.sweeper.trials=1"]) == 0
+    assert any("scene.validation=true" in record.getMessage() for record in caplog.records)
+    part = search_part(runs / "x")
+    assert part is not None
+    assert "Judged by the test views" in part.line
+    caplog.clear()
+    assert cli.run([*COMMAND, "hydra.sweeper.trials=1", "name=y", "scene.validation=true"]) == 0
+    assert not any("scene.validation=true" in record.getMessage() for record in caplog.records)
+    part = search_part(runs / "y")
+    assert part is not None
+    assert "no test view was looked at" in part.line

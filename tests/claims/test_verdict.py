@@ -107,7 +107,7 @@ def test_arms_under_other_conditions_are_not_compared(make_pairs: MakePairs) -> 
     claim, file = claim_with()
     pairs = make_pairs(effect={"psnr": 1.0}, seeds=range(4))
     for one, _ in pairs.values():
-        one.data["iterations"] = 7000  # type: ignore[index]
+        object.__setattr__(one.record, "iterations", 7000)
     found = judge_claim(claim, file, pairs, SCENES)
     assert found.word == "not testable here"
     assert "differ in iterations" in found.reason

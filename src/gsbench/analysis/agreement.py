@@ -125,11 +125,17 @@ def _agreement(scene: str, arm: Arm, pairs: Sequence[tuple[TrialResult, TrialRes
 
     def apart(first: TrialResult, second: TrialResult) -> tuple[float, float]:
         distance = cloud_distance(*(read(trial.path / POINT_CLOUD) for trial in (first, second)))
-        return distance.mean / first.data["scene_extent"], distance.far / first.data["scene_extent"]
+        return distance.mean / _extent(first), distance.far / _extent(first)
 
     distances = list(_measured(pairs, apart, faults))
     means, fars = [mean for mean, _ in distances], [far for _, far in distances]
     return Agreement(scene, arm, len(pairs), _mean(psnrs), _mean(means), _mean(fars), tuple(dict.fromkeys(faults)))
+
+
+def _extent(trial: TrialResult) -> float:
+    if not trial.record.scene_extent:
+        raise InputError(f"{trial.label} does not say how large its scene is")
+    return trial.record.scene_extent
 
 
 def _mean(values: Sequence[float]) -> float | None:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
+from gsbench.analysis.attribution import attribute, attribution_sentence
 from gsbench.analysis.cells import (
     Cell,
     best_cells,
@@ -23,14 +24,16 @@ from gsbench.analysis.cells import (
 )
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.differences import differing_conditions
-from gsbench.analysis.origins import cloud_notes, machine_notes
-from gsbench.analysis.pairing import BASELINE, ViewCache, choose_pairs
+from gsbench.analysis.origins import cloud_notes, held_out_notes, machine_notes, points_notes
+from gsbench.analysis.pairing import BASELINE, ViewCache, choose_pairs, controls_of
 from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.analysis.results import Arm, Experiment, TrialResult
+from gsbench.analysis.translations import translation_notes
 from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 from gsbench.words import counted, signed
 
 DEFAULT_ROWS = ("scene", "init", "densify")
+SIDE_BY_SIDE = ("scene.split", "scene.sector")
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,7 @@ class Table:
     rows: tuple[Row, ...]
     notes: tuple[str, ...] = ()
     keys: tuple[tuple[str, str], ...] = field(default=(), repr=False)  # (quantity, arm) of each column
+    wrapped: bool = False  # cells hold text that may need several lines on paper
 
 
 def build_table(
@@ -83,12 +87,16 @@ def build_table(
 
     ``rows`` and ``columns`` are fields of a trial or dotted configuration keys; what stands in neither is averaged
     over: seeds as trials, scenes as means of scenes. By default, rows are scene, initialiser, densifier and every
-    setting that was swept within those. ``order`` gives the rows and the columns to show, also where nothing was run;
-    ``names`` replaces values in headings. Raises ``InputError`` where a cell would mix what may not be averaged.
+    setting that was swept within those; splits that were swept stand side by side. ``order`` gives the rows and the
+    columns to show, also where nothing was run; ``names`` replaces values in headings. Raises ``InputError`` where a
+    cell would mix what may not be averaged.
     """
     trials = list(experiment.trials if trials is None else trials)
     if rows is None:
-        rows = (*DEFAULT_ROWS, *(key for key in swept_settings(trials) if key not in columns))
+        swept = swept_settings(trials)
+        if not columns:  # what is held out asks another question, not of another arm: side by side
+            columns = tuple(key for key in SIDE_BY_SIDE if key in swept)
+        rows = (*DEFAULT_ROWS, *(key for key in swept if key not in columns))
     quantities = choose_quantities(trials, metrics)
     fields = (*rows, *columns)
     groups = by_key(trials, lambda trial: tuple(field_value(trial, name) for name in fields))
@@ -127,7 +135,11 @@ def build_table(
     notes += _reading_notes(grid, quantities, expected, "scene" in fields) + _origin_notes(trials)
     notes += (
         _declared_notes(experiment)
+        + _attribution_notes(experiment)
         + _cost_notes(trials)
+        + translation_notes(trials)
+        + held_out_notes(trials)
+        + points_notes(trials)
         + machine_notes(trials)
         + cloud_notes(trials)
         + _left_out(experiment)
@@ -157,11 +169,11 @@ def _best(
     bold: set[object] = set()
     notes: dict[str, None] = {}
     for quantity in quantities:
-        rivals: dict[str, dict[object, Cell]] = {}
+        rivals: dict[tuple[str, str], dict[object, Cell]] = {}
         for (key, name), cell in grid.items():
             if name == quantity.key:
-                rivals.setdefault("" if place is None else key[place], {})[key, name] = cell
-        for scene, cells in rivals.items():
+                rivals.setdefault(("" if place is None else key[place], _split(cell)), {})[key, name] = cell
+        for (scene, _), cells in rivals.items():
             by_scene = by_key([trial for cell in cells.values() for trial in cell.trials], lambda trial: trial.scene)
             differing = {key for group in by_scene.values() for key in differing_conditions(group)}
             if differing:
@@ -169,6 +181,11 @@ def _best(
             else:
                 bold |= best_cells(cells, quantity)
     return bold, list(notes)
+
+
+def _split(cell: Cell) -> str:
+    """What was held out for a cell; cells of different splits answer different questions, and are no rivals."""
+    return cell.trials[0].split if cell.trials else ""
 
 
 def _mean_rows(
@@ -207,7 +224,9 @@ def _mean_rows(
         return []
     bold: set[object] = set()
     for quantity in quantities if comparable else ():
-        bold |= best_cells({key: cell for key, cell in cells.items() if key[2] == quantity.key}, quantity)
+        own = {key: cell for key, cell in cells.items() if key[2] == quantity.key}
+        for split in {_split(cell) for cell in own.values()}:
+            bold |= best_cells({key: cell for key, cell in own.items() if _split(cell) == split}, quantity)
     label = f"mean of {counted(usual, 'scene')}"
     result = []
     for index, other in enumerate(others):
@@ -233,7 +252,7 @@ def _reading_notes(
     cells = grid.values()
     if any(0 < cell.count < expected or not cell.trials for cell in cells):
         notes.append(f"(k/{expected}): only k of {expected} trials have a value; —: none.")
-    protocols = {str(trial.data["protocol"]) for cell in cells for trial in cell.trials}
+    protocols = {trial.record.protocol for cell in cells for trial in cell.trials}
     notes.append(f"Protocol {', '.join(sorted(protocols))}.")
     for quantity in quantities:
         reasons = {
@@ -253,16 +272,20 @@ def _origin_notes(trials: Sequence[TrialResult]) -> list[str]:
     """Which arms gsbench did not train, and what of them it saw."""
     notes = []
     for what, origin in _BY_PROGRAM:
-        own = [trial for trial in trials if trial.program and trial.data.get("evaluated_from") == origin]
+        own = [trial for trial in trials if trial.program and trial.record.evaluated_from == origin]
         if own:
-            versions = {(f"{trial.init}-{trial.densify}", str(trial.data["trained_by"]["version"])) for trial in own}
+            versions = {
+                (f"{trial.init}-{trial.densify}", trial.record.trained_by.version)
+                for trial in own
+                if trial.record.trained_by is not None
+            }
             arms = ", ".join(f"{arm} (version {version})" for arm, version in sorted(versions))
             notes.append(f"{what} (its time is that of the whole program, its budget its own): {arms}.")
     for what, origin in (
         ("A model that another program trained, rendered here", FROM_MODEL),
         ("Renders of another program, measured as they are", FROM_RENDERS),
     ):
-        own = [trial for trial in trials if trial.made_elsewhere and trial.data["evaluated_from"] == origin]
+        own = [trial for trial in trials if trial.made_elsewhere and trial.record.evaluated_from == origin]
         if own:
             arms = ", ".join(sorted({f"{trial.init}-{trial.densify}" for trial in own}))
             notes.append(f"{what} (its conditions are not known): {arms}.")
@@ -275,13 +298,25 @@ def _declared_notes(experiment: Experiment) -> list[str]:
     Which trials a table shows has no say in it, so that nobody can choose a verdict by choosing trials.
     """
     declared = standing(experiment.folder, experiment.trials)
-    if declared is None:
+    if declared is None or any(trial.translated_from for trial in experiment.trials):
         return []
     from gsbench.analysis.verdicts import declared_lines, judge  # here, for a quick start of what needs no test
 
-    trials = with_variants(experiment.trials)
-    pairs = choose_pairs(sorted({trial.arm for trial in trials}))
+    trials, pairs = compared_pairs(experiment)
     return declared_lines(declared, judge(trials, pairs, ViewCache(), declared))
+
+
+def _attribution_notes(experiment: Experiment) -> list[str]:
+    """For each pair of arms that differ in more than one ingredient, in which, and what would isolate one."""
+    trials, pairs = compared_pairs(experiment)
+    return [sentence for pair in pairs if (sentence := attribution_sentence(attribute(trials, *pair), *pair))]
+
+
+def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
+    """The experiment's trials as arms, and the pairs of arms that are compared."""
+    trials = with_variants(experiment.trials)
+    arms = sorted({trial.arm for trial in trials})
+    return trials, choose_pairs(arms, controls=controls_of(trials)) if arms else []
 
 
 def _cost_notes(trials: Sequence[TrialResult]) -> list[str]:
@@ -326,8 +361,8 @@ def change_words(of_totals: float, of_scenes: float, scenes: int) -> str:
 
 
 _COSTS: dict[str, Callable[[TrialResult], float | None]] = {
-    "Gaussians": lambda trial: trial.data.get("num_gaussians"),
-    "Training time": lambda trial: trial.data["seconds"].get("train"),
+    "Gaussians": lambda trial: trial.record.num_gaussians,
+    "Training time": lambda trial: trial.record.seconds.get("train"),
 }
 
 

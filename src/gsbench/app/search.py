@@ -26,10 +26,13 @@ from gsbench.config.command_words import check_makes_trials
 from gsbench.config.compose import explained
 from gsbench.errors import InputError
 from gsbench.eval.facts import find, known_keys
-from gsbench.files import checked_runs_folder, make_runs_folder, read_object, write_json
+from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.launch.trial import Trial
+from gsbench.parsing import DamagedError
 from gsbench.runs.hashing import config_hash, sha256_of
-from gsbench.runs.layout import RESULTS, SEARCH, SEARCH_JOURNAL
+from gsbench.runs.inputs import read_results
+from gsbench.runs.layout import SEARCH, SEARCH_JOURNAL
+from gsbench.runs.search_record import Point, SearchRecord
 from gsbench.settings import check_settings
 from gsbench.system.install import install_command
 from gsbench.system.locks import hold
@@ -125,6 +128,12 @@ def search(
         space = read_space(OverridesParser.create(context.config_loader).parse_overrides(list(words)))
     lowest = {key: _lowest(distribution) for key, distribution in space.searched.items()}
     first = trials_of_jobs(context, master, space.jobs(lowest))
+    unseen = all(trial.values["scene"]["validation"] for trial in first)
+    if not unseen:
+        log.warning(
+            "this search is judged by the test views, so that they choose its best and cannot test it any more: "
+            "scene.validation=true puts them away and judges by other views"
+        )
     if task.look_only:
         seeds = counted(len(space.seeds), "seed")
         points = counted(wanted.n_trials, "point")
@@ -142,8 +151,8 @@ def search(
             launch_trials(task, master, launcher, trials)
             for place, number in enumerate(batch):
                 _tell(study, number, trials[place * len(space.seeds) :][: len(space.seeds)], wanted)
-            write_json(home / SEARCH, _record(study, wanted, space))
-        write_json(home / SEARCH, _record(study, wanted, space))
+            write_json(home / SEARCH, _record(study, wanted, space, unseen).to_json())
+        write_json(home / SEARCH, _record(study, wanted, space, unseen).to_json())
     _say_best(study, wanted, home.name)
 
 
@@ -246,7 +255,7 @@ def _tell(study: Study, number: int, trials: Sequence[Trial], wanted: SearchSett
     from optuna.trial import TrialState
 
     folders = [trial.folder for trial in trials]
-    found = [read_object(folder / RESULTS).get("metrics", {}).get(wanted.metric) for folder in folders]
+    found = [_metric_of(folder, wanted.metric) for folder in folders]
     values = [value for value in found if value is not None]
     if len(values) < len(found):
         study.tell(number, state=TrialState.FAIL)
@@ -258,26 +267,35 @@ def _tell(study: Study, number: int, trials: Sequence[Trial], wanted: SearchSett
     log.info("search: point %d of %d: %s: %s", number + 1, wanted.n_trials, where, came)
 
 
-def _record(study: Study, wanted: SearchSettings, space: Space) -> dict[str, Any]:
-    """What the report shows."""
+def _metric_of(folder: Path, metric: str) -> float | None:
+    try:
+        return read_results(folder)[0].metrics.get(metric)
+    except (FileNotFoundError, DamagedError):
+        return None
+
+
+def _record(study: Study, wanted: SearchSettings, space: Space, unseen: bool) -> SearchRecord:
+    """The record that the report shows; ``unseen`` says that no point saw a test view."""
     from optuna.distributions import FloatDistribution, IntDistribution
 
-    return {
-        "metric": wanted.metric,
-        "direction": wanted.sign,
-        "wanted": wanted.n_trials,
-        "seeds": len(space.seeds),
-        "log": [k for k, d in space.searched.items() if isinstance(d, FloatDistribution | IntDistribution) and d.log],
-        "points": [
-            {
-                "number": trial.number,
-                "state": {"COMPLETE": "done", "FAIL": "failed"}.get(trial.state.name, "unfinished"),
-                "settings": {key: _shown(value) for key, value in trial.params.items()},
-                "value": trial.value,
-            }
+    states: dict[str, Literal["done", "failed"]] = {"COMPLETE": "done", "FAIL": "failed"}
+    return SearchRecord(
+        metric=wanted.metric,
+        direction=1 if wanted.sign > 0 else -1,
+        wanted=wanted.n_trials,
+        seeds=len(space.seeds),
+        validation=unseen,
+        log=[k for k, d in space.searched.items() if isinstance(d, FloatDistribution | IntDistribution) and d.log],
+        points=[
+            Point(
+                number=trial.number,
+                state=states.get(trial.state.name, "unfinished"),
+                settings={key: _shown(value) for key, value in trial.params.items()},
+                value=trial.value,
+            )
             for trial in study.get_trials(deepcopy=False)
         ],
-    }
+    )
 
 
 def _shown(value: Any) -> Any:

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbench.analysis.shares import Run, shapley
 from gsbench.analysis.statistics import Interval, t_interval
 from gsbench.errors import InputError
 from gsbench.words import closest
@@ -28,7 +29,6 @@ MAX_SWITCHES = 8
 # Switches that are products of others, by number of switches: the smallest designs of resolution V (ibid., table 6.22).
 GENERATORS = {5: ("ABCD",), 6: ("ABCDE",), 7: ("ABCDEF",), 8: ("ABCD", "ABEF")}
 
-Run = frozenset[str]
 Array = NDArray[np.float64]
 
 
@@ -74,20 +74,6 @@ def plan_runs(switches: Sequence[str], fractional: bool = False) -> list[Run]:
         runs.append(frozenset(name for name, level in zip(switches, (*levels, *made), strict=True) if level > 0))
     none, every = frozenset[str](), frozenset(switches)
     return list(dict.fromkeys([none, every, *sorted(runs, key=lambda run: (len(run), sorted(run)))]))
-
-
-def shapley(switches: Sequence[str], values: Mapping[Run, float]) -> dict[str, float]:
-    """The share of each switch in ``values[all] - values[none]``, from the values of all 2^n sets."""
-    count, shares = len(switches), {}
-    for switch in switches:
-        others = [name for name in switches if name != switch]
-        total = 0.0
-        for size in range(count):
-            weight = 1 / (count * math.comb(count - 1, size))
-            for chosen in itertools.combinations(others, size):
-                total += weight * (values[frozenset((*chosen, switch))] - values[frozenset(chosen)])
-        shares[switch] = total
-    return shares
 
 
 def ablate(switches: Sequence[str], results: Mapping[Run, Sequence[float]]) -> Ablation:

@@ -44,7 +44,7 @@ MAX_SEED = 2**63 - 1  # torch's generators take no larger one
 
 ExperimentName = Annotated[
     str,
-    Predicate(lambda name: is_folder_name(name) and name not in IN_RUNS),
+    Predicate(lambda name: is_folder_name(name) and name.casefold() not in IN_RUNS),
     doc(f"a plain folder name, and none of {', '.join(IN_RUNS)}"),
 ]
 DeviceName = Annotated[

@@ -84,7 +84,7 @@ def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
     module, _, name = target.rpartition(".")
     try:
         found = getattr(importlib.import_module(module), name)
-    except Exception as error:  # importing a user's file runs it: it may raise anything
+    except (Exception, SystemExit) as error:  # importing a user's file runs it: it may raise anything
         reason = f"{type(error).__name__}: {error}{_beside(error)}"
         raise InputError(f"{group}.{TARGET}={target} cannot be imported ({reason})") from error
     home = f"{getattr(found, '__module__', None)}.{getattr(found, '__qualname__', name)}"
@@ -94,7 +94,7 @@ def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
     return found
 
 
-def _beside(error: Exception) -> str:
+def _beside(error: BaseException) -> str:
     """The mend where a module is missing that lies in another folder, or beside an allowed one without being so."""
     if not isinstance(error, ModuleNotFoundError):
         return ""

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from gsbench.errors import InputError
+from gsbench.runs.trial_record import MetricRecord
 
 MORE = "eval.more"  # lists metrics that are computed only if named there
 GEOMETRY, FLICKER = "eval.geometry", "eval.flicker"  # ask for what is measured of a model
@@ -182,24 +183,16 @@ def facts_of(key: str, metric: object) -> MetricFacts:
     return MetricFacts(key, label, direction, decimals, unit, worthwhile)
 
 
-def to_record(facts: MetricFacts) -> dict[str, Any]:
+def to_record(facts: MetricFacts) -> MetricRecord:
     """The facts that results keep of a user's metric, so that tables need not import its class."""
-    kept = ("label", "direction", "decimals", "unit", "worthwhile")
-    return {name: value for name, value in asdict(facts).items() if name in kept}
+    return MetricRecord(**{entry.name: getattr(facts, entry.name) for entry in fields(MetricRecord)})
 
 
-def from_record(key: str, record: object) -> MetricFacts:
+def from_record(key: str, record: MetricRecord | None) -> MetricFacts:
     """The facts of a user's metric from its results; without a record, its key is all that is known."""
-    if not isinstance(record, Mapping):
+    if record is None:
         return MetricFacts(key, key, 0, DECIMALS)
-    return MetricFacts(
-        key,
-        str(record.get("label", key)),
-        int(record.get("direction", 0)),
-        int(record.get("decimals", DECIMALS)),
-        str(record.get("unit", "")),
-        record.get("worthwhile"),
-    )
+    return MetricFacts(key, record.label, record.direction, record.decimals, record.unit, record.worthwhile)
 
 
 def _is_count(value: object) -> bool:

@@ -20,11 +20,13 @@ from gsbench.scene.types import Capture
 
 MODEL_FOLDER = Path("sparse", "0")  # below the output folder: where COLMAP users and 3DGS trainers look
 OWN_GAUGE_FOLDER = Path("sparse_own_gauge", "0")  # the same model as its own mapper scaled it, before alignment
+WORK_FOLDER = "work"  # below the output folder, while a run lasts
 REPORT_FILE = "report.json"
 GAUSSIANS_FILE = "gaussians.ply"  # optional: the Gaussians to start from, where there is more than points
 PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
 MIN_IMAGES = 3  # two views have no third that could contradict a wrong geometry
 Poses = Literal["shared", "own"]
+PointsFrom = Literal["all", "train", "retriangulated"]
 Seed = Annotated[int, Interval(ge=0, le=2**31 - 1)]  # COLMAP takes no larger one
 
 
@@ -108,6 +110,20 @@ class Gauge:
 
 
 @dataclass(frozen=True)
+class TrainingPoints:
+    """Record of a cloud in which test views have no say (``init.points_from``): what is left of it.
+
+    ``taken`` is the share of the ``of`` points that went (negative where more came); None where test photographs were
+    never matched, so that nobody knows how many there would have been.
+    """
+
+    choice: PointsFrom
+    kept: int
+    of: int | None
+    taken: float | None
+
+
+@dataclass(frozen=True)
 class InitReport:
     """Results of an initialiser; `to_dict` is the content of ``report.json``."""
 
@@ -131,6 +147,7 @@ class InitReport:
     warnings: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)  # features, pairs, verified pairs, inlier matches
     mapped_by: str | None = None  # the way that placed the cameras (init.mapper); None where they were given
+    training_points: TrainingPoints | None = None  # None where all views made the points
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""

@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
-from gsbench.init.base import MODEL_FOLDER, PICTURE_FILE, REPORT_FILE, Gauge, InitReport, PoseErrors
+from gsbench.init.base import MODEL_FOLDER, PICTURE_FILE, REPORT_FILE, Gauge, InitReport, PoseErrors, TrainingPoints
 from gsbench.init.colmap.alignment import Similarity, rotation_angles, transformed_rotations
 from gsbench.init.colmap.reconstruct import common_poses, poses_by_name, save_reconstruction
 from gsbench.init.plot import draw_cloud
@@ -89,6 +89,7 @@ def make_report(
     counts: Mapping[str, int] | None = None,
     mapped_by: str | None = None,
     warnings: Sequence[str] = (),
+    training_points: TrainingPoints | None = None,
 ) -> InitReport:
     """The report on ``model`` as it is written; ``packages`` are those whose installed versions it states."""
     placed = set(poses_by_name(model))
@@ -111,6 +112,7 @@ def make_report(
         pose_errors=pose_errors,
         counts=counts or {},
         mapped_by=mapped_by,
+        training_points=training_points,
     )
     return replace(report, warnings=(*warnings, *find_warnings(report, model)))
 

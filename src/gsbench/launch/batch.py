@@ -12,7 +12,7 @@ from typing import Any
 from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder, storage_errors
-from gsbench.launch.declare import declare, declared_metrics
+from gsbench.launch.declare import declare, declared_metrics, planned_trials
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
 from gsbench.launch.preflight import check_parts, check_trackers, missing_folders, missing_weights
@@ -77,7 +77,7 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
     make_runs_folder(runs)
     Store(runs / STORE).sweep(STAGES)
     add_to_plan(trials)
-    declare(metrics)
+    declare(metrics, planned_trials(trials))
 
 
 def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]:

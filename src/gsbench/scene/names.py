@@ -8,10 +8,10 @@ from pathlib import Path, PurePosixPath
 
 from gsbench.errors import InputError
 from gsbench.scene.images import IMAGE_SUFFIXES
+from gsbench.scene.split import TEST_EVERY
 from gsbench.words import some_of
 
 MAX_IMAGES = 200  # the paper's limit per scene
-TEST_EVERY = 8  # Mip-NeRF 360 and 3DGS hold out every 8th image, from the first
 MIN_IMAGES = 3
 
 
@@ -37,7 +37,7 @@ def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
     return matches
 
 
-def select_images(names: Sequence[str], max_images: int) -> list[str]:
+def select_images(names: Sequence[str], max_images: int, least: int = MIN_IMAGES) -> list[str]:
     """Select at most ``max_images`` of the names, evenly spaced: the k-th of m is the one at index ``k * n // m``.
 
     The first is always kept, and a closed ring of views stays evenly spaced. This comes before the split.
@@ -46,8 +46,8 @@ def select_images(names: Sequence[str], max_images: int) -> list[str]:
         >>> select_images(["a", "b", "c", "d", "e"], 3)
         ['a', 'b', 'd']
     """
-    if max_images < MIN_IMAGES:
-        raise InputError(f"scene.max_images must be at least {MIN_IMAGES}, got {max_images}")
+    if max_images < least:
+        raise InputError(f"scene.max_images must be at least {least}, got {max_images}")
     if len(names) <= max_images:
         return list(names)
     return [names[k * len(names) // max_images] for k in range(max_images)]

@@ -31,6 +31,8 @@ SETTINGS = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
     "PGCONNECT_TIMEOUT": "20",
+    # A machine that vanished within a transaction would hold its rows until TCP gives up, after hours.
+    "PGOPTIONS": "-c idle_in_transaction_session_timeout=60s",
 }
 
 

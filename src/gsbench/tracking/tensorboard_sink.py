@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from gsbench.runs.layout import TENSORBOARD
-from gsbench.tracking.record import TrialRecord
+from gsbench.tracking.record import TrackedFiles
 from gsbench.tracking.sink import Point, Summary
 
 
@@ -17,7 +17,7 @@ class TensorBoardSink:
 
     state_file = "tensorboard.json"
 
-    def __init__(self, record: TrialRecord) -> None:
+    def __init__(self, record: TrackedFiles) -> None:
         self._record = record
         self._folder = record.runs / TENSORBOARD / record.path
         self._started = time.time()

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from gsbench.runs.layout import WANDB
-from gsbench.tracking.record import TrialRecord
+from gsbench.tracking.record import TrackedFiles
 from gsbench.tracking.sink import Point, Summary
 
 STEP = "iteration"  # the axis of our curves: their own counter only goes up, and we read two files
@@ -19,7 +19,7 @@ class WandbSink:
 
     state_file = "wandb.json"
 
-    def __init__(self, options: dict[str, Any], record: TrialRecord) -> None:
+    def __init__(self, options: dict[str, Any], record: TrackedFiles) -> None:
         self._record = record
         if options["uri"]:
             os.environ["WANDB_BASE_URL"] = options["uri"]

@@ -27,6 +27,7 @@ from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster import Rasterizer
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
+from gsbench.runs.rows import whole_lines
 from gsbench.scene.types import Scene
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
@@ -290,16 +291,8 @@ def drop_after(path: Path, step: int) -> None:
 
     A kill meanwhile leaves the file as it was: what is lost here is in no checkpoint.
     """
-    if not path.exists():
-        return
-    kept = []
-    for line in path.read_text().splitlines():
-        try:
-            if json.loads(line)["step"] <= step:
-                kept.append(line)
-        except (json.JSONDecodeError, KeyError, TypeError):
-            break
-    write_text(path, "".join(line + "\n" for line in kept))
+    if path.exists():
+        write_text(path, "".join(f"{line}\n" for line, at in whole_lines(path) if at <= step))
 
 
 def _append(stream: Any, record: dict[str, Any]) -> None:

@@ -60,7 +60,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         if is_init:
-            export_init(trial.path.parents[3] / STORE / INIT.name / trial.data["hashes"][INIT.name], out)
+            export_init(trial.path.parents[3] / STORE / INIT.name / trial.record.hashes[INIT.name], out)
         else:
             export_model(model_file(trial), options.to or _format_of(out), out)
     except OSError as error:

@@ -12,10 +12,11 @@ from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.errors_by_region import read_image
 from gsbench.analysis.origins import cloud_lines
-from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs
+from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs, controls_of
 from gsbench.analysis.paper import inconsistencies, load_paper
 from gsbench.analysis.paper_tables import layout_of, paper_tables
 from gsbench.analysis.report.crops import data_uri
+from gsbench.analysis.report.question_charts import question_part
 from gsbench.analysis.report.search_charts import search_part
 from gsbench.analysis.report.sections import (
     compare_arms,
@@ -41,8 +42,10 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
     views = ViewCache()
     declared = standing(experiment.folder, trials)
     search = search_part(experiment.folder)
-    pairs = [] if search else choose_pairs(arms, baseline)  # among points that were chosen by results no test holds
+    # Among points of a search, which were chosen by results, no test holds.
+    pairs = [] if search else choose_pairs(arms, baseline, controls_of(trials))
     judged = judge(trials, pairs, views, declared)
+    questions = question_part(trials, judged, views)
     versus = [compare_arms(trials, *pair, views, own) for pair, own in judged.items()]
     quantity = next((one.declared for one in judged.values() if one.declared is not None), None)
     layout = layout_of(experiment.name)
@@ -65,11 +68,13 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         tables=[to_html(table) for table in tables],
         contradictions=[] if layout is None else inconsistencies(load_paper()),
         search=search,
+        questions=questions,
         sweeps=[] if search else sweep_charts(trials),
         tradeoffs=tradeoff_charts(trials),
         gaps=tradeoff_gaps(trials, baseline),
         agreements=agreements(trials),
         arm_name=arm_name,
+        to_html=to_html,
         training=training_charts(trials, arms),
         events=event_charts(trials, arms),
         volumes=volumes,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from gsbench.errors import InputError
-from gsbench.init.base import MIN_IMAGES, Initializer, InitReport, Preparation
+from gsbench.init.base import MIN_IMAGES, WORK_FOLDER, Initializer, InitReport, Preparation
 from gsbench.init.colmap.options import ColmapOptions
 from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.logs import Progress, no_progress
@@ -18,7 +18,6 @@ from gsbench.scene.types import Capture
 logger = logging.getLogger(__name__)
 
 LOG_FILE = "colmap.log"
-WORK_FOLDER = "work"
 
 
 @dataclass(frozen=True, kw_only=True)

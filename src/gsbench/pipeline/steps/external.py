@@ -27,6 +27,7 @@ from gsbench.files import write_json
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.components import options_of
+from gsbench.pipeline.steps.code import step_of_code
 from gsbench.pipeline.steps.views import Views
 from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG, TRAINING
 from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
@@ -102,7 +103,7 @@ def external_step(
         }
         write_json(folder / TRAINING, summary)
 
-    return Step(replace(TRAIN, resumable=False), inputs, build)  # it starts from the beginning
+    return step_of_code(replace(TRAIN, resumable=False), inputs, build, __name__)  # it starts from the beginning
 
 
 def take_result(trainer: External, pattern: str, views: Views, output: Path, folder: Path) -> dict[str, Any]:
