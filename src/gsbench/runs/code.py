@@ -28,8 +28,8 @@ PACKAGE = Path(__file__).resolve().parents[1]
 RELEASED = "released.json"  # in the package: the digests of all files as they were released
 AS_RELEASED = "released"  # the state of a file that is
 DIGEST_CHARACTERS = 16
-# Parts that make no number: texts and pictures, how processes run, where files lie. What `config` and `settings` make of
-# the user's words is in the keys as it is.
+# Parts that make no number: what is said and shown, how processes run, where files lie. What `config` and `settings`
+# make of the user's words is in the keys as it is.
 WITHOUT_PART = frozenset(
     """
     analysis app bench claims cli config datasets errors launch logs parsing records renders runs settings system
