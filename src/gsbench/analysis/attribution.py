@@ -1,4 +1,4 @@
-"""In how many ingredients two arms differ, and which arm would isolate one of them.
+"""Attribution of a difference: the ingredients in which two arms differ, and the arm that would isolate one of them.
 
 A difference between arms can be put down to an ingredient only where it is the one in which they differ. Ingredients
 are read from the trials' recorded configurations and code: each setting is one, settings that only make sense together
@@ -23,7 +23,7 @@ ELSEWHERE = "what a training elsewhere did, of which nothing is recorded"
 BY_PROGRAM = "all that the program {} does otherwise"
 TARGET, INIT = "densify._target_", "initial cloud"
 
-# What a class of densifiers does otherwise than ADC. A class that does not stand here is one ingredient as a whole.
+# Departures of a class of densifiers from ADC. A class that does not stand here is one ingredient as a whole.
 RULES: dict[str, tuple[str, ...]] = {
     "gsbench.densify.ADC": (),
     "gsbench.densify.NoDensifier": ("densification",),
@@ -77,7 +77,7 @@ class Attribution:
 
     @property
     def is_mixed(self) -> bool:
-        """Whether a difference between the arms may come from more than one ingredient."""
+        """Return whether a difference between the arms may come from more than one ingredient."""
         return len(self.ingredients) > 1 or any(map(_is_bundle, self.ingredients))
 
 
@@ -103,7 +103,7 @@ def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str
 
 
 def attribute(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Attribution:
-    """In what ``second`` differs from ``first``, and which other arm, of these trials or shipped, isolates what.
+    """List where ``second`` differs from ``first``, and which other arm, of these trials or shipped, isolates what.
 
     An arm isolates an ingredient where it differs from ``second`` by that alone.
     """

@@ -67,7 +67,7 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
 
 
 def default_lines(trial: TrialResult) -> list[str]:
-    """What of an arm is its authors' default, what gsbench's and what this trial's own, as its file states it."""
+    """Settings of an arm by their origin, as its file states it: its authors' defaults, gsbench's, the trial's own."""
     name, config = shipped_name(trial.config), trial.config
     if not config:
         return [f"Defaults. {arm_name(trial.arm)}: {UNKNOWN}."]
@@ -184,7 +184,7 @@ def _code(trial: TrialResult) -> str | None:
     return ", ".join(filter(None, [program, f"gsbench {release}" if release else "", *parts])) or None
 
 
-# What is shown of both arms, whether they differ in it or not.
+# Settings that are shown of both arms, whether they differ in them or not.
 MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "trials": lambda trials: str(len(trials)),
     "views for training": _span(_recorded(lambda record: record.train_views)),

@@ -128,7 +128,7 @@ class TrialResult:
 
     @property
     def unavailable(self) -> Mapping[str, str]:
-        """Why metrics are missing."""
+        """The reasons why metrics are missing."""
         return self.record.unavailable
 
     @property
@@ -207,25 +207,25 @@ class TrialResult:
 
     @property
     def split(self) -> str:
-        """Which views are held out, as short text; "" where it was not recorded, nor is the configuration known."""
+        """The rule that holds views out, as short text; "" where neither a record nor the configuration says it."""
         if self.record.split:
             return self.record.split
         return "" if "scene.name" not in self.config else split_text(self.config)
 
     @property
     def question(self) -> str:
-        """What the held-out views ask of a model: interpolation or extrapolation; "" where lists hold them out."""
+        """The question that held-out views ask of a model: interpolation or extrapolation; "" for a list of views."""
         kind = re.split("[ ,]", self.split, maxsplit=1)[0]
         return QUESTIONS.get(kind, "")
 
     @property
     def from_renders(self) -> bool:
-        """Whether another program's renders were measured, whose model was not seen."""
+        """Return whether renders of another program were measured, without a model."""
         return self.record.evaluated_from == FROM_RENDERS
 
     @property
     def made_elsewhere(self) -> bool:
-        """Whether another program made the model or the renders, in a time and with a budget that nobody knows."""
+        """Return whether another program made the model or the renders, so that time and budget are unknown."""
         return self.record.evaluated_from is not None and not self.program
 
     @property

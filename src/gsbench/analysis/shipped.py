@@ -41,8 +41,9 @@ def shipped_name(config: Mapping[str, Any]) -> str | None:
 
 @dataclass(frozen=True)
 class FileNotes:
-    """What the file of a shipped arm says of its authors: its first lines, their values where they are others, and the
-    preset of `train` that goes with it ("" for none)."""
+    """Notes of a shipped arm's file on its authors: its first lines, their values where they are others, and the
+    preset of `train` that goes with it ("" for none).
+    """
 
     text: str
     theirs: Mapping[str, str]
