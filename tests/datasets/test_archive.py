@@ -46,6 +46,14 @@ def test_a_wrong_offset_is_damage(offset: int, layout: str, value: int, tmp_path
     assert not (tmp_path / "a.jpg").exists()
 
 
+def test_a_member_without_a_name_is_passed_over() -> None:
+    data = packed("s/images/a.jpg", "x")
+    data = patched(data, b"x" + data[data.rindex(b"x") + 1 :], 0, "<B", 0)  # zipfile takes a name up to the first NUL
+    with open_archive(io.BytesIO(data), "x.zip") as archive:
+        assert "" in archive.namelist()
+        assert [member.name for member in members_of(archive, "s", ["images"], "x.zip")] == ["images/a.jpg"]
+
+
 @pytest.mark.parametrize(
     ("names", "said"),
     [

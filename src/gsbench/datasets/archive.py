@@ -52,7 +52,7 @@ def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], whe
     """
     members: dict[str, Member] = {}
     for info in archive.infolist():
-        if info.is_dir() or not info.filename.startswith(f"{folder}/"):
+        if not info.filename.startswith(f"{folder}/") or info.is_dir():
             continue
         name = info.filename[len(folder) + 1 :]
         if not any(name.startswith(f"{part}/") for part in wanted) or "/." in f"/{name}":
