@@ -1,4 +1,4 @@
-"""How often stopping when decided is wrong, and what it saves: simulated sweeps, for the tables of docs/verdict.md.
+"""Error rates and savings of stopping when decided, from simulated sweeps, for the tables of docs/verdict.md.
 
     python scripts/stopping_rates.py                write the tables into the page (about five minutes)
     python scripts/stopping_rates.py --sweeps 200   print them from fewer sweeps
@@ -50,7 +50,7 @@ class Size:
         return Design(self.scenes, plan_looks(self.most))
 
     def units(self, differences: Array) -> Array:
-        """What the fixed design tests, from [scenes, seeds]: the pairs, or the scenes' means."""
+        """The values that the fixed design tests, from [scenes, seeds]: the pairs, or the scenes' means."""
         own = differences[:, : self.fixed]
         return own.mean(axis=1) if self.design.by_scene else own.ravel()
 

@@ -20,7 +20,7 @@ CHUNK = 1 << 20
 TEMPORARY = re.compile(r"^\..+\.tmp(-\d+)?$")  # how gsbench names a file that it is still writing
 FULL = (errno.ENOSPC, errno.EDQUOT)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
-# What libraries say without an error number when a write is cut short: numpy's tofile, torch's zip writer, SQLite.
+# Messages of libraries, without an error number, when a write is cut short: numpy's tofile, torch's zip writer, SQLite.
 FULL_TEXT = re.compile(
     r"No space left|requested and \d+ written|PytorchStreamWriter failed|unexpected pos|disk is full"
 )
@@ -28,7 +28,7 @@ NEARLY_NOTHING = 64 * 1024  # bytes free: with less, any failed write is a full 
 
 
 class DiskFullError(GsbenchError):
-    """The disk of the runs folder is full: no trial can go on (exit code 1)."""
+    """Error of a full disk of the runs folder: no trial can go on (exit code 1)."""
 
 
 @contextmanager
@@ -69,29 +69,6 @@ def link_or_copy(source: Path, target: Path) -> None:
             os.link(source, temporary)
         except OSError:
             shutil.copyfile(source, temporary)
-
-
-def read_object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; empty where there is none that can be read."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
-def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """The objects of a JSON-lines file up to the first damaged line, as a killed writer leaves it; [] if absent."""
-    rows: list[dict[str, Any]] = []
-    try:
-        with path.open(encoding="utf-8") as file:
-            for line in file:
-                row = json.loads(line)
-                if isinstance(row, dict):
-                    rows.append(row)
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError):
-        pass
-    return rows
 
 
 def sync_to_disk(path: Path) -> None:

@@ -288,7 +288,7 @@ def test_arms_under_different_conditions_are_not_compared(make_experiment: Calla
     experiment = make_experiment()
     for trial in experiment.trials:
         if trial.densify == "adc":
-            trial.data["iterations"] = 7000
+            object.__setattr__(trial.record, "iterations", 7000)
     with pytest.raises(InputError, match="the arms differ in iterations"):
         pair_arms(experiment.trials, ADC, VOLUMETRIC, "psnr", ViewCache())
 

@@ -16,6 +16,8 @@ from gsbench.analysis.differences import (
 from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
+from gsbench.runs.hashing import BEFORE
+from gsbench.runs.splits import setting
 
 K = TypeVar("K", bound=Hashable)
 
@@ -47,9 +49,9 @@ class Cell:
 def field_value(trial: TrialResult, name: str) -> str:
     """A field of a trial, or a dotted key of its configuration, as text; raises ``InputError`` where it has none."""
     if name in TRIAL_FIELDS:
-        return str(trial.data[name])
-    if name in trial.config:
-        return str(trial.config[name])
+        return str(getattr(trial.record, name))
+    if trial.config and (name in trial.config or name in BEFORE):
+        return str(setting(trial.config, name))
     raise InputError(
         f"{trial.label} has no setting {name!r}; use {', '.join(TRIAL_FIELDS)} or a key of its config.yaml"
     )
@@ -96,7 +98,7 @@ def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
     if not swept:
         return list(trials)
     return [
-        replace(trial, variant=" ".join(f"{key.rpartition('.')[2]}={trial.config.get(key)}" for key in swept))
+        replace(trial, variant=" ".join(f"{key.rpartition('.')[2]}={setting(trial.config, key)}" for key in swept))
         for trial in trials
     ]
 

@@ -1,5 +1,5 @@
-"""Which metric a verdict was declared to be about (``eval.primary``), when, which results were there before, and which
-trials came after.
+"""Declaration of the metric that a verdict is about (``eval.primary``): its time, the results that came before it, and
+the trials that were added later.
 
 `gsbench.runs.declaration` keeps the record; a trial's ``results.json`` says when it was measured (``measured``).
 """
@@ -12,7 +12,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult
-from gsbench.runs.declaration import Declaration, read_declarations, trial_key, unix_time
+from gsbench.runs.declaration import (
+    STOPPING,
+    Declaration,
+    metric_and_question,
+    read_declarations,
+    read_plans,
+    trial_key,
+    unix_time,
+)
 from gsbench.words import counted, listed
 
 
@@ -30,20 +38,26 @@ class ActiveDeclaration:
     added: tuple[TrialResult, ...]
     trials: int
     earlier: tuple[Declaration, ...]
+    looks: bool = False  # whether its trials came in planned looks
 
     @property
     def metric(self) -> str:
-        return self.declaration.metric
+        return metric_and_question(self.declaration.metric)[0]
+
+    @property
+    def question(self) -> str:
+        """The one question that the verdict is about: interpolation or extrapolation; "" for all that were asked."""
+        return metric_and_question(self.declaration.metric)[1]
 
     @property
     def beforehand(self) -> bool:
-        """Whether metric and trials were all fixed before a result was there: only then does the metric stand for
-        itself."""
+        """Return whether metric and trials were fixed before any result: only then the metric stands alone."""
         return not self.seen and not self.added
 
     def sentences(self, name: str) -> list[str]:
-        """What a reader must know of the declaration of the metric called ``name``."""
+        """Sentences that a reader must know of the declaration of the metric called ``name``."""
         when = self.declaration.when
+        name += f" at {self.question}" if self.question else ""
         if self.seen:
             lines = [
                 f"{name} was declared when results were there (eval.primary, {when}): {len(self.seen)} of "
@@ -62,7 +76,14 @@ class ActiveDeclaration:
                 f"{name} was declared beforehand (eval.primary, {when}), before any of the {self._all()} was measured."
             ]
         planned = sum(map(len, (self.declaration.trials or {}).values()))
-        if planned and (missing := planned - (self.trials - len(self.added))):
+        missing = planned - (self.trials - len(self.added)) if planned else 0
+        if self.looks:
+            lines.append(
+                f"Seeds came in planned looks (launch.stop_when_decided); {missing} of the {planned} declared trials are "
+                "not there. The verdict is that of the looks (gsbench report): p and intervals of tests that take the "
+                "number of seeds as fixed are too sure."
+            )
+        elif missing:
             lines.append(
                 f"{missing} of the {planned} declared trials are not there yet: until they are, this is a look at a "
                 "part, and who ends at a look that pleases finds more than there is."
@@ -93,7 +114,7 @@ def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration |
 
     Trials may be added to it as long as no result is there; later ones cost it its place as soon as they are done.
     """
-    declared = read_declarations(folder, (trial.data.get("declared") for trial in trials))
+    declared = read_declarations(folder, (trial.record.declared for trial in trials))
     if not declared:
         return None
     metric = declared[-1].metric
@@ -111,7 +132,8 @@ def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration |
     else:  # the first record may be lost but for what its trials repeat: all since the next may have been added
         again = next((one.time for one in since if one.trials is not None), math.inf)
         added = tuple(trial for trial in trials if measured(trial) >= again)
-    return ActiveDeclaration(named, seen, added, len(trials), tuple(others))
+    looks = any(STOPPING in plan.plan for plan in read_plans(folder))
+    return ActiveDeclaration(named, seen, added, len(trials), tuple(others), looks)
 
 
 def _is_declared(trial: TrialResult, declaration: Declaration) -> bool:
@@ -125,6 +147,6 @@ def _arm(trial: TrialResult) -> str:
 
 
 def measured(trial: TrialResult) -> float:
-    """When the trial's metrics were there, Unix time; of results that do not say it, when they were written."""
-    moment = unix_time(trial.data.get("measured"))
+    """The Unix time at which the trial's metrics were there; of results that do not say it, that of the file."""
+    moment = None if trial.record.measured is None else unix_time(trial.record.measured)
     return trial.finished if moment is None else moment

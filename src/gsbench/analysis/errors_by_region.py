@@ -1,4 +1,4 @@
-"""Where an arm helps: the errors of two arms' renders, binned by what the ground truth or the scene is like there.
+"""Errors of two arms' renders, binned by a property of the ground truth or of the scene: the places where an arm helps.
 
 Every pixel gets a property, such as the texture energy of the ground truth; pixels are sorted into equally filled
 bins of it, and the mean error of each arm is taken in each bin, view and trial. Differences are then tested as those of

@@ -23,8 +23,8 @@ from gsbench.analysis.results import Arm, TrialResult, canonical
 from gsbench.analysis.shipped import REFERENCE, notes_of, resolved, shipped_arms, shipped_name
 from gsbench.analysis.tables import Column, Entry, Row, Table
 from gsbench.analysis.tuning import tuning_lines
-from gsbench.files import read_json_lines
 from gsbench.runs.layout import EVENTS
+from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted, listed
 
 LONGEST = 60  # characters of a value that are shown
@@ -72,13 +72,13 @@ def default_lines(trial: TrialResult) -> list[str]:
     if not config:
         return [f"Defaults. {arm_name(trial.arm)}: {UNKNOWN}."]
     if trial.program:
-        version = trial.data["trained_by"].get("version", UNKNOWN)
+        version = trial.trainer_version or UNKNOWN
         what = f"the program {trial.program} (version {version}) with its own defaults, but for what its command gives"
         return [f"Defaults. {arm_name(trial.arm)}: {what}: {_shown(config.get('densify.command'))}."]
     if name is None:
         target = config.get("densify._target_", "a class that is not recorded")
-        version = trial.code.get(f"{CODE}{target}")
-        of_file = f" (version {short_version(version)})" if version else ""
+        digest = trial.code.get(f"{CODE}{target}")
+        of_file = f" (version {short_version(digest)})" if digest else ""
         what = f"{target}{of_file} is no arm of gsbench; its defaults stand in its class"
         return [f"Defaults. {arm_name(trial.arm)}: {what}."]
     notes = notes_of(name)
@@ -149,66 +149,59 @@ def _each(read: Callable[[TrialResult], str | None]) -> Callable[[Sequence[Trial
 
 def _rounds(trial: TrialResult) -> float | None:
     """How often the densifier refined; a log that is missing or empty says nothing."""
-    return float(len(read_json_lines(trial.path / EVENTS))) or None
+    return float(len(trial.curve(EVENTS))) or None
 
 
 def _last_round(trial: TrialResult) -> float | None:
-    steps = [row["step"] for row in read_json_lines(trial.path / EVENTS) if isinstance(row.get("step"), int)]
+    steps = [row["step"] for row in trial.curve(EVENTS)]
     return float(max(steps)) if steps else None
 
 
-def _recorded(*keys: str) -> Reader:
-    """Reads a number of ``results.json``, nested keys in order."""
-
-    def read(trial: TrialResult) -> float | None:
-        found: Any = trial.data
-        for key in keys:
-            found = found.get(key) if isinstance(found, dict) else None
-        return float(found) if isinstance(found, int | float) else None
-
-    return read
+def _recorded(read: Callable[[TrialRecord], float | None]) -> Reader:
+    """Reads a number of ``results.json``."""
+    return lambda trial: read(trial.record)
 
 
 def _resolution(trial: TrialResult) -> str | None:
-    size = trial.data.get("resolution")
-    return f"{size[0]}×{size[1]} px" if isinstance(size, list) and len(size) == 2 else None
+    size = trial.record.resolution
+    return None if size is None else f"{size[0]}×{size[1]} px"
 
 
 def _budget(trial: TrialResult) -> str | None:
     """``15,000 Gaussians (governor), 600 s``"""
-    budget = trial.data.get("budget")
-    if not isinstance(budget, dict):
+    budget = trial.record.budget
+    if budget is None:
         return None
-    count, cap, seconds = (budget.get(key) for key in ("max_gaussians", "cap", "seconds"))
-    parts = [f"{count:,} Gaussians ({cap})" if isinstance(count, int) else "", f"{seconds} s" if seconds else ""]
+    count, seconds = budget.max_gaussians, budget.seconds
+    parts = [f"{count:,} Gaussians ({budget.cap})" if count else "", f"{seconds:g} s" if seconds else ""]
     return ", ".join(filter(None, parts)) or "none"
 
 
 def _code(trial: TrialResult) -> str | None:
     parts = [f"{part.removeprefix(CODE)} {short_version(version)}" for part, version in sorted(trial.code.items())]
-    release = trial.data.get("versions", {}).get("gsbench")
-    program = f"{trial.program} {trial.data['trained_by'].get('version', '')}".strip() if trial.program else ""
+    release = trial.record.versions.get("gsbench")
+    program = f"{trial.program} {trial.trainer_version}".strip()
     return ", ".join(filter(None, [program, f"gsbench {release}" if release else "", *parts])) or None
 
 
 # What is shown of both arms, whether they differ in it or not.
 MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "trials": lambda trials: str(len(trials)),
-    "views for training": _span(_recorded("train_views")),
-    "held-out views": _span(_recorded("test_views")),
+    "views for training": _span(_recorded(lambda record: record.train_views)),
+    "held-out views": _span(_recorded(lambda record: record.test_views)),
     "pictures": _each(_resolution),
-    "photographs (hash)": _each(lambda trial: str(trial.data.get("hashes", {}).get("data") or "")[:12]),
-    "initial points": _span(_recorded("num_init_points")),
+    "photographs (hash)": _each(lambda trial: trial.record.hashes.get("data", "")[:12]),
+    "initial points": _span(_recorded(lambda record: record.num_init_points)),
     "initial cloud (hash)": _each(lambda trial: (cloud_of(trial) or "")[:12]),
-    "iterations": _span(_recorded("iterations")),
+    "iterations": _span(_recorded(lambda record: record.iterations)),
     "rounds of the densifier": _span(_rounds),
     "last round (iteration)": _span(_last_round),
     "budget": _each(_budget),
-    "Gaussians in the end": _span(_recorded("num_gaussians")),
-    "seconds of training": _span(_recorded("seconds", "train")),
-    "memory (MB)": _span(_recorded("peak_memory_mb")),
-    "rasterizer": _each(lambda trial: str(trial.data["raster"])),
-    "protocol": _each(lambda trial: str(trial.data["protocol"])),
+    "Gaussians in the end": _span(_recorded(lambda record: record.num_gaussians)),
+    "seconds of training": _span(_recorded(lambda record: record.seconds.get("train"))),
+    "memory (MB)": _span(_recorded(lambda record: record.peak_memory_mb)),
+    "rasterizer": _each(lambda trial: trial.record.raster),
+    "protocol": _each(lambda trial: trial.record.protocol),
     "machine": _each(machine_of),
     "code": _each(_code),
 }

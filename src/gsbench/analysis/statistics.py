@@ -1,4 +1,4 @@
-"""Does one arm beat another? Paired differences by scene and seed, with one test that respects what is repeated.
+"""Comparison of two arms: paired differences by scene and seed, with one test that respects what is repeated.
 
 The views of one trial share its training, so they are no independent repetitions of it: a trial is the smallest unit
 that a test here counts. Three questions are kept apart. *This scene*: do the differences of its trials, paired by seed,

@@ -22,16 +22,20 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
     """Which arms gsbench did not train, and what of them it saw."""
     notes = []
     for what, origin in _BY_PROGRAM:
-        own = [trial for trial in trials if trial.program and trial.data.get("evaluated_from") == origin]
+        own = [trial for trial in trials if trial.program and trial.record.evaluated_from == origin]
         if own:
-            versions = {(f"{trial.init}-{trial.densify}", str(trial.data["trained_by"]["version"])) for trial in own}
+            versions = {
+                (f"{trial.init}-{trial.densify}", trial.record.trained_by.version)
+                for trial in own
+                if trial.record.trained_by is not None
+            }
             arms = ", ".join(f"{arm} (version {version})" for arm, version in sorted(versions))
             notes.append(f"{what} (its time is that of the whole program, its budget its own): {arms}.")
     for what, origin in (
         ("A model that another program trained, rendered here", FROM_MODEL),
         ("Renders of another program, measured as they are", FROM_RENDERS),
     ):
-        own = [trial for trial in trials if trial.made_elsewhere and trial.data["evaluated_from"] == origin]
+        own = [trial for trial in trials if trial.made_elsewhere and trial.record.evaluated_from == origin]
         if own:
             arms = ", ".join(sorted({f"{trial.init}-{trial.densify}" for trial in own}))
             notes.append(f"{what} (its conditions are not known): {arms}.")
@@ -44,7 +48,7 @@ def declared_notes(experiment: Experiment) -> list[str]:
     Which trials a table shows has no say in it, so that nobody can choose a verdict by choosing trials.
     """
     declared = standing(experiment.folder, experiment.trials)
-    if declared is None:
+    if declared is None or any(trial.translated_from for trial in experiment.trials):
         return []
     from gsbench.analysis.verdicts import declared_lines, judge  # here, for a quick start of what needs no test
 

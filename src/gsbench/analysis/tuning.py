@@ -10,8 +10,9 @@ from gsbench.analysis.attribution import TARGET, differing_keys
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.results import Arm, TrialResult, canonical
 from gsbench.analysis.shipped import shipped_name
-from gsbench.files import read_object
+from gsbench.parsing import DamagedError
 from gsbench.runs.layout import SEARCH
+from gsbench.runs.search_record import read_search
 from gsbench.words import counted, listed
 
 MOST_VALUES = 8  # of a setting, that are named
@@ -58,17 +59,17 @@ def _searched(own: TrialResult) -> list[str]:
 
 
 def _search_line(file: Path, own: TrialResult) -> str:
-    record = read_object(file)
-    points = record.get("points")
-    if not isinstance(points, list):
+    try:
+        search = read_search(file.parent)
+    except (FileNotFoundError, DamagedError):
         return ""
-    for point in points:
-        settings = point.get("settings") if isinstance(point, dict) else None
-        if isinstance(settings, dict) and settings and all(own.config.get(key) == settings[key] for key in settings):
+    for point in search.points:
+        settings = point.settings
+        if settings and all(own.config.get(key) == settings[key] for key in settings):
             chosen = listed([f"{key}={settings[key]}" for key in sorted(settings)])
             return (
-                f"{'-'.join(own.arm)}: {chosen} is one of {counted(len(points), 'point')} of the search "
-                f"{file.parent.name}, by {record.get('metric')} of its held-out views."
+                f"{'-'.join(own.arm)}: {chosen} is one of {counted(len(search.points), 'point')} of the search "
+                f"{file.parent.name}, by {search.metric} of its held-out views."
             )
     return ""
 

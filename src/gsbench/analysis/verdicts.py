@@ -3,8 +3,9 @@
 Where nothing was declared (``eval.primary``), all metrics of all pairs are one family, adjusted by Holm (1979). Where a
 metric was declared, two questions are kept apart, each with its own 5 % for the chance that any answer is false:
 
-- the declared metric, one test for each pair of arms: of a single pair it is tested as it is, of several adjusted by
-  Holm, as Demšar (2006, section 3.2.2) adjusts comparisons of many methods with one control;
+- the declared metric, at one question if one was named (``psnr@extrapolation``), one test for each pair of arms: of a
+  single pair it is tested as it is, of several adjusted by Holm, as Demšar (2006, section 3.2.2) adjusts comparisons of
+  many methods with one control;
 - all other metrics of all pairs, called secondary and adjusted by Holm for their whole number.
 
 There is no gate between the two, though one would hold both under a single 5 % (Dmitrienko and Tamhane 2007): where the
@@ -63,6 +64,7 @@ class _Question:
     pair: Pair
     quantity: Quantity
     paired: Paired
+    asks: str  # interpolation, extrapolation, or "" for neither
 
 
 def judge(
@@ -83,7 +85,8 @@ def judge(
             try:
                 if one.direction == 0:
                     raise InputError("whether more of it is better is not known")
-                questions.append(_Question(pair, one, pair_arms(own, *pair, one.key, views)))
+                paired = pair_arms(own, *pair, one.key, views)
+                questions.append(_Question(pair, one, paired, own[0].question))
             except InputError as error:
                 reasons = [trial.unavailable[one.key] for trial in own if one.key in trial.unavailable]
                 faults[pair][one.key] = reasons[0] if reasons else str(error)
@@ -109,12 +112,14 @@ def declared_quantity(trials: Sequence[TrialResult], declared: ActiveDeclaration
 
 
 def declared_lines(declared: ActiveDeclaration, judged: dict[Pair, ArmVerdicts]) -> list[str]:
-    """What was declared, and the verdict on it for each pair of arms, for the notes below a table."""
+    """Lines below a table that say what was declared, and the verdict on it for each pair of arms."""
     quantity = next(iter(judged.values())).declared if judged else None
     lines = declared.sentences(declared.metric if quantity is None else quantity.name)
     for (first, second), one in judged.items():
         against = f"{arm_name(second)} against {arm_name(first)}"
         found = [verdict for verdict in one.verdicts if verdict.quantity.key == declared.metric]
+        if found and found[0].role == "secondary":
+            continue  # the other question
         lines += [f"Verdict, {against}: {_in_words(verdict)}." for verdict in found]
         if not found:
             lines.append(f"Verdict, {against}: none, since {declared.metric} has no value: {one.missing}.")
@@ -122,7 +127,7 @@ def declared_lines(declared: ActiveDeclaration, judged: dict[Pair, ArmVerdicts])
 
 
 def families(judged: Sequence[ArmVerdicts]) -> list[str]:
-    """How many tests each family had, and how it was adjusted."""
+    """Lines that say how many tests each family had, and how it was adjusted."""
     sizes: dict[Role, int] = {}
     for one in judged:
         sizes |= {verdict.role: verdict.comparison.family for verdict in one.verdicts}
@@ -158,7 +163,8 @@ def _answer(questions: Sequence[_Question], declared: ActiveDeclaration | None) 
 def _role(question: _Question, declared: ActiveDeclaration | None) -> Role:
     if declared is None or not declared.beforehand:
         return "one of all"
-    return "declared" if question.quantity.key == declared.metric else "secondary"
+    asked = declared.question in ("", question.asks)
+    return "declared" if asked and question.quantity.key == declared.metric else "secondary"
 
 
 def _verdict(quantity: Quantity, comparison: Comparison, role: Role) -> Verdict:

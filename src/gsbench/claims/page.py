@@ -41,7 +41,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """What both formats show."""
+    """Content of the verdicts' page, for both formats."""
 
     title: str
     lines: tuple[str, ...]
@@ -157,8 +157,8 @@ def _size_line(file: ClaimsFile, trials: Sequence[TrialResult]) -> list[str]:
     if not file.size or not trials:
         return []
     scenes = sorted({trial.scene for trial in trials})
-    steps = sorted({int(trial.data["iterations"]) for trial in trials})
-    sizes = sorted({f"{size[0]}×{size[1]}" for trial in trials if (size := trial.data.get("resolution"))})
+    steps = sorted({trial.record.iterations for trial in trials})
+    sizes = sorted({f"{size[0]}×{size[1]}" for trial in trials if (size := trial.record.resolution)})
     seeds = len({trial.seed for trial in trials})
     here = (
         f"{counted(len(scenes), 'scene')} ({', '.join(scenes)}), up to {seeds} seeds, "

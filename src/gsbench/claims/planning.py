@@ -1,4 +1,4 @@
-"""How many scenes and seeds resolve a difference, and what the hours at hand can resolve: asked of pilot trials.
+"""Planning from pilot trials: the scenes and seeds that resolve a difference, and what the hours at hand can resolve.
 
 A paired difference of scene s and seed k is ``mean + scene effect + noise``: the effect differs between scenes by a
 deviation, and trainings of one scene differ by another. From pilot trials both are estimated by the analysis of
@@ -88,7 +88,7 @@ def power(size: Size, difference: float, found: Components, like_these: bool) ->
 
 
 def sizes_needed(difference: float, found: Components, like_these: bool, wanted: float = POWER) -> list[Size]:
-    """For each number of scenes the fewest seeds that see ``difference`` with the ``wanted`` power; [] beyond reach.
+    """List the fewest seeds that see ``difference`` with the ``wanted`` power, by number of scenes; [] where none do.
 
     Scenes that would need more seeds than ``MAX_SEEDS`` are left out, and so is what needs more scenes and no fewer
     seeds than a design before it. A statement about scenes like these starts at ``MIN_SCENES``.

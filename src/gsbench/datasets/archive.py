@@ -16,7 +16,7 @@ RUN_GAP_BYTES = 1 << 18  # members closer than this are read in one request, the
 
 
 class DamagedError(Exception):
-    """What arrived is not what the archive's directory promises."""
+    """Error of a file that is not what the archive's directory promises."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], whe
 
 
 def holds(path: Path, size: int, crc: int) -> bool:
-    """Whether the file ``path`` is there with this size and CRC-32."""
+    """Return whether the file ``path`` is there with this size and CRC-32."""
     try:
         if path.stat().st_size != size:
             return False

@@ -54,7 +54,7 @@ class Fetcher:
         return archive.url if self.mirror is None else f"{self.mirror.rstrip('/')}/{archive.name}"
 
     def plan(self, archive: Archive, scenes: Sequence[SceneFiles]) -> list[ScenePlan]:
-        """What would be fetched; asks for the archive's directory only. Raises `RangesRefusedError` where it cannot."""
+        """Plan a fetch; reads only the archive's directory. Raises `RangesRefusedError` where it cannot be read."""
         with self._opened(archive, may_fetch_whole=False) as (opened, _):
             return [self._plan(archive, opened, files) for files in scenes]
 

@@ -1,4 +1,4 @@
-"""What another program gets of a trial: its training views, and of its test views the cameras alone."""
+"""Inputs of another program: the trial's training views, and of its test views the cameras alone."""
 
 from __future__ import annotations
 

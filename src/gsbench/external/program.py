@@ -25,7 +25,7 @@ SECONDS_TO_END = 5.0  # patience with a program that was asked to end
 
 @dataclass(frozen=True)
 class Ended:
-    """How a program ended: its exit code (negative: by a signal), whether its time was up, and what it took."""
+    """End of a program: its exit code (negative: by a signal), whether its time was up, and what it took."""
 
     code: int
     timed_out: bool

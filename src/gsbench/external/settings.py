@@ -19,7 +19,7 @@ from gsbench.errors import InputError
 from gsbench.external.placeholders import fill, names_in, program_of, words_of
 from gsbench.settings import MISSING, check_settings
 
-# What a command may ask for beside the options of its YAML.
+# Placeholders of a command beside the options of its YAML.
 DATA = "data"  # folder of the training views: images/ and the COLMAP model sparse/0
 TEST_CAMERAS = "test_cameras"  # folder of the test views' cameras: transforms.json and the COLMAP model sparse/0
 OUTPUT = "output"  # empty folder, in which the program also starts
@@ -39,6 +39,21 @@ class External:
     folder: of one 3DGS PLY, or of the pictures of the test views, whose names are matched (or ``by_order``).
     ``version`` names the program's version: it is part of the results' key. ``version_command`` prints something that
     must contain it.
+
+    Examples:
+        A program ``train.py`` that writes ``point_cloud.ply``:
+
+        >>> trainer = External(
+        ...     command="python train.py --data {data} --out {output} --steps {iterations} --rate {rate}",
+        ...     result="point_cloud.ply",
+        ...     version="1.2",
+        ...     options={"rate": 0.01},
+        ... )
+        >>> trainer.program, trainer.leaves_model
+        ('python', True)
+        >>> External(command="python train.py", result="*.png", version="1.2")
+        Traceback (most recent call last):
+        gsbench.errors.InputError: densify.command has no {data}: the folder that the program is to train on
     """
 
     command: CommandLine
@@ -72,7 +87,7 @@ class External:
 
     @property
     def leaves_model(self) -> bool:
-        """Whether the result is a model; else it is pictures."""
+        """Return whether the result is a model; else it is pictures."""
         return self.result.lower().endswith(MODEL_SUFFIX)
 
     @property
@@ -85,7 +100,7 @@ class External:
         return program_of(self.command, self.options)
 
     def executable(self) -> str:
-        """Where the program lies. Raises InputError where this machine has none."""
+        """The path of the program. Raises InputError where this machine has none."""
         path = self.environment.get("PATH", os.environ.get("PATH"))
         found = shutil.which(Path(self.program).expanduser(), path=path)
         if found is None:

@@ -52,7 +52,7 @@ def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
 
 
 def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
-    """All that precedes the first trial where a launcher of somebody else's will run them, several at once perhaps."""
+    """Do all that precedes the first trial where another launcher will run them, perhaps several at once."""
     from gsbench.launch.jobs import prepare_tracking
 
     values = trials[0].values

@@ -46,9 +46,8 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
         return TrialState(folder, state, _changed(folder / RESULTS), "")
     if state == "running":
         holder = read_holder(folder / LOCK)
-        within = f", Slurm job {holder['slurm']}" if holder.get("slurm") else ""
-        where = f"process {holder.get('pid', '?')} on {holder.get('host', '?')}{within}"
-        return TrialState(folder, state, holder.get("since"), f"{_reached(folder)} {where}".strip())
+        since, where = (None, "process ? on ?") if holder is None else (holder.since, holder.words)
+        return TrialState(folder, state, since, f"{_reached(folder)} {where}".strip())
     submission = read_submission(folder)
     lost = ""
     if submission:

@@ -23,6 +23,7 @@ METRICS = "metrics.json"  # of an evaluation
 # in an experiment's folder
 PLAN = "plan.json"  # the trials that were asked for
 DECLARED = "declared.jsonl"  # the metrics that verdicts were declared to be about, and when
+ABLATION = "ablation.json"  # which trials have which parts of a densifier switched on
 SEARCH, SEARCH_JOURNAL = "search.json", "search.journal"  # what a search found, and Optuna's own record of it
 TRIAL_GLOB = "*/*/*-seed*"  # the trials that are there
 
@@ -37,6 +38,7 @@ INPUTS = "inputs.json"  # what the results were made of: a finished trial is rec
 BUILDING = "building.json"  # the stage that an unfinished trial is at, and where
 INIT_REPORT = "init_report.json"
 PER_VIEW = "per_view.csv"
+PROTOCOLS = "protocols.json"  # the same renders under the conventions of others, where somebody asked
 CURVES = "metrics.jsonl"  # of the training
 EVENTS = "events.jsonl"  # what every refinement did
 HISTOGRAMS = "volume_histograms.jsonl"

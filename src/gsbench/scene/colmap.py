@@ -156,6 +156,21 @@ def cameras_of(model: pycolmap.Reconstruction) -> dict[str, Camera]:
     return dict(sorted(cameras.items()))
 
 
+def reference_cameras(model: pycolmap.Reconstruction, names: Iterable[str]) -> list[Camera]:
+    """The poses of the registered images ``names``, with the focal lengths of their cameras, distorted or not.
+
+    They are for asking where cameras stand and look, not for rendering.
+    """
+    found = []
+    for name in names:
+        image = model.find_image_with_name(name)
+        camera, pose = model.cameras[image.camera_id], image.cam_from_world()
+        size, focal = (camera.width, camera.height), camera.mean_focal_length()
+        places = (focal, focal, camera.width / 2, camera.height / 2)
+        found.append(Camera(*size, *places, pose.rotation.matrix(), np.array(pose.translation)))
+    return found
+
+
 def rigid_pose(camera: Camera) -> pycolmap.Rigid3d:
     """The world-to-camera pose of a `Camera` in pycolmap's type."""
     return pycolmap.Rigid3d(np.column_stack([camera.rotation, camera.translation]))

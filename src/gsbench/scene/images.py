@@ -14,11 +14,11 @@ from PIL import Image, UnidentifiedImageError
 
 from gsbench.errors import InputError
 
-Resample = Literal["lanczos", "area"]
+Resample = Literal["lanczos", "area", "bicubic"]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 EXIF_ORIENTATION = 0x0112
-_FILTERS = {"lanczos": Image.Resampling.LANCZOS, "area": Image.Resampling.BOX}
+_FILTERS = {"lanczos": Image.Resampling.LANCZOS, "area": Image.Resampling.BOX, "bicubic": Image.Resampling.BICUBIC}
 _SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I;16N")
 _WIDE_MODES = ("I", "F")  # 32-bit integer and float: no agreed white point
 
@@ -67,7 +67,7 @@ def resize_image(
     """The image [H, W, 3] at another size.
 
     ``lanczos`` is Pillow's windowed sinc with three lobes, widened to the scale (so it does not alias); ``area`` is the
-    mean over each pixel's footprint.
+    mean over each pixel's footprint; ``bicubic`` Pillow's, with a = -0.5 and widened as well.
     """
     if resample not in _FILTERS:
         raise InputError(f"scene.resample must be one of {', '.join(_FILTERS)}, got {resample!r}")
@@ -93,7 +93,7 @@ def check_size(path: Path, size: tuple[int, int], camera_size: tuple[int, int]) 
 
 
 def same_up_to_rounding(size: tuple[int, int], reference: tuple[int, int]) -> bool:
-    """Whether one common scale takes ``reference`` to ``size`` with every side off by at most one pixel."""
+    """Return whether one common scale takes ``reference`` to ``size`` with every side off by at most one pixel."""
     (width, height), (reference_width, reference_height) = size, reference
     lowest = max((width - 1) / reference_width, (height - 1) / reference_height)
     highest = min((width + 1) / reference_width, (height + 1) / reference_height)

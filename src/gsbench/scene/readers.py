@@ -11,8 +11,10 @@ from pathlib import Path
 from gsbench.datasets.catalog import how_to_get
 from gsbench.errors import InputError
 from gsbench.scene.colmap_files import model_files
+from gsbench.scene.hold_out import Cameras, hold_out
 from gsbench.scene.images import IMAGE_SUFFIXES
-from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, TEST_EVERY, match_names, select_images, split_names
+from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, match_names, select_images
+from gsbench.scene.split import EVERY_NTH, TEST_LIST, TRAIN_LIST, SplitRule
 from gsbench.scene.types import Capture
 from gsbench.words import some_of
 
@@ -27,24 +29,23 @@ def read_colmap(
     images: str | None = None,
     sparse: str | None = None,
     max_images: int = MAX_IMAGES,
-    test_every: int = TEST_EVERY,
-    train_list: str | None = None,
-    test_list: str | None = None,
+    split: SplitRule = EVERY_NTH,
     exact_poses: bool = False,
 ) -> Capture:
     """Read a COLMAP folder: ``path/<images>`` (else "images") and ``path/<sparse>`` (else "sparse/0" or "sparse").
 
     The photos are those that the model has a pose for and that are in the folder; a file may have another extension
-    than the model says. See `select_images` for which are kept and `split_names` for which are held out.
+    than the model says. See `select_images` for which are kept and `SplitRule` for which are held out.
 
     Raises `InputError` if a folder is missing, the model is damaged, or fewer than three photos are usable.
     """
-    from gsbench.scene.colmap import read_model, registered_names  # here, because photos alone need no pycolmap
+    from gsbench.scene.colmap import read_model, reference_cameras, registered_names  # photos alone need no pycolmap
 
     root = existing_folder(name, path)
     model_folder = _find_sparse(root, sparse)
     folder = _subfolder(root, images or "images", "scene.images")
-    wanted = registered_names(read_model(model_folder))
+    model = read_model(model_folder)
+    wanted = registered_names(model)
     matches = match_names(wanted, list_images(folder))
     missing = [image for image in wanted if image not in matches]
     if missing:
@@ -52,9 +53,10 @@ def read_colmap(
             "%s: %d of %d images of the model have no file: %s", folder, len(missing), len(wanted), some_of(missing)
         )
     _require_enough(len(matches), folder, f"that the model {model_folder} has a pose for")
+    files = {file: image for image, file in matches.items()}
     return _capture(
-        name, folder, sorted(matches.values()), model_folder, exact_poses,
-        max_images=max_images, test_every=test_every, lists=_read_lists(root, train_list, test_list),
+        name, folder, sorted(matches.values()), model_folder, exact_poses, max_images, split, root,
+        lambda names: reference_cameras(model, [files[file] for file in names]),
     )  # fmt: skip
 
 
@@ -63,9 +65,7 @@ def read_photos(
     path: Path | str,
     images: str | None = None,
     max_images: int = MAX_IMAGES,
-    test_every: int = TEST_EVERY,
-    train_list: str | None = None,
-    test_list: str | None = None,
+    split: SplitRule = EVERY_NTH,
 ) -> Capture:
     """Read bare photographs: all images in ``path/<images>``, or ``path/images`` if there is one, or ``path``.
 
@@ -80,10 +80,7 @@ def read_photos(
         folder = root / "images" if (root / "images").is_dir() else root
     names = list_images(folder)
     _require_enough(len(names), folder, f"({', '.join(sorted(s[1:] for s in IMAGE_SUFFIXES))})")
-    return _capture(
-        name, folder, names, None, False,
-        max_images=max_images, test_every=test_every, lists=_read_lists(root, train_list, test_list),
-    )  # fmt: skip
+    return _capture(name, folder, names, None, False, max_images, split, root)
 
 
 def existing_folder(name: str, path: Path | str) -> Path:
@@ -97,7 +94,7 @@ def existing_folder(name: str, path: Path | str) -> Path:
 
 
 def missing_folder(name: str, root: Path) -> str:
-    """What is wrong with the folder ``root`` of the scene ``name``, which is not there."""
+    """Explain that the folder ``root`` of the scene ``name`` is not there, and what to do about it."""
     return f"scene {name}: the folder {root} {'is a file' if root.exists() else 'does not exist'}"
 
 
@@ -134,24 +131,26 @@ def _capture(
     model: Path | None,
     exact_poses: bool,
     max_images: int,
-    test_every: int,
-    lists: tuple[list[str] | None, list[str] | None],
+    split: SplitRule,
+    root: Path,
+    cameras: Cameras | None = None,
 ) -> Capture:
+    lists = _read_lists(root, split)
     train, test = (None if wanted is None else _resolve(wanted, names, folder) for wanted in lists)
     if train is not None and test is not None:
         names = sorted({*train, *test})
-    selected = select_images(names, max_images)
-    training, testing = split_names(selected, test_every, train, test)
-    kept = tuple(sorted([*training, *testing]))
-    _require_enough(len(kept), folder, "in the split lists")
+    held_out = hold_out(select_images(names, max_images), split, (train, test), cameras)
+    kept = tuple(sorted([*held_out.train, *held_out.test]))
+    _require_enough(len(kept), folder, "in the split lists" if split.by_lists else "left by the split")
     return Capture(
         name=name,
         images=folder,
         image_names=kept,
-        test_names=tuple(testing),
+        test_names=held_out.test,
         model=model,
         exact_poses=exact_poses,
         fingerprint=fingerprint(folder, kept, model_files(model) if model is not None else ()),
+        held_out=held_out.words,
     )
 
 
@@ -165,7 +164,16 @@ def _resolve(wanted: Sequence[str], names: Sequence[str], folder: Path) -> list[
     return sorted(matches.values())
 
 
-def _read_lists(root: Path, train: str | None, test: str | None) -> tuple[list[str] | None, list[str] | None]:
+def _read_lists(root: Path, split: SplitRule) -> tuple[list[str] | None, list[str] | None]:
+    """The training and the test list; ``split=list`` without names finds those that nerfbaselines writes."""
+    train, test = split.train_list, split.test_list
+    if split.split == "list" and train is None and test is None:
+        train, test = (name if (root / name).is_file() else None for name in (TRAIN_LIST, TEST_LIST))
+        if train is None and test is None:
+            raise InputError(
+                f"scene.split=list: neither {TRAIN_LIST} nor {TEST_LIST} is in {root}: name the files with "
+                "scene.train_list and scene.test_list"
+            )
     return _read_list(root, train, "scene.train_list"), _read_list(root, test, "scene.test_list")
 
 

@@ -42,7 +42,7 @@ _REASON_LINE = re.compile(r"what\(\)|terminate called|Check failed|Error|error|f
 
 
 class CrashError(GsbenchError):
-    """An isolated function ended without a result: its process crashed, was killed, or ran out of memory."""
+    """Error of an isolated function without a result: its process crashed, was killed, or ran out of memory."""
 
 
 def run_isolated(
@@ -151,7 +151,7 @@ def _portable(error: Exception) -> Exception:
 
 
 def describe_exit(code: int) -> str:
-    """How a process ended that should not have, by its exit code: "crashed (SIGSEGV)", "ended early (exit code 1)"."""
+    """Describe the unexpected end of a process by its exit code: "crashed (SIGSEGV)", "ended early (exit code 1)"."""
     if code < 0:
         try:
             name = signal.Signals(-code).name

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from gsbench.datasets.catalog import DATA_VARIABLE, data_dir, read_catalog
-from gsbench.raster.executors import EXECUTORS, resolve
+from gsbench.raster.executors import EXECUTORS, find, resolve
 from gsbench.runs.layout import DATABASE, STORE
 from gsbench.system.install import install_command
 from gsbench.system.resources import available_threads, installed_gpus
@@ -27,8 +27,11 @@ TRITON_CAPABILITY = (8, 0)  # "NVIDIA GPUs (Compute Capability 8.0+)", in Triton
 OPTIONAL = {  # package -> what needs it, and the extra that brings it
     "transformers": ("init=dim", "dim"),
     "gsplat": ("raster=gsplat and export --to compressed", "gsplat"),
+    "optuna": ("hydra/sweeper=optuna", "search"),
     "submitit": ("launch=local and launch=slurm", "slurm"),
+    "tensorboard": ("tracking=tensorboard", "tensorboard"),
     "viser": ("gsbench view", "view"),
+    "wandb": ("tracking=wandb", "wandb"),
 }
 
 
@@ -42,7 +45,7 @@ class Finding:
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: 1 if something is bad."""
+    """Run the verb: 1 if something is bad."""
     parser = ArgumentParser(prog="gsbench doctor", description="Check this machine and say what is missing.")
     parser.add_argument(
         "--store", action="store_true", help="also read every stored result whole and name damaged ones"
@@ -141,13 +144,15 @@ def check_packages() -> Iterator[Finding]:
 
 
 def check_triton() -> Iterator[Finding]:
-    """What raster=triton compiles with at its first run on a GPU."""
+    """Check the compiler that raster=triton needs at its first run on a GPU."""
     from gsbench.raster.triton.toolchain import missing_tools
 
     installed = _version("triton")
     if installed is None:  # torch for CUDA would have brought it along
         return
-    if missing := missing_tools():
+    if old := find("triton").too_old():
+        yield Finding("note", "triton", f"raster=triton {old}")
+    elif missing := missing_tools():
         yield Finding("note", "triton", f"{installed}; at its first run on a GPU it needs {' and '.join(missing)}")
     else:
         text = f"{installed}; the C compiler and Python.h that it needs at its first run on a GPU are here"
@@ -155,7 +160,7 @@ def check_triton() -> Iterator[Finding]:
 
 
 def check_kernels() -> Iterator[Finding]:
-    """Where the CPU's compiled kernels are kept; without such a place every start compiles anew."""
+    """Check the place of the CPU's compiled kernels; without one every start compiles anew."""
     from gsbench.raster.cpu.jit import TEMPORARY_PREFIX, cache_base
 
     place = cache_base()
@@ -167,7 +172,7 @@ def check_kernels() -> Iterator[Finding]:
 
 
 def check_executors() -> Iterator[Finding]:
-    """Which rasterizers run here, and which is taken if none is chosen."""
+    """Check which rasterizers run here, and which is taken if none is chosen."""
     import torch
 
     here = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -250,7 +255,7 @@ def check_weights() -> Iterator[Finding]:
 
 
 def check_store(runs: Path) -> Iterator[Finding]:
-    """Every stored result, read whole."""
+    """Check every stored result by reading it whole."""
     from gsbench.runs.stages import STAGES
     from gsbench.runs.store import read_manifest
 

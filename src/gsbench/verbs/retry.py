@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: as the sweep's own command, the exit code says whether some trial failed."""
+    """Run the verb: as the sweep's own command, the exit code says whether some trial failed."""
     from gsbench.app.command import run_trials
 
     parser = ArgumentParser(

@@ -19,7 +19,9 @@ from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experime
 from gsbench.analysis.table_formats import FORMATS
 from gsbench.analysis.table_notes import compared_pairs
 from gsbench.analysis.tables import DEFAULT_ROWS, build_table
+from gsbench.analysis.translations import by_protocol
 from gsbench.errors import InputError
+from gsbench.eval.protocol import ALL
 from gsbench.files import write_text
 from gsbench.verbs.arguments import ArgumentParser, names, path
 
@@ -29,7 +31,7 @@ PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsiste
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb; raises InputError for bad input."""
+    """Run the verb; raises InputError for bad input."""
     options = _parser().parse_args(argv)
     if options.experiment == PAPER_NOTES and not (runs / PAPER_NOTES).exists():
         print("\n".join(f"- {line}" for line in inconsistencies(load_paper())))
@@ -37,6 +39,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
     experiment = load_experiment(runs, options.experiment)
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
+    if options.protocol is not None:
+        experiment = by_protocol(experiment, options.protocol)
     trials = select_trials(experiment.trials, _conditions(options.where))
     texts = _trials(trials, options) if options.format == TRIALS else _tables(experiment, trials, options)
     _write(texts, options.out, experiment.name)
@@ -119,6 +123,12 @@ def _parser() -> ArgumentParser:
         "--paper",
         metavar="NAME",
         help=f"also hold the trials against published numbers: {', '.join(published_names())}",
+    )
+    parser.add_argument(
+        "--protocol",
+        choices=list(ALL),
+        help="the metrics of the same renders by this protocol, once `gsbench evaluate EXPERIMENT --protocol all` "
+        "measured them",
     )
     parser.add_argument(
         "--layout",

@@ -1,9 +1,8 @@
-"""What the report says and draws, section by section, from result files only."""
+"""Sections of the report, each made from result files only."""
 
 from __future__ import annotations
 
 import statistics
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -24,8 +23,8 @@ from gsbench.analysis.tradeoffs import COST_READERS, CurveGap, curve_gap, traini
 from gsbench.analysis.verdicts import ArmVerdicts, Verdict, judge
 from gsbench.errors import InputError
 from gsbench.events import Cause, RefineEvent
-from gsbench.files import read_json_lines
 from gsbench.runs import layout
+from gsbench.runs.rows import read_histograms
 from gsbench.words import signed
 
 CROPS = 4  # places of each kind
@@ -41,7 +40,7 @@ CURVES = (  # key of metrics.jsonl, title, y axis
 
 @dataclass(frozen=True)
 class Versus:
-    """Everything about one pair of arms."""
+    """All results about one pair of arms."""
 
     first: Arm
     second: Arm
@@ -134,7 +133,7 @@ def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str
     """Events by cause: totals of every arm, and over the iterations of each arm."""
     totals = []
     for arm in arms:
-        logged = [trial.data.get("events") or {} for trial in trials if trial.arm == arm]
+        logged = [trial.record.events for trial in trials if trial.arm == arm]
         totals.append(
             (arm_name(arm), {c: statistics.fmean(float(events.get(c, 0)) for events in logged) for c in EVENT_CAUSES})
         )
@@ -168,7 +167,7 @@ def _strictness_chart(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> str
 
 def _origin_chart(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> str:
     """What made the Gaussians that are left at the end, as the mean of a trial."""
-    origins = {arm: [trial.data.get("causes") or {} for trial in trials if trial.arm == arm] for arm in arms}
+    origins = {arm: [trial.record.causes for trial in trials if trial.arm == arm] for arm in arms}
     causes = list(dict.fromkeys(cause for logged in origins.values() for counts in logged for cause in counts))
     means = {
         arm: [statistics.fmean(float(counts.get(cause, 0)) for counts in logged) for cause in causes]
@@ -223,13 +222,13 @@ def provenance(trials: Sequence[TrialResult]) -> list[dict[str, str]]:
     return [
         {
             "trial": trial.label,
-            "raster": str(trial.data["raster"]),
-            "protocol": str(trial.data["protocol"]),
-            "iterations": str(trial.data["iterations"]),
-            **{f"{key} hash": str(value)[:12] for key, value in trial.data.get("hashes", {}).items()},
+            "raster": trial.record.raster,
+            "protocol": trial.record.protocol,
+            "iterations": str(trial.record.iterations),
+            **{f"{key} hash": str(value)[:12] for key, value in trial.record.hashes.items()},
             "code": ", ".join(f"{part} {short_version(version)}" for part, version in trial.code.items()),
             "machine": machine_of(trial) or "",
-            "versions": ", ".join(f"{key} {value}" for key, value in trial.data.get("versions", {}).items()),
+            "versions": ", ".join(f"{key} {value}" for key, value in trial.record.versions.items()),
         }
         for trial in trials
     ]
@@ -291,11 +290,7 @@ def _region_chart(errors: RegionErrors, first: Arm, second: Arm) -> str:
 
 
 def _rows(trial: TrialResult, name: str, key: str) -> list[tuple[float, float]]:
-    return [
-        (float(row["step"]), float(row[key]))
-        for row in read_json_lines(trial.path / name)
-        if _is_number(row.get("step")) and _is_number(row.get(key))
-    ]
+    return [(float(row["step"]), float(row[key])) for row in trial.curve(name) if key in row]
 
 
 def _is_number(value: object) -> bool:
@@ -304,12 +299,12 @@ def _is_number(value: object) -> bool:
 
 def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, list[tuple[float, float]]]:
     """Pooled counts of ``volume_histograms.jsonl`` by iteration, as (volume at the bin's centre, share)."""
-    pooled: dict[int, Counter[float]] = {}
+    pooled: dict[int, dict[float, float]] = {}
     for trial in trials:
-        for row in read_json_lines(trial.path / layout.HISTOGRAMS):
-            edges, counts = row.get("log10_edges", []), row.get("counts", [])
-            for low, high, count in zip(edges, edges[1:], counts, strict=False):
-                pooled.setdefault(int(row["step"]), Counter())[10 ** ((low + high) / 2)] += count
+        for row in read_histograms(trial.path / layout.HISTOGRAMS, trial.digests):
+            for low, high, count in zip(row.log10_edges, row.log10_edges[1:], row.counts, strict=False):
+                bins, volume = pooled.setdefault(row.step, {}), 10 ** ((low + high) / 2)
+                bins[volume] = bins.get(volume, 0.0) + count
     return {
         step: [(volume, count / total) for volume, count in sorted(bins.items()) if count]
         for step, bins in sorted(pooled.items())

@@ -18,7 +18,7 @@ COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time (s)"}
 def tradeoff_charts(trials: Sequence[TrialResult]) -> list[str]:
     """One chart for each pair of main metric and cost; a densifier's variants are the points of its line."""
     charts = []
-    for metric in _main_metrics(trials):
+    for metric in main_metrics(trials):
         for cost, label in COST_LABELS.items():
             curves = _curves(trials, metric, cost)
             series = [
@@ -32,7 +32,7 @@ def tradeoff_charts(trials: Sequence[TrialResult]) -> list[str]:
 def tradeoff_gaps(trials: Sequence[TrialResult], baseline: str = BASELINE) -> list[str]:
     """The area between every densifier's curve and the baseline's, in words, where both have several points."""
     lines = []
-    for metric in _main_metrics(trials):
+    for metric in main_metrics(trials):
         for cost, label in COST_LABELS.items():
             curves = _curves(trials, metric, cost)
             for (init, densify), curve in curves.items():
@@ -46,7 +46,7 @@ def tradeoff_gaps(trials: Sequence[TrialResult], baseline: str = BASELINE) -> li
     return lines
 
 
-def _main_metrics(trials: Sequence[TrialResult]) -> list[Quantity]:
+def main_metrics(trials: Sequence[TrialResult]) -> list[Quantity]:
     """PSNR, and the first perceptual metric that is at hand, beginning with the protocol's LPIPS."""
     for name in ("lpips", *(facts.key for facts in METRICS if facts.perceptual)):
         perceptual = quantity(name, trials)

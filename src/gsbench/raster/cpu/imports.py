@@ -1,4 +1,4 @@
-"""Which of the package's sources a module is made of: the files that it imports, and those that these import."""
+"""Sources of the package that a module is made of: the files that it imports, and those that these import."""
 
 from __future__ import annotations
 
