@@ -1,4 +1,4 @@
-"""Which kernel of a step takes how long."""
+"""Times of a step by kernel."""
 
 from __future__ import annotations
 
