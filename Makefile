@@ -1,8 +1,9 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-# Two files of tests at a time, each in a process of its own: half the time, and no test that needs another to have run.
-PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+# Two files of tests at a time, each in a process of its own, in the order of their names (else those with few tests, which
+# run the whole program, come last): half the time, and no test that needs another to have run.
+PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 # Each library that chooses its instructions by the processor, told to choose the plainest. Compiled kernels keep a cache
@@ -14,7 +15,7 @@ CORE_TESTS := @tests/core.txt
 
 # The next version of Hydra, as far as it is released, laid over .venv for the tests of what Hydra does.
 NEXT_HYDRA := 'hydra-core>=1.4.0rc1,<1.5' 'omegaconf>=2.4.1rc1,<2.5'
-NEXT_HYDRA_TESTS := tests/app/test_joined_sweeps.py tests/config/test_schema.py
+NEXT_HYDRA_TESTS := tests/app tests/config tests/end_to_end/test_hydra.py
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-slow test-generic test-next-hydra lint docs lock

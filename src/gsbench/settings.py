@@ -30,13 +30,13 @@ MAX_NAME_BYTES = 100  # of a name: folders are made of two, and file systems end
 
 
 def is_folder_name(value: str) -> bool:
-    """Whether a text can name a folder, on any system and in the address of a trial (``x:scene:arm:0``)."""
+    """Return whether a text can name a folder, on any system and in the address of a trial (``x:scene:arm:0``)."""
     is_plain = value.isprintable() and not set(value) & set('/\\:*?"<>|') and value == value.strip()
     return is_plain and value[:1] not in ("", ".", "-") and len(value.encode()) <= MAX_NAME_BYTES
 
 
 def is_address(value: str) -> bool:
-    """Whether a text can be the address of a tracker."""
+    """Return whether a text can be the address of a tracker."""
     return re.fullmatch(r"[a-z][a-z0-9+.-]*://\S*", value) is not None and value.isprintable()
 
 
@@ -50,6 +50,19 @@ TargetName = Annotated[
 MISSING: Any = "???"  # a value that must be given, as Hydra writes it in YAML
 Fraction = Annotated[float, Interval(ge=0, le=1)]
 OpenFraction = Annotated[float, Interval(gt=0, lt=1)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Switch:
+    """A part of a method that can be taken out (``gsbench ablate``): by the settings ``off``; ``words`` say what it is.
+
+    Without the switch ``within`` this one does nothing.
+    """
+
+    off: dict[str, Any]
+    words: str = ""
+    within: str = ""
+
 
 CONFIG = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True, coerce_numbers_to_str=True)
 PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", dict: "a mapping {key: value}"}

@@ -112,7 +112,7 @@ def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, launc
     assert [path.stat().st_mtime_ns for path in results] == written  # nothing is done twice
 
 
-@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+@pytest.mark.parametrize("launcher", ["joblib", pytest.param("submitit_local", marks=pytest.mark.slow)])
 def test_a_callback_of_yours_is_found_in_the_processes_of_another_launcher(
     gsbench: Run, tmp_path: Path, launcher: str
 ) -> None:
@@ -128,6 +128,7 @@ def test_a_callback_of_yours_is_found_in_the_processes_of_another_launcher(
     assert {"sweep begins", "0 begins with seed 0", "1 begins with seed 1", "sweep ends"} <= set(notes)
 
 
+@pytest.mark.slow
 def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(gsbench: Run, tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(
         "from gsbench.densify import NoDensifier\n"

@@ -147,6 +147,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", str(disk)], check=True)
 
 
+@pytest.mark.slow
 def test_full_disk_ends_the_sweep_in_one_line_and_more_space_mends_it(
     gsbench: Run, undisturbed: dict[str, Any], small_disk: Path
 ) -> None:

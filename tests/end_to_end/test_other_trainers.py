@@ -246,6 +246,7 @@ def test_bad_programs_end_in_a_line_each_and_lose_nothing_else(
         assert "observations 0" in Path(log[1]).read_text()
 
 
+@pytest.mark.slow
 def test_one_that_hangs_is_ended(
     trainers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -291,7 +292,10 @@ def hanging(
     process.communicate()
 
 
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "signum",
+    [signal.SIGINT, *(pytest.param(signum, marks=pytest.mark.slow) for signum in (signal.SIGTERM, signal.SIGKILL))],
+)
 def test_it_ends_with_gsbench(hanging: tuple[subprocess.Popen[str], list[int]], signum: int) -> None:
     process, pids = hanging
     assert len(pids) == 2

@@ -52,7 +52,7 @@ CLUSTER = [
 ]
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(scope="session", autouse=True)
 def slurm() -> None:
     if shutil.which("sinfo") is None:
         pytest.skip("no Slurm here: scripts/slurm_one_node.sh start (root, Debian or Ubuntu) sets one up")

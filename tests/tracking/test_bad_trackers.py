@@ -19,6 +19,7 @@ import pytest
 
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.tracking import connect, mirror_trial, prepare
+from gsbench.tracking.client import SETTINGS
 from tests.end_to_end.conftest import SMALL
 from tests.processes import heed_interrupts
 from tests.tracking.helpers import (
@@ -78,7 +79,14 @@ def check_complete(runs: Path, name: str, code: int, errors: str) -> None:
     assert json.loads(results.read_text())["status"] == "complete"
 
 
-@pytest.mark.parametrize("kind", ["never answers", "answers after a minute", "refuses", "hangs up", "postgresql"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "never answers",
+        "refuses",
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("answers after a minute", "hangs up", "postgresql")),
+    ],
+)
 def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
     with ExitStack() as stack:
         port = free_port()
@@ -94,7 +102,10 @@ def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
     check_complete(runs, name, program.returncode, errors)
 
 
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "signum",
+    [signal.SIGINT, *(pytest.param(signum, marks=pytest.mark.slow) for signum in (signal.SIGTERM, signal.SIGKILL))],
+)
 def test_nothing_is_left_of_a_trial_that_is_ended_while_its_tracker_hangs(signum: int, runs: Path) -> None:
     name = f"ended_by_{signum}"
     with Listener() as tracker:
@@ -177,8 +188,16 @@ def tracker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         )
 
 
-def test_a_tracker_may_go_at_any_moment(tracker: tuple[Gate, str], tmp_path: Path) -> None:
-    """It is taken away early, late and in between; each time ``sync`` completes one run, with each value once."""
+def test_a_tracker_may_go_at_any_moment(
+    tracker: tuple[Gate, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is taken away early, late and in between; each time ``sync`` completes one run, with each value once.
+
+    A transaction that was cut off, of which the database never hears again, keeps nobody from its rows for long.
+    """
+    seconds = SETTINGS["PGOPTIONS"].replace("60s", "3s")
+    assert seconds != SETTINGS["PGOPTIONS"]
+    monkeypatch.setenv("PGOPTIONS", seconds)
     gate, uri = tracker
     prepare(options(uri, patience=SECONDS), tmp_path, "tracked")
     gate.passed = 0

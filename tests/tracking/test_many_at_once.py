@@ -56,6 +56,7 @@ def check_jobs(client: Any) -> None:
     assert found_runs(client, "Default") == []
 
 
+@pytest.mark.slow
 @pytest.mark.end_to_end
 def test_eight_jobs_at_once_on_a_new_sqlite_database(tmp_path: Path) -> None:
     run_jobs(tmp_path, None)

@@ -137,7 +137,9 @@ def test_curves_of_a_training_in_progress_are_followed(runs: Path, tmp_path: Pat
     assert seen == 1
 
 
-@pytest.mark.parametrize("uri", ["down", "not a database", "no such place", "nonsense"])
+@pytest.mark.parametrize(
+    "uri", [pytest.param("down", marks=pytest.mark.slow), "not a database", "no such place", "nonsense"]
+)
 def test_a_broken_tracker_harms_no_trial(uri: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "broken.db").write_text("this is no database" * 100)
     address = {

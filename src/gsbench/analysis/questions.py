@@ -14,10 +14,11 @@ import numpy as np
 
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import Arm, TrialResult, setting
+from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import Interval, t_interval
 from gsbench.analysis.verdicts import ArmVerdicts, Pair, Verdict
 from gsbench.runs.declaration import EXTRAPOLATION, INTERPOLATION
+from gsbench.runs.splits import setting
 
 # settings that say what is held out: trials that differ in them alone are of one arm
 SPLIT_SETTINGS = tuple(
@@ -99,7 +100,7 @@ def find_turns(trials: Sequence[TrialResult], judged: Mapping[Pair, ArmVerdicts]
 
 
 def find_gaps(trials: Sequence[TrialResult]) -> list[Gap]:
-    """For each arm with trials of both questions: how far it falls from interpolation to extrapolation."""
+    """The fall of each arm with trials of both questions, from interpolation to extrapolation."""
     bases = without_split(trials)
     groups: dict[Arm, dict[str, list[TrialResult]]] = {}
     for trial in trials:

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.errors import InputError
 from gsbench.eval.facts import find
 from gsbench.eval.protocol import get_protocol
-from gsbench.files import read_object
-from gsbench.runs.layout import PROTOCOLS
+from gsbench.runs.translation_record import read_translations
 from gsbench.words import signed
-
-TRANSLATED = "translated_from"  # in ``data`` of such a trial: the protocol of the trial itself
-SHARES = "translation"
 
 
 def by_protocol(experiment: Experiment, name: str) -> Experiment:
@@ -26,37 +21,34 @@ def by_protocol(experiment: Experiment, name: str) -> Experiment:
 
 
 def _translated(trial: TrialResult, wanted: str) -> TrialResult:
-    own = str(trial.data["protocol"])
+    own = trial.record.protocol
     if own == wanted:
         return trial
-    record = read_object(trial.path / PROTOCOLS)
-    hashes = trial.data.get("hashes", {})
-    found: Any = record.get("protocols", {}).get(wanted)
-    if record.get("made_of") != (hashes.get("evaluate") or hashes.get("config")) or not isinstance(found, dict):
+    found = read_translations(trial.path, trial.record).get(wanted)
+    if found is None:
         raise InputError(
             f"{trial.label} was not measured by {wanted}: gsbench evaluate {trial.experiment} "
             f"--protocol {wanted.rpartition('-')[0]}"
         )
-    data = dict(trial.data) | {"protocol": wanted, "metrics": found["metrics"], TRANSLATED: own, SHARES: found}
-    return replace(trial, metrics=found["metrics"], unavailable=found["unavailable"], data=data)
+    record = replace(trial.record, protocol=wanted, metrics=found.metrics, unavailable=found.unavailable)
+    return replace(trial, record=record, translation=found, translated_from=own)
 
 
 def translation_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """For trials by another protocol: what of the difference each convention makes, and what could not be followed."""
+    """Explain trials by another protocol: what each convention adds to the difference, and what was not followed."""
     shares: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     unknown: dict[str, str] = {}
-    translated = [trial for trial in trials if TRANSLATED in trial.data]
+    translated = [trial for trial in trials if trial.translated_from]
     for trial in translated:
-        found: Mapping[str, Any] = trial.data[SHARES]
-        for metric, parts in found["shares"].items():
-            for name, value in parts.items():
+        assert trial.translation is not None
+        for metric, own_shares in trial.translation.shares.items():
+            for name, value in own_shares.items():
                 shares[metric][name].append(value)
-        unknown |= {f"{name}: {reason}": name for name, reason in found["unknown"].items()}
+        unknown |= {f"{name}: {reason}": name for name, reason in trial.translation.unknown.items()}
     if not translated:
         return []
-    data, notes = translated[0].data, []
-    source = get_protocol(str(data["protocol"]).rpartition("-")[0]).source
-    notes.append(f"The renders of trials by {data[TRANSLATED]}, measured by {data['protocol']} ({source}).")
+    own, now = translated[0].translated_from, translated[0].record.protocol
+    notes = [f"The renders of trials by {own}, measured by {now} ({get_protocol(now.rpartition('-')[0]).source})."]
     for metric, parts in shares.items():
         facts = find(metric)
         assert facts is not None
@@ -64,6 +56,6 @@ def translation_notes(trials: Sequence[TrialResult]) -> list[str]:
         count = len(translated)
         means = {name: sum(values) / count for name, values in parts.items()}  # a trial without it has 0 of it
         listed = ", ".join(f"{signed(value, spec)} {name}" for name, value in means.items())
-        notes.append(f"{facts.name} against {data[TRANSLATED]}: {signed(sum(means.values()), spec)} ({listed}).")
+        notes.append(f"{facts.name} against {own}: {signed(sum(means.values()), spec)} ({listed}).")
     notes += [f"Not followed, {line}." for line in sorted(unknown)]
     return notes

@@ -1,4 +1,4 @@
-"""Which ingredient carries it: factorial designs over named switches, and each switch's share of the whole gain.
+"""Shares of ingredients in a gain: factorial designs over named switches, and each switch's share of the whole gain.
 
 Each switch is off or on; a run is a set of switches that are on. The gain of a set is its value minus that of the empty
 set. Shapley's value (1953) shares the gain of the full set among the switches: the mean, over all orders of turning
@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Share:
-    """What a switch adds on average over all orders, with Student's interval over trials; ``part`` of the whole gain.
+    """Mean gain from a switch over all orders of turning switches on, with Student's interval; ``part`` of the whole.
 
     ``alone`` is what it adds to nothing, ``last`` what it adds to all others. ``part`` is None where the gain's
     interval holds zero, since a part of nothing means nothing.

@@ -1,4 +1,4 @@
-"""From a file of claims to trials and back: what can be tested here, which trials that takes, the verdicts so far.
+"""Checks of a file of claims: what can be tested here, the trials that it takes, and the verdicts so far.
 
 The trials are ordinary ones of one experiment, found again by their folders, so a check that was killed goes on where
 it stopped and ends with the same verdicts.
@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.claims.file import Claim, ClaimsFile
@@ -26,6 +26,7 @@ from gsbench.words import counted, some_of
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T", bound=Composed)
 Lacking = Callable[[Composed, str], str]  # (trial, metric) -> why it cannot be had here, or ""
 
 
@@ -43,7 +44,7 @@ class Question:
 
     @property
     def why_not(self) -> str:
-        """Why it cannot be tested here at all; "" where it can."""
+        """The reason why the question cannot be tested here at all; "" where it can."""
         return "" if self.testable else self.claim.not_testable or "; ".join(self.missing)
 
 
@@ -66,12 +67,12 @@ class Check:
 
     @property
     def sharing(self) -> int:
-        """How many tests share the error rate."""
+        """The number of tests that share the error rate."""
         return max(1, sum(question.testable for question in self.questions))
 
     @cached_property
     def plan(self) -> dict[str, Any]:
-        """What is written down before trials run: the file's plan, and what of it can be tested here."""
+        """The declared plan: the file's, with what of it can be tested here; written down before trials run."""
         tested = {question.claim.id: list(question.scenes) for question in self.questions if question.testable}
         return self.file.plan() | {"tested": tested}
 
@@ -148,11 +149,25 @@ def prepare(file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequenc
     return Check(file, runs, tuple(questions), first)
 
 
+class Looked(Protocol[T]):
+    """The subject of a look: questions, each with a claim, with their trials and verdicts at a number of seeds."""
+
+    @property
+    def questions(self) -> Sequence[Question]: ...
+
+    @property
+    def looks(self) -> Sequence[int]: ...
+
+    def trials(self, questions: Sequence[Question], seeds: int) -> list[T]: ...
+
+    def verdicts(self, declared: DeclaredPlan) -> list[Verdict]: ...
+
+
 def run_looks(
-    check: Check,
+    check: Looked[T],
     declared: DeclaredPlan,
-    run: Callable[[Sequence[Composed]], object],
-    ready: Callable[[Composed], bool] = lambda trial: False,
+    run: Callable[[Sequence[T]], object],
+    ready: Callable[[T], bool] = lambda trial: False,
 ) -> list[Verdict]:
     """Add seeds in the planned looks until every claim is decided; ``run`` runs what is not ``ready`` yet.
 

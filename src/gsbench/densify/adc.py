@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
@@ -11,19 +12,19 @@ from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import Refinement, Rule
+from gsbench.densify.base import NEVER, Refinement, Rule
 from gsbench.densify.budget import admit
 from gsbench.densify.budgeted import Budgeted
 from gsbench.densify.operations import revised_logits
 from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import OpenFraction
+from gsbench.settings import OpenFraction, Switch
 
 LOCKED_ROUNDS = 5  # after an opacity reset the governor does not raise the cull; our choice
 
 
 class Grown(NamedTuple):
-    """What a Gaussian becomes in a round, before pruning."""
+    """Outcomes of a Gaussian in a round, before pruning."""
 
     number: Tensor  # [N]
     log_scales: Tensor  # [N, 3]
@@ -42,6 +43,14 @@ class ADC(Budgeted):
         "gradient_sum": torch.float32,  # NDC, since the last refinement
         "visible_count": torch.int32,  # iterations
         "max_radii": torch.int32,  # px
+    }
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "opacity_reset": Switch(
+            {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
+        ),
+        "absolute_gradient": Switch({"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"),
+        "revised_opacity": Switch({"revised_opacity": False}, "children that share their parent's opacity"),
     }
 
     gradient: Literal["signed", "absolute"] = "signed"  # absolute: AbsGS, arXiv 2404.10484
@@ -107,14 +116,14 @@ class ADC(Budgeted):
         return mean >= limit if self.threshold_inclusive else mean > limit
 
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
-        """Those of the ``candidates`` [N] that the budget admits, and how many it refuses: the largest mean gradients.
+        """Choose the ``candidates`` [N] of the largest mean gradients that the budget admits, and count the refused.
 
         Each adds ``gain`` Gaussians.
         """
         return admit(candidates, self.mean_gradient(), gain, self.allowance(refinement))
 
     def grown(self, refinement: Refinement) -> Grown:
-        """What growth would make of each Gaussian."""
+        """The outcome of growth for each Gaussian."""
         values = refinement.gaussians.values
         over, large = self.candidates(refinement)
         logits = torch.where(over, revised_logits(values.opacity_logits), values.opacity_logits)
@@ -161,7 +170,7 @@ class ADC(Budgeted):
         return huge
 
     def may_cull(self, step: int) -> bool:
-        """Not in the first rounds after an opacity reset."""
+        """Return whether pruning is due: not in the first rounds after an opacity reset."""
         since_reset = step % self.opacity_reset_interval
         return step <= self.opacity_reset_interval or not 0 < since_reset <= LOCKED_ROUNDS * self.interval
 

@@ -3,7 +3,7 @@ did."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -17,14 +17,15 @@ from gsbench.events import Cause, RefineEvent
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import check_settings
+from gsbench.settings import Switch, check_settings
 
 CPU = torch.device("cpu")
+NEVER = 10**9  # an iteration, or an interval, beyond any training
 
 
 @dataclass(frozen=True)
 class DensifyContext:
-    """What a densifier knows of the training that it serves."""
+    """Facts of a training that its densifier is given."""
 
     extent: float  # world units: 3DGS's cameras_extent
     white_background: bool = False
@@ -58,7 +59,7 @@ class Densifier:
     A subclass is a dataclass of hyper-parameters, whose annotations say what is allowed. In every iteration the trainer
     calls ``regularizer`` before the backward pass, ``observe`` after it, then ``refine``, then the optimiser step, then
     ``after_step``. A subclass says what happens by ``rules``, and what it gathers by ``STATISTICS``, besides those of
-    its own base.
+    its own base; and which of its parts can be taken out by ``SWITCHES``, for ``gsbench ablate``.
 
     State: ``context``; ``lineage``; and ``statistics``, one tensor [N] for each name in ``STATISTICS``, zero at the
     start. They follow every ``edit`` (the new have zero), are saved, and are on the device of the Gaussians.
@@ -91,6 +92,7 @@ class Densifier:
     """
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {}
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {}
     needs_absolute_gradient: bool = False
     needs_footprint: bool = False  # ``RenderOutput.footprint``, which not every rasterizer gives
 
@@ -111,7 +113,7 @@ class Densifier:
 
     @property
     def most_gaussians(self) -> int | None:
-        """How many Gaussians there may be at any time, by ``max_gaussians`` where a class has that; None: no limit."""
+        """The limit on the number of Gaussians, ``max_gaussians`` where a class has that; None: no limit."""
         return getattr(self, "max_gaussians", None)
 
     def prepare(self, gaussians: Gaussians) -> Gaussians:
@@ -132,7 +134,7 @@ class Densifier:
         """Gather statistics of iteration ``step`` (1, 2, …) after its backward pass."""
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """What is due at ``refinement.step``, in the order in which it is done; usually nothing."""
+        """The rules that are due at ``refinement.step``, in the order in which they are applied; usually none."""
         return []
 
     @torch.no_grad()
@@ -148,7 +150,7 @@ class Densifier:
         return refinement.event
 
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
-        """Called after the optimiser step of iteration ``step``."""
+        """React to the optimiser step of iteration ``step``, which has just been made."""
 
     def edit(
         self,

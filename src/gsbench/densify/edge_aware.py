@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from pydantic import PositiveFloat, PositiveInt
@@ -17,7 +18,7 @@ from gsbench.densify.operations import quantile
 from gsbench.densify.scores import by_mean, draw, draw_views, edge_scores
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import Fraction, OpenFraction
+from gsbench.settings import Fraction, OpenFraction, Switch
 
 # The authors' code has iterations, rounds being 100 apart and opacity resets 3,000; here these are rounds and resets.
 CLOSING_ROUNDS = 5  # before the end of the window cap=root has reached its budget, and the score is the gradient
@@ -41,6 +42,13 @@ class EdgeAware(LongAxis):
     gathered within the window only.
     """
 
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "absolute_gradient": Switch({"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"),
+        "fading": Switch({"opacity_factor": 1.0}, "children fainter than their parent"),
+        "early_prune": Switch({"early_prune_opacity": 0.0}, "the pruning of the faint before the first round"),
+        "recovery_prune": Switch({"recovery_share": 0.0}, "the pruning of what did not recover from an opacity reset"),
+    }
+
     gradient: Literal["signed", "absolute"] = "absolute"
     gradient_threshold: PositiveFloat = 3e-4
     score_views: PositiveInt = 10
@@ -55,7 +63,7 @@ class EdgeAware(LongAxis):
             super().observe(step, render)
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """Those of ADC, and the prunings around them."""
+        """The rules of ADC, and the prunings around them."""
         step, rules = refinement.step, super().rules(refinement)
         if self.prune in rules and step >= self.stop - self.interval:
             rules.remove(self.prune)
@@ -66,12 +74,12 @@ class EdgeAware(LongAxis):
         return rules
 
     def rounds_after_reset(self, step: int) -> float:
-        """How many rounds ago opacities were reset (or training began), while that counts; else infinity."""
+        """The number of rounds since opacities were reset (or training began), while that counts; else infinity."""
         counts = step < RESETS * self.opacity_reset_interval
         return step % self.opacity_reset_interval / self.interval if counts else math.inf
 
     def closing(self, step: int) -> bool:
-        """Whether ``step`` is in the closing rounds."""
+        """Return whether ``step`` is in the closing rounds."""
         return step > self.stop - CLOSING_ROUNDS * self.interval
 
     def allowance(self, refinement: Refinement) -> int | None:
@@ -101,7 +109,7 @@ class EdgeAware(LongAxis):
         return chosen, count - int(chosen.sum())
 
     def scores(self, gaussians: Gaussians, step: int, rng: torch.Generator) -> Tensor:
-        """By which candidates are drawn, [N]."""
+        """The scores by which candidates are drawn, [N]."""
         if self.closing(step):
             return self.mean_gradient()
         views = self.context.training_views
@@ -109,7 +117,7 @@ class EdgeAware(LongAxis):
         return edge_scores(views, draw_views(views, count, rng), gaussians, step, by_mean)
 
     def huge(self, step: int, log_scales: Tensor) -> Tensor:
-        """Nobody, [N]: these authors do not prune by size."""
+        """A mask [N] without any Gaussian: these authors do not prune by size."""
         return torch.zeros_like(log_scales[:, 0], dtype=torch.bool)
 
     def prune_early(self, refinement: Refinement) -> None:

@@ -1,9 +1,9 @@
-"""ResGS: who is to grow stays, fainter, and gets a smaller child; thresholds follow a level."""
+"""ResGS: a Gaussian that grows stays, fainter, and gets a smaller child; thresholds follow a level."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
@@ -18,7 +18,7 @@ from gsbench.densify.operations import faded
 from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import OpenFraction
+from gsbench.settings import OpenFraction, Switch
 
 GATHER_ROUNDS = 2  # before the window's start gradients are gathered: 200 iterations in the authors' code
 
@@ -37,6 +37,12 @@ class ResGS(ADC):
     """
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"level": torch.int32}  # how many residual splits made a Gaussian
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "absolute_gradient": Switch({"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"),
+        "fading": Switch({"fade": 1.0}, "opacities that fade"),
+        "levels": Switch({"level_factor": 1.0}, "lower thresholds for whom earlier stages passed over"),
+    }
 
     gradient: Literal["signed", "absolute"] = "absolute"
     gradient_threshold: PositiveFloat = 6.7e-4
@@ -59,7 +65,7 @@ class ResGS(ADC):
         return self.start + round(fraction * (self.stop - self.start) / self.interval) * self.interval
 
     def warming_up(self, step: int) -> bool:
-        """Whether a phase has ended so shortly before that nothing is gathered yet."""
+        """Return whether a phase ended so shortly before that nothing is gathered yet."""
         length = self.iteration_at(self.warm_up) - self.start
         return any(0 < step - self.iteration_at(end) < length for end in self.phase_ends)
 
@@ -123,7 +129,7 @@ class ResGS(ADC):
         gaussians.overwrite("opacity_logits", fainter, where=parents)
 
     def huge(self, step: int, log_scales: Tensor) -> Tensor:
-        """Nobody, [N]: these authors do not prune by size."""
+        """A mask [N] without any Gaussian: these authors do not prune by size."""
         return torch.zeros_like(log_scales[:, 0], dtype=torch.bool)
 
     def reset_statistics(self, refinement: Refinement) -> None:

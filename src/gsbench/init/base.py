@@ -1,4 +1,4 @@
-"""What an initialiser is: capture in, a COLMAP model and a report out."""
+"""Contract of an initialiser: it takes a capture, and gives a COLMAP model and a report."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class PoseErrors:
 
 @dataclass(frozen=True)
 class Gauge:
-    """What a volume threshold in raw model units means in a model's unit of length.
+    """Volume threshold in raw model units, expressed in a model's unit of length.
 
     COLMAP scales each model as it likes, so one threshold selects different Gaussians in another model of a scene.
     """
@@ -111,7 +111,7 @@ class Gauge:
 
 @dataclass(frozen=True)
 class TrainingPoints:
-    """What is left of a cloud where test views have no say in it (``init.points_from``).
+    """Record of a cloud in which test views have no say (``init.points_from``): what is left of it.
 
     ``taken`` is the share of the ``of`` points that went (negative where more came); None where test photographs were
     never matched, so that nobody knows how many there would have been.
@@ -125,7 +125,7 @@ class TrainingPoints:
 
 @dataclass(frozen=True)
 class InitReport:
-    """What came out of an initialiser; `to_dict` is what ``report.json`` holds."""
+    """Results of an initialiser; `to_dict` is the content of ``report.json``."""
 
     init: str
     poses: str  # shared: the reference's; own: estimated here
@@ -160,7 +160,7 @@ class InitReport:
 
 @dataclass(frozen=True)
 class Preparation:
-    """What was done before COLMAP: its time, its counts and settings for the report, and what deserves a warning."""
+    """Preparation before COLMAP: its time, its counts and settings for the report, and what deserves a warning."""
 
     seconds: Mapping[str, float] = field(default_factory=dict)
     counts: Mapping[str, int] = field(default_factory=dict)
@@ -195,11 +195,11 @@ class Initializer(ABC):
     name: ClassVar[str]  # as reports call it
 
     def needs_reference(self, capture: Capture) -> bool:
-        """Whether `run` needs a ``reference`` model for this capture because it came without cameras."""
+        """Return whether `run` needs a ``reference`` model for this capture because it came without cameras."""
         return False
 
     def content(self) -> str | None:
-        """What the result depends on beside the options and the capture: the hash of a file that an option names."""
+        """The hashes of files that options name, on which the result depends beside the options and the capture."""
         return None
 
     @abstractmethod

@@ -37,7 +37,7 @@ def training_extent(model: pycolmap.Reconstruction, capture: Capture) -> float:
 
 
 def measure_gauge(extent: float, scale_to_reference: float | None) -> Gauge:
-    """What the paper's V_th is in a model with this scene extent."""
+    """Express the paper's V_th in a model with this scene extent."""
     radius = (3 * VOLUME_THRESHOLD / (4 * math.pi)) ** (1 / 3)
     return Gauge(
         scene_extent=extent,
@@ -126,7 +126,7 @@ def write_result(model: pycolmap.Reconstruction, report: InitReport, output_dir:
 
 
 def find_warnings(report: InitReport, model: pycolmap.Reconstruction) -> tuple[str, ...]:
-    """What in a model should make its reader doubt it, each in one line; that all images are placed is no proof."""
+    """List the reasons to doubt a model, each in one line; that all images are placed is no proof."""
     found = []
     if report.num_registered < REGISTERED_SHARE * report.num_images:
         missing = ", ".join(report.unregistered[:5]) + (" …" if len(report.unregistered) > 5 else "")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations
 from pathlib import Path
@@ -19,7 +19,7 @@ from gsbench.analysis.shares import Run, shapley
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, quantize, summarize
 from gsbench.eval.protocol import OTHERS, Protocol, get_protocol, protocol_of
-from gsbench.files import read_object, write_json
+from gsbench.files import write_json
 from gsbench.gaussians.model import MAX_SH_DEGREE
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER
@@ -27,6 +27,7 @@ from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs.layout import GROUND_TRUTH, POINT_CLOUD, PROTOCOLS, RENDERS, STORE, VIEWS
 from gsbench.runs.store import Store
+from gsbench.runs.translation_record import VERSION, Translation, Translations, made_of, read_translations
 from gsbench.runs.trial_files import read_config
 from gsbench.scene.images import read_image
 from gsbench.scene.load import load_scene
@@ -38,7 +39,6 @@ from gsbench.words import signed
 
 log = logging.getLogger(__name__)
 
-FILE_VERSION = 1
 SHARED_METRICS = ("psnr", "ssim")  # whose difference is shared; LPIPS by another network is another metric
 WITHOUT_EFFECT = {"psnr": ("SSIM padding",)}
 ROUNDING_TOLERANCE = 1  # 8-bit levels by which a render that is made again may differ from its file
@@ -49,7 +49,7 @@ Pictures = Mapping[str, Picture]  # by view
 
 @dataclass
 class Material:
-    """What a trial's test views are measured from, by view, [H, W, 3] each.
+    """The images that a trial's test views are measured from, by view, [H, W, 3] each.
 
     ``renders`` and ``photographs`` are those of the trial's files, ``exact`` the renders before rounding (float32, in
     [0, 1]), ``shrunk`` gives the photographs as a protocol shrinks them. The last two raise InputError for what cannot
@@ -62,28 +62,15 @@ class Material:
     shrunk: Callable[[Protocol], Pictures]
 
 
-@dataclass
-class Translation:
-    """A protocol's metrics of a trial, and the share of each convention in the difference to the trial's own.
-
-    ``unknown`` maps a convention that could not be followed to the reason in one line.
-    """
-
-    metrics: dict[str, float]
-    unavailable: dict[str, str]
-    shares: dict[str, dict[str, float]] = field(default_factory=dict)
-    unknown: dict[str, str] = field(default_factory=dict)
-
-
 def translate_trials(place: str, protocol: str | None, runs: Path) -> None:
     """Measure the trials of an experiment, or one trial, by ``protocol`` or all of `OTHERS`; keep and print it."""
     torch.set_num_threads(available_threads())
     trials = [find_trial(place, runs)] if ":" in place else list(load_experiment(runs, place).trials)
     wanted = list(OTHERS.values()) if protocol in (None, "all") else [get_protocol(str(protocol))]
     for trial in trials:
-        base = protocol_of(str(trial.data["protocol"]))
+        base = protocol_of(trial.record.protocol)
         if base is None:
-            raise InputError(f"{trial.label} was measured by {trial.data['protocol']}, which is not known here")
+            raise InputError(f"{trial.label} was measured by {trial.record.protocol}, which is not known here")
         material = material_of(trial, runs)
         found = {one.id: translate(material, base, one, _lpips_evaluator(trial)) for one in wanted}
         _keep(trial, found)
@@ -139,7 +126,12 @@ def translate(
     final = make(replace(protocol, eight_bit=protocol.eight_bit or exact is None))
     renders = material.renders if exact is None else exact
     per_view = {view: final.evaluate_view(render, photographs[view]) for view, render in renders.items()}
-    return Translation(summarize(per_view, final.unavailable), dict(final.unavailable), shares, unknown)
+    return Translation(
+        metrics=summarize(per_view, final.unavailable),
+        unavailable=dict(final.unavailable),
+        shares=shares,
+        unknown=unknown,
+    )
 
 
 def material_of(trial: TrialResult, runs: Path) -> Material:
@@ -261,13 +253,6 @@ def _lpips_evaluator(trial: TrialResult) -> Callable[[Protocol], Evaluator]:
 
 def _keep(trial: TrialResult, found: Mapping[str, Translation]) -> None:
     """Write what was found beside what the trial's folder has of other protocols, if that is of the same renders."""
-    made_of = trial.data.get("hashes", {}).get("evaluate") or trial.data.get("hashes", {}).get("config")
-    known = read_object(trial.path / PROTOCOLS)
-    protocols = known.get("protocols", {}) if known.get("made_of") == made_of else {}
-    protocols |= {
-        name: {
-            "metrics": one.metrics, "unavailable": one.unavailable, "shares": one.shares, "unknown": one.unknown,
-        }
-        for name, one in found.items()
-    }  # fmt: skip
-    write_json(trial.path / PROTOCOLS, {"version": FILE_VERSION, "made_of": made_of, "protocols": protocols})
+    known = read_translations(trial.path, trial.record)
+    kept = Translations(version=VERSION, made_of=made_of(trial.record), protocols=known | dict(found))
+    write_json(trial.path / PROTOCOLS, kept.to_json())

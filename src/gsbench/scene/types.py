@@ -1,4 +1,4 @@
-"""What a scene is: photographs on disk before initialisation, views with cameras after it."""
+"""Types of a scene: photographs on disk before initialisation, views with cameras after it."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ EVERY = "all"
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: 0 if every photograph was measured."""
+    """Run the verb: 0 if every photograph was measured."""
     options = _parser().parse_intermixed_args(argv)
     if options.protocol == EVERY or options.truth is None:
         from gsbench.renders.translate import translate_trials

@@ -117,7 +117,7 @@ def test_an_assumed_focal_length_is_known_and_verified_anew(tmp_path: Path) -> N
         assert opened.num_verified_image_pairs() == 36
 
 
-@pytest.mark.parametrize("mapper", ["auto", "global"])
+@pytest.mark.parametrize("mapper", [pytest.param("auto", marks=pytest.mark.slow), "global"])
 def test_copies_of_one_view_are_no_scene(tmp_path: Path, mapper: Mapper) -> None:
     """Without parallax every way must be refused, not believed."""
     database, _ = small_baseline(tmp_path, spread=0.0)

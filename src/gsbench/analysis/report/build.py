@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
@@ -12,7 +13,7 @@ from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.errors_by_region import read_image
 from gsbench.analysis.origins import cloud_lines
-from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs
+from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs, controls_of
 from gsbench.analysis.paper import inconsistencies, load_paper
 from gsbench.analysis.paper_tables import layout_of, paper_tables
 from gsbench.analysis.report.crops import data_uri
@@ -35,14 +36,29 @@ from gsbench.runs.layout import FIGURES
 from gsbench.words import signed
 
 
-def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
-    """The report as HTML, with every densifier held against ``baseline``; a pure function of the experiment's files."""
+@dataclass(frozen=True)
+class AblationPart:
+    """Descriptions of the runs in lines, and charts as SVG."""
+
+    lines: Sequence[str]
+    charts: Sequence[str]
+
+
+def build_report(
+    experiment: Experiment, baseline: str = BASELINE, looked: Sequence[str] = (), ablation: AblationPart | None = None
+) -> str:
+    """The report as HTML, with every densifier held against ``baseline``; a pure function of the experiment's files.
+
+    ``looked`` are the verdicts of a sweep that stopped when decided: they stand above those that take numbers of seeds
+    as fixed. ``ablation`` is what switching parts of a densifier off has shown.
+    """
     trials = with_variants(experiment.trials)
     arms = sorted({trial.arm for trial in trials})
     views = ViewCache()
     declared = standing(experiment.folder, trials)
     search = search_part(experiment.folder)
-    pairs = [] if search else choose_pairs(arms, baseline)  # among points that were chosen by results no test holds
+    # Among points of a search, which were chosen by results, no test holds.
+    pairs = [] if search else choose_pairs(arms, baseline, controls_of(trials))
     judged = judge(trials, pairs, views, declared)
     questions = question_part(trials, judged, views)
     versus = [compare_arms(trials, *pair, views, own) for pair, own in judged.items()]
@@ -64,6 +80,8 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         versus=versus,
         declared=declared.sentences(quantity.name) if declared and quantity else [],
         families=families(list(judged.values())),
+        looked=looked,
+        ablation=ablation,
         tables=[to_html(table) for table in tables],
         contradictions=[] if layout is None else inconsistencies(load_paper()),
         search=search,
@@ -73,6 +91,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         gaps=tradeoff_gaps(trials, baseline),
         agreements=agreements(trials),
         arm_name=arm_name,
+        to_html=to_html,
         training=training_charts(trials, arms),
         events=event_charts(trials, arms),
         volumes=volumes,
@@ -86,14 +105,17 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
 
 
 def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
-    """(caption, data URI) of the pictures that trials left for the report; one seed of each scene and arm."""
-    found = []
+    """(caption, data URI) of the pictures that trials left for the report; one seed of each scene and arm.
+
+    A picture that several arms of a scene share, such as that of their initial cloud, is there once.
+    """
+    found: dict[tuple[str, str, str], list[str]] = {}  # by name, scene and picture: the arms and seeds
     for group in by_key(trials, lambda trial: (trial.scene, trial.arm)).values():
         trial = group[0]
         for path in sorted((trial.path / FIGURES).glob("*.png")):
-            caption = f"{path.stem.replace('_', ' ')}: {trial.scene}, {trial.init}-{trial.densify}, seed {trial.seed}"
-            found.append((caption, data_uri(read_image(path))))
-    return found
+            key = path.stem.replace("_", " "), trial.scene, data_uri(read_image(path))
+            found.setdefault(key, []).append(f"{trial.init}-{trial.densify}, seed {trial.seed}")
+    return [(f"{name}: {scene}, {'; '.join(arms)}", uri) for (name, scene, uri), arms in found.items()]
 
 
 def _resource(name: str) -> str:

@@ -17,7 +17,7 @@ FAMILY = ("init.name", "densify._target_")
 
 
 def sweep_charts(trials: Sequence[TrialResult]) -> list[str]:
-    """For each initialiser and class of densifier of which one setting was varied, a chart for each quantity.
+    """Draw a chart of each quantity for each initialiser and class of densifier of which one setting was varied.
 
     A line is a scene, relative to its own mean over the values, so that scenes of unlike levels share an axis and each
     scene's best value can be seen: a threshold in scene units need not suit all scenes. The baseline, which has no such

@@ -1,4 +1,4 @@
-"""From photographs and options to a reported COLMAP model. Calls native code that can abort: run it isolated."""
+"""Reconstruction of a reported COLMAP model from photographs. Calls native code that can abort: run it isolated."""
 
 from __future__ import annotations
 

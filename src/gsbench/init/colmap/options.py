@@ -28,7 +28,7 @@ MIN_DETECTION_SIZE = 32  # px: below it no detector finds anything
 
 @dataclass(frozen=True)
 class DatabaseTask:
-    """What is to be filled: the database with cameras and images in it, and the pairs of images to be matched.
+    """Database to be filled, with cameras and images in it, and the pairs of images to be matched.
 
     ``images`` is a folder with the same names as the capture's in which COLMAP can read every file.
     """
@@ -92,7 +92,7 @@ class ColmapOptions(ABC):
 
     @property
     def takes_reference_cameras(self) -> bool:
-        """Whether the cameras (intrinsics at least) are the reference's where there is one."""
+        """Return whether the cameras (intrinsics at least) are the reference's where there is one."""
         return self.poses == "shared" or self.intrinsics == "reference"
 
     def select_images(self, capture: Capture, reference: pycolmap.Reconstruction | None) -> list[str]:
@@ -104,5 +104,5 @@ class ColmapOptions(ABC):
         return [name for name in names if name not in test]
 
     def leaves_out(self, reference: pycolmap.Reconstruction | None) -> bool:
-        """Whether test photographs are not even looked at: nothing of them is needed where the cameras are given."""
+        """Return whether test photographs are not even looked at, which are not needed where the cameras are given."""
         return self.points_from != "all" and self.poses == "shared" and reference is not None

@@ -1,4 +1,4 @@
-"""From a database of verified matches to a model: cameras and points, or points under known cameras.
+"""Reconstruction from a database of verified matches: cameras and points, or points under known cameras.
 
 Everything here calls native code that can abort the process: run it isolated.
 """
@@ -41,7 +41,7 @@ class Verification:
     min_inlier_ratio: float = 0.0  # … and as a share of all of the pair
 
     def options(self) -> pycolmap.TwoViewGeometryOptions:
-        """As COLMAP takes them."""
+        """The options in COLMAP's own type."""
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = self.seed
         options.min_num_inliers = self.min_inliers
@@ -51,7 +51,7 @@ class Verification:
 
 @dataclass(frozen=True)
 class MappingSettings:
-    """How COLMAP's mapper and triangulator run; see the fields of `gsbench.init.Sfm`."""
+    """Settings of COLMAP's mapper and triangulator; see the fields of `gsbench.init.Sfm`."""
 
     seed: int
     threads: int

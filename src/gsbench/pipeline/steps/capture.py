@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.logs import progress
+from gsbench.pipeline.steps.code import step_of_code
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.stages import CAPTURE
 from gsbench.runs.step import Step
@@ -27,7 +28,7 @@ def capture_step(options: SceneConfig) -> Step | None:
         with progress("scene") as report:
             render_courtyard(folder, progress=report, **inputs)
 
-    return Step(CAPTURE, inputs, build)
+    return step_of_code(CAPTURE, inputs, build, __name__)
 
 
 def read_capture(options: SceneConfig, made: Path | None) -> Capture:
