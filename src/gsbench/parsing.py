@@ -109,7 +109,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def parse_yaml(content: bytes, path: Path) -> Any:
-    """What YAML says; raises DamagedError for what is none, or has values that `fault_of` names.
+    """Parse YAML; raises DamagedError for what is none, or has values that `fault_of` names.
 
     Numbers need not be finite: YAML is what users set, and a class may have an infinite default.
     """
@@ -147,7 +147,7 @@ def _danger_in_yaml(text: str) -> str:
 
 
 def fault_of(value: Any, most: int | None = None, infinite: bool = False) -> str:
-    """Why ``value`` is not plain, "" where it is: keys are texts or integers, levels at most `MOST_DEPTH`.
+    """The reason why ``value`` is not plain, "" where it is: keys are texts or integers, levels at most `MOST_DEPTH`.
 
     ``most`` is how many values it may have, an alias of YAML counted as often as it stands there. Numbers are finite
     unless ``infinite``.

@@ -76,7 +76,7 @@ def adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 def misfit(error: ValidationError) -> str:
-    """What is wrong with a file, in words: ``is damaged: metrics.psnr is '27' (input should be a valid number)``."""
+    """Describe the fault of a file: ``is damaged: metrics.psnr is '27' (input should be a valid number)``."""
     first: ErrorDetails = error.errors(include_url=False)[0]
     key, kind = ".".join(str(part) for part in first["loc"]), first["type"]
     if kind == "json_invalid":

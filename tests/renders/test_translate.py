@@ -184,6 +184,7 @@ def test_what_was_measured_of_other_renders_is_not_shown(home: Path) -> None:
         (["renders"], "--truth is not given"),
         (["small", "--protocol", "all", "--truth", "small:courtyard:none"], "take no --truth"),
         (["small", "--protocol", "all", "eval.flip=true"], "as they were made"),
+        (["renders", "--protocol", "gsplat", "--truth", "small:courtyard:none"], "with --as EXPERIMENT:ARM, then"),
     ],
 )
 def test_wrong_words_are_refused(

@@ -81,7 +81,7 @@ def choose_pairs(
 
 
 def controls_of(trials: Sequence[TrialResult]) -> dict[str, str]:
-    """By densifier, the other one that the trials' settings name as its control (``eval.controls``)."""
+    """The control of each densifier, another one that the trials' settings name (``eval.controls``)."""
     firsts = [group[0] for group in by_key(trials, lambda trial: trial.arm).values()]
     return {
         key.removeprefix(CONTROLS): str(value)

@@ -1,4 +1,4 @@
-"""How likely a test sees a difference of a given size, and how many seeds that takes."""
+"""Power of a test: its chance to see a difference of a given size, and the seeds that this takes."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ def find_turns(trials: Sequence[TrialResult], judged: Mapping[Pair, ArmVerdicts]
 
 
 def find_gaps(trials: Sequence[TrialResult]) -> list[Gap]:
-    """For each arm with trials of both questions: how far it falls from interpolation to extrapolation."""
+    """The fall of each arm with trials of both questions, from interpolation to extrapolation."""
     bases = without_split(trials)
     groups: dict[Arm, dict[str, list[TrialResult]]] = {}
     for trial in trials:

@@ -84,7 +84,7 @@ class SceneComparison:
 
 @dataclass(frozen=True)
 class BeyondScenes:
-    """Whether what was found holds for scenes like these: the same mean, tested with scenes as units.
+    """Test of whether the finding holds for scenes like these: the same mean, with scenes as units.
 
     ``p`` is the larger one of that test and of the one about these scenes, since the narrower statement must hold
     first; ``p_family`` is adjusted for the family, and ``holds`` where it is below 5 %.
@@ -258,7 +258,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 
 def holm_factors(p_values: Iterable[float | None]) -> list[float | None]:
-    """By what Holm's method (1979) multiplies each p, at least 1; None for None, which is not counted.
+    """The factor by which Holm's method (1979) multiplies each p, at least 1; None for None, which is not counted.
 
     The smallest of m by m, the next by m - 1, and so on, but none below the one before it.
     """

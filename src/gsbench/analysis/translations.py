@@ -35,7 +35,7 @@ def _translated(trial: TrialResult, wanted: str) -> TrialResult:
 
 
 def translation_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """For trials by another protocol: what of the difference each convention makes, and what could not be followed."""
+    """Explain trials by another protocol: what each convention adds to the difference, and what was not followed."""
     shares: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     unknown: dict[str, str] = {}
     translated = [trial for trial in trials if trial.translated_from]

@@ -1,4 +1,4 @@
-"""What was tuned before or beside a comparison, as far as files tell: by which metric, on which views."""
+"""Tuning before or beside a comparison, as far as files tell: by which metric, on which views."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NOTHING = "No tuning is recorded: one choice of settings an arm was run here. Wh
 
 
 def tuning_lines(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[str]:
-    """For each arm of a pair: which of its settings were tried at several values in these trials, and in searches.
+    """List, for each arm of a pair, the settings that were tried at several values in these trials, and in searches.
 
     Every such choice was seen on the held-out views, which judge the verdict as well, unless somebody kept it apart.
     """

@@ -1,4 +1,4 @@
-"""Which kernel of a step takes how long."""
+"""Times of a step by kernel."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _profiled(times: Counter[str]) -> Iterator[None]:
         yield
         torch.cuda.synchronize()
     for event in profile.events() or ():
-        if event.device_type == torch.autograd.DeviceType.CUDA:
+        if str(event.device_type) == "DeviceType.CUDA":
             times[short_name(event.name)] += event.time_range.elapsed_us() / 1e3
 
 

@@ -25,13 +25,12 @@ from gsbench.claims.verdict import Pair, PairKey, Verdict, judge_claim
 from gsbench.config.compose import Composed
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find
-from gsbench.runs.declaration import DeclaredPlan, read_plans
+from gsbench.runs.declaration import STOPPING, DeclaredPlan, read_plans
 from gsbench.runs.hashing import flatten, sha256_of
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted
 
-STOPPING = "stopping"  # the key of such a plan in the record of declarations
 SEED = "-seed"  # in the name of a trial's folder, before the seed
 
 
@@ -83,11 +82,11 @@ class SweepPlan:
         return plan_looks(len(self.seeds))
 
     def design(self, claim: Claim, scenes: int, sharing: int) -> Design:
-        """As a file of claims has it."""
+        """The design of a pair's looks, as a file of claims has it."""
         return Design(scenes, self.looks, self.error_rate / sharing)
 
     def claim(self, pair: PlannedPair) -> Claim:
-        """What the pair is asked: whether its arm is better."""
+        """The question that the pair is asked: whether its arm is better."""
         return Claim(
             id=f"{pair.arm} against {pair.baseline}",
             says=f"{pair.arm} is better than {pair.baseline}",
@@ -101,7 +100,7 @@ class SweepPlan:
         )
 
     def verdicts(self, home: Path, declared: DeclaredPlan) -> list[Verdict]:
-        """Of every pair, from the trials of the experiment in ``home`` that are done."""
+        """Verdicts of every pair, from the trials of the experiment in ``home`` that are done."""
         trials = read_experiment(home).trials if home.is_dir() else ()
         by_folder = {trial.path.relative_to(home).as_posix(): trial for trial in trials}
         return [
@@ -159,7 +158,7 @@ class Stopping(Generic[T]):
         return self.plan.verdicts(self.home, declared)
 
     def describe(self) -> str:
-        """What a dry run says of the looks."""
+        """Lines that a dry run prints of the looks."""
         first, most = (len(self.trials(self.questions, seeds)) for seeds in (self.looks[0], self.looks[-1]))
         pairs, looks = counted(len(self.plan.pairs), "pair"), ", ".join(map(str, self.looks))
         return (

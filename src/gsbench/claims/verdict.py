@@ -30,7 +30,7 @@ Pair = tuple[TrialResult, TrialResult]  # baseline, arm
 
 
 class Planner(Protocol):
-    """What plans the looks at a claim: a file of claims, or a sweep."""
+    """Planner of the looks at a claim: a file of claims, or a sweep."""
 
     def design(self, claim: Claim, scenes: int, sharing: int) -> Design: ...
 
@@ -40,8 +40,8 @@ class Verdict:
     """One claim's verdict.
 
     ``decision`` is None where nothing could be tested, as where the arms are one and the same at this size.
-    ``baselines`` is the baseline's mean in the measure's own unit.
-    ``trials`` are those that the decision rests on, pair by pair; ``notes`` say what was left out and why.
+    ``baseline`` is the baseline's mean in the measure's own unit. ``trials`` are those that the decision rests on,
+    pair by pair; ``notes`` say what was left out and why.
     ``beforehand``: none of them was measured before the plan was declared.
     """
 

@@ -111,7 +111,7 @@ class Gauge:
 
 @dataclass(frozen=True)
 class TrainingPoints:
-    """What is left of a cloud where test views have no say in it (``init.points_from``).
+    """Record of a cloud in which test views have no say (``init.points_from``): what is left of it.
 
     ``taken`` is the share of the ``of`` points that went (negative where more came); None where test photographs were
     never matched, so that nobody knows how many there would have been.

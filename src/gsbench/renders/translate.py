@@ -49,7 +49,7 @@ Pictures = Mapping[str, Picture]  # by view
 
 @dataclass
 class Material:
-    """What a trial's test views are measured from, by view, [H, W, 3] each.
+    """The images that a trial's test views are measured from, by view, [H, W, 3] each.
 
     ``renders`` and ``photographs`` are those of the trial's files, ``exact`` the renders before rounding (float32, in
     [0, 1]), ``shrunk`` gives the photographs as a protocol shrinks them. The last two raise InputError for what cannot

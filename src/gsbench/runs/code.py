@@ -1,4 +1,4 @@
-"""Which state of gsbench's own code makes a result: a digest of each file that has a part in it. Loads no torch.
+"""State of gsbench's own code behind a result: a digest of each file that has a part in it. Loads no torch.
 
 A file's digest is of its syntax: comments, docstrings and layout have no part in it. Where all files are as in a
 release (``released.json``), the versions of the stages stand for them, which are bumped by hand.
@@ -28,15 +28,15 @@ PACKAGE = Path(__file__).resolve().parents[1]
 RELEASED = "released.json"  # in the package: the digests of all files as they were released
 AS_RELEASED = "released"  # the state of a file that is
 DIGEST_CHARACTERS = 16
-# What makes no number: what is said and shown, how processes run, where files lie. What `config` and `settings` make of
-# the user's words is in the keys as it is.
+# Parts that make no number: what is said and shown, how processes run, where files lie. What `config` and `settings`
+# make of the user's words is in the keys as it is.
 WITHOUT_PART = frozenset(
     """
     analysis app bench claims cli config datasets errors launch logs parsing records renders runs settings system
     tracking verbs view words
     """.split()  # noqa: SIM905 - words are easier to read than a list of quoted ones
 )
-# What puts a trial together: a part in each, and followed no further, since it knows parts of every kind.
+# Modules that put a trial together: a part in each, and followed no further, since they know parts of every kind.
 WIRING = tuple(f"pipeline/{name}.py" for name in ("components", "parts", "results", "trial", "wiring"))
 
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
@@ -80,19 +80,19 @@ def files_of(roots: Iterable[tuple[str, str | None]]) -> dict[str, str]:
 
 
 def edited(files: Mapping[str, str]) -> dict[str, str]:
-    """Those of ``files`` that are not as released."""
+    """List the ``files`` that are not as released."""
     return {file: state for file, state in files.items() if state != AS_RELEASED}
 
 
 def changed_files(recorded: Mapping[str, str]) -> list[str]:
-    """Those files whose state is no longer the recorded one."""
+    """List the files whose state is no longer the recorded one."""
     changed = [file for file, state in recorded.items() if state_of(file) != state]
     _keep_digests()
     return changed
 
 
 def changed_while_running(files: Iterable[str], in_processes: bool) -> list[str]:
-    """Those of ``files`` that may have been run in another state than was noted: they were edited and loaded later.
+    """List the ``files`` that may have run in another state than was noted: they were edited and loaded later.
 
     With ``in_processes``, the work was done in processes of their own, which load all anew.
     """

@@ -1,4 +1,4 @@
-"""What a Python file imports, read from its text: nothing is run, and an import that waits in a function counts too."""
+"""Imports of a Python file, read from its text: nothing is run, and an import that waits in a function counts too."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 BY_NAME = frozenset({"import_module", "__import__"})  # called with the name of a module
-# What else makes code run that no import statement names; `attach` is lazy_loader's.
+# Functions that make code run which no import statement names; `attach` is lazy_loader's.
 BY_OTHER_MEANS = frozenset(
     """
     exec run_path run_module spec_from_file_location spec_from_loader module_from_spec SourceFileLoader load_module

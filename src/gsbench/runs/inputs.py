@@ -29,8 +29,9 @@ Stamp = tuple[int, int]  # size in bytes, time of change in ns
 
 @dataclass(frozen=True, kw_only=True)
 class Promise(Part):
-    """What the files that tables and reports read must still be: the hash of the results as canonical JSON, and the
-    sha256 of files by name."""
+    """Required state of the files that tables and reports read: the hash of the results as canonical JSON, and the
+    sha256 of files by name.
+    """
 
     version: int
     results: str

@@ -1,4 +1,4 @@
-"""Which version of a user's own code made a result: the hash of the files that a class needs. Loads no torch.
+"""Version of a user's own code behind a result: the hash of the files that a class needs. Loads no torch.
 
 These are the file that defines the class, the packages it is in, and what they import of the user's own, at any
 remove: what lies in their package or beside it, what ``allow_targets`` names, and what Python finds outside its own
@@ -56,13 +56,13 @@ def source_of(target: str) -> dict[str, str]:
 
 
 def has_changed_since_import(target: str) -> bool:
-    """Whether the files of a class are no longer those that this process has imported, and therefore runs."""
+    """Return whether the files of a class are no longer those that this process has imported, and therefore runs."""
     source = source_of(target)
     return bool(source) and _Reach(target, as_imported=False).digest() != source["source"]
 
 
 def gsbench_imports(target: str) -> list[tuple[str, str | None]]:
-    """What the files of a user's class import of gsbench: modules, and what is taken of each."""
+    """The imports of gsbench in the files of a user's class: modules, and what is taken of each."""
     return sorted(_Reach(target).of_gsbench, key=str)
 
 

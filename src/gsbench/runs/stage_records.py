@@ -1,4 +1,4 @@
-"""What the stages leave in the store beside their files: ``training.json`` and ``metrics.json``."""
+"""Records that stages leave in the store beside their files: ``training.json`` and ``metrics.json``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsbench.runs.trial_record import Earlier, Iteration, MetricRecord, Trainer
 
 @dataclass(frozen=True, kw_only=True)
 class Training(Part):
-    """What a training took and gave; of another program's, ``trained_by`` and ``evaluated_from`` are set."""
+    """Record of what a training took and gave; of another program's, ``trained_by`` and ``evaluated_from`` are set."""
 
     iterations: Count
     num_init_points: Count

@@ -32,7 +32,7 @@ class Named(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class Tracked(Part):
-    """What mirroring a trial later needs of the group ``tracking``."""
+    """Settings of the group ``tracking`` that mirroring a trial later needs."""
 
     uri: str | None
     flush_seconds: Amount
@@ -42,7 +42,7 @@ class Tracked(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class Configured(Part):
-    """What a trial's ``config.yaml`` must have before anything is made of it; `gsbench.config.schema` has the rest."""
+    """Keys that a trial's ``config.yaml`` must have to be used at all; `gsbench.config.schema` has the rest."""
 
     name: FolderName
     seed: Count
@@ -57,7 +57,7 @@ class Configured(Part):
 class Failure(Part):
     """``failed.json``: the kind of the error, its text, where it came from, and when (Unix time)."""
 
-    error: str
+    error: str = ""
     message: str = ""
     traceback: str = field(default="", repr=False)
     time: Amount = 0.0
@@ -65,7 +65,7 @@ class Failure(Part):
 
     @property
     def reason(self) -> str:
-        """In one line."""
+        """The failure in one line."""
         return one_line(self.message or self.error) or "no reason was given"
 
 
@@ -141,7 +141,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def failure_of(folder: Path) -> str:
-    """Why a trial failed, in one line."""
+    """The reason why a trial failed, in one line."""
     try:
         return read_typed(folder / FAILED, Failure).reason
     except (FileNotFoundError, DamagedError):

@@ -1,4 +1,4 @@
-"""What ``results.json`` of a finished trial holds: its writers fill this record, its readers are given it."""
+"""Content of a finished trial's ``results.json``: its writers fill this record, its readers are given it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Iteration = Annotated[str, Field(pattern=r"^\d{1,18}$")]  # as the key of an obj
 
 @dataclass(frozen=True, kw_only=True)
 class Budget(Part):
-    """What held the growth back: a cap on Gaussians, the rule that keeps it, a limit of time in s."""
+    """Limits on the growth of a trial: a cap on Gaussians, the rule that keeps it, a limit of time in s."""
 
     max_gaussians: Count | None = None
     cap: str | None = None
@@ -44,7 +44,7 @@ class Code(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class MetricRecord(Part):
-    """How a user's own metric is to be read; see `gsbench.eval.facts`."""
+    """Facts of a user's own metric; see `gsbench.eval.facts`."""
 
     label: str
     direction: Literal[-1, 0, 1] = 0
@@ -149,5 +149,5 @@ def record_from(content: bytes, path: Path) -> TrialRecord:
 
 
 def results_text(record: TrialRecord) -> str:
-    """What is written into ``results.json``."""
+    """The content of ``results.json``."""
     return json.dumps(record.to_json(), indent=1, allow_nan=False) + "\n"

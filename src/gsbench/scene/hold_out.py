@@ -18,7 +18,7 @@ Cameras = Callable[[Sequence[str]], Sequence[Camera]]
 
 @dataclass(frozen=True)
 class HeldOut:
-    """What a rule does with sorted names; ``words`` say how, ``put_away`` are test views that are not looked at."""
+    """Result of a rule on sorted names; ``words`` say how, ``put_away`` are test views that are not looked at."""
 
     train: tuple[str, ...]
     test: tuple[str, ...]

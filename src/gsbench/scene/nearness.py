@@ -1,4 +1,4 @@
-"""How far views are from those that a model was trained on: an error grows with that, whoever made the model."""
+"""Distances of views from those that a model was trained on: an error grows with that, whoever made the model."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def axis_angles(axes: Array, others: Array) -> Array:
 
 
 def nearness(cameras: Sequence[Camera], training: Sequence[Camera], extent: float) -> list[dict[str, float]]:
-    """How far each of ``cameras`` is from the training cameras: from the nearest in angle and the nearest in place.
+    """Measure how far each of ``cameras`` is from the training cameras: the nearest in angle and the nearest in place.
 
     ``angle_to_nearest`` is the least angle between its viewing direction and that of a training camera, in degrees;
     ``distance_to_nearest`` the least distance between their centres, in scene extents (not given where that is 0).

@@ -58,5 +58,5 @@ class SceneConfig:
 
     @property
     def split_rule(self) -> SplitRule:
-        """What is held out."""
+        """The split: the settings of what is held out."""
         return SplitRule(**{entry.name: getattr(self, entry.name) for entry in fields(SplitRule)})

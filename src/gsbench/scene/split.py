@@ -1,4 +1,4 @@
-"""What is held out of a capture, as settings; `gsbench.scene.hold_out` does it. Loads nothing."""
+"""Settings of what is held out of a capture; `gsbench.scene.hold_out` does it. Loads nothing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TRAIN_LIST, TEST_LIST = "train_list.txt", "test_list.txt"  # the names that nerf
 
 @dataclass(frozen=True)
 class SplitRule:
-    """How views are held out; the fields are those of `gsbench.scene.options.SceneConfig`.
+    """Settings of holding views out; the fields are those of `gsbench.scene.options.SceneConfig`.
 
     ``every_nth``: every ``test_every``-th name, from the first. ``sector``: part ``sector`` of ``sectors`` contiguous
     ones (`gsbench.scene.sectors.arrange`). ``list``: as the lists say. With ``match_views`` the first two hold out

@@ -85,7 +85,7 @@ def is_held(path: Path) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Holder(Part):
-    """What the holder of a lock writes about itself: host, process, Slurm job, since when (Unix time), at what work."""
+    """Record that a lock's holder writes of itself: host, process, Slurm job, time of start (Unix), its work."""
 
     host: str
     pid: int
@@ -100,7 +100,7 @@ class Holder(Part):
 
 
 def read_holder(path: Path) -> Holder | None:
-    """What the holder of the lock ``path`` wrote about itself; None where nothing can be read."""
+    """Read what the holder of the lock ``path`` wrote about itself; None where nothing can be read."""
     try:
         return read_typed(_holder_file(path), Holder)
     except (FileNotFoundError, DamagedError):

@@ -12,8 +12,9 @@ from gsbench.records import Count, Part, read_typed
 
 @dataclass(frozen=True, kw_only=True)
 class MirrorState(Part):
-    """What any sink keeps: ``complete`` is the hash of the results that it shows, ``logged`` the newest iteration by
-    file; the rest says which run it is, in the sink's own words."""
+    """State that any sink keeps: ``complete`` is the hash of the results that it shows, ``logged`` the newest iteration
+    by file; the rest says which run it is, in the sink's own words.
+    """
 
     complete: str | None = None
     logged: dict[str, Count] = field(default_factory=dict)
@@ -29,7 +30,7 @@ class MirrorState(Part):
 
 
 def read_state(file: Path) -> dict[str, Any]:
-    """What stands in ``file``; empty, as if nothing were mirrored yet, where it is absent or damaged."""
+    """Read the state in ``file``; empty, as if nothing were mirrored yet, where it is absent or damaged."""
     try:
         state = read_typed(file, MirrorState)
     except (FileNotFoundError, DamagedError):

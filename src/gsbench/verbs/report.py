@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -33,6 +34,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
     if options.baseline is not None and options.baseline not in densifiers:
         raise InputError(f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}")
     file = experiment.folder / REPORT_NAME if options.out is None else file_at(options.out, experiment.name)
+    for warning in experiment.warnings:
+        print(f"left out: {warning}", file=sys.stderr)
     looked = [headline(verdict) for verdict in standing_verdicts(experiment.folder)]
     text = build_report(experiment, options.baseline or BASELINE, looked, ablation_part(experiment.folder))
     try:

@@ -36,7 +36,7 @@ def headline(judged: ArmVerdicts, first: Arm, second: Arm) -> str:
 
 
 def secondary(judged: ArmVerdicts) -> str:
-    """What the secondary metrics show, where one was declared and they can be decided."""
+    """Headlines of the secondary metrics, where one was declared and they can be decided."""
     others = [verdict for verdict in judged.verdicts if verdict.role == "secondary"]
     decidable = any(verdict.comparison.p is not None for verdict in others)
     return f"Secondary, adjusted for their number: {_in_words(others)}." if decidable else ""
@@ -69,7 +69,7 @@ def _beyond(verdicts: Sequence[Verdict]) -> str:
 
 
 def by_scene_lines(verdicts: Sequence[Verdict]) -> list[str]:
-    """For each metric in which single scenes are decided (p below 5 %, adjusted), a line that names them.
+    """A line for each metric in which single scenes are decided (p below 5 %, adjusted), which names them.
 
     A mean over scenes that disagree hides both sides of what was found.
     """

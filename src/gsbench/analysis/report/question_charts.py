@@ -25,7 +25,7 @@ MOST_POINTS = 12  # of a line; more views are taken together in as many bins
 
 @dataclass(frozen=True)
 class QuestionPart:
-    """What the report shows; ``line`` is the answer in a sentence, empty where one question alone was asked."""
+    """Part of the report on questions; ``line`` is the answer, empty where one question alone was asked."""
 
     line: str
     turned: tuple[str, ...]
@@ -47,7 +47,7 @@ def question_part(
 
 
 def angle_charts(trials: Sequence[TrialResult], views: ViewCache) -> list[str]:
-    """For each scene and main metric: the value of test views over their angle to the nearest training view, by arm."""
+    """Draw, by scene and main metric, the test views' values over their angle to the nearest training view, by arm."""
     arms, charts = without_split(trials), []
     for scene, group in sorted(by_key(trials, lambda trial: trial.scene).items()):
         for metric in main_metrics(group):
@@ -75,7 +75,7 @@ def binned(points: Sequence[tuple[float, float]], most: int = MOST_POINTS) -> li
 
 
 def places(trials: Sequence[TrialResult], views: ViewCache) -> list[str]:
-    """For each scene and split: what was held out, and how far that is from training."""
+    """Say for each scene and split what was held out, and how far that is from training."""
     lines = []
     for (scene, split), group in sorted(by_key(trials, lambda trial: (trial.scene, trial.split)).items()):
         rows = _rows(group[0], views)

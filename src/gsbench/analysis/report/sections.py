@@ -63,7 +63,7 @@ class Versus:
 
     @property
     def beyond(self) -> bool:
-        """Whether there are scenes enough to ask about scenes like these."""
+        """Return whether there are scenes enough to ask about scenes like these."""
         return any(verdict.comparison.beyond is not None for verdict in self.verdicts)
 
     @property

@@ -104,5 +104,5 @@ class ColmapOptions(ABC):
         return [name for name in names if name not in test]
 
     def leaves_out(self, reference: pycolmap.Reconstruction | None) -> bool:
-        """Whether test photographs are not even looked at: nothing of them is needed where the cameras are given."""
+        """Return whether test photographs are not even looked at, which are not needed where the cameras are given."""
         return self.points_from != "all" and self.poses == "shared" and reference is not None

@@ -93,7 +93,7 @@ def database_of_tracks(path: Path, model: pycolmap.Reconstruction, names: Collec
 
 
 def track_matches(model: pycolmap.Reconstruction, names: Collection[str]) -> dict[tuple[int, int], NDArray[np.uint32]]:
-    """By pairs of image ids, lower first: which 2D points [M, 2] of the two see one point."""
+    """The 2D points [M, 2] of two images that see one point, by the pair of their ids, lower first."""
     kept = _ids(model, names)
     by_length: dict[int, list[list[tuple[int, int]]]] = defaultdict(list)
     for _, point in sorted(model.points3D.items()):
