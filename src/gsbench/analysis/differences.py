@@ -16,6 +16,7 @@ IGNORED_SETTINGS = (
     *("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path"),
     "eval.primary",
 )
+UNSET = canonical(None)
 CODE = "code of "  # how the keys of ``TrialResult.code`` start that are a user's own classes
 
 
@@ -36,12 +37,16 @@ def differing_conditions(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
 
 
 def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
-    """The settings in which trials with different configuration hashes differ, those that may differ left out."""
+    """The settings in which trials with different configuration hashes differ, those that may differ left out.
+
+    A key that a configuration lacks counts as unset: a metric that was added later is null in earlier trials.
+    """
     if len({trial.config_hash for trial in trials}) == 1:
         return {}
-    keys = {key for trial in trials for key in trial.config if not key.startswith(IGNORED_SETTINGS)}
-    values = {key: sorted({canonical(trial.config.get(key)) for trial in trials}) for key in sorted(keys)}
-    return {key: found for key, found in values.items() if len(found) > 1}
+    kinds = {trial.kind: trial.config_texts for trial in trials}.values()
+    keys = {key for texts in kinds for key in texts if not key.startswith(IGNORED_SETTINGS)}
+    values = {key: {texts.get(key, UNSET) for texts in kinds} for key in keys}
+    return {key: sorted(found) for key, found in sorted(values.items()) if len(found) > 1}
 
 
 def differing_code(trials: Iterable[TrialResult]) -> dict[str, Versions]:
