@@ -13,7 +13,7 @@ from pathlib import Path
 
 from gsbench import __version__
 from gsbench.errors import GsbenchError, InputError
-from gsbench.files import checked_runs_folder
+from gsbench.files import checked_runs_folder, storage_errors
 from gsbench.logs import printable_output, set_up_logging
 from gsbench.system.own_modules import SAFE_PATH
 from gsbench.verbs.table import VERBS
@@ -57,9 +57,21 @@ def run(argv: list[str]) -> int:
             f"gsbench: stopped{f' by {stop}' if str(stop) else ''}; the same command goes on from here", file=sys.stderr
         )
         return getattr(stop, "exit_code", INTERRUPTED)
+    except ImportError as error:
+        if not _is_interrupt(error):
+            raise
+        print("gsbench: stopped; the same command goes on from here", file=sys.stderr)
+        return INTERRUPTED
     except BrokenPipeError:  # the reader of our output, such as `head`, has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether a Ctrl-C is behind an error: native modules that it stops while they are imported raise ImportError."""
+    return error is not None and (
+        isinstance(error, KeyboardInterrupt) or _is_interrupt(error.__cause__ or error.__context__)
+    )
 
 
 def _refuse(error: GsbenchError, code: int) -> int:
@@ -80,7 +92,9 @@ def _verb(name: str, argv: list[str]) -> int:
             f"(verbs: {', '.join(VERBS)})"
         )
     main_function: Callable[[list[str], Path], int] = importlib.import_module(VERBS[name][0]).main
-    return main_function(argv, runs_dir())
+    runs = runs_dir()
+    with storage_errors(runs):
+        return main_function(argv, runs)
 
 
 def _trials(argv: list[str]) -> int:

@@ -8,6 +8,7 @@ import json
 import os
 import re
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -69,6 +70,14 @@ def link_or_copy(source: Path, target: Path) -> None:
             os.link(source, temporary)
         except OSError:
             shutil.copyfile(source, temporary)
+
+
+def require_regular(path: Path) -> None:
+    """Raise InputError for a pipe, a device or a socket, whose reading need not end; what is not there is let pass."""
+    with suppress(OSError):
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+            raise InputError(f"{path} is no regular file: put a copy of its content there")
 
 
 def sync_to_disk(path: Path) -> None:
@@ -142,6 +151,15 @@ def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
     place = getattr(error, "filename", None) or folder
     if number in FULL or FULL_TEXT.search(str(error)) or (_is_write_error(error) and _free(folder) < NEARLY_NOTHING):
         return DiskFullError(f"the disk of {folder} is full: free some space, and the same command goes on from here")
+    if number == errno.EFBIG:
+        return InputError(
+            f"{place} may not grow any more ({os.strerror(number)}): raise `ulimit -f`, or set runs=FOLDER"
+        )
+    if number == errno.ENOLCK:
+        return InputError(
+            f"the file system of {place} has no locks ({os.strerror(number)}), without which trials would disturb each "
+            "other: set runs=FOLDER or GSBENCH_RUNS to another one, or have its lock service started"
+        )
     if number in FORBIDDEN:
         return InputError(f"{place} may not be written to ({os.strerror(number)}): set runs=FOLDER or GSBENCH_RUNS")
     return None

@@ -51,6 +51,19 @@ MISSING: Any = "???"  # a value that must be given, as Hydra writes it in YAML
 Fraction = Annotated[float, Interval(ge=0, le=1)]
 OpenFraction = Annotated[float, Interval(gt=0, lt=1)]
 
+
+@dataclasses.dataclass(frozen=True)
+class Switch:
+    """A part of a method that can be taken out (``gsbench ablate``): by the settings ``off``; ``words`` say what it is.
+
+    Without the switch ``within`` this one does nothing.
+    """
+
+    off: dict[str, Any]
+    words: str = ""
+    within: str = ""
+
+
 CONFIG = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True, coerce_numbers_to_str=True)
 PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", dict: "a mapping {key: value}"}
 

@@ -43,7 +43,7 @@ class GsbenchSweeper(Sweeper):
         )
 
     def sweep(self, arguments: list[str]) -> Any:
-        from gsbench.app.task import sweep
+        from gsbench.app.sweeps import sweep
 
         return sweep(self.task, self.context, self.config, self.launcher, self.params, arguments)
 

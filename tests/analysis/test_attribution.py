@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from gsbench.analysis.attribution import NO_RECORD, RULES, attribute, attribution_sentence, ingredients
+from gsbench.analysis.attribution import ELSEWHERE, NO_RECORD, RULES, attribute, attribution_sentence, ingredients
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.analysis.shipped import resolved, shipped_arms
 from gsbench.analysis.tables import build_table
+from gsbench.runs.hashing import config_hash
 from tests.analysis.synthetic import write_arms
 from tests.conftest import ROOT
 
@@ -144,6 +146,31 @@ def test_trials_without_a_record_are_said_to_have_none(tmp_path: Path) -> None:
     assert sentence(list(load_experiment(tmp_path, "exp").trials), "adc", "longaxis").endswith(f"by {NO_RECORD}.")
 
 
+def test_what_another_program_did_is_many_ingredients_at_once(tmp_path: Path) -> None:
+    program = {"_target_": "gsbench.densify.External", "command": "train"}
+    trials = trials_of(tmp_path, {"adc": densifier("adc"), "3dgs": program, "brush": program})
+    assert sentence(trials, "adc", "3dgs") == (
+        "sfm-3dgs differs from sfm-adc by all that the program 3dgs does otherwise."
+    )
+    assert "the program brush does otherwise and all that the program 3dgs" in sentence(trials, "3dgs", "brush")
+
+
+def test_what_was_trained_elsewhere_is_not_known(tmp_path: Path) -> None:
+    for path in write_arms(tmp_path, {"adc": densifier("adc"), "theirs": densifier("adc")}):
+        if path.parent.name == "sfm-theirs":
+            data = json.loads((path / "results.json").read_text())
+            (path / "results.json").write_text(json.dumps(data | {"evaluated_from": "model"}))
+    trials = list(load_experiment(tmp_path, "exp").trials)
+    assert trials[-1].made_elsewhere
+    assert sentence(trials, "adc", "theirs") == f"sfm-theirs differs from sfm-adc by {ELSEWHERE}."
+
+
+def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> None:
+    trials_of(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")})
+    (tmp_path / "exp" / "search.json").write_text("{}")
+    assert not any("differs from" in note for note in build_table(load_experiment(tmp_path, "exp")).notes)
+
+
 # --- controls
 
 
@@ -159,6 +186,11 @@ def test_controls_are_held_against_their_arms(tmp_path: Path) -> None:
         (varied[0], varied[4]),
         (varied[1], varied[5]),
     ]
+
+
+def test_naming_a_control_makes_no_other_trial() -> None:
+    with_control = {"eval": {"lpips": [], "controls": {"longaxis": "absgrad"}}, "densify": {"name": "adc"}}
+    assert config_hash(with_control) == config_hash({"eval": {"lpips": []}, "densify": {"name": "adc"}})
 
 
 def test_experiments_list_the_control_of_every_mixed_arm() -> None:

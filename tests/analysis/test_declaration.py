@@ -178,7 +178,7 @@ def test_trials_remember_a_declaration_whose_record_is_gone(tmp_path: Path) -> N
     data = json.loads((path / "results.json").read_text())
     (path / "results.json").write_text(json.dumps(data | {"declared": {"metric": "psnr", "time": EARLY}}))
     experiment = load_experiment(tmp_path, "exp")
-    repeated = [trial.data.get("declared") for trial in experiment.trials]
+    repeated = [trial.record.declared for trial in experiment.trials]
     assert [one.metric for one in read_declarations(experiment.folder, repeated)] == ["psnr"]
     assert read_declarations(tmp_path / "nothing") == []
 

@@ -15,6 +15,8 @@ from gsbench.analysis.pairing import ViewCache, choose_pairs
 from gsbench.analysis.questions import HOLDS, OPEN, TURNS, UNSURE, Turn, find_gaps, find_turns
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.report.question_charts import angle_charts, binned, question_part
+from gsbench.analysis.report.sweep_charts import sweep_charts
+from gsbench.analysis.report.tradeoff_charts import tradeoff_charts
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
@@ -245,3 +247,11 @@ def test_split_is_told_from_results_or_from_the_configuration(tmp_path: Path) ->
     assert {trial.split for trial in trials} == {"every_nth, matched with 4", "sector 3 of 4, matched"}
     one = next(trial for trial in trials if trial.question == "extrapolation")
     assert one.conditions()["split"] == one.split
+
+
+def test_no_chart_joins_the_two_questions(tmp_path: Path) -> None:
+    trials = with_variants(write_splits(tmp_path, {}).trials)
+    assert sweep_charts(trials) == []
+    titles = [re.findall(r"<figcaption>(.*?)</figcaption>", chart)[0] for chart in tradeoff_charts(trials)]
+    assert titles
+    assert all(title.endswith((", every_nth", ", sector 0 of 8")) for title in titles)

@@ -14,7 +14,9 @@ from gsbench.errors import GsbenchError
 from gsbench.launch import serial
 from gsbench.launch.outcome import Outcome, outcome_of_error
 from gsbench.runs.finished import Done, NotDone
+from gsbench.runs.inputs import read_results
 from gsbench.runs.trial_files import TrialPaths
+from tests.finished import write_results
 
 optuna = pytest.importorskip("optuna", reason="needs Optuna (extra search)")
 
@@ -52,7 +54,7 @@ class Trials:
         folder.mkdir(parents=True)
         error = abs(threshold - BEST) / max(threshold, BEST)
         metrics = {"psnr": 30 - 10 * error + seed, "flip": error, "mine": error}
-        (folder / "results.json").write_text(json.dumps({"status": "complete", "metrics": metrics}))
+        write_results(folder, trial.values, metrics=metrics)
         return Outcome(folder, "done", "psnr", metrics=metrics)
 
 
@@ -64,7 +66,7 @@ def trials(monkeypatch: pytest.MonkeyPatch) -> Trials:
     # What a stand-in leaves has no record of what it was made of; how finished trials are known is tested elsewhere.
     def found(values: dict[str, Any], *rest: Any) -> Done | NotDone:
         path = results_of(values)
-        return Done(json.loads(path.read_text())) if path.exists() else NotDone("unfinished", "")
+        return Done(read_results(path.parent)[0]) if path.exists() else NotDone("unfinished", "")
 
     monkeypatch.setattr("gsbench.launch.batch.find_finished", found)
     return stand_in

@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from gsbench.claims.pooling import Study, describe, pool, pooled_forest
+from gsbench.claims.pooling import Study, describe, mean_of, pool, pooled_forest, restricted_likelihood_tau2
 from gsbench.errors import InputError
 
 # (tuberculosis, none) of the vaccinated and of the others, by trial
@@ -38,6 +39,32 @@ def test_published_values_of_the_bcg_trials() -> None:
     assert found.q_p is not None
     assert found.q_p < 1e-20
     assert sum(found.weights) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("tau2", "mean", "error"),
+    [
+        (0.30876026286237634, -0.7141172220732269, 0.18069662833554745),
+        (0.3180684522038206, -0.714968153493337, 0.18089219153759872),
+    ],
+    ids=["DerSimonian and Laird", "Paule and Mandel"],
+)
+def test_mean_and_error_are_those_of_statsmodels(tau2: float, mean: float, error: float) -> None:
+    """statsmodels 0.15.0, combine_effects(…, method_re="chi2" and "iterated"): mean_effect_re, root of var_hksj_re."""
+    effects, variances = np.array([one.effect for one in STUDIES]), np.array([one.error**2 for one in STUDIES])
+    assert mean_of(effects, variances, tau2) == pytest.approx((mean, error), rel=1e-9)
+
+
+def test_tau_is_where_the_density_of_the_contrasts_is_largest() -> None:
+    """Restricted likelihood as it is defined: the density of k - 1 contrasts, in which the mean has no part."""
+    effects, variances = np.array([one.effect for one in STUDIES]), np.array([one.error**2 for one in STUDIES])
+    contrasts = np.linalg.svd(np.ones((1, len(effects))))[2][1:]  # [k - 1, k], orthogonal to the mean
+    grid = np.arange(0.25, 0.40, 1e-4)
+    densities = [
+        stats.multivariate_normal(cov=contrasts @ np.diag(variances + tau2) @ contrasts.T).logpdf(contrasts @ effects)
+        for tau2 in grid
+    ]
+    assert restricted_likelihood_tau2(effects, variances) == pytest.approx(grid[int(np.argmax(densities))], abs=1e-4)
 
 
 def test_studies_that_agree_have_no_variance_between_them() -> None:

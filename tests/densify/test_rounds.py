@@ -210,7 +210,7 @@ SWITCHES: dict[str, list[object]] = {
     "max_gaussians": [None, 90],
     "cap": ["soft", "hard", "curve"],
     "threshold_mode": ["absolute", "extent_relative", "quantile", "auto"],
-    "condition_of": ["eigenvalues", "scales"],
+    "condition_of": ["eigenvalues", "scales", "nothing"],
     "max_condition": [None, 1.0, 4.0],
     "split_isotropic": [True, False],
     "volume_children": [2, 3],

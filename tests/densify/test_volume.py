@@ -34,6 +34,8 @@ def test_elongated_by_two() -> None:
     child = child_log_scales(parent)
     torch.testing.assert_close(child.exp(), torch.tensor([[1.0, 0.5, 0.5]], dtype=torch.float64))
     assert math.exp(log_volume(parent) - log_volume(child)) == pytest.approx(8)
+    as_adc = child_log_scales(parent, "nothing", plain_shrink=1.6)  # no eq. 7
+    torch.testing.assert_close(as_adc.exp(), parent.exp() / 1.6)
     in_scales = child_log_scales(parent, "scales")  # s / kappa
     torch.testing.assert_close(in_scales.exp(), torch.tensor([[0.5, 0.25, 0.25]], dtype=torch.float64))
 

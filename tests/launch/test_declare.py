@@ -87,7 +87,7 @@ def test_a_plan_of_claims_is_kept_beside_declared_metrics(tmp_path: Path, caplog
     assert not caplog.text
     with caplog.at_level(logging.WARNING):
         declare_plan(home, {"claims": [1]}, "bbbb")
-    assert "another plan of claims was declared before" in caplog.text
+    assert "another plan was declared before" in caplog.text
     assert {plan.hash for plan in read_plans(home)} == {"aaaa", "bbbb"}
     assert [one.metric for one in read_declarations(home)] == ["psnr"]
     assert next(plan for plan in read_plans(home) if plan.hash == "bbbb").plan == {"claims": [1]}

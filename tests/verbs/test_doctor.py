@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
@@ -83,6 +84,15 @@ def test_rasterizers_on_a_gpu(gpus: SimpleNamespace, monkeypatch: pytest.MonkeyP
     assert texts["raster=triton"].startswith("on cuda: ")
     assert texts["raster=reference"].startswith("on cpu and cuda: ")
     assert texts["raster=gsplat"].startswith("needs gsplat: ")
+
+
+def test_triton_that_is_too_old_is_said_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_version", lambda package: "3.3.1")
+    monkeypatch.setattr(importlib.metadata, "version", lambda package: "3.3.1")
+    ((verdict, text),) = said(doctor.check_triton())
+    assert verdict == "note"
+    assert "needs triton 3.4 or newer, and 3.3.1 is installed" in text
+    assert "torch>=2.8" in text
 
 
 def test_kernels_are_said_to_be_where_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,8 @@ from gsbench.words import listed
 
 MOST_NAMED = 6  # ingredients that a headline names before it counts
 NO_RECORD = "what is not recorded (a trial has no readable config.yaml)"
+ELSEWHERE = "what a training elsewhere did, of which nothing is recorded"
+BY_PROGRAM = "all that the program {} does otherwise"
 TARGET, INIT = "densify._target_", "initial cloud"
 
 # Departures of a class of densifiers from ADC. A class that does not stand here is one ingredient as a whole.
@@ -37,7 +39,6 @@ RULES: dict[str, tuple[str, ...]] = {
     "gsbench.densify.ResGS": ("residual split", "levels", "fading opacity"),
     "gsbench.densify.Taming": ("score", "prunings"),
     "gsbench.densify.Volumetric": ("volume rule",),
-    "gsbench.densify.External": ("program",),
 }
 # Settings with one name for several keys. All others are called as their key, without the group of the densifier.
 NAMES = {
@@ -77,7 +78,7 @@ class Attribution:
     @property
     def is_mixed(self) -> bool:
         """Return whether a difference between the arms may come from more than one ingredient."""
-        return len(self.ingredients) > 1 or NO_RECORD in self.ingredients
+        return len(self.ingredients) > 1 or any(map(_is_bundle, self.ingredients))
 
 
 def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, ...]:
@@ -132,7 +133,7 @@ def attribution_sentence(found: Attribution, first: Arm, second: Arm) -> str:
     if more := len(found.ingredients) - len(named):
         named.append(f"{more} more")
     text = f"{'-'.join(second)} differs from {'-'.join(first)} by {listed(named)}"
-    if NO_RECORD in found.ingredients:
+    if len(found.ingredients) == 1:
         return f"{text}."
     ways = [f"isolate {name} with {arm}" for name, arm in found.isolating.items()]
     return f"{text}; {'; '.join(ways) or 'no arm at hand isolates one of them'}."
@@ -145,8 +146,15 @@ def representatives(trials: Iterable[TrialResult], first: Arm, second: Arm) -> t
     return min(pairs, key=lambda pair: (pair[0].scene != pair[1].scene, pair[0].seed != pair[1].seed))
 
 
+def _is_bundle(ingredient: str) -> bool:
+    """Whether it stands for many at once, which nobody can tell apart."""
+    return ingredient in (NO_RECORD, ELSEWHERE) or ingredient.startswith(BY_PROGRAM.partition("{")[0])
+
+
 def _ingredients_of(one: TrialResult, other: TrialResult) -> tuple[str, ...]:
     """Those of the configurations, and code of which the trials used two versions."""
+    if one.made_elsewhere or other.made_elsewhere:
+        return (ELSEWHERE,)
     return tuple(dict.fromkeys([*ingredients(one.config, other.config), *differing_code((one, other))]))
 
 
@@ -184,5 +192,5 @@ def _rule_names(config: Mapping[str, Any]) -> tuple[str, ...]:
     if target is None:
         return ()
     if target == "gsbench.densify.External":
-        return (f"program {config.get('densify.name')}",)
+        return (BY_PROGRAM.format(config.get("densify.name")),)
     return RULES.get(str(target), (f"rule {target}",))

@@ -12,7 +12,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult
-from gsbench.runs.declaration import Declaration, metric_and_question, read_declarations, trial_key, unix_time
+from gsbench.runs.declaration import (
+    STOPPING,
+    Declaration,
+    metric_and_question,
+    read_declarations,
+    read_plans,
+    trial_key,
+    unix_time,
+)
 from gsbench.words import counted, listed
 
 
@@ -30,6 +38,7 @@ class ActiveDeclaration:
     added: tuple[TrialResult, ...]
     trials: int
     earlier: tuple[Declaration, ...]
+    looks: bool = False  # whether its trials came in planned looks
 
     @property
     def metric(self) -> str:
@@ -67,7 +76,14 @@ class ActiveDeclaration:
                 f"{name} was declared beforehand (eval.primary, {when}), before any of the {self._all()} was measured."
             ]
         planned = sum(map(len, (self.declaration.trials or {}).values()))
-        if planned and (missing := planned - (self.trials - len(self.added))):
+        missing = planned - (self.trials - len(self.added)) if planned else 0
+        if self.looks:
+            lines.append(
+                f"Seeds came in planned looks (launch.stop_when_decided); {missing} of the {planned} declared trials are "
+                "not there. The verdict is that of the looks (gsbench report): p and intervals of tests that take the "
+                "number of seeds as fixed are too sure."
+            )
+        elif missing:
             lines.append(
                 f"{missing} of the {planned} declared trials are not there yet: until they are, this is a look at a "
                 "part, and who ends at a look that pleases finds more than there is."
@@ -116,7 +132,8 @@ def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration |
     else:  # the first record may be lost but for what its trials repeat: all since the next may have been added
         again = next((one.time for one in since if one.trials is not None), math.inf)
         added = tuple(trial for trial in trials if measured(trial) >= again)
-    return ActiveDeclaration(named, seen, added, len(trials), tuple(others))
+    looks = any(STOPPING in plan.plan for plan in read_plans(folder))
+    return ActiveDeclaration(named, seen, added, len(trials), tuple(others), looks)
 
 
 def _is_declared(trial: TrialResult, declaration: Declaration) -> bool:

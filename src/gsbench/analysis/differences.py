@@ -16,7 +16,7 @@ Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 # Settings in which trials of one cell may differ: they name the trial or say where it runs, not what is computed.
 IGNORED_SETTINGS = (
     *("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path"),
-    *("eval.primary", "eval.controls"),
+    *("eval.primary", "eval.controls", "densify.switches"),
 )
 CODE = "code of "  # how the keys of ``TrialResult.code`` start that are a user's own classes
 

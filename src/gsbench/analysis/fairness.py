@@ -14,7 +14,6 @@ from gsbench.analysis.attribution import (
     attribute,
     attribution_sentence,
     differing_keys,
-    ingredients,
     representatives,
 )
 from gsbench.analysis.differences import CODE, short_version
@@ -51,7 +50,8 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
     settings = [_setting_row(key, one, other) for key in differing_keys(one.config, other.config)]
     if settings:
         settings[0] = Row(settings[0].labels, settings[0].entries, rule_above=True)
-    notes = [attribution_sentence(attribute(trials, first, second), first, second) or _alone(one, other, first, second)]
+    found = attribute(trials, first, second)
+    notes = [attribution_sentence(found, first, second) or _alone(found.ingredients, first, second)]
     notes += [f"Compared: {counted(len(pairs), 'pair')} of trials of one scene and seed."]
     notes += [f"Tuning. {line}" for line in tuning_lines(trials, (first, second))]
     notes += [line for trial in (one, other) for line in default_lines(trial)]
@@ -106,8 +106,7 @@ def _source(text: str) -> str:
     return f"Its file says: “{text}”" if text else ""
 
 
-def _alone(one: TrialResult, other: TrialResult, first: Arm, second: Arm) -> str:
-    found = ingredients(one.config, other.config)
+def _alone(found: Sequence[str], first: Arm, second: Arm) -> str:
     if not found:
         return f"{arm_name(second)} and {arm_name(first)} differ in no recorded setting."
     return f"{arm_name(second)} differs from {arm_name(first)} by {found[0]} alone."

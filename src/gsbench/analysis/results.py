@@ -9,11 +9,10 @@ from __future__ import annotations
 import csv
 import io
 import json
-import logging
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -33,40 +32,56 @@ from gsbench.runs.translation_record import Translation
 from gsbench.runs.trial_files import failure_of
 from gsbench.runs.trial_record import TrialRecord, UnfinishedError
 
-log = logging.getLogger(__name__)
-
 TRIAL_FOLDER = re.compile(r"(?P<hash>[0-9a-f]{8})-seed(?P<seed>\d+)")
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
 
 Arm = tuple[str, str]  # initialiser, densifier
 
 
+Kind = tuple[str, str, str, str]  # scene, initialiser, densifier, hash of the configuration
+
+
 class Configurations:
-    """The settings that determine results, read once for all trials of one kind."""
+    """The settings that determine the results of an experiment's trials, read once for all of one kind."""
 
     def __init__(self) -> None:
-        self._known: dict[tuple[str, ...], Mapping[str, Any]] = {}
+        self._known: dict[Kind, Mapping[str, Any]] = {}
 
-    def shared(self, folder: Path, kind: tuple[str, ...]) -> Mapping[str, Any]:
-        """The settings of the trial in ``folder``, as those of any other of the same ``kind``."""
+    def shared(self, kind: Kind, folder: Path) -> Mapping[str, Any]:
+        """The settings of the trial in ``folder``, as those of any other of its ``kind``; {} where unreadable."""
         if kind not in self._known:
-            found = read_flat_config(folder)
-            self._known[kind] = {key: value for key, value in found.items() if key.split(".")[0] not in NOT_HASHED}
+            self.find(kind, [folder])
         return self._known[kind]
 
+    def find(self, kind: Kind, folders: Iterable[Path]) -> str:
+        """Read the settings of a kind from the first of ``folders`` that has them; else why the last has not."""
+        fault = ""
+        for folder in folders:
+            try:
+                found = load_flat_config(folder)
+            except FileNotFoundError:
+                fault = f"{CONFIG} is not there"
+            except DamagedError as error:
+                fault = f"{error.path.name} {error.reason}"
+            else:
+                own = {key: value for key, value in found.items() if key.split(".")[0] not in NOT_HASHED}
+                self._known[kind] = own
+                return ""
+        self._known.setdefault(kind, {})
+        return fault
 
-def read_flat_config(folder: Path) -> dict[str, Any]:
-    """The configuration of the trial in ``folder`` with dotted keys; empty where it is absent or cannot be read."""
-    try:
-        values = read_settings(folder)
-        if values is None:
-            values = read_yaml(folder / CONFIG)
-    except FileNotFoundError:
-        return {}
-    except DamagedError as error:
-        log.warning("left out: %s", error)
-        return {}
-    return flatten(values) if isinstance(values, dict) else {}
+
+def load_flat_config(folder: Path) -> dict[str, Any]:
+    """The configuration of the trial in ``folder`` with dotted keys; raises FileNotFoundError and DamagedError.
+
+    It is read from ``inputs.json`` where that has it, which is some twenty times quicker than YAML.
+    """
+    values = read_settings(folder)
+    if values is None:
+        values = read_yaml(folder / CONFIG)
+    if not isinstance(values, dict):
+        raise DamagedError(folder / CONFIG, "is damaged: it is no configuration")
+    return flatten(values)
 
 
 @dataclass(frozen=True)
@@ -132,11 +147,20 @@ class TrialResult:
 
         They are read once for all trials that share them: a trial's own are `whole_config`.
         """
-        return self.settings.shared(self.path, (self.scene, self.init, self.densify, self.config_hash))
+        return self.settings.shared(self.kind, self.path)
 
+    @property
+    def kind(self) -> Kind:
+        """What trials have in common that differ in their seeds."""
+        return self.scene, self.init, self.densify, self.config_hash
+
+    @cached_property
     def whole_config(self) -> Mapping[str, Any]:
         """Every setting of the trial, those included that have no part in the result; as `config`."""
-        return read_flat_config(self.path)
+        try:
+            return load_flat_config(self.path)
+        except (FileNotFoundError, DamagedError):
+            return {}
 
     def curve(self, name: str) -> list[dict[str, bool | int | float]]:
         """The rows of the trial's ``metrics.jsonl`` or ``events.jsonl``; see `gsbench.runs.rows`."""
@@ -264,8 +288,27 @@ def read_experiment(folder: Path) -> Experiment:
             trials.append(read_trial(Path(place), runs_dir, settings))
         except _UnusableError as reason:
             warnings.append(f"{os.path.relpath(place, runs_dir)}: {one_line(str(reason))}")
+    trials, unknown = _with_known_settings(trials, settings)
+    warnings += [f"{os.path.relpath(trial.path, runs_dir)}: damaged, {reason}" for trial, reason in unknown]
     trials.sort(key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash))
     return Experiment(folder.name, folder, tuple(trials), tuple(sorted(warnings)))
+
+
+def _with_known_settings(
+    trials: Sequence[TrialResult], settings: Configurations
+) -> tuple[list[TrialResult], list[tuple[TrialResult, str]]]:
+    """The trials whose settings are known where they are needed, and the others, each with the reason.
+
+    Settings are needed where trials of one scene, initialiser and densifier differ in them.
+    """
+    folders: dict[Kind, list[Path]] = {}
+    variants: dict[tuple[str, ...], set[str]] = {}
+    for trial in trials:
+        folders.setdefault(trial.kind, []).append(trial.path)
+        variants.setdefault(trial.kind[:3], set()).add(trial.config_hash)
+    faults = {kind: settings.find(kind, found) for kind, found in folders.items() if len(variants[kind[:3]]) > 1}
+    known = [trial for trial in trials if not faults.get(trial.kind)]
+    return known, [(trial, faults[trial.kind]) for trial in trials if faults.get(trial.kind)]
 
 
 def list_experiments(runs_dir: Path) -> list[str]:

@@ -23,6 +23,9 @@ PRESET = re.compile(r"\btrain=(\w+)")
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")  # the value of another key
 
 
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
 @cache
 def shipped_arms() -> dict[str, Mapping[str, Any]]:
     """The settings of each densifier of gsbench by its name; programs of others are none."""
@@ -73,6 +76,6 @@ def resolved(settings: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str
 @cache
 def _read(name: str) -> dict[str, Any]:
     """An arm's own settings above those of the arms that its list of defaults names."""
-    content = yaml.safe_load((conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8"))
+    content = yaml.load((conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8"), Loader=_LOADER)
     parents = [parent for parent in content.pop("defaults", []) if parent != "_self_"]
     return {key: value for parent in parents for key, value in _read(parent).items()} | content

@@ -76,7 +76,8 @@ def to_latex(table: Table) -> str:
 
 def to_html(table: Table) -> str:
     """A ``<figure>`` with the table, its caption and notes; no styles of its own."""
-    parts = [f'<figure class="table"><table>\n<caption>{html.escape(table.title)}</caption>\n<thead>\n']
+    kind = "table wrapped" if table.wrapped else "table"
+    parts = [f'<figure class="{kind}"><table>\n<caption>{html.escape(table.title)}</caption>\n<thead>\n']
     groups = _column_groups(table)
     grouped = any(name for name, _ in groups)
     if grouped:
@@ -121,6 +122,7 @@ table { border-collapse: collapse } caption { text-align: left; font-weight: 600
 th, td { padding: .3rem .7rem; text-align: right; white-space: nowrap }
 th[scope=row], th.name { text-align: left } th[scope=row] { font-weight: normal }
 thead tr:last-child th { border-bottom: 1px solid #888 } tr.rule > * { border-top: 1px solid #888 }
+.wrapped td, .wrapped thead th { white-space: normal; text-align: left; min-width: 8rem; overflow-wrap: anywhere }
 th[scope=colgroup] { text-align: center } figcaption { font-size: .85rem; color: #555 }
 """
 

@@ -11,25 +11,23 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from gsbench.analysis.attribution import attribute, attribution_sentence
 from gsbench.analysis.cells import (
     Cell,
     best_cells,
     by_key,
     check_averageable,
+    check_fields,
     field_value,
     make_cell,
     swept_settings,
-    with_variants,
 )
-from gsbench.analysis.declaration import standing
 from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.origins import cloud_notes, held_out_notes, machine_notes, points_notes
-from gsbench.analysis.pairing import BASELINE, ViewCache, choose_pairs, controls_of
+from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import Arm, Experiment, TrialResult
+from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.analysis.table_notes import attribution_notes, declared_notes, origin_notes
 from gsbench.analysis.translations import translation_notes
-from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 from gsbench.words import counted, signed
 
 DEFAULT_ROWS = ("scene", "init", "densify")
@@ -99,6 +97,7 @@ def build_table(
         rows = (*DEFAULT_ROWS, *(key for key in swept if key not in columns))
     quantities = choose_quantities(trials, metrics)
     fields = (*rows, *columns)
+    check_fields(trials, fields)
     groups = by_key(trials, lambda trial: tuple(field_value(trial, name) for name in fields))
     for key, group in groups.items():
         check_averageable(group, " ".join(f"{name}={value}" for name, value in zip(fields, key, strict=True)))
@@ -132,10 +131,10 @@ def build_table(
     arms = [" + ".join(names.get(value, value) for value in arm) for arm in arm_keys]
     keys = tuple((quantity.key, "+".join(arm)) for quantity in quantities for arm in arm_keys)
     heads = tuple(Column(q.heading, arm) if columns else Column("", q.heading) for q in quantities for arm in arms)
-    notes += _reading_notes(grid, quantities, expected, "scene" in fields) + _origin_notes(trials)
+    notes += _reading_notes(grid, quantities, expected, "scene" in fields) + origin_notes(trials)
     notes += (
-        _declared_notes(experiment)
-        + _attribution_notes(experiment)
+        declared_notes(experiment)
+        + attribution_notes(experiment)
         + _cost_notes(trials)
         + translation_notes(trials)
         + held_out_notes(trials)
@@ -260,63 +259,6 @@ def _reading_notes(
         }
         notes += [f"{quantity.name}: n/a, {reason}." for reason in sorted(reasons)]
     return notes
-
-
-_BY_PROGRAM = (
-    ("Trained here by another program, its model rendered by gsbench", FROM_MODEL),
-    ("Trained here by another program, its own renders measured as they are", FROM_RENDERS),
-)
-
-
-def _origin_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """Which arms gsbench did not train, and what of them it saw."""
-    notes = []
-    for what, origin in _BY_PROGRAM:
-        own = [trial for trial in trials if trial.program and trial.record.evaluated_from == origin]
-        if own:
-            versions = {
-                (f"{trial.init}-{trial.densify}", trial.record.trained_by.version)
-                for trial in own
-                if trial.record.trained_by is not None
-            }
-            arms = ", ".join(f"{arm} (version {version})" for arm, version in sorted(versions))
-            notes.append(f"{what} (its time is that of the whole program, its budget its own): {arms}.")
-    for what, origin in (
-        ("A model that another program trained, rendered here", FROM_MODEL),
-        ("Renders of another program, measured as they are", FROM_RENDERS),
-    ):
-        own = [trial for trial in trials if trial.made_elsewhere and trial.record.evaluated_from == origin]
-        if own:
-            arms = ", ".join(sorted({f"{trial.init}-{trial.densify}" for trial in own}))
-            notes.append(f"{what} (its conditions are not known): {arms}.")
-    return notes
-
-
-def _declared_notes(experiment: Experiment) -> list[str]:
-    """The verdict on the declared metric, of the whole experiment; nothing where none was declared.
-
-    Which trials a table shows has no say in it, so that nobody can choose a verdict by choosing trials.
-    """
-    declared = standing(experiment.folder, experiment.trials)
-    if declared is None or any(trial.translated_from for trial in experiment.trials):
-        return []
-    from gsbench.analysis.verdicts import declared_lines, judge  # here, for a quick start of what needs no test
-
-    trials, pairs = compared_pairs(experiment)
-    return declared_lines(declared, judge(trials, pairs, ViewCache(), declared))
-
-
-def _attribution_notes(experiment: Experiment) -> list[str]:
-    """For each pair of arms that differ in more than one ingredient, in which, and what would isolate one."""
-    trials, pairs = compared_pairs(experiment)
-    return [sentence for pair in pairs if (sentence := attribution_sentence(attribute(trials, *pair), *pair))]
-
-
-def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
-    """The experiment's trials as arms, and the pairs of arms that are compared."""
-    trials = with_variants(experiment.trials)
-    arms = sorted({trial.arm for trial in trials})
-    return trials, choose_pairs(arms, controls=controls_of(trials)) if arms else []
 
 
 def _cost_notes(trials: Sequence[TrialResult]) -> list[str]:

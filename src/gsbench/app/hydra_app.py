@@ -19,7 +19,15 @@ from gsbench.config.command_words import check_words, is_sweep
 from gsbench.config.compose import compose_master, composing, explained, ready_trial
 from gsbench.config.hydra_guard import load_callbacks, make_callbacks
 from gsbench.config.hydra_internals import Callbacks
-from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, begin_sweep, record_sweep, start, words_of
+from gsbench.config.hydra_job import (
+    CONFIG_NAME,
+    HydraJob,
+    begin_sweep,
+    check_output_folder,
+    record_sweep,
+    start,
+    words_of,
+)
 from gsbench.errors import InputError
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.trial import Trial
@@ -99,7 +107,15 @@ def _check(master: DictConfig, multirun: bool, look_only: bool) -> None:
         raise InputError(f"hydra/launcher={launcher} launches sweeps: add -m, or leave it out")
     if launcher != OWN and master.launch.name != "serial":
         raise InputError(f"hydra/launcher={launcher} and launch={master.launch.name} are two launchers: choose one")
+    if not look_only:
+        check_output_folder(master, multirun)
     if look_only and launcher != OWN and sweeper != OWN:
         raise InputError(f"hydra/sweeper={sweeper} does not say beforehand what hydra/launcher={launcher} will run")
+    if master.launch.stop_when_decided and not multirun:
+        raise InputError("launch.stop_when_decided adds seeds to a sweep: add -m, two densifiers and seed=0,1,2,3")
+    if master.launch.stop_when_decided and sweeper != OWN:
+        raise InputError(
+            f"hydra/sweeper={sweeper} chooses by itself what to run: leave it or launch.stop_when_decided out"
+        )
     if sweeper != OWN and not master.launch.wait:
         raise InputError(f"hydra/sweeper={sweeper} learns from results, so launch.wait must be true")

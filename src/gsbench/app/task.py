@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext
 from omegaconf import DictConfig
 
-from gsbench.app.grids import words_of_grids
 from gsbench.config.command_words import check_sweep
-from gsbench.config.compose import compose_jobs, explained, ready_trial
+from gsbench.config.compose import compose_jobs, ready_trial
 from gsbench.config.hydra_job import words_of
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.batch import begin_for_another_launcher
@@ -82,31 +80,12 @@ def trials_of_jobs(
     return [Trial.of(composed) for composed in compose_jobs(context, master, jobs, first)]
 
 
-def sweep(
-    task: Task,
-    context: HydraContext,
-    master: DictConfig,
-    launcher: Launcher,
-    params: Mapping[str, Any],
-    words: Sequence[str],
+def launch_trials(
+    task: Task, master: DictConfig, launcher: Launcher, trials: Sequence[Trial], first: int | None = None
 ) -> Sequence[JobReturn]:
-    """Run all points of a sweep's grids at once, for gsbench's sweeper.
-
-    ``params`` are the settings and values of ``hydra.sweeper.params``.
-    """
-    parser = OverridesParser.create(context.config_loader)
-    with explained(words):
-        jobs = [
-            point
-            for of_grid in words_of_grids(params, task.grids, words)
-            for point in grid(parser.parse_overrides(of_grid))
-        ]
-    return launch_trials(task, master, launcher, trials_of_jobs(context, master, jobs))
-
-
-def launch_trials(task: Task, master: DictConfig, launcher: Launcher, trials: Sequence[Trial]) -> Sequence[JobReturn]:
     """Run trials that a sweeper of gsbench's has composed, by any launcher.
 
+    ``first`` is the number of the first job, by which Hydra's launchers name folders; by default the trial's own.
     Another launcher than gsbench's gets them after a look at all, so that what is refused is refused before any work.
     """
     name = master.hydra.runtime.choices["hydra/launcher"]
@@ -115,7 +94,9 @@ def launch_trials(task: Task, master: DictConfig, launcher: Launcher, trials: Se
     begin_for_another_launcher(trials)
     jobs = [trial.job for trial in trials if trial.job is not None]
     try:
-        returned = launcher.launch([list(job.words) for job in jobs], initial_job_idx=jobs[0].number or 0)
+        returned = launcher.launch(
+            [list(job.words) for job in jobs], initial_job_idx=(jobs[0].number or 0) if first is None else first
+        )
     except GsbenchError:
         raise
     except Exception as error:

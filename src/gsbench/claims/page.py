@@ -56,11 +56,15 @@ def make_page(
     tested = sum(verdict.word != "not testable here" for verdict in verdicts)
     lines = [
         f"{file.paper}. " + ", ".join(f"{count} {word}" for word, count in counts.items() if count) + ".",
-        f"The chance that any of the {counted(tested, 'verdict')} is false is at most {100 * file.error_rate:g} %, "
-        "which they share equally, each over all its looks at the trials (docs/verdict.md). A verdict is about these "
-        "scenes at this size.",
         _declared_line(declared, plans),
     ]
+    if tested:
+        lines.insert(
+            1,
+            f"The chance that any of the {counted(tested, 'verdict')} is false is at most {100 * file.error_rate:g} %, "
+            "which they share equally, each over all its looks at the trials (docs/verdict.md). A verdict is about "
+            "these scenes at this size.",
+        )
     smaller = _size_line(file, [trial for verdict in verdicts for trial in verdict.trials])
     return Page(f"{file.name}: claims and verdicts", (*lines, *smaller), tuple(map(_section, verdicts)))
 

@@ -81,10 +81,8 @@ def pool(studies: Sequence[Study]) -> Pooled:
     variances = np.array([study.error**2 for study in studies])  # [k]
     count = len(studies)
     tau2 = restricted_likelihood_tau2(effects, variances)
+    mean, error = mean_of(effects, variances, tau2)
     weights = 1 / (variances + tau2)
-    mean = float(weights @ effects / weights.sum())
-    scale = max(1.0, float(weights @ (effects - mean) ** 2) / (count - 1))
-    error = math.sqrt(scale / weights.sum())
     half = float(special.stdtrit(count - 1, 1 - ALPHA / 2)) * error
     plain = 1 / variances
     q = float(plain @ (effects - plain @ effects / plain.sum()) ** 2)
@@ -105,6 +103,14 @@ def pool(studies: Sequence[Study]) -> Pooled:
         prediction=prediction,
         weights=tuple(float(weight) for weight in weights / weights.sum()),
     )
+
+
+def mean_of(effects: Array, variances: Array, tau2: float) -> tuple[float, float]:
+    """(mean, standard error) of ``effects`` [k] with a variance ``tau2`` between them, by Hartung and Knapp."""
+    weights = 1 / (variances + tau2)
+    mean = float(weights @ effects / weights.sum())
+    scale = max(1.0, float(weights @ (effects - mean) ** 2) / (len(effects) - 1))
+    return mean, math.sqrt(scale / weights.sum())
 
 
 def restricted_likelihood_tau2(effects: Array, variances: Array) -> float:

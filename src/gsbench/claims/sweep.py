@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.claims.file import Claim, ClaimsFile
@@ -26,6 +26,7 @@ from gsbench.words import counted, some_of
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T", bound=Composed)
 Lacking = Callable[[Composed, str], str]  # (trial, metric) -> why it cannot be had here, or ""
 
 
@@ -148,11 +149,25 @@ def prepare(file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequenc
     return Check(file, runs, tuple(questions), first)
 
 
+class Looked(Protocol[T]):
+    """What is looked at: questions, each with a claim, and what trials and verdicts they have at a number of seeds."""
+
+    @property
+    def questions(self) -> Sequence[Question]: ...
+
+    @property
+    def looks(self) -> Sequence[int]: ...
+
+    def trials(self, questions: Sequence[Question], seeds: int) -> list[T]: ...
+
+    def verdicts(self, declared: DeclaredPlan) -> list[Verdict]: ...
+
+
 def run_looks(
-    check: Check,
+    check: Looked[T],
     declared: DeclaredPlan,
-    run: Callable[[Sequence[Composed]], object],
-    ready: Callable[[Composed], bool] = lambda trial: False,
+    run: Callable[[Sequence[T]], object],
+    ready: Callable[[T], bool] = lambda trial: False,
 ) -> list[Verdict]:
     """Add seeds in the planned looks until every claim is decided; ``run`` runs what is not ``ready`` yet.
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from gsbench.analysis.declaration import measured
 from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.results import TrialResult
 from gsbench.analysis.statistics import Interval
-from gsbench.claims.file import Claim, ClaimsFile
+from gsbench.claims.file import Claim
 from gsbench.claims.measures import Measure, find_measure, read_measure
 from gsbench.claims.sequential import Decision, Design, decide
 from gsbench.errors import InputError
@@ -29,12 +29,19 @@ PairKey = tuple[str, int]  # scene, seed
 Pair = tuple[TrialResult, TrialResult]  # baseline, arm
 
 
+class Planner(Protocol):
+    """What plans the looks at a claim: a file of claims, or a sweep."""
+
+    def design(self, claim: Claim, scenes: int, sharing: int) -> Design: ...
+
+
 @dataclass(frozen=True)
 class Verdict:
     """One claim's verdict.
 
-    ``decision`` is None where nothing could be tested. ``baselines`` is the baseline's mean in the measure's own unit.
-    ``trials`` are those that the decision rests on, pair by pair; ``notes`` say what was left out and why.
+    ``decision`` is None where nothing could be tested, as where the arms are one and the same at this size.
+    ``baseline`` is the baseline's mean in the measure's own unit. ``trials`` are those that the decision rests on,
+    pair by pair; ``notes`` say what was left out and why.
     ``beforehand``: none of them was measured before the plan was declared.
     """
 
@@ -62,7 +69,7 @@ class Verdict:
 
 def judge_claim(
     claim: Claim,
-    file: ClaimsFile,
+    planner: Planner,
     pairs: Mapping[PairKey, Pair],
     scenes: Sequence[str],
     sharing: int = 1,
@@ -70,7 +77,7 @@ def judge_claim(
 ) -> Verdict:
     """The verdict of a claim from its pairs of trials by scene and seed.
 
-    ``scenes`` are those that can be run here, ``sharing`` is how many tests share the file's error rate. Where trials
+    ``scenes`` are those that can be run here, ``sharing`` is how many tests share the error rate. Where trials
     were measured before ``declared_at`` (Unix time), when the plan was written down, the claim's metric is one of all
     that were measured, and has its part of the error rate alone.
     """
@@ -83,6 +90,13 @@ def judge_claim(
     differences, bases, faults = _differences(claim, pairs, measure)
     if pairs and not differences:
         return Verdict(claim, NOT_TESTABLE, faults[0], measure, notes=tuple(faults[1:]))
+    if pairs and all(map(_is_equal, pairs.values())):
+        reason = (
+            f"both arms of {counted(len(pairs), 'pair')} of trials are equal to the last bit: what they differ in "
+            "never acted at this size"
+        )
+        trials = tuple(trial for key in sorted(pairs) for trial in pairs[key])
+        return Verdict(claim, NOT_TESTABLE, reason, measure, trials=trials, notes=tuple(faults))
     late = 0 if declared_at is None else sum(measured(trial) < declared_at for trial in both)
     if late:
         names = {name for trial in both for name in trial.metrics} | {claim.metric}
@@ -91,7 +105,7 @@ def judge_claim(
             f"{counted(late, 'trial')} had been measured before this plan was declared: the metric is one of "
             f"{len(names)} that could have been chosen, which share the error rate"
         )
-    design = file.design(claim, len(scenes), sharing)
+    design = planner.design(claim, len(scenes), sharing)
     rows = [_unbroken(scene, differences, design.looks[-1]) for scene in scenes]  # [S] of [K]
     decision = decide(rows, design, claim.effect.margin, claim.sign)
     seen = {(scene, seed) for scene in scenes for seed in range(decision.seeds)}
@@ -108,6 +122,13 @@ def judge_claim(
         tuple(faults),
         not late,
     )
+
+
+def _is_equal(pair: Pair) -> bool:
+    """Whether the two models are one and the same, as far as numbers tell."""
+    one, other = pair
+    same_count = one.record.num_gaussians == other.record.num_gaussians
+    return bool(one.metrics) and one.metrics == other.metrics and same_count
 
 
 def _differences(

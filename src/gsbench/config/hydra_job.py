@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from hydra.core.utils import run_job, setup_globals
@@ -15,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config.hydra_guard import make_callbacks
+from gsbench.errors import InputError
 from gsbench.logs import show_details
 
 if TYPE_CHECKING:
@@ -126,6 +128,26 @@ def start(config: DictConfig, mode: RunMode) -> DictConfig:
     with read_write(config.hydra), open_dict(config.hydra):
         config.hydra.mode = mode
     return config
+
+
+def check_output_folder(master: DictConfig, multirun: bool) -> None:
+    """Refuse a folder for Hydra's own files that cannot be made, before any work; the default is in the runs folder.
+
+    One whose name only a job knows is left to that job.
+    """
+    key = "hydra.sweep.dir" if multirun else "hydra.run.dir"
+    try:
+        folder = Path(str(OmegaConf.select(master, key))).absolute()
+    except OmegaConfBaseException:
+        return
+    if folder == Path(OWN_FOLDER.replace("${runs}", str(master.runs))).absolute():
+        return  # the runs folder is looked at by who fills it, or finds all done there
+    try:
+        existing = next(place for place in (folder, *folder.parents) if place.exists())
+        with TemporaryDirectory(prefix=".probe-", dir=existing):
+            pass
+    except (OSError, ValueError) as error:
+        raise InputError(f"{key}={folder} cannot be made ({getattr(error, 'strerror', None) or error})") from None
 
 
 def words_of(overrides: Any) -> tuple[list[str], list[str]]:

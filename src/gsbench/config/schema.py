@@ -83,6 +83,8 @@ class LaunchConfig:
     name: Literal["serial", "local", "slurm"] = MISSING
     parallel: PositiveInt = 1  # trials at once
     timeout_min: PositiveInt | None = None  # minutes until a trial is stopped with a checkpoint and queued again
+    stop_when_decided: bool = False  # look at eval.primary seed by seed; what is decided gets no further seeds
+    least_difference: PositiveFloat | None = None  # of eval.primary, that matters; null: what papers count as one
     wait: bool = True  # Slurm only, as are the next: until all trials have ended; false: submit them and leave
     max_requeues: NonNegativeInt = 20  # how often a trial may run out of time
     signal_seconds: PositiveInt = 120  # so long before the end a trial is told to save its checkpoint
@@ -99,6 +101,8 @@ class LaunchConfig:
         check_settings(self, "launch")
         if self.name != "slurm" and not self.wait:
             raise InputError(f"launch.wait=false leaves the trials to Slurm, so it needs launch=slurm, not {self.name}")
+        if self.stop_when_decided and not self.wait:
+            raise InputError("launch.stop_when_decided looks at results between seeds, so launch.wait must be true")
         if self.name == "slurm" and self.timeout_min is not None and self.signal_seconds >= 60 * self.timeout_min:
             raise InputError(
                 f"launch.signal_seconds must be below launch.timeout_min ({self.timeout_min} minutes), "

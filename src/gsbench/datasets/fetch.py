@@ -16,7 +16,7 @@ from gsbench.datasets.plan import SceneFiles, ScenePlan, check_unchanged, descri
 from gsbench.datasets.records import RECORDS, FileRecord, SceneRecord, add_record, read_records, today
 from gsbench.datasets.remote import FetchError, Patience, RangesRefusedError, RemoteFile, download, size_of
 from gsbench.errors import InputError
-from gsbench.files import atomic, file_sha256
+from gsbench.files import atomic, file_sha256, require_regular
 from gsbench.logs import Progress
 from gsbench.words import readable_bytes, some_of
 
@@ -73,6 +73,7 @@ class Fetcher:
     ) -> Iterator[tuple[zipfile.ZipFile, RemoteFile | None]]:
         where = self.location_of(archive)
         if "://" not in where:
+            require_regular(Path(where).expanduser())
             try:
                 file = Path(where).expanduser().open("rb")
             except OSError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -10,10 +11,10 @@ from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from gsbench.densify.adc import ADC
-from gsbench.densify.base import Refinement, Rule
+from gsbench.densify.base import NEVER, Refinement, Rule
 from gsbench.densify.budget import admit
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import OpenFraction
+from gsbench.settings import OpenFraction, Switch
 
 
 @dataclass
@@ -27,6 +28,14 @@ class AbsGS(ADC):
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"absolute_sum": torch.float32}  # NDC, since the last refinement
     needs_absolute_gradient = True
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "opacity_ceiling": Switch({"ceiling_interval": NEVER}, "the ceiling on opacities"),
+        "small_split_size": Switch({"split_size": ADC.split_size}, "the smaller size above which a Gaussian is split"),
+        "opacity_reset": Switch(
+            {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
+        ),
+    }
 
     split_size: PositiveFloat = 0.001
     split_threshold: PositiveFloat = 4e-4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
@@ -11,13 +12,13 @@ from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import Refinement, Rule
+from gsbench.densify.base import NEVER, Refinement, Rule
 from gsbench.densify.budget import admit
 from gsbench.densify.budgeted import Budgeted
 from gsbench.densify.operations import revised_logits
 from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import OpenFraction
+from gsbench.settings import OpenFraction, Switch
 
 LOCKED_ROUNDS = 5  # after an opacity reset the governor does not raise the cull; our choice
 
@@ -42,6 +43,14 @@ class ADC(Budgeted):
         "gradient_sum": torch.float32,  # NDC, since the last refinement
         "visible_count": torch.int32,  # iterations
         "max_radii": torch.int32,  # px
+    }
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "opacity_reset": Switch(
+            {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
+        ),
+        "absolute_gradient": Switch({"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"),
+        "revised_opacity": Switch({"revised_opacity": False}, "children that share their parent's opacity"),
     }
 
     gradient: Literal["signed", "absolute"] = "signed"  # absolute: AbsGS, arXiv 2404.10484

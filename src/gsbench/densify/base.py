@@ -3,7 +3,7 @@ did."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -17,9 +17,10 @@ from gsbench.events import Cause, RefineEvent
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import check_settings
+from gsbench.settings import Switch, check_settings
 
 CPU = torch.device("cpu")
+NEVER = 10**9  # an iteration, or an interval, beyond any training
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class Densifier:
     A subclass is a dataclass of hyper-parameters, whose annotations say what is allowed. In every iteration the trainer
     calls ``regularizer`` before the backward pass, ``observe`` after it, then ``refine``, then the optimiser step, then
     ``after_step``. A subclass says what happens by ``rules``, and what it gathers by ``STATISTICS``, besides those of
-    its own base.
+    its own base; and which of its parts can be taken out by ``SWITCHES``, for ``gsbench ablate``.
 
     State: ``context``; ``lineage``; and ``statistics``, one tensor [N] for each name in ``STATISTICS``, zero at the
     start. They follow every ``edit`` (the new have zero), are saved, and are on the device of the Gaussians.
@@ -91,6 +92,7 @@ class Densifier:
     """
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {}
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {}
     needs_absolute_gradient: bool = False
     needs_footprint: bool = False  # ``RenderOutput.footprint``, which not every rasterizer gives
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from pydantic import PositiveFloat, PositiveInt
@@ -17,7 +18,7 @@ from gsbench.densify.operations import quantile
 from gsbench.densify.scores import by_mean, draw, draw_views, edge_scores
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import Fraction, OpenFraction
+from gsbench.settings import Fraction, OpenFraction, Switch
 
 # The authors' code has iterations, rounds being 100 apart and opacity resets 3,000; here these are rounds and resets.
 CLOSING_ROUNDS = 5  # before the end of the window cap=root has reached its budget, and the score is the gradient
@@ -40,6 +41,13 @@ class EdgeAware(LongAxis):
     ``early_prune_opacity``, and three rounds after an opacity reset the faintest ``recovery_share``. Gradients are
     gathered within the window only.
     """
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "absolute_gradient": Switch({"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"),
+        "fading": Switch({"opacity_factor": 1.0}, "children fainter than their parent"),
+        "early_prune": Switch({"early_prune_opacity": 0.0}, "the pruning of the faint before the first round"),
+        "recovery_prune": Switch({"recovery_share": 0.0}, "the pruning of what did not recover from an opacity reset"),
+    }
 
     gradient: Literal["signed", "absolute"] = "absolute"
     gradient_threshold: PositiveFloat = 3e-4

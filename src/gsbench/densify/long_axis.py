@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from annotated_types import Interval
 from torch import Tensor
 
 from gsbench.densify.adc import ADC, Grown
-from gsbench.densify.base import Refinement
+from gsbench.densify.base import NEVER, Refinement
 from gsbench.densify.operations import faded
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
-from gsbench.settings import OpenFraction
+from gsbench.settings import OpenFraction, Switch
 
 REACH = 3.0  # standard deviations: where a Gaussian is taken to end
 
@@ -29,6 +30,13 @@ class LongAxis(ADC):
     ``opacity_factor``; the parent goes. Nothing is drawn at random. The options ``split_size``, ``split_children``,
     ``split_shrink`` and ``revised_opacity`` of ADC have no meaning here.
     """
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "fading": Switch({"opacity_factor": 1.0}, "children fainter than their parent"),
+        "opacity_reset": Switch(
+            {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
+        ),
+    }
 
     split_distance: OpenFraction = 0.45
     opacity_factor: Annotated[float, Interval(gt=0, le=1)] = 0.6

@@ -4,8 +4,9 @@ heuristics."""
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from annotated_types import Interval
@@ -18,7 +19,7 @@ from gsbench.densify.operations import standard_normal
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
-from gsbench.settings import OpenFraction
+from gsbench.settings import OpenFraction, Switch
 
 BINOMIALS = 51  # rows in the authors' table; they let a Gaussian and its copies be one fewer
 GATE_STEEPNESS = 100.0  # of the sigmoid that keeps noise off opaque Gaussians
@@ -30,6 +31,12 @@ class MCMC(Budgeted):
 
     Copies share opacity and size so that the picture stays the same (eq. 9 of the paper). The cap is always exact.
     """
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "noise": Switch({"noise_rate": 0.0}, "noise on the means"),
+        "opacity_term": Switch({"opacity_weight": 0.0}, "the opacities' term of the loss"),
+        "scale_term": Switch({"scale_weight": 0.0}, "the scales' term of the loss"),
+    }
 
     stop: int = 25_000
     max_gaussians: PositiveInt = 1_000_000

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
@@ -22,7 +22,7 @@ from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import Fraction, OpenFraction
+from gsbench.settings import Fraction, OpenFraction, Switch
 
 # Numbers of LichtFeld-Studio's code (src/training/strategies/mrnf.cpp, kernels/mrnf_kernels.cu).
 EDGE_WEIGHT = 0.25  # of the edge score, over its median, beside 1
@@ -48,6 +48,12 @@ class MRNF(Budgeted):
     """
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"seen": torch.bool}  # since the last round
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "noise": Switch({"noise_rate": 0.0}, "noise on the means"),
+        "opacity_decay": Switch({"opacity_decay": 0.0}, "opacities that decay"),
+        "scale_decay": Switch({"scale_decay": 0.0}, "scales that decay"),
+    }
 
     start: NonNegativeInt = 0
     stop: int = 25_000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -10,7 +11,9 @@ from pydantic import PositiveFloat
 from torch import Tensor
 
 from gsbench.densify.adc import ADC
+from gsbench.densify.base import NEVER
 from gsbench.raster.base import RenderOutput
+from gsbench.settings import Switch
 
 
 @dataclass
@@ -26,6 +29,13 @@ class PixelGS(ADC):
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {
         "weighted_gradient_sum": torch.float32,  # NDC px, since the last refinement
         "pixel_sum": torch.int64,  # px
+    }
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "near_scaling": Switch({"near_fraction": None}, "less growth near the cameras"),
+        "opacity_reset": Switch(
+            {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
+        ),
     }
 
     near_fraction: PositiveFloat | None = 0.37  # of the scene extent; None: f = 1

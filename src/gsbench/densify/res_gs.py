@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
@@ -18,7 +18,7 @@ from gsbench.densify.operations import faded
 from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import OpenFraction
+from gsbench.settings import OpenFraction, Switch
 
 GATHER_ROUNDS = 2  # before the window's start gradients are gathered: 200 iterations in the authors' code
 
@@ -37,6 +37,12 @@ class ResGS(ADC):
     """
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"level": torch.int32}  # how many residual splits made a Gaussian
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "absolute_gradient": Switch({"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"),
+        "fading": Switch({"fade": 1.0}, "opacities that fade"),
+        "levels": Switch({"level_factor": 1.0}, "lower thresholds for whom earlier stages passed over"),
+    }
 
     gradient: Literal["signed", "absolute"] = "absolute"
     gradient_threshold: PositiveFloat = 6.7e-4

@@ -8,7 +8,7 @@ from typing import Literal
 from torch import Tensor
 
 LOG_SPHERE = math.log(4 * math.pi / 3)
-ConditionOf = Literal["eigenvalues", "scales"]
+ConditionOf = Literal["eigenvalues", "scales", "nothing"]
 
 
 def log_volume(log_scales: Tensor) -> Tensor:
@@ -22,13 +22,19 @@ def log_condition(log_scales: Tensor) -> Tensor:
 
 
 def child_log_scales(
-    log_scales: Tensor, applied_to: ConditionOf = "eigenvalues", max_condition: float | None = None
+    log_scales: Tensor,
+    applied_to: ConditionOf = "eigenvalues",
+    max_condition: float | None = None,
+    plain_shrink: float = 1.6,
 ) -> Tensor:
     """Scales of the children (eq. 7), [N, 3].
 
     ``eigenvalues``: lambda' = lambda / kappa, so log s' = log s - log(kappa) / 2. ``scales``: s' = s / kappa.
-    ``max_condition`` (at least 1) limits the kappa that is divided by.
+    ``nothing``: s' = s / ``plain_shrink``, as ADC splits, in place of eq. 7. ``max_condition`` (at least 1) limits the
+    kappa that is divided by.
     """
+    if applied_to == "nothing":
+        return log_scales - math.log(plain_shrink)
     condition = log_condition(log_scales)  # [N]
     if max_condition is not None:
         condition = condition.clamp_max(math.log(max_condition))

@@ -7,8 +7,9 @@ split, which the rule extends, where they do not.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from annotated_types import Ge
@@ -23,7 +24,7 @@ from gsbench.densify.volume import ConditionOf, child_log_scales, log_volume
 from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
-from gsbench.settings import OpenFraction
+from gsbench.settings import OpenFraction, Switch
 
 ThresholdMode = Literal["absolute", "extent_relative", "quantile", "auto"]
 TUKEY_FENCE = 1.5  # interquartile ranges above the third quartile (Tukey 1977)
@@ -44,10 +45,20 @@ class Volumetric(ADC):
     it multiplies: 3, the size of which V_th is the cube; 1, V_th itself, so that sizes move by the factor's cube root.
     """
 
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "volume_rule": Switch({"volume_stop": 0}, "the split of what is too large"),
+        "shrink": Switch(
+            {"condition_of": "nothing"}, "eq. 7's scales of its children, instead of ADC's", "volume_rule"
+        ),
+        "no_resplit": Switch({"split_isotropic": True}, "what would be split again is left alone", "volume_rule"),
+    }
+
     volume_threshold: PositiveFloat = VOLUME_THRESHOLD
     threshold_mode: ThresholdMode = "absolute"
     volume_quantile: OpenFraction = 0.9978  # 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03
-    condition_of: ConditionOf = "eigenvalues"  # what kappa divides: eigenvalues (eq. 7) or scales
+    condition_of: ConditionOf = (
+        "eigenvalues"  # what kappa divides: eigenvalues (eq. 7), scales, or nothing (ADC's shrink)
+    )
     max_condition: Annotated[float, Ge(1)] | None = None  # limits kappa, so that children of needles do not vanish
     split_isotropic: bool = True  # False: leave those whose children would be above the threshold again
     volume_children: Annotated[int, Ge(2)] = 2
@@ -86,6 +97,10 @@ class Volumetric(ADC):
         stop = self.stop if self.volume_stop is None else self.volume_stop
         return start < step < stop and step % (self.volume_interval or self.interval) == 0
 
+    def child_log_scales(self, log_scales: Tensor) -> Tensor:
+        """Scales [N, 3] of the children of Gaussians with scales [N, 3] that are split by volume."""
+        return child_log_scales(log_scales, self.condition_of, self.max_condition, self.split_shrink)
+
     @property
     def volume_gain(self) -> int:
         """The number of Gaussians that a split by volume adds."""
@@ -97,7 +112,7 @@ class Volumetric(ADC):
         threshold = self.log_threshold(volumes)
         if self.split_isotropic:
             return volumes > threshold
-        children = log_volume(child_log_scales(log_scales, self.condition_of, self.max_condition))
+        children = log_volume(self.child_log_scales(log_scales))
         return (volumes > threshold) & (children <= threshold)
 
     def grown(self, refinement: Refinement) -> Grown:
@@ -114,7 +129,7 @@ class Volumetric(ADC):
             large = self.voluminous(log_scales)
         number = torch.where(large, (1 + self.volume_gain) * number, number)
         if self.volume_order != "after_prune":
-            children = child_log_scales(log_scales, self.condition_of, self.max_condition)
+            children = self.child_log_scales(log_scales)
             log_scales = torch.where(large.unsqueeze(-1), children, log_scales)
         return grown._replace(number=number, log_scales=log_scales)
 
@@ -124,7 +139,7 @@ class Volumetric(ADC):
         log_scales = refinement.gaussians.values.log_scales.detach()
         volumes = log_volume(log_scales)  # [N]
         threshold = self.log_threshold(volumes)
-        children = child_log_scales(log_scales, self.condition_of, self.max_condition)  # [N, 3]
+        children = self.child_log_scales(log_scales)  # [N, 3]
         again = log_volume(children) > threshold  # [N] children that the next round would select too
         selected, blocked = admit(self.voluminous(log_scales), volumes, self.volume_gain, self.allowance(refinement))
         event.volume_threshold = math.exp(threshold)

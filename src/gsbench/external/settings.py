@@ -9,7 +9,8 @@ import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 from annotated_types import MinLen, Predicate, doc
@@ -24,10 +25,31 @@ DATA = "data"  # folder of the training views: images/ and the COLMAP model spar
 TEST_CAMERAS = "test_cameras"  # folder of the test views' cameras: transforms.json and the COLMAP model sparse/0
 OUTPUT = "output"  # empty folder, in which the program also starts
 KNOWN = (DATA, TEST_CAMERAS, OUTPUT, "iterations", "seed", "device", "threads")
+PLACES = (DATA, TEST_CAMERAS, OUTPUT)  # folders, which are absolute
 MODEL_SUFFIX = ".ply"
 
 Text = Annotated[str, MinLen(1), Predicate(lambda text: text != MISSING and bool(text.strip())), doc("a text")]
 CommandLine = Annotated[list[str] | str, doc("a list of words, or a text that is split as a shell would")]
+
+
+def check_pattern(pattern: str) -> None:
+    """Raise InputError for a pattern that can fit no file below a folder."""
+    key = f"densify.result={pattern}"
+    parts = PurePosixPath(pattern).parts
+    if (
+        not parts
+        or PurePosixPath(pattern).is_absolute()
+        or PureWindowsPath(pattern).drive
+        or {"..", "\0"} & {*parts, *pattern}
+    ):
+        raise InputError(f"{key}: give a pattern of files below the program's output folder, such as point_cloud/*.ply")
+    try:
+        with TemporaryDirectory() as empty:
+            list(Path(empty).glob(pattern))
+    except (ValueError, NotImplementedError, IndexError, OSError, RecursionError) as error:
+        raise InputError(
+            f"{key} is no pattern of files ({error}): ** stands for folders, so it is a part of its own"
+        ) from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +96,9 @@ class External:
                 raise InputError(
                     f"densify.options.{name}: an option is one value with a name of its own, none of {', '.join(KNOWN)}"
                 )
+        check_pattern(
+            fill(self.result, dict.fromkeys(KNOWN, "1") | dict.fromkeys(PLACES, "/") | self.options, "densify.result")
+        )
         known = dict.fromkeys((*KNOWN, *self.options))
         for key, text in [("command", word) for word in self.words] + [("result", self.result)]:
             fill(text, known, f"densify.{key}")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from gsbench.errors import InputError
-from gsbench.files import atomic
+from gsbench.files import atomic, require_regular
 from gsbench.gaussians.model import MAX_SH_DEGREE, NUM_SH_REST, Gaussians
 
 NUM_REST = 3 * NUM_SH_REST  # f_rest is stored channel by channel: 15 of red, 15 of green, 15 of blue
@@ -77,6 +77,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 def _check_length(path: Path) -> None:
     """Raise ValueError where the header promises more than the file can hold, which would be allocated unread."""
+    require_regular(path)
     with path.open("rb") as stream:
         header, found, _ = stream.read(MAX_HEADER).partition(b"end_header")
     if not found:

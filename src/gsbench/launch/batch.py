@@ -11,7 +11,7 @@ from typing import Any
 
 from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
-from gsbench.files import checked_runs_folder, make_runs_folder, storage_errors
+from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.declare import declare, declared_metrics, planned_trials
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
@@ -74,7 +74,13 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
         drop_parts(unfinished)
     if launcher != "slurm":
         check_trackers(unfinished)
-    make_runs_folder(runs)
+    try:
+        make_runs_folder(runs)
+    except OSError as error:
+        if unfinished or error.errno not in FORBIDDEN:
+            raise
+        log.info("%s may not be written to (%s), so its plan stays as it is", runs, error.strerror)
+        return
     Store(runs / STORE).sweep(STAGES)
     add_to_plan(trials)
     declare(metrics, planned_trials(trials))

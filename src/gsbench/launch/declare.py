@@ -1,5 +1,4 @@
-"""Writing down which metric with which trials, or which plan of claims, a command declares before its trials run. Loads
-no torch."""
+"""Writing down the metric with its trials, or the plan, that a command declares before trials run. Loads no torch."""
 
 from __future__ import annotations
 
@@ -91,7 +90,10 @@ def _together(one: Planned, other: Planned) -> Planned:
 
 
 def declare_plan(home: Path, plan: Mapping[str, Any], plan_hash: str) -> DeclaredPlan:
-    """Add a plan of claims to the record of the experiment in ``home``, unless it is the latest there; what stands."""
+    """Add a plan, of claims or of a sweep's looks, to the record of the experiment in ``home``; what stands there.
+
+    One that is the latest there already stands with its time.
+    """
     home.mkdir(parents=True, exist_ok=True)
     with hold(home / f".{DECLARED}.lock", "the declarations"):
         known = read_plans(home)
@@ -100,7 +102,9 @@ def declare_plan(home: Path, plan: Mapping[str, Any], plan_hash: str) -> Declare
         declared = DeclaredPlan(int(time.time()), plan_hash, dict(plan))
         _write(home, read_declarations(home), [*known, declared])
     if known:
-        log.warning("%s: another plan of claims was declared before, and the page will say so", home.name)
+        log.warning(
+            "%s: another plan was declared before: trials that were measured under it count as looked at", home.name
+        )
     return declared
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import statistics
@@ -14,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsbench.errors import GsbenchError
+from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.queue import ask_queue, state_in_queue
 from gsbench.launch.trial import Trial
 from gsbench.parsing import DamagedError
@@ -27,6 +28,8 @@ from gsbench.runs.trial_files import TrialPaths, stage_and_step, state_of
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.locks import hold
 from gsbench.words import counted, readable_time
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -75,11 +78,13 @@ def remove(home: Path, folders: Iterable[Path]) -> None:
 
 
 def read_plan(home: Path) -> list[Planned]:
-    """The planned trials of the experiment in ``home``; none if it has no plan."""
-    return [
-        Planned(home / name, entry.overrides, entry.cwd, entry.time)
-        for name, entry in sorted(read_entries(home).items())
-    ]
+    """The planned trials of the experiment in ``home``; none if it has no plan, or a damaged one, which is named."""
+    try:
+        entries = read_entries(home)
+    except InputError as error:
+        log.warning("left out: %s", error)
+        entries = {}
+    return [Planned(home / name, entry.overrides, entry.cwd, entry.time) for name, entry in sorted(entries.items())]
 
 
 def _finished(folder: Path) -> TrialRecord | None:

@@ -30,7 +30,7 @@ from gsbench.settings import checked, unknown_setting
 
 log = logging.getLogger(__name__)
 
-RESERVED = ("_target_", "name")  # keys of a group that are not options of its class
+RESERVED = ("_target_", "name", "switches")  # keys of a group that are not options of its class
 METHODS = {
     "init": ("needs_reference", "content", "run"),
     "densify": ("prepare", "begin", "observe", "refine", "after_step"),

@@ -5,9 +5,11 @@ A rasterizer of your own needs no entry here: ``raster._target_=mine.MyRasterize
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import logging
 import os
+import re
 from dataclasses import dataclass
 
 from gsbench.errors import InputError
@@ -28,6 +30,8 @@ class Executor:
     text: str  # what it is, in one line
     package: str | None = None  # what it imports beyond gsbench's own requirements
     install: str = ""  # how to get that package
+    minimum: tuple[int, int] | None = None  # the oldest version of it that works
+    upgrade: str = ""  # how to get that version
     takes_threads: bool = False  # its class has an argument ``threads``
     has_footprint: bool = True  # its renders say which pixels each Gaussian covers
 
@@ -47,7 +51,21 @@ class Executor:
             return f"runs on device={needed}, not on {device_type}; choose from {others}, or set device={needed}"
         if not self.is_installed:
             return f"needs {self.package}: {self.install}"
-        return None
+        return self.too_old()
+
+    def too_old(self) -> str | None:
+        """What to do about a package that is older than ``minimum``; None if it is not, or its version is not known."""
+        if self.package is None or self.minimum is None:
+            return None
+        try:
+            found = importlib.metadata.version(self.package)
+        except importlib.metadata.PackageNotFoundError:  # for one GPU or another it goes by other names
+            return None
+        numbers = [int(number) for number in re.findall(r"\d+", found)[:2]]
+        if tuple(numbers) >= self.minimum:
+            return None
+        wanted = ".".join(map(str, self.minimum))
+        return f"needs {self.package} {wanted} or newer, and {found} is installed: {self.upgrade}"
 
 
 EXECUTORS = (
@@ -71,6 +89,8 @@ EXECUTORS = (
         text="Triton kernels, compiled at first use by what torch brings along; the same bits on every run",
         package="triton",
         install="pip install triton, in the version that your torch asks for",
+        minimum=(3, 4),  # 3.3 has no `knobs`, and its kernels take no named tuple
+        upgrade="pip install 'torch>=2.8', which brings it along",
     ),
     Executor(
         "gsplat",

@@ -40,6 +40,7 @@ from gsbench.words import signed
 log = logging.getLogger(__name__)
 
 SHARED_METRICS = ("psnr", "ssim")  # whose difference is shared; LPIPS by another network is another metric
+WITHOUT_EFFECT = {"psnr": ("SSIM padding",)}
 ROUNDING_TOLERANCE = 1  # 8-bit levels by which a render that is made again may differ from its file
 
 Picture = NDArray[np.uint8]
@@ -116,12 +117,12 @@ def translate(
         per_view = {view: evaluator.evaluate_view(render, truths[view]) for view, render in renders.items()}
         return summarize(per_view, evaluator.unavailable)
 
-    runs = [Run(chosen) for size in range(len(used) + 1) for chosen in combinations(used, size)]
-    shares = {
-        metric: shapley(used, {run: values(run)[metric] for run in runs})
-        for metric in SHARED_METRICS
-        if all(metric in values(run) for run in runs)
-    }
+    shares = {}
+    for metric in SHARED_METRICS:
+        matter = [name for name in used if name not in WITHOUT_EFFECT.get(metric, ())]
+        runs = [Run(chosen) for size in range(len(matter) + 1) for chosen in combinations(matter, size)]
+        if all(metric in values(run) for run in runs):
+            shares[metric] = shapley(matter, {run: values(run)[metric] for run in runs})
     final = make(replace(protocol, eight_bit=protocol.eight_bit or exact is None))
     renders = material.renders if exact is None else exact
     per_view = {view: final.evaluate_view(render, photographs[view]) for view, render in renders.items()}

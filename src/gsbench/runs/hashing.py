@@ -10,7 +10,8 @@ from typing import Any
 from gsbench.runs.source import source_of
 
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")  # options that cannot change a result
-DECLARED = {"eval": ("primary", "controls")}  # settings of a group that say how results will be read, whatever they are
+# Settings of a group that say how results will be read, or what may be varied, whatever they are.
+DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",)}
 # Settings that are younger than results that people keep, with the value at which all is as it was before them: at
 # that value they have no part in a hash or key, and a configuration without them means it.
 LATER: dict[str, dict[str, Any]] = {
@@ -23,12 +24,17 @@ NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tra
 
 def config_hash(values: dict[str, Any]) -> str:
     """sha256 of what determines a result apart from the seed: not names, devices, folders, tracking or launchers."""
+    return sha256_of(_with_sources(determining(values)))
+
+
+def determining(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings among ``values`` that determine a result, apart from the seed and the code of a user's classes."""
     kept = {key: value for key, value in values.items() if key not in NOT_HASHED}
     for key, group in kept.items():
         if isinstance(group, dict):
             dropped = (*WITHOUT_EFFECT, *DECLARED.get(key, ()))
             kept[key] = {name: value for name, value in as_before(key, group).items() if name not in dropped}
-    return sha256_of(_with_sources(kept))
+    return kept
 
 
 def as_before(group: str, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ METRICS = "metrics.json"  # of an evaluation
 # in an experiment's folder
 PLAN = "plan.json"  # the trials that were asked for
 DECLARED = "declared.jsonl"  # the metrics that verdicts were declared to be about, and when
+ABLATION = "ablation.json"  # which trials have which parts of a densifier switched on
 SEARCH, SEARCH_JOURNAL = "search.json", "search.journal"  # what a search found, and Optuna's own record of it
 TRIAL_GLOB = "*/*/*-seed*"  # the trials that are there
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+import stat
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -211,7 +212,7 @@ def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) 
 def _is_sound(path: Path, recorded: Output, thorough: bool) -> bool:
     try:
         state = path.stat()
-        if state.st_size != recorded.size:
+        if not stat.S_ISREG(state.st_mode) or state.st_size != recorded.size:
             return False
         if not thorough and state.st_mtime_ns == recorded.mtime_ns:
             return True

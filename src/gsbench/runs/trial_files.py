@@ -57,7 +57,7 @@ class Configured(Part):
 class Failure(Part):
     """``failed.json``: the kind of the error, its text, where it came from, and when (Unix time)."""
 
-    error: str
+    error: str = ""
     message: str = ""
     traceback: str = field(default="", repr=False)
     time: Amount = 0.0

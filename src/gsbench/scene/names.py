@@ -13,6 +13,7 @@ from gsbench.words import some_of
 
 MAX_IMAGES = 200  # the paper's limit per scene
 MIN_IMAGES = 3
+MAX_NAME_BYTES = 220  # of a picture's name; file systems end at 255, and a file that is being written has a longer one
 
 
 def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
@@ -95,6 +96,22 @@ def split_names(
 def _stem(name: str) -> str:
     path = PurePosixPath(name)
     return (path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path).as_posix()
+
+
+def check_picture_names(names: Iterable[str], folder: Path) -> None:
+    """Raise `InputError` where the pictures of two views would have one name, or a name that no file can have."""
+    taken: dict[str, str] = {}
+    for name in names:
+        picture = png_name(name)
+        if len(picture.encode()) > MAX_NAME_BYTES:
+            raise InputError(
+                f"{folder / name}: a name of more than {MAX_NAME_BYTES} bytes, folders included: shorten it"
+            )
+        if picture in taken:
+            raise InputError(
+                f"{folder}: the pictures of {taken[picture]} and {name} would both be {picture}: rename one"
+            )
+        taken[picture] = name
 
 
 def png_name(view_name: str) -> str:

@@ -10,10 +10,11 @@ from pathlib import Path
 
 from gsbench.datasets.catalog import how_to_get
 from gsbench.errors import InputError
+from gsbench.files import require_regular
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.hold_out import Cameras, hold_out
 from gsbench.scene.images import IMAGE_SUFFIXES
-from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, match_names, select_images
+from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, check_picture_names, match_names, select_images
 from gsbench.scene.split import EVERY_NTH, TEST_LIST, TRAIN_LIST, SplitRule
 from gsbench.scene.types import Capture
 from gsbench.words import some_of
@@ -99,14 +100,38 @@ def missing_folder(name: str, root: Path) -> str:
 
 
 def list_images(folder: Path) -> list[str]:
-    """The sorted image files in a folder and its sub-folders, relative, with "/" as separator; hidden ones left out."""
-    names = []
-    for parent, folders, files in os.walk(folder, followlinks=True):
-        folders[:] = sorted(entry for entry in folders if not entry.startswith("."))
-        for file in files:
-            if Path(file).suffix.lower() in IMAGE_SUFFIXES and not file.startswith("."):
-                names.append((Path(parent) / file).relative_to(folder).as_posix())
+    """The sorted image files in a folder and its sub-folders, relative, with "/" as separator; hidden ones left out.
+
+    Links to folders are followed, and no folder is read twice.
+    """
+    names: list[str] = []
+    waiting, links, seen = [folder], list[Path](), set[tuple[int, int]]()
+    while waiting or links:
+        parent = waiting.pop() if waiting else links.pop(0)  # a folder goes by its own name rather than by a link's
+        if (place := _identity(parent)) in seen:
+            continue
+        seen.add(place)
+        for entry in sorted(_entries(parent), key=lambda entry: entry.name):
+            if entry.name.startswith("."):
+                continue
+            if entry.is_dir():
+                (links if entry.is_symlink() else waiting).append(Path(entry.path))
+            elif Path(entry.name).suffix.lower() in IMAGE_SUFFIXES:
+                names.append(Path(entry.path).relative_to(folder).as_posix())
     return sorted(names)
+
+
+def _identity(folder: Path) -> tuple[int, int]:
+    found = folder.stat()
+    return found.st_dev, found.st_ino
+
+
+def _entries(folder: Path) -> list[os.DirEntry[str]]:
+    try:
+        with os.scandir(folder) as entries:
+            return list(entries)
+    except PermissionError:  # as if it were not there
+        return []
 
 
 def fingerprint(folder: Path, names: Iterable[str], model_files: Iterable[Path] = ()) -> str:
@@ -115,6 +140,7 @@ def fingerprint(folder: Path, names: Iterable[str], model_files: Iterable[Path] 
     entries = [(f"image/{name}", folder / name) for name in sorted(names)]
     entries += [(f"model/{file.name}", file) for file in sorted(model_files)]
     for label, file in entries:
+        require_regular(file)
         try:
             with file.open("rb") as stream:
                 content = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -141,6 +167,7 @@ def _capture(
         names = sorted({*train, *test})
     held_out = hold_out(select_images(names, max_images), split, (train, test), cameras)
     kept = tuple(sorted([*held_out.train, *held_out.test]))
+    check_picture_names(held_out.test, folder)
     _require_enough(len(kept), folder, "in the split lists" if split.by_lists else "left by the split")
     return Capture(
         name=name,
@@ -181,6 +208,7 @@ def _read_list(root: Path, file: str | None, key: str) -> list[str] | None:
     if file is None:
         return None
     path = root / file  # an absolute path stays as it is
+    require_regular(path)
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

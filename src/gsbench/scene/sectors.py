@@ -44,14 +44,14 @@ def arrange(cameras: Sequence[Camera]) -> Arrangement:
     widest = int(gaps.argmax())
     gap = float(gaps[widest])
     if gap >= SURROUNDED:
-        fault = f"the cameras stand on one side of the scene (no camera in {gap:.0f} degrees around its centre)"
+        fault = f"the cameras stand on one side of the scene, with none in {gap:.0f} degrees around its centre"
         words = f"by planes across the principal axis of the cameras' centres, since {fault}"
         return Arrangement(_sorted(along_axis(centers)), words)
     if gap > OPEN_RING:
         order = np.roll(order, -(widest + 1))
     return Arrangement(
         tuple(int(index) for index in order),
-        f"by azimuth around the scene's up and centre, since the cameras surround it (widest gap {gap:.0f} degrees)",
+        f"by azimuth around the scene's up and centre, as the cameras surround it (gaps up to {gap:.0f} degrees)",
     )
 
 
@@ -108,7 +108,7 @@ def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, 
     forwards = np.array([camera.rotation[2] for camera in cameras])  # [V, 3]
     facing = float((((center - centers) * forwards).sum(axis=1) > 0).mean())
     if facing < FACING:
-        return None, f"the cameras do not look at one place ({facing:.0%} do)"
+        return None, f"the cameras do not look at one place; {facing:.0%} do"
     up = scene_up(cameras, centers)
     flat = (centers - center) - ((centers - center) @ up)[:, None] * up  # [V, 3]
     first = flat[0] / np.linalg.norm(flat[0]) if np.linalg.norm(flat[0]) > 0 else np.zeros(3)

@@ -37,6 +37,7 @@ _BOOTSTRAP = (
 )
 _SECONDS_TO_END = 10.0  # patience with a child that ends what it started, before it is killed
 _TAIL_LINES = 3
+_TAIL_BYTES = 1 << 20  # in which they are looked for: a program may print gigabytes
 _STACK_LINE = re.compile(r"^\s*(@|PC:|\*\*\* )|^\s*File |^\s*$")  # glog's crash dump, blank lines
 _REASON_LINE = re.compile(r"what\(\)|terminate called|Check failed|Error|error|free\(\)|malloc|corrupt")
 
@@ -72,7 +73,7 @@ def run_isolated(
             start = stream.seek(0, os.SEEK_END)
             code = _run_child(call, result, stream)
         if code != 0 or not result.is_file():
-            raise CrashError(f"{what} {describe_exit(code)}; its last words: {_telling_tail(output, start)}")
+            raise CrashError(f"{what} {describe_exit(code)}; its last words: {telling_tail(output, start)}")
         succeeded, value, trace = pickle.loads(result.read_bytes())
     if succeeded:
         return value
@@ -161,10 +162,11 @@ def describe_exit(code: int) -> str:
     return f"ended early (exit code {code})"
 
 
-def _telling_tail(output: Path, start: int) -> str:
+def telling_tail(output: Path, start: int = 0) -> str:
+    """`telling_lines` of the end of a file of output, of which what is before ``start`` does not count."""
     with output.open("rb") as stream:
-        stream.seek(start)
-        return telling_lines(stream.read())
+        stream.seek(max(start, stream.seek(0, os.SEEK_END) - _TAIL_BYTES))
+        return telling_lines(stream.read(_TAIL_BYTES))
 
 
 def telling_lines(output: bytes) -> str:

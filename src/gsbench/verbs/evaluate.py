@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.errors import InputError
-from gsbench.eval.protocol import ALL
+from gsbench.eval.protocol import ALL, OTHERS
 from gsbench.verbs.arguments import ArgumentParser
 
 EVERY = "all"
@@ -22,6 +22,11 @@ def main(argv: Sequence[str], runs: Path) -> int:
         _check_translation(options)
         translate_trials(options.renders, options.protocol, runs)
         return 0
+    if options.protocol in OTHERS:
+        raise InputError(
+            f"--protocol {options.protocol} also says how photographs are shrunk, which is not known of --truth: enter "
+            f"the renders with --as EXPERIMENT:ARM, then gsbench evaluate EXPERIMENT --protocol {options.protocol}"
+        )
     from gsbench.renders.measure import measure_renders
 
     measure_renders(options, runs)

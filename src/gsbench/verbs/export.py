@@ -1,4 +1,4 @@
-"""``gsbench export``: a trained model, or an initial cloud, for other programs."""
+"""``gsbench export``: a trained model, an initial cloud, or an experiment's results, for others."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.runs.layout import STORE
@@ -38,16 +39,24 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser(
         prog="gsbench export",
         description="Write a trained model for other programs; `gsbench export init TRIAL --out DIR` copies the COLMAP "
-        "model that the trial started from.",
+        "model that the trial started from; `gsbench export --results EXPERIMENT` writes results, configurations and "
+        "hashes, without pixels, as one small archive.",
     )
-    parser.add_argument("trial", nargs="+", metavar="TRIAL", help=f"{ADDRESS}; after the word init: its initial model")
+    parser.add_argument("--results", metavar="EXPERIMENT", help="the archive of its results (default: EXPERIMENT.zip)")
+    parser.add_argument("trial", nargs="*", metavar="TRIAL", help=f"{ADDRESS}; after the word init: its initial model")
     parser.add_argument(
         "--to", choices=list(FORMATS), help="; ".join(f"{name}: {text}" for name, text in FORMATS.items())
     )
     parser.add_argument(
-        "--out", type=path, required=True, metavar="PATH", help="the file, or for init the folder, to write"
+        "--out", type=path, metavar="PATH", help="the file, or for init the folder, to write; needed for a TRIAL"
     )
     options = parser.parse_args(argv)
+    if options.results is not None:
+        if options.trial or options.to:
+            raise InputError("export --results takes an experiment and --out alone")
+        return export_results(options.results, runs, options.out)
+    if not options.trial or options.out is None:
+        raise InputError("export needs a TRIAL and --out PATH, or --results EXPERIMENT (see gsbench export --help)")
     from gsbench.view.trials import find_trial, model_file
 
     is_init = len(options.trial) == 2 and options.trial[0] == "init"
@@ -67,6 +76,25 @@ def main(argv: Sequence[str], runs: Path) -> int:
         raise InputError(f"cannot write {out} ({error.strerror or error}); give another --out") from error
     log.info("%s", trial.label)
     print(out)
+    return 0
+
+
+def export_results(name: str, runs: Path, out: Path | None) -> int:
+    """Write the archive of an experiment's results, and say what is not in it; 0."""
+    from gsbench.claims.archive import write_archive
+
+    experiment = load_experiment(runs, name)
+    file = Path(f"{name}.zip") if out is None else out
+    if file.is_dir():
+        file = file / f"{name}.zip"
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        left_out = write_archive(experiment, file)
+    except OSError as error:
+        raise InputError(f"cannot write {file} ({error.strerror or error}); give another --out") from error
+    for line in left_out:
+        log.warning("left out: %s", line)
+    print(file)
     return 0
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.results import load_experiment
+from gsbench.claims.stopping import headline, standing_verdicts
+from gsbench.claims.switches import ablation_part
 from gsbench.errors import InputError
 from gsbench.files import write_text
 from gsbench.verbs.arguments import ArgumentParser, path
@@ -31,7 +34,10 @@ def main(argv: Sequence[str], runs: Path) -> int:
     if options.baseline is not None and options.baseline not in densifiers:
         raise InputError(f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}")
     file = experiment.folder / REPORT_NAME if options.out is None else file_at(options.out, experiment.name)
-    text = build_report(experiment, options.baseline or BASELINE)
+    for warning in experiment.warnings:
+        print(f"left out: {warning}", file=sys.stderr)
+    looked = [headline(verdict) for verdict in standing_verdicts(experiment.folder)]
+    text = build_report(experiment, options.baseline or BASELINE, looked, ablation_part(experiment.folder))
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         write_text(file, text)

@@ -17,7 +17,7 @@ from gsbench.runs.trial_files import label_of
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
-ORDER = ("failed", "running", "queued", "partial", "missing", "superseded", "done")
+ORDER = ("failed", "damaged", "running", "queued", "partial", "missing", "superseded", "done")
 
 
 def main(argv: Sequence[str], runs: Path) -> int:

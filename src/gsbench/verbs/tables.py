@@ -17,7 +17,8 @@ from gsbench.analysis.paper_tables import PAPER_TABLES, layout_of, paper_tables
 from gsbench.analysis.published import published_names, published_table
 from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experiment
 from gsbench.analysis.table_formats import FORMATS
-from gsbench.analysis.tables import DEFAULT_ROWS, build_table, compared_pairs
+from gsbench.analysis.table_notes import compared_pairs
+from gsbench.analysis.tables import DEFAULT_ROWS, build_table
 from gsbench.analysis.translations import by_protocol
 from gsbench.errors import InputError
 from gsbench.eval.protocol import ALL

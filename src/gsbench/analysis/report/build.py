@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
@@ -35,8 +36,22 @@ from gsbench.runs.layout import FIGURES
 from gsbench.words import signed
 
 
-def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
-    """The report as HTML, with every densifier held against ``baseline``; a pure function of the experiment's files."""
+@dataclass(frozen=True)
+class AblationPart:
+    """What the runs were, in lines, and charts as SVG."""
+
+    lines: Sequence[str]
+    charts: Sequence[str]
+
+
+def build_report(
+    experiment: Experiment, baseline: str = BASELINE, looked: Sequence[str] = (), ablation: AblationPart | None = None
+) -> str:
+    """The report as HTML, with every densifier held against ``baseline``; a pure function of the experiment's files.
+
+    ``looked`` are the verdicts of a sweep that stopped when decided: they stand above those that take numbers of seeds
+    as fixed. ``ablation`` is what switching parts of a densifier off has shown.
+    """
     trials = with_variants(experiment.trials)
     arms = sorted({trial.arm for trial in trials})
     views = ViewCache()
@@ -65,6 +80,8 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         versus=versus,
         declared=declared.sentences(quantity.name) if declared and quantity else [],
         families=families(list(judged.values())),
+        looked=looked,
+        ablation=ablation,
         tables=[to_html(table) for table in tables],
         contradictions=[] if layout is None else inconsistencies(load_paper()),
         search=search,

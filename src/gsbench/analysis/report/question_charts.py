@@ -61,17 +61,16 @@ def angle_charts(trials: Sequence[TrialResult], views: ViewCache) -> list[str]:
 
 
 def binned(points: Sequence[tuple[float, float]], most: int = MOST_POINTS) -> list[tuple[float, float]]:
-    """Means of (x, y) in at most ``most`` equally filled bins of x, in order; views of one angle stay together."""
-    by_x: dict[float, list[float]] = defaultdict(list)
+    """Means of (x, y) in at most ``most`` bins of x, in order, filled alike; what rounds to one stays together."""
+    alike: dict[int, list[tuple[float, float]]] = defaultdict(list)
     for x, y in points:
-        by_x[x].append(y)
-    ordered = sorted(by_x.items())
-    bins = min(most, len(ordered))
+        alike[round(x)].append((x, y))
+    groups = [alike[key] for key in sorted(alike)]
+    bins = min(most, len(groups))
     found = []
     for index in range(bins):
-        part = ordered[index * len(ordered) // bins : (index + 1) * len(ordered) // bins]
-        values = [value for _, own in part for value in own]
-        found.append((sum(x * len(own) for x, own in part) / len(values), statistics.fmean(values)))
+        part = [p for group in groups[index * len(groups) // bins : (index + 1) * len(groups) // bins] for p in group]
+        found.append((statistics.fmean(x for x, _ in part), statistics.fmean(y for _, y in part)))
     return found
 
 
@@ -85,11 +84,11 @@ def places(trials: Sequence[TrialResult], views: ViewCache) -> list[str]:
         if not angles:
             continue
         question = f", {group[0].question}" if group[0].question else ""
-        words = f" ({group[0].record.held_out})" if group[0].record.held_out else ""
+        words = f": {group[0].record.held_out}" if group[0].record.held_out else ""
         far = f", {_span(distances, '.2f')} scene extents" if distances else ""
         lines.append(
-            f"{scene}, {split or 'split not recorded'}{question}: {counted(len(rows), 'test view')}{words}, "
-            f"{_span(angles, '.1f')} degrees{far} from the nearest training view"
+            f"{scene}, {split or 'split not recorded'}{question}: {counted(len(rows), 'test view')}, "
+            f"{_span(angles, '.1f')} degrees{far} from the nearest training view{words}"
         )
     return lines
 

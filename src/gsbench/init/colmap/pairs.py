@@ -54,14 +54,16 @@ def gps_positions(paths: list[Path]) -> NDArray[np.float64] | None:
 
     geodetic = []
     for path in paths:
-        with Image.open(path) as image:
-            gps = image.getexif().get_ifd(_GPS_IFD)
         try:
+            with Image.open(path) as image:
+                gps = image.getexif().get_ifd(_GPS_IFD)
             latitude = _degrees(gps[_GPS_LATITUDE], gps[_GPS_LATITUDE_REF] == "S")
             longitude = _degrees(gps[_GPS_LONGITUDE], gps[_GPS_LONGITUDE_REF] == "W")
             geodetic.append((latitude, longitude, float(gps.get(_GPS_ALTITUDE, 0.0))))
-        except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        except Exception:  # noqa: BLE001 - Pillow raises many kinds on damaged fields, as if there were none
             return None
+    if not np.isfinite(geodetic).all():
+        return None
     latitudes, longitudes, altitudes = np.array(geodetic).reshape(-1, 3).T
     radians = np.radians
     east = EARTH_RADIUS_M * radians(longitudes - longitudes.mean()) * np.cos(radians(latitudes.mean()))

@@ -1,0 +1,227 @@
+"""An experiment's results as one small file that others can read: a zip archive, and an RO-Crate 1.1 at once.
+
+It holds, without any pixels:
+
+- ``results.jsonl``: the ``results.json`` of every trial, one a line, with the folder that it lay in;
+- ``configurations.jsonl``: every configuration, with the folders of the trials that had it (their seeds apart);
+- ``per_view.csv``: the metrics of every test view;
+- ``declared.jsonl``: what was declared before trials ran, where something was;
+- ``archive.json``: the version of this format and the sha256 of the files above;
+- ``ro-crate-metadata.json``: the same in the terms of RO-Crate (w3id.org/ro/crate/1.1), for other tools.
+
+Paths of the machine are left out: of folders the last name is kept. The same results make the same archive, bit by bit.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePath
+from typing import Any
+
+import yaml
+
+from gsbench import __version__
+from gsbench.analysis.results import Experiment, TrialResult, read_experiment, read_views
+from gsbench.claims.crate import crate_metadata
+from gsbench.errors import InputError
+from gsbench.files import atomic
+from gsbench.runs.layout import CONFIG, DECLARED, PER_VIEW, RESULTS
+from gsbench.settings import is_folder_name
+
+FORMAT, VERSION = "gsbench results", 1
+MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
+TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
+MOST_BYTES = 1 << 28  # of a file when unpacked; more than any experiment has
+FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # of the files within: the earliest that zip knows
+PRIVATE = ("runs",)  # settings that say where somebody's files lie, and nothing else
+SEED_KEY = "seed"
+
+
+def write_archive(experiment: Experiment, out: Path) -> list[str]:
+    """Write the experiment's results to the file ``out``; returns a line for each trial that is left out, with why.
+
+    Raises InputError where none is left.
+    """
+    kept, rows, left_out = [], [], list(experiment.warnings)
+    for trial in experiment.trials:
+        try:
+            rows += [(_folder(trial), view, metrics) for view, metrics in sorted(read_views(trial).items())]
+        except InputError as error:
+            left_out.append(f"{trial.label}: {error}")
+            continue
+        kept.append(trial)
+    if not kept:
+        raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
+    declared = experiment.folder / DECLARED
+    contents = {
+        TRIALS: _json_lines(
+            {"folder": _folder(trial), "results": _without_paths(trial.record.to_json())} for trial in kept
+        ),
+        CONFIGURATIONS: _configurations(kept),
+        PER_VIEW: _table(rows),
+    } | ({DECLARED: declared.read_bytes()} if declared.is_file() else {})
+    manifest = {
+        "format": FORMAT,
+        "version": VERSION,
+        "experiment": experiment.name,
+        "gsbench": __version__,
+        "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
+    }
+    contents[MANIFEST] = (json.dumps(manifest, indent=1) + "\n").encode()
+    crate = crate_metadata(experiment.name, kept, {name: len(content) for name, content in contents.items()})
+    contents[CRATE] = (json.dumps(crate, indent=1) + "\n").encode()
+    with atomic(out, sync=False) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for name in (CRATE, *(name for name in contents if name != CRATE)):
+            info = zipfile.ZipInfo(name, FIXED_DATE)
+            archive.writestr(info, contents[name], zipfile.ZIP_DEFLATED, compresslevel=9)
+    return left_out
+
+
+def unpack_archive(file: Path, runs: Path) -> Experiment:
+    """Lay the trials of an archive into the runs folder ``runs``, which is to be empty, and read them as an experiment.
+
+    Raises InputError, one line that names the file, for an archive that is none, cut, edited or of another version.
+    """
+    try:
+        manifest, contents = _read(file)
+        home = runs / _name(manifest["experiment"])
+        trials = [(_place(line["folder"]), line["results"]) for line in _lines(contents[TRIALS])]
+        _unpack(home, trials, contents)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+    except (KeyError, TypeError, ValueError, AttributeError, csv.Error) as error:
+        raise InputError(f"{file}: its content is not that of an archive ({error!r}): export it again") from None
+    experiment = read_experiment(home)
+    if not experiment.trials or experiment.warnings:
+        reason = experiment.warnings[0] if experiment.warnings else "it has no trial"
+        raise InputError(f"{file}: {reason}")
+    return experiment
+
+
+def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """The manifest, and the files that it lists, each with the right checksum."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            manifest = json.loads(_member(archive, MANIFEST))
+            if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+                raise InputError(f"its {MANIFEST} is not one of gsbench: give what gsbench export --results wrote")
+            if manifest.get("version") != VERSION:
+                raise InputError(
+                    f"it is of version {manifest.get('version')} of the archive (gsbench {manifest.get('gsbench')}), "
+                    f"and this gsbench reads {VERSION}: use one gsbench for both"
+                )
+            contents = {str(name): _member(archive, str(name)) for name in manifest["sha256"]}
+    except FileNotFoundError:
+        raise InputError("no such file") from None
+    except IsADirectoryError:
+        raise InputError("it is a folder: give an archive, or a folder of nerfbaselines' result files") from None
+    except (OSError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise InputError(f"it is no whole zip archive ({error}): fetch or export it again") from None
+    except UnicodeDecodeError:
+        raise InputError(f"its {MANIFEST} is not UTF-8") from None
+    except json.JSONDecodeError as error:
+        raise InputError(f"its {MANIFEST} is not JSON ({error})") from None
+    for name, content in contents.items():
+        if hashlib.sha256(content).hexdigest() != manifest["sha256"][name]:
+            raise InputError(f"{name} was changed after the export (its sha256 is another): export it again")
+    return manifest, contents
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> bytes:
+    try:
+        info = archive.getinfo(name)
+    except KeyError:
+        raise InputError(f"it lacks {name}: it is no archive of gsbench's, or was cut") from None
+    if info.file_size > MOST_BYTES:
+        raise InputError(f"{name} would be {info.file_size} bytes: no archive of gsbench's has so many")
+    with archive.open(info) as stream:
+        return stream.read(MOST_BYTES)
+
+
+def _unpack(home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: Mapping[str, bytes]) -> None:
+    """Write the files of every trial as gsbench has them."""
+    for folder, results in trials:
+        (home / folder).mkdir(parents=True)
+        (home / folder / RESULTS).write_text(json.dumps(results), encoding="utf-8")
+    known = {folder for folder, _ in trials}
+    for line in _lines(contents[CONFIGURATIONS]):
+        for folder, seed in line["trials"]:
+            if folder in known:
+                content = yaml.safe_dump(line["configuration"] | {SEED_KEY: seed}, sort_keys=False)
+                (home / folder / CONFIG).write_text(content, encoding="utf-8")
+    reader = csv.DictReader(io.StringIO(contents[PER_VIEW].decode()))
+    by_trial: dict[str, list[dict[str, str]]] = {}
+    for row in reader:
+        by_trial.setdefault(row.pop("trial"), []).append(row)
+    columns = [name for name in reader.fieldnames or () if name != "trial"]
+    for folder in known & by_trial.keys():
+        with (home / folder / PER_VIEW).open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.DictWriter(stream, columns)
+            writer.writeheader()
+            writer.writerows(by_trial[folder])
+    if DECLARED in contents:
+        (home / DECLARED).write_bytes(contents[DECLARED])
+
+
+def _folder(trial: TrialResult) -> str:
+    """Of a trial within its experiment."""
+    return "/".join(trial.path.parts[-3:])
+
+
+def _name(name: object) -> str:
+    if not isinstance(name, str) or not is_folder_name(name):
+        raise InputError(f"{name!r} can be no name of an experiment")
+    return name
+
+
+def _place(folder: object) -> str:
+    """The folder of a trial, which must not lead anywhere else."""
+    parts = str(folder).split("/")
+    if len(parts) != 3 or not all(map(is_folder_name, parts)):
+        raise InputError(f"{folder!r} can be no folder of a trial")
+    return str(folder)
+
+
+def _configurations(trials: Sequence[TrialResult]) -> bytes:
+    """Each configuration once."""
+    found: dict[str, list[tuple[str, int]]] = {}
+    for trial in trials:
+        values = yaml.safe_load((trial.path / CONFIG).read_text(encoding="utf-8"))
+        kept = {key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}
+        found.setdefault(json.dumps(_without_paths(kept)), []).append((_folder(trial), trial.seed))
+    return _json_lines({"configuration": json.loads(text), "trials": trials} for text, trials in found.items())
+
+
+def _without_paths(value: Any) -> Any:
+    """Plain values, of whose absolute paths the last names are kept."""
+    if isinstance(value, Mapping):
+        return {key: _without_paths(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_paths(entry) for entry in value]
+    if isinstance(value, str) and (value.startswith(("/", "~")) or PurePath(value).is_absolute()):
+        return PurePath(value).name
+    return value
+
+
+def _json_lines(entries: Any) -> bytes:
+    return "".join(json.dumps(entry, separators=(",", ":")) + "\n" for entry in entries).encode()
+
+
+def _lines(content: bytes) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in content.decode().splitlines()]
+
+
+def _table(rows: Sequence[tuple[str, str, Mapping[str, float]]]) -> bytes:
+    names = list(dict.fromkeys(name for _, _, metrics in rows for name in metrics))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["trial", "view", *names])
+    for folder, view, metrics in rows:
+        writer.writerow([folder, view, *(repr(metrics[name]) if name in metrics else "" for name in names)])
+    return text.getvalue().encode()

@@ -1,0 +1,69 @@
+"""What an archive of results is, in the terms of RO-Crate 1.1 (w3id.org/ro/crate/1.1, sections 3 to 6 and 8)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from gsbench import __version__
+from gsbench.analysis.declaration import measured
+from gsbench.analysis.results import TrialResult
+
+SPECIFICATION = "https://w3id.org/ro/crate/1.1"
+FILES = {  # media type, and in words what it is
+    "results.jsonl": (
+        "application/jsonl",
+        "Results of every trial, one JSON object a line: metrics, counts, hashes, code",
+    ),
+    "configurations.jsonl": ("application/jsonl", "Every configuration, with the trials that had it"),
+    "per_view.csv": ("text/csv", "Metrics of every test view of every trial"),
+    "declared.jsonl": ("application/jsonl", "What was declared before the trials were run"),
+    "archive.json": ("application/json", "Version of the archive, and the sha256 of its files"),
+}
+
+
+def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str, int]) -> dict[str, Any]:
+    """The content of ``ro-crate-metadata.json``: ``sizes`` has the bytes of each file of the archive."""
+    scenes = sorted({trial.scene for trial in trials})
+    arms = sorted({f"{trial.init}-{trial.densify}" for trial in trials})
+    protocols = sorted({trial.record.protocol for trial in trials})
+    when = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime(max(map(measured, trials))))
+    root = {
+        "@id": "./",
+        "@type": "Dataset",
+        "name": f"{name}: results of gsbench",
+        "description": f"{len(trials)} trainings of 3D Gaussian Splatting: {', '.join(arms)} on {', '.join(scenes)}, "
+        f"measured by {', '.join(protocols)}. No images and no models.",
+        "datePublished": when[:10],
+        "keywords": ["3D Gaussian Splatting", *arms, *scenes],
+        "hasPart": [{"@id": file} for file in sizes],
+        "mentions": [{"@id": "#trials"}],
+    }
+    files = [
+        {
+            "@id": file,
+            "@type": "File",
+            "name": file,
+            "description": FILES[file][1],
+            "encodingFormat": FILES[file][0],
+            "contentSize": str(size),
+        }
+        for file, size in sizes.items()
+    ]
+    action = {
+        "@id": "#trials",
+        "@type": "CreateAction",
+        "name": "Training and measuring",
+        "instrument": {"@id": "#gsbench"},
+        "result": [{"@id": "results.jsonl"}, {"@id": "per_view.csv"}],
+        "endTime": when,
+    }
+    program = {"@id": "#gsbench", "@type": "SoftwareApplication", "name": "gsbench", "version": __version__}
+    descriptor = {
+        "@id": "ro-crate-metadata.json",
+        "@type": "CreativeWork",
+        "conformsTo": {"@id": SPECIFICATION},
+        "about": {"@id": "./"},
+    }
+    return {"@context": f"{SPECIFICATION}/context", "@graph": [descriptor, root, *files, action, program]}

@@ -1,0 +1,234 @@
+"""Studies for a meta-analysis, out of what others hand over: archives of gsbench, and result files of nerfbaselines.
+
+A study is one source's mean difference of two arms in one metric with its standard error, over pairs of trials of one
+scene and seed, or from six scenes on over scenes (docs/verdict.md). Results of nerfbaselines
+(https://github.com/nerfbaselines/nerfbaselines, ``*.json`` of its ``evaluate``) have no seeds, so its pairs are scenes.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import json
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbench.analysis.cells import with_variants
+from gsbench.analysis.pairing import ViewCache, arm_name, pair_arms
+from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.statistics import MIN_SCENES
+from gsbench.claims.archive import unpack_archive
+from gsbench.claims.pooling import Study
+from gsbench.errors import InputError
+
+NERFBASELINES = "nerfbaselines"
+NERFBASELINES_METRICS = {"psnr": "psnr", "ssim": "ssim", "lpips_alex": "lpips", "lpips_vgg": "lpips_vgg"}  # our keys
+ROUNDED = 2e-5  # nerfbaselines writes its means with five decimals
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is pooled: the names that ``arm`` and ``baseline`` go by in the sources, and our key of the metric."""
+
+    arm: tuple[str, ...]
+    baseline: tuple[str, ...]
+    metric: str
+
+
+@dataclass(frozen=True)
+class Found:
+    """Studies of one source, what they say of themselves, and ``trials`` as marks: none is to be counted twice."""
+
+    studies: tuple[Study, ...]
+    notes: tuple[str, ...] = ()
+    trials: frozenset[str] = frozenset()
+
+
+def read_source(path: Path, wanted: Wanted, name: str = "") -> Found:
+    """The studies in ``path``, one for each protocol, called ``name`` (default: as the file).
+
+    Raises InputError, one line, where there is none.
+    """
+    read = _read_nerfbaselines if path.is_dir() else _read_archive
+    return read(path, wanted, name or path.stem)
+
+
+def standard_error(differences: Sequence[Array]) -> tuple[float, float]:
+    """(mean, standard error) of differences [K] by scene: over pairs, or from `MIN_SCENES` scenes on over scenes.
+
+    The error is nan where there is one unit.
+    """
+    units = np.array([d.mean() for d in differences]) if len(differences) >= MIN_SCENES else np.concatenate(differences)
+    error = float(units.std(ddof=1)) / math.sqrt(len(units)) if len(units) > 1 else math.nan
+    return float(units.mean()), error
+
+
+def _read_archive(path: Path, wanted: Wanted, name: str) -> Found:
+    with tempfile.TemporaryDirectory() as folder:
+        trials = with_variants(unpack_archive(path, Path(folder)).trials)
+        views = ViewCache()
+        studies, notes = [], []
+        protocols = sorted({trial.record.protocol for trial in trials})
+        for protocol in protocols:
+            own = [trial for trial in trials if trial.record.protocol == protocol]
+            pairs = _pairs(own, wanted, path)
+            for first, second in pairs:
+                told_apart = [protocol] * (len(protocols) > 1) + [first[0]] * (len(pairs) > 1)
+                label = f"{name} ({', '.join(told_apart)})" if told_apart else name
+                paired = pair_arms(own, first, second, wanted.metric, views)
+                effect = standard_error([matrix.mean(axis=1) for matrix in paired.differences])
+                studies.append(Study(label, *effect, _conditions(protocol, wanted.metric)))
+                count = sum(len(matrix) for matrix in paired.differences)
+                notes.append(
+                    f"{label}: {arm_name(second)} against {arm_name(first)}, {count} pairs of trials on "
+                    f"{', '.join(paired.scenes)}; {_size(own)}"
+                )
+                notes += [f"{label}: left out, {line}" for line in paired.left_out]
+        return Found(tuple(studies), tuple(notes), frozenset(map(_mark, trials)))
+
+
+def _pairs(trials: Sequence[TrialResult], wanted: Wanted, path: Path) -> list[tuple[Arm, Arm]]:
+    """(baseline, arm) under each initialiser that has both; a name is that of a densifier, with its variant or not."""
+    arms = sorted({trial.arm for trial in trials})
+
+    def named(init: str, names: Sequence[str]) -> list[Arm]:
+        return [arm for arm in arms if arm[0] == init and {arm[1], arm[1].partition(" ")[0], arm_name(arm)} & {*names}]
+
+    found = []
+    for init in sorted({init for init, _ in arms}):
+        ones, others = named(init, wanted.baseline), named(init, wanted.arm)
+        if len(ones) > 1 or len(others) > 1:
+            several = ones if len(ones) > 1 else others
+            raise InputError(
+                f"{path}: {' and '.join(arm_name(arm) for arm in several)} go by one name: give the whole name of one"
+            )
+        if ones and others:
+            found.append((ones[0], others[0]))
+    if not found:
+        raise InputError(
+            f"{path} has no pair of {' or '.join(wanted.arm)} and {' or '.join(wanted.baseline)} (there are "
+            f"{', '.join(map(arm_name, arms))})"
+        )
+    return found
+
+
+def _conditions(protocol: str, metric: str) -> dict[str, str]:
+    return {"protocol": protocol, "metric": metric}
+
+
+def _size(trials: Sequence[TrialResult]) -> str:
+    """In which trials of archives may differ without being refused, for people to judge."""
+    sizes = sorted({f"{size[0]}×{size[1]}" for trial in trials if (size := trial.record.resolution)})
+    steps = sorted({f"{trial.record.iterations:,}" for trial in trials})
+    versions = sorted({trial.record.versions.get("gsbench", "?") for trial in trials})
+    return f"{' or '.join(steps)} iterations, {' or '.join(sizes)} px, gsbench {' or '.join(versions)}"
+
+
+def _mark(trial: TrialResult) -> str:
+    """What tells a trial from every other: made again elsewhere, it has other seconds."""
+    record = trial.record
+    told = [trial.config_hash, trial.seed, record.hashes, record.seconds, dict(trial.metrics)]
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class _Result:
+    """One file of nerfbaselines."""
+
+    method: str
+    scene: str
+    protocol: str
+    metrics: Mapping[str, float]
+    mark: str
+
+
+def _read_nerfbaselines(folder: Path, wanted: Wanted, name: str) -> Found:
+    """The files anywhere below ``folder``: one study for each protocol and data set, whose pairs are its scenes."""
+    key = NERFBASELINES_METRICS.get(wanted.metric)
+    if key is None:
+        raise InputError(f"{folder}: nerfbaselines measures {', '.join(NERFBASELINES_METRICS)}, not {wanted.metric}")
+    notes, results = [], []
+    for file in sorted(folder.rglob("*.json")):
+        try:
+            results.append(_result(file))
+        except InputError as error:
+            notes.append(f"left out, {error}")
+    studies = []
+    for protocol in sorted({one.protocol for one in results}):
+        own = [one for one in results if one.protocol == protocol]
+        sides = [_by_scene(own, names, folder) for names in (wanted.baseline, wanted.arm)]
+        scenes = [s for s in sorted(sides[0].keys() & sides[1].keys()) if all(key in side[s].metrics for side in sides)]
+        if not scenes:
+            continue
+        differences = [np.array([sides[1][scene].metrics[key] - sides[0][scene].metrics[key]]) for scene in scenes]
+        several = len({one.protocol for one in results}) > 1
+        label = f"{name} ({protocol})" if several else name
+        studies.append(Study(label, *standard_error(differences), _conditions(protocol, wanted.metric)))
+        notes.append(f"{label}: {len(scenes)} scenes ({', '.join(scenes)}), one training each; {protocol}")
+    if not studies:
+        reason = f"; {notes[0]}" if notes else ""
+        raise InputError(
+            f"{folder} has no result files of nerfbaselines in which {' or '.join(wanted.arm)} and "
+            f"{' or '.join(wanted.baseline)} share a scene{reason}"
+        )
+    return Found(tuple(studies), tuple(notes), frozenset(one.mark for one in results))
+
+
+def _by_scene(results: Sequence[_Result], names: Sequence[str], folder: Path) -> dict[str, _Result]:
+    found: dict[str, _Result] = {}
+    for one in results:
+        if one.method not in names:
+            continue
+        if one.scene in found:
+            raise InputError(
+                f"{folder}: {one.scene} stands twice for {' or '.join(names)}: keep one file of each scene"
+            )
+        found[one.scene] = one
+    return found
+
+
+def _result(file: Path) -> _Result:
+    """Read and check one file; its means must be those of its raw values, and these those that were hashed."""
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+        about = data["nb_info"]
+        dataset = data.get("render_dataset_metadata") or about["dataset_metadata"]
+        raw = {name: _floats(text) for name, text in data["metrics_raw"].items()}
+        means = {name: float(np.mean(values)) for name, values in raw.items()}
+        scene = f"{dataset.get('id') or dataset['name']}/{dataset['scene']}"
+        protocol = f"{NERFBASELINES} {data.get('evaluation_protocol', 'default')}"
+        result = _Result(str(about["method"]), scene, protocol, means, file_mark(raw))
+    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError, AttributeError, binascii.Error) as error:
+        raise InputError(f"{file} is no result file of nerfbaselines ({error!r})") from None
+    changed = data.get("metrics_sha256", result.mark) != result.mark
+    for name, value in data.get("metrics", {}).items():
+        changed |= name not in means or not math.isclose(value, means[name], rel_tol=ROUNDED, abs_tol=ROUNDED)
+    if changed or not all(map(math.isfinite, means.values())):
+        raise InputError(f"{file} was changed: its means are not those of the values that it was written with")
+    return result
+
+
+def file_mark(raw: Mapping[str, Array]) -> str:
+    """``metrics_sha256`` as nerfbaselines computes it: names and sorted float32 values in base64, line by line."""
+    digest = hashlib.sha256()
+    for name in sorted(raw):
+        digest.update(name.lower().encode())
+        digest.update(base64.b64encode(np.sort(raw[name]).astype("<f4").tobytes()))
+        digest.update(b"\n")
+    return digest.hexdigest()
+
+
+def _floats(text: str) -> Array:
+    values = np.frombuffer(base64.b64decode(text, validate=True), "<f4").astype(np.float64)
+    if not len(values):
+        raise ValueError("no values")
+    return values

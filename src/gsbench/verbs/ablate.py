@@ -1,0 +1,148 @@
+"""``gsbench ablate``: which part of a densifier carries its gain."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gsbench.app.command import run_trials
+from gsbench.app.hydra_app import compose_trials
+from gsbench.claims.switches import (
+    Record,
+    choose_switches,
+    declared_switches,
+    runs_to_train,
+    shares_of,
+    table,
+    words_of,
+    write_record,
+)
+from gsbench.errors import InputError
+from gsbench.launch.plan import describe_plan
+from gsbench.launch.trial import Trial
+from gsbench.settings import Switch
+from gsbench.verbs.arguments import ArgumentParser, names
+from gsbench.words import counted
+
+DEFAULT_METRIC = "psnr"
+
+
+def main(argv: Sequence[str], runs: Path) -> int:
+    """The verb: the exit code says, as that of a sweep, whether some trial failed; raises InputError for bad input."""
+    options, settings = _parser().parse_known_args(argv)
+    if unknown := [word for word in settings if word.startswith("-")]:
+        raise InputError(f"ablate: {unknown[0]} is not an option (see gsbench ablate --help)")
+    words = [*settings, *([] if _names_experiment(settings) else [f"name={_default_name(settings)}"])]
+    first = _trials(words)
+    densify = _only_densifier(first)
+    found = declared_switches(_class_switches(first[0]), first[0].values["densify"]) | dict(options.switch)
+    switches = choose_switches(found, options.switches, densify)
+    trials = {
+        run: _trials([*words, *_off(words_of(run, switches), first[0])])
+        for run in runs_to_train(switches, options.fractional)
+    }
+    every = list(trials.values())
+    _check_different(trials)
+    flat = [trial for group in every for trial in group]
+    print(
+        f"{densify}: {counted(len(switches), 'part')} ({', '.join(switches)}), {len(trials)} runs, "
+        f"{counted(len(flat), 'trial')}"
+    )
+    if options.dry_run:
+        print("\n".join(describe_plan(flat, flat[0].values["launch"]["parallel"])))
+        return 0
+    home = flat[0].paths.home
+    code = run_trials(flat)
+    folders = {run: tuple(t.folder.relative_to(home).as_posix() for t in group) for run, group in trials.items()}
+    record = Record(densify, switches, tuple(folders.items()), options.fractional)
+    write_record(home, record)
+    if code == 0:
+        metric = options.metric or flat[0].values["eval"].get("primary") or DEFAULT_METRIC
+        print("\n".join(table(shares_of(record, home, metric), metric)))
+        print(f"drawn for every metric: gsbench report {home.name}")
+    return code
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser(
+        prog="gsbench ablate",
+        description="Train a densifier with its parts switched off in all combinations (docs/claims.md), and say what "
+        "each part adds.",
+        epilog="All other words are settings, as of a sweep: densify=volumetric_once scene=courtyard seed=0,1,2 …",
+    )
+    parser.add_argument(
+        "--switches", type=names, default=(), metavar="A,B", help="only these; default: all it declares"
+    )
+    parser.add_argument(
+        "--switch",
+        type=_switch,
+        action="append",
+        default=[],
+        metavar="NAME:KEY=VALUE",
+        help="a further switch, taken out by densify.KEY=VALUE (more, with semicolons between)",
+    )
+    parser.add_argument("--metric", help="printed; default: eval.primary, else psnr")
+    parser.add_argument("--fractional", action="store_true", help="from five switches on: a fraction of the runs")
+    parser.add_argument("--dry-run", action="store_true", help="list the trials and their state; run nothing")
+    return parser
+
+
+def _switch(text: str) -> tuple[str, Switch]:
+    name, colon, settings = text.partition(":")
+    pairs = [setting.partition("=") for setting in settings.split(";")]
+    if not name or not colon or not all(key and equals for key, equals, _ in pairs):
+        raise argparse.ArgumentTypeError(f"must be NAME:KEY=VALUE, got {text!r}")
+    return name, Switch({key.removeprefix("densify."): yaml.safe_load(value) for key, _, value in pairs})
+
+
+def _trials(words: Sequence[str]) -> list[Trial]:
+    """The trials of a sweep's words, without what Hydra knows of them as jobs of one command."""
+    trials = [Trial(trial.values, trial.yaml, trial.overrides) for trial in compose_trials(words, multirun=True)]
+    if trials[0].values["launch"]["stop_when_decided"]:
+        raise InputError("ablate needs all seeds of all runs: leave launch.stop_when_decided out")
+    return trials
+
+
+def _only_densifier(trials: Sequence[Trial]) -> str:
+    arms = {(trial.values["init"]["name"], trial.values["densify"]["name"]) for trial in trials}
+    if len(arms) > 1 or len({trial.paths.home for trial in trials}) > 1:
+        raise InputError("ablate takes one initialiser and one densifier apart: only scene and seed may list values")
+    if len({(trial.values["scene"]["name"], trial.values["seed"]) for trial in trials}) < len(trials):
+        raise InputError("ablate: only scene and seed may list values")
+    return str(trials[0].values["densify"]["name"])
+
+
+def _class_switches(trial: Trial) -> dict[str, Switch]:
+    return dict(getattr(type(trial.parts.trainer), "SWITCHES", {}))
+
+
+def _off(settings: dict[str, Any], first: Trial) -> list[str]:
+    """Words that give the densifier these settings."""
+    known = first.values["densify"]
+    return [f"{'' if key in known else '+'}densify.{key}={_text(value)}" for key, value in settings.items()]
+
+
+def _text(value: Any) -> str:
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _names_experiment(words: Sequence[str]) -> bool:
+    return any(word.startswith(("name=", "+experiment=")) for word in words)
+
+
+def _default_name(words: Sequence[str]) -> str:
+    chosen = [word.partition("=")[2] for word in words if word.startswith("densify=")]
+    return f"ablate_{chosen[-1].replace('/', '_')}" if chosen else "ablate"
+
+
+def _check_different(trials: dict[frozenset[str], list[Trial]]) -> None:
+    """Raise InputError where two runs are the same trial: a switch whose setting changes nothing."""
+    seen: dict[Path, frozenset[str]] = {}
+    for run, group in trials.items():
+        other = seen.setdefault(group[0].folder, run)
+        if other != run:
+            raise InputError(f"switching {', '.join(sorted(other ^ run))} changes no setting: give another VALUE")

@@ -1,0 +1,108 @@
+"""``gsbench pool``: one answer from the results of many."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+
+from gsbench.analysis.pairing import BASELINE
+from gsbench.analysis.quantities import metric_quantity
+from gsbench.claims.pooling import Pooled, describe, pool, pooled_forest
+from gsbench.claims.studies import Wanted, read_source
+from gsbench.errors import InputError
+from gsbench.files import write_text
+from gsbench.verbs.arguments import ArgumentParser, names, path
+
+DONE, LEFT_OUT = 0, 1
+
+
+def main(argv: Sequence[str], runs: Path) -> int:
+    """The verb: 0, or 1 where a source was left out; raises InputError where none can be read."""
+    parser = ArgumentParser(
+        prog="gsbench pool",
+        description="A random-effects mean over many sources: archives of `gsbench export --results`, and folders of "
+        "nerfbaselines' result files.",
+    )
+    parser.add_argument("sources", nargs="+", type=path, metavar="SOURCE")
+    parser.add_argument("--arm", type=names, required=True, help="a densifier; names it goes by, comma between")
+    parser.add_argument("--baseline", type=names, default=(BASELINE,), help=f"what it is held against ({BASELINE})")
+    parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_vgg")
+    parser.add_argument("--protocol", help="only studies by this one, such as paper-1")
+    parser.add_argument("--out", type=path, metavar="FILE", help="also write this HTML file, with the forest plot")
+    options = parser.parse_args(argv)
+    pooled, notes, faults = pool_sources(
+        options.sources, Wanted(options.arm, options.baseline, options.metric), options.protocol
+    )
+    lines = [*_rows(pooled), "", *describe(pooled), *notes, *faults]
+    print("\n".join(lines))
+    for fault in faults:
+        print(f"gsbench: {fault}", file=sys.stderr)
+    if options.out is not None:
+        title = f"{options.arm[0]} against {options.baseline[0]}: {options.metric}"
+        try:
+            write_text(options.out, _page(title, pooled, options.metric, [*describe(pooled), *notes, *faults]))
+        except OSError as error:
+            raise InputError(f"cannot write {options.out} ({error.strerror}); give another --out") from None
+        print(options.out)
+    return LEFT_OUT if faults else DONE
+
+
+def pool_sources(
+    sources: Sequence[Path], wanted: Wanted, protocol: str | None = None
+) -> tuple[Pooled, list[str], list[str]]:
+    """(the mean of all studies in ``sources``, notes on them, a line for each source or study that is left out).
+
+    Raises InputError where nothing is left.
+    """
+    studies, notes, faults = [], list[str](), list[str]()
+    seen: dict[str, Path] = {}
+    names_of = Counter(source.stem for source in sources)
+    for source in sources:
+        try:
+            found = read_source(source, wanted, source.stem if names_of[source.stem] == 1 else str(source))
+        except InputError as error:
+            faults.append(f"left out: {error}")
+            continue
+        if twice := found.trials & seen.keys():
+            faults.append(f"left out: {source} has trials that {seen[min(twice)]} has, and they would count twice")
+            continue
+        seen |= dict.fromkeys(found.trials, source)
+        notes += found.notes
+        for study in found.studies:
+            if protocol is not None and study.conditions["protocol"] != protocol:
+                notes.append(f"{study.name}: not asked for, it is by {study.conditions['protocol']}")
+            elif not study.error > 0:
+                faults.append(f"left out: {study.name} has one pair, or pairs without any spread: no error is known")
+            else:
+                studies.append(study)
+    if not studies:
+        raise InputError((faults or notes)[0].removeprefix("left out: "))
+    return pool(studies), notes, faults
+
+
+def _rows(pooled: Pooled) -> list[str]:
+    lines = ["| study | difference | standard error | weight | protocol |", "|---|---|---|---|---|"]
+    weights = pooled.weights or (None,) * len(pooled.studies)
+    for study, weight in zip(pooled.studies, weights, strict=True):
+        share = "" if weight is None else f"{100 * weight:.0f} %"
+        lines.append(
+            f"| {study.name} | {study.effect:+.4g} | {study.error:.3g} | {share} | {study.conditions['protocol']} |"
+        )
+    return lines
+
+
+def _page(title: str, pooled: Pooled, metric: str, lines: Sequence[str]) -> str:
+    """One HTML file that needs no other."""
+    shown = metric_quantity(metric, ())
+    style = files("gsbench.analysis.report").joinpath("style.css").read_text(encoding="utf-8")
+    chart = pooled_forest(pooled, title, f"difference in {shown.name}", shown.direction)
+    listed = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f'<link rel="icon" href="data:,"><style>{style}</style></head>\n'
+        f'<body><main><h1>{escape(title)}</h1><div class="charts">{chart}</div><ul>{listed}</ul></main></body></html>\n'
+    )

@@ -1,0 +1,224 @@
+"""A sweep in planned looks: which trials each look launches, when it stops, and that a stopped one goes on."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsbench import cli
+from gsbench.analysis.declaration import standing
+from gsbench.analysis.results import read_experiment
+from gsbench.claims.stopping import standing_verdicts
+from gsbench.launch.declare import declare, declared_metrics, planned_trials
+from gsbench.launch.outcome import Outcome, outcome_of_results
+from gsbench.launch.plan import add_to_plan
+from gsbench.launch.trial import Trial
+from gsbench.runs.declaration import read_plans
+from gsbench.runs.layout import CONFIG, RESULTS
+from tests.analysis.synthetic import Plan, trial_data, write_trial
+from tests.launch.test_declare import TINY
+
+BASE = ["-m", *(word for word in TINY if word != "densify=none"), "name=stop", "launch.stop_when_decided=true"]
+SWEEP = [*BASE, "densify=adc,volumetric", "seed=0,1,2,3", "eval.primary=psnr"]
+
+
+class Fake:
+    """Made-up results in the place of trained ones: ``psnr`` of an arm on a seed; ``stops_at`` raises there."""
+
+    def __init__(
+        self, psnr: Callable[[str, int], float], fails: int | None = None, stops_at: int | None = None
+    ) -> None:
+        self.psnr, self.fails, self.stops_at = psnr, fails, stops_at
+        self.batches: list[list[tuple[str, int]]] = []
+
+    def __call__(self, trials: Sequence[Trial]) -> list[Outcome]:
+        add_to_plan(trials)
+        declare(declared_metrics(trials), planned_trials(trials))
+        self.batches.append([])
+        outcomes = []
+        for trial in trials:
+            values = trial.values
+            arm, seed = values["densify"]["name"], values["seed"]
+            self.batches[-1].append((arm, seed))
+            if seed == self.fails:
+                outcomes.append(Outcome(trial.folder, "failed", "made up"))
+                continue
+            if seed == self.stops_at:
+                raise KeyboardInterrupt
+            data = {"metrics": {}}
+            if not (trial.folder / RESULTS).exists():
+                views = {"psnr": self.psnr(arm, seed) + np.arange(3.0)}
+                data = trial_data(Plan(experiment="stop"), "courtyard", "random", arm, seed, views)
+                write_trial(trial.paths.runs, data, views, trial.folder.name.partition("-")[0])
+                (trial.folder / CONFIG).write_text(trial.yaml)
+            outcomes.append(outcome_of_results(trial.folder, data))
+        return outcomes
+
+
+@pytest.fixture
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "runs"
+
+
+@pytest.fixture
+def sweep(runs: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    def run(fake: Fake, *words: str) -> int:
+        monkeypatch.setattr("gsbench.app.command.run_batch", fake)
+        return cli.run([*SWEEP, *words])
+
+    return run
+
+
+def noise(arm: str, seed: int) -> float:
+    return float(np.random.default_rng([seed, arm == "adc"]).normal(26, 2))
+
+
+def clear(arm: str, seed: int) -> float:
+    """Volumetric gains much, ``adc-2`` nothing; seeds differ by a hair."""
+    return 26 + 2 * (arm == "volumetric") + 1e-3 * np.sin(seed + len(arm))
+
+
+def test_a_clear_difference_ends_at_the_first_look(sweep: Callable[..., int], runs: Path) -> None:
+    fake = Fake(clear)
+    assert sweep(fake) == 0
+    assert fake.batches == [[("adc", 0), ("volumetric", 0), ("adc", 1), ("volumetric", 1)]]
+    (verdict,) = standing_verdicts(runs / "stop")
+    assert verdict.decision is not None
+    assert (verdict.decision.outcome, verdict.decision.seeds, verdict.beforehand) == ("for", 2, True)
+
+
+def test_noise_gets_all_seeds_and_each_trial_is_launched_once(sweep: Callable[..., int], runs: Path) -> None:
+    fake = Fake(noise)
+    assert sweep(fake) == 0
+    assert [len(batch) for batch in fake.batches] == [4, 2, 2]
+    assert len({trial for batch in fake.batches for trial in batch}) == 8
+    (verdict,) = standing_verdicts(runs / "stop")
+    assert verdict.word == "undecided"
+
+
+@pytest.mark.parametrize("psnr", [noise, clear], ids=lambda function: function.__name__)
+def test_seeds_of_planned_looks_are_declared_at_once_and_cost_the_metric_nothing(
+    sweep: Callable[..., int], runs: Path, psnr: Callable[[str, int], float]
+) -> None:
+    assert sweep(Fake(psnr)) == 0
+    experiment = read_experiment(runs / "stop")
+    found = standing(experiment.folder, experiment.trials)
+    assert found is not None
+    assert (found.beforehand, found.added) == (True, ())
+    missing = 0 if psnr is noise else 4
+    assert any(f"{missing} of the 8 declared trials are not there" in line for line in found.sentences("PSNR"))
+    assert any("that take the number of seeds as fixed are too sure" in line for line in found.sentences("PSNR"))
+
+
+def test_a_decided_pair_gets_no_seeds_and_the_pairs_share_the_error_rate(
+    sweep: Callable[..., int], runs: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    fake = Fake(lambda arm, seed: clear(arm, seed) if arm != "mcmc" else noise(arm, seed))
+    with caplog.at_level(logging.INFO):
+        assert sweep(fake, "densify=adc,volumetric,mcmc") == 0
+    assert [len(batch) for batch in fake.batches] == [6, 2, 2]
+    assert {arm for arm, _ in fake.batches[1]} == {"adc", "mcmc"}
+    assert [v.design.alpha for v in standing_verdicts(runs / "stop") if v.design] == [0.025, 0.025]
+    assert "2 of 12 trials were not needed" in caplog.text
+
+
+def test_stopped_at_any_trial_it_goes_on_with_the_same_plan(sweep: Callable[..., int], runs: Path) -> None:
+    assert sweep(Fake(noise, stops_at=2)) == cli.INTERRUPTED
+    (plan,) = read_plans(runs / "stop")
+    fake = Fake(noise)
+    assert sweep(fake) == 0
+    assert [len(batch) for batch in fake.batches] == [4, 2, 2]  # what is done is handed over, and skipped there
+    assert read_plans(runs / "stop") == [plan]
+    assert all(verdict.beforehand for verdict in standing_verdicts(runs / "stop"))
+
+
+def test_a_failed_seed_ends_the_looks_and_its_return_decides(sweep: Callable[..., int], runs: Path) -> None:
+    assert sweep(Fake(clear, fails=1)) == 1
+    (verdict,) = standing_verdicts(runs / "stop")
+    assert "waits for courtyard" in verdict.reason
+    assert sweep(Fake(clear)) == 0
+    (verdict,) = standing_verdicts(runs / "stop")
+    assert verdict.word == "supported"
+
+
+def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(sweep: Callable[..., int], runs: Path) -> None:
+    assert sweep(Fake(noise)) == 0
+    for file in (runs / "stop").glob("*/*/*/results.json"):  # measured long before the second plan
+        file.write_text(file.read_text().replace('"raster"', '"measured": "2020-01-01T00:00:00Z", "raster"'))
+    assert sweep(Fake(noise), "seed=0,1,2,3,4,5") == 0
+    assert len(read_plans(runs / "stop")) == 2
+    (verdict,) = standing_verdicts(runs / "stop")
+    assert not verdict.beforehand
+    assert "had been measured before this plan" in verdict.notes[0]
+
+
+def test_another_launcher_of_hydras_gets_one_look_at_a_time(sweep: Callable[..., int]) -> None:
+    fake = Fake(noise)
+    assert sweep(fake, "hydra/launcher=basic", "launch=serial") == 0
+    assert len(fake.batches) == 8  # a call for each trial
+    assert [seed for ((_, seed),) in fake.batches] == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep: Callable[..., int], runs: Path) -> None:
+    """Arms that differ in a setting alone are told apart as in the report."""
+    fake = Fake(clear)
+    assert sweep(fake, "densify=adc,volumetric", "densify.max_gaussians=1000,2000", "launch.least_difference=0.5") == 0
+    verdicts = standing_verdicts(runs / "stop")
+    assert [(v.claim.baseline, v.claim.arm, v.claim.least) for v in verdicts] == [
+        (f"random-adc max_gaussians={count}", f"random-volumetric max_gaussians={count}", 0.5) for count in (1000, 2000)
+    ]
+    assert cli.run(["report", "stop"]) == 0
+    text = (runs / "stop" / "report.html").read_text()
+    assert "random-volumetric max_gaussians=1000 against random-adc max_gaussians=1000: better in PSNR" in text
+    assert "launch.stop_when_decided" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["eval.primary=null"], "needs the metric that decides"),
+        (["seed=3"], "at least 2 seeds"),
+        (["densify=adc"], "this sweep has one"),
+        (["launch=slurm", "launch.wait=false"], "launch.wait must be true"),
+        (["hydra/sweeper=optuna"], "chooses by itself what to run"),
+        (["launch.least_difference=0"], "launch.least_difference"),
+        (["launch.stop_when_decided=maybe"], "launch.stop_when_decided"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_what_cannot_be_looked_at_is_refused_before_any_trial(
+    sweep: Callable[..., int], runs: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fake = Fake(clear)
+    assert sweep(fake, *words) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: ")]
+    assert message in line
+    assert not fake.batches
+    assert not runs.exists()
+
+
+def test_one_trial_is_no_sweep(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run([*TINY, "launch.stop_when_decided=true"]) == 2
+    assert "adds seeds to a sweep" in capsys.readouterr().err
+
+
+def test_a_dry_run_says_when_it_looks_and_writes_nothing(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run([*SWEEP, "--dry-run"]) == 0
+    assert "looks at 2, 3, 4 seeds, 4 trials until the first, 8 at most" in capsys.readouterr().out
+    assert not runs.exists()
+
+
+def test_a_damaged_plan_is_named_in_one_line(
+    sweep: Callable[..., int], runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert sweep(Fake(clear)) == 0
+    file = runs / "stop" / "declared.jsonl"
+    file.write_text(file.read_text().replace('"pairs"', '"pears"'))
+    assert cli.run(["report", "stop"]) == 2
+    assert "damaged" in capsys.readouterr().err

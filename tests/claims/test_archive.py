@@ -1,0 +1,216 @@
+"""Archives of results: what comes back, what is never in them, and damage of every kind named in one line."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gsbench.analysis.results import load_experiment, read_views
+from gsbench.claims.archive import unpack_archive, write_archive
+from gsbench.cli import run
+from gsbench.errors import InputError
+from tests.analysis.synthetic import Plan, write_runs
+
+MANY = Plan(scenes=[f"scene{k}" for k in range(9)], seeds=range(3), views=25)  # as many trials as Table 1 has
+
+
+def export(tmp_path: Path, plan: Plan = Plan()) -> Path:  # noqa: B008 - never changed
+    runs = tmp_path / "runs"
+    write_runs(runs, plan)
+    (runs / "exp" / "declared.jsonl").write_text('{"metric": "psnr", "time": "2026-01-01T00:00:00Z"}\n')
+    write_archive(load_experiment(runs, "exp"), tmp_path / "exp.zip")
+    return tmp_path / "exp.zip"
+
+
+def members(file: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(file) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def rewrite(file: Path, change: Callable[[dict[str, bytes]], None]) -> None:
+    content = members(file)
+    change(content)
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, data in content.items():
+            archive.writestr(name, data)
+
+
+def test_results_settings_and_views_come_back(tmp_path: Path) -> None:
+    file = export(tmp_path)
+    there = load_experiment(tmp_path / "runs", "exp")
+    back = unpack_archive(file, tmp_path / "other")
+    assert [one.label for one in back.trials] == [one.label for one in there.trials]
+    for one, other in zip(there.trials, back.trials, strict=True):
+        assert other.data == one.data
+        assert other.config == one.config
+        assert read_views(other) == read_views(one)
+    assert (back.folder / "declared.jsonl").read_text() == (there.folder / "declared.jsonl").read_text()
+
+
+def test_an_archive_is_small_and_the_same_results_make_the_same(tmp_path: Path) -> None:
+    file = export(tmp_path, MANY)
+    assert file.stat().st_size < 300_000
+    before = file.read_bytes()
+    write_archive(load_experiment(tmp_path / "runs", "exp"), file)
+    assert file.read_bytes() == before
+
+
+def test_no_pixels_and_no_paths_of_the_machine(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    (path, *_) = write_runs(runs, Plan(pictures=True, views=2))
+    config = yaml.safe_load((path / "config.yaml").read_text())
+    config["runs"], config["scene"]["path"] = "/home/alice/runs", "/home/alice/photos/garden"
+    (path / "config.yaml").write_text(json.dumps(config))
+    results = json.loads((path / "results.json").read_text())
+    results["unavailable"] = {"lpips_alex": "no such file", "where": "/home/alice/weights/a.pth"}
+    (path / "results.json").write_text(json.dumps(results))
+    write_archive(load_experiment(runs, "exp"), tmp_path / "exp.zip")
+    content = members(tmp_path / "exp.zip")
+    assert not any(name.endswith((".png", ".ply")) for name in content)
+    assert b"alice" not in b"".join(content.values())
+    assert any(
+        one.config.get("scene.path") == "garden" for one in unpack_archive(tmp_path / "exp.zip", runs / "b").trials
+    )
+
+
+def test_it_is_an_ro_crate(tmp_path: Path) -> None:
+    """The rules of RO-Crate 1.1, sections 3 (root data entity), 4 (data entities) and 2 (packaging)."""
+    file = export(tmp_path)
+    content = members(file)
+    crate = json.loads(content["ro-crate-metadata.json"])
+    by_id = {entity["@id"]: entity for entity in crate["@graph"]}
+    assert len(by_id) == len(crate["@graph"])
+    assert crate["@context"] == "https://w3id.org/ro/crate/1.1/context"
+    descriptor, root = by_id["ro-crate-metadata.json"], by_id["./"]
+    assert descriptor["@type"] == "CreativeWork"
+    assert descriptor["conformsTo"] == {"@id": "https://w3id.org/ro/crate/1.1"}
+    assert descriptor["about"] == {"@id": "./"}
+    assert root["@type"] == "Dataset"
+    assert all(root[key] for key in ("name", "description", "datePublished"))
+    parts = {entity["@id"] for entity in root["hasPart"]}
+    assert parts == content.keys() - {"ro-crate-metadata.json"}
+    assert all(by_id[part]["@type"] == "File" for part in parts)
+    assert all(int(by_id[part]["contentSize"]) == len(content[part]) for part in parts)
+
+    def references(value: object) -> set[str]:
+        if isinstance(value, dict):
+            own = {value["@id"]} if value.keys() == {"@id"} else set()
+            return own.union(*map(references, value.values()))
+        return set().union(*map(references, value)) if isinstance(value, list) else set()
+
+    assert references(crate["@graph"]) <= by_id.keys() | {"https://w3id.org/ro/crate/1.1"}
+
+
+def cut(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:-600])
+
+
+def edit(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
+    def change(content: dict[str, bytes]) -> None:
+        assert old in content[name]
+        content[name] = content[name].replace(old, new)
+
+    return lambda file: rewrite(file, change)
+
+
+def drop(name: str) -> Callable[[Path], None]:
+    return lambda file: rewrite(file, lambda content: content.pop(name) and None)
+
+
+def resigned(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
+    """An edit by somebody who wrote the new checksum down, too."""
+    import hashlib
+
+    def change(content: dict[str, bytes]) -> None:
+        assert old in content[name]
+        content[name] = content[name].replace(old, new)
+        manifest = json.loads(content["archive.json"])
+        manifest["sha256"][name] = hashlib.sha256(content[name]).hexdigest()
+        content["archive.json"] = json.dumps(manifest).encode()
+
+    return lambda file: rewrite(file, change)
+
+
+def flip_a_bit(file: Path) -> None:
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 0x40
+    file.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (cut, "no whole zip"),
+        (flip_a_bit, "exp.zip: "),
+        (lambda file: file.write_bytes(b""), "no whole zip"),
+        (lambda file: file.write_text("results"), "no whole zip"),
+        (lambda file: file.unlink(), "no such file"),
+        (edit("results.jsonl", b'"psnr":2', b'"psnr":3'), "results.jsonl was changed after the export"),
+        (edit("per_view.csv", b"view000", b"view00x"), "per_view.csv was changed"),
+        (edit("archive.json", b'"version": 1', b'"version": 2'), "of version 2 of the archive"),
+        (edit("archive.json", b"gsbench results", b"other"), "not one of gsbench"),
+        (edit("archive.json", b'"sha256"', b'"sha255"'), "not that of an archive"),
+        (edit("archive.json", b"{", b"["), "not JSON"),
+        (drop("archive.json"), "lacks archive.json"),
+        (drop("configurations.jsonl"), "lacks configurations.jsonl"),
+        (resigned("results.jsonl", b'"folder":"courtyard/', b'"folder":"../../../tmp/'), "no folder of a trial"),
+        (resigned("results.jsonl", b'"folder":"courtyard/', b'"folder":"room/'), "foreign"),
+        (resigned("results.jsonl", b'"status":"complete"', b'"status":"well"'), "unfinished"),
+        (
+            resigned(
+                "results.jsonl",
+                b"{",
+                b"[",
+            ),
+            "not that of an archive",
+        ),
+        (edit("archive.json", b'"experiment": "exp"', b'"experiment": "../up"'), "no name of an experiment"),
+    ],
+)
+def test_damage_of_every_kind_is_one_line_and_leaves_nothing(
+    tmp_path: Path, damage: Callable[[Path], None], message: str
+) -> None:
+    file = export(tmp_path)
+    damage(file)
+    with pytest.raises(InputError) as raised:
+        unpack_archive(file, tmp_path / "other")
+    assert message in str(raised.value)
+    assert str(raised.value).startswith(str(file))
+    assert "\n" not in str(raised.value)
+    assert {path.name for path in tmp_path.iterdir()} <= {"runs", "exp.zip", "other"}
+
+
+def test_a_file_too_large_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = export(tmp_path)
+    monkeypatch.setattr("gsbench.claims.archive.MOST_BYTES", 1000)
+    with pytest.raises(InputError, match="no archive of gsbench's has so many"):
+        unpack_archive(file, tmp_path / "other")
+
+
+def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = tmp_path / "runs"
+    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    first, second, *_ = write_runs(runs, Plan())
+    (first / "per_view.csv").write_text("view,psnr\nview000,1.0\n")
+    (second / "results.json").write_text("{")
+    assert run(["export", "--results", "exp", "--out", str(tmp_path / "out" / "a.zip")]) == 0
+    captured = capsys.readouterr()
+    assert captured.out == f"{tmp_path / 'out' / 'a.zip'}\n"
+    assert "does not average" in captured.err
+    assert "not JSON" in captured.err
+    assert len(unpack_archive(tmp_path / "out" / "a.zip", tmp_path / "b").trials) == 10
+    for path in runs.glob("exp/*/*/*/per_view.csv"):
+        path.write_text("")
+    assert run(["export", "--results", "exp", "--out", str(tmp_path / "b.zip")]) == 2
+    assert "no whole trial to export" in capsys.readouterr().err
+    assert not (tmp_path / "b.zip").exists()
+    for words in (["--results", "exp", "exp:courtyard:adc:0"], ["--results", "exq"], ["exp:courtyard:adc:0"], []):
+        assert run(["export", *words]) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1

@@ -1,0 +1,207 @@
+"""Switches of densifiers: which are on, which runs they make, and shares from result files with known gains."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsbench.claims.ablation import Run
+from gsbench.claims.switches import (
+    Record,
+    ablation_part,
+    choose_switches,
+    declared_switches,
+    effective,
+    read_record,
+    runs_to_train,
+    shares_of,
+    table,
+    words_of,
+    write_record,
+)
+from gsbench.cli import run
+from gsbench.config.command_words import options
+from gsbench.config.compose import compose_one
+from gsbench.densify.volumetric import Volumetric
+from gsbench.errors import InputError
+from gsbench.pipeline.components import build
+from gsbench.runs.hashing import config_hash
+from gsbench.settings import Switch
+from tests.analysis.synthetic import Plan, trial_data, write_trial
+from tests.launch.test_declare import TINY
+
+NESTED = {
+    "rule": Switch({"stop": 0}),
+    "shrink": Switch({"of": 1}, within="rule"),
+    "once": Switch({"b": 2}, within="rule"),
+}
+
+
+def on(*names: str) -> Run:
+    return frozenset(names)
+
+
+def test_what_acts_within_another_is_trained_only_where_that_is_on() -> None:
+    runs = runs_to_train(NESTED, fractional=False)
+    assert runs == [on("rule", "shrink", "once"), on("once", "rule"), on("rule", "shrink"), on("rule"), on()]
+    assert effective(on("shrink", "once"), NESTED) == on()
+    alone = {"shrink": NESTED["shrink"]}  # where the rule is not asked about it stays as it is: on
+    assert runs_to_train(alone, fractional=False) == [on("shrink"), on()]
+    assert words_of(on("rule"), NESTED) == {"of": 1, "b": 2}
+    assert words_of(on("rule", "shrink", "once"), NESTED) == {}
+
+
+def test_switches_within_each_other_are_refused() -> None:
+    circle = {"a": Switch({"x": 1}, within="b"), "b": Switch({"y": 1}, within="a")}
+    with pytest.raises(InputError, match="circle"):
+        runs_to_train(circle, fractional=False)
+    chain = {"a": Switch({"x": 1}), "b": Switch({"y": 1}, within="a"), "c": Switch({"z": 1}, within="b")}
+    assert [sorted(found) for found in runs_to_train(chain, fractional=False)] == [
+        ["a", "b", "c"],
+        ["a", "b"],
+        ["a"],
+        [],
+    ]
+
+
+@pytest.mark.parametrize("arm", [name for name in options("densify") if name != "none" and "/" not in name])
+def test_every_declared_switch_of_every_arm_makes_another_densifier(arm: str) -> None:
+    """Its settings are those of the class, allowed there, and act on the arm as configured."""
+    values = compose_one([f"densify={arm}"]).values["densify"]
+    own = type(build("densify", values, [])).SWITCHES
+    found = declared_switches(own, values)
+    for switch in found.values():
+        made = build("densify", values | switch.off, [])
+        assert all(getattr(made, key) == value for key, value in switch.off.items())
+    assert all(switch.within in {"", *own} for switch in own.values())
+
+
+def test_the_paper_rule_has_the_three_that_matter_and_only_those_that_are_on() -> None:
+    once = compose_one(["densify=volumetric_once"]).values["densify"]
+    assert list(declared_switches(Volumetric.SWITCHES, once)) == ["volume_rule", "shrink", "no_resplit"]
+    plain = compose_one(["densify=volumetric"]).values["densify"]
+    assert list(declared_switches(Volumetric.SWITCHES, plain)) == ["volume_rule", "shrink"]
+    defaults = {entry.name: entry.default for entry in fields(Volumetric) if entry.default is not MISSING}
+    assert set().union(*(switch.off for switch in Volumetric.SWITCHES.values())) <= set(defaults)
+
+
+def test_a_yaml_declares_switches_that_are_no_part_of_a_result() -> None:
+    values: dict[str, Any] = {"grow": 1, "switches": {"growth": {"off": {"grow": 0}, "words": "it grows"}}}
+    assert declared_switches({}, values) == {"growth": Switch({"grow": 0}, "it grows")}
+    plain = compose_one(["densify=adc"]).values
+    named = compose_one(["densify=adc", "+densify.switches={mine: {off: {split_shrink: 2}}}"]).values
+    assert config_hash(named) == config_hash(plain)
+    assert build("densify", named["densify"], []).split_shrink == 1.6
+    for wrong in ({"a": {}}, {"a": 1}, [1], {"a": {"off": 3}}, {"a": {"off": {"x": 1}, "of": 2}}):
+        with pytest.raises(InputError, match=r"densify\.switches"):
+            declared_switches({}, {"switches": wrong})
+
+
+def test_a_name_that_is_no_switch_is_named_with_the_nearest() -> None:
+    with pytest.raises(InputError, match="did you mean shrink"):
+        choose_switches(NESTED, ["shrnk"], "x")
+    with pytest.raises(InputError, match="declares no switch"):
+        choose_switches({}, [], "x")
+    assert list(choose_switches(NESTED, ["once"], "x")) == ["once"]
+
+
+def write_ablation(home: Path, gains: Mapping[str, float], seeds: int = 3) -> Record:
+    """Trials in which each part of `NESTED` adds its gain in PSNR, where it acts."""
+    runs = []
+    for number, chosen in enumerate(runs_to_train(NESTED, fractional=False)):
+        folders = []
+        for seed in range(seeds):
+            noise = 0.001 * np.random.default_rng([number, seed]).normal()
+            views = {"psnr": 26 + sum(gains[name] for name in chosen) + noise + np.zeros(3)}
+            data = trial_data(Plan(), "courtyard", "sfm", "volumetric", seed, views)
+            path = write_trial(home.parent, data, views, f"{number:08x}")
+            folders.append(path.relative_to(home).as_posix())
+        runs.append((chosen, tuple(folders)))
+    record = Record("volumetric", NESTED, tuple(runs), fractional=False)
+    write_record(home, record)
+    return record
+
+
+def test_shares_come_back_from_files(tmp_path: Path) -> None:
+    """By hand: a part within the rule adds its gain in those orders in which the rule came before it, half of them."""
+    home = tmp_path / "exp"
+    record = write_ablation(home, {"rule": 1.0, "shrink": 0.4, "once": -0.2})
+    assert read_record(home) == record
+    found = shares_of(record, home, "psnr")
+    assert {share.switch: round(share.value, 2) for share in found.shares} == {"rule": 1.1, "shrink": 0.2, "once": -0.1}
+    assert found.gain == pytest.approx(1.2, abs=0.01)
+    assert found.shares[1].alone == 0.0
+    assert all(share.interval and share.interval.low < share.value < share.interval.high for share in found.shares)
+    lines = table(found, "psnr")
+    assert "| rule | +1.1" in lines[2]
+    part = ablation_part(home)
+    assert part is not None
+    assert len(part.charts) == 1
+    assert all(name in part.charts[0] for name in ("rule", "shrink", "once", "all together", "PSNR"))
+
+
+def test_missing_trials_and_damaged_records_are_named(tmp_path: Path) -> None:
+    home = tmp_path / "exp"
+    record = write_ablation(home, {"rule": 1.0, "shrink": 0.4, "once": -0.2})
+    (home / record.runs[0][1][1] / "results.json").unlink()
+    with pytest.raises(InputError, match=r"1 trial of the ablation lack psnr, such as courtyard/sfm-volumetric"):
+        shares_of(record, home, "psnr")
+    part = ablation_part(home)
+    assert part is not None
+    assert not part.charts
+    assert "not shown" in part.lines[-1]
+    file = home / "ablation.json"
+    for change in ({"version": 9}, {"runs": [{}]}, {"switches": {"a": {"no": 1}}}):
+        content = json.loads(file.read_text())
+        file.write_text(json.dumps(content | change))
+        with pytest.raises(InputError, match=r"ablation\.json is"):
+            read_record(home)
+        file.write_text(json.dumps(content))
+    file.unlink()
+    assert ablation_part(home) is None
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["densify=none"], "declares no switch"),
+        (["densify=adc,volumetric"], "one densifier"),
+        (["densify=adc", "densify.split_shrink=1.5,2"], "only scene and seed"),
+        (["densify=adc", "--switches", "opacity_rest"], "did you mean opacity_reset"),
+        (["densify=adc", "--switch", "a:split_shrink"], "NAME:KEY=VALUE"),
+        (["densify=adc", "--switch", "a:split_shrnk=2"], "split_shrnk"),
+        (["densify=adc", "--fast"], "--fast is not an option"),
+        (["densify=adc", "launch.stop_when_decided=true", "eval.primary=psnr", "seed=0,1"], "stop_when_decided"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_bad_words_are_refused_in_a_line(
+    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    assert run(["ablate", *(word for word in TINY if word != "densify=none"), *words]) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: ")]
+    assert message in line
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.end_to_end
+def test_the_verb_trains_each_run_once_and_the_report_draws_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    words = [*(word for word in TINY if word != "densify=none"), "densify=adc", "seed=0,1", "name=parts"]
+    words += ["--switch", "size:split_size=0.5", "--switches", "size"]
+    assert run(["ablate", *words]) == 0
+    out = capsys.readouterr().out
+    assert "adc: 1 part (size), 2 runs, 4 trials" in out
+    assert "| size | " in out
+    assert run(["report", "parts"]) == 0
+    assert "Which part carries it" in (tmp_path / "runs" / "parts" / "report.html").read_text()
