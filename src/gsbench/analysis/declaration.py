@@ -79,9 +79,9 @@ class ActiveDeclaration:
         missing = planned - (self.trials - len(self.added)) if planned else 0
         if self.looks:
             lines.append(
-                f"Seeds came in planned looks (launch.stop_when_decided); {missing} of the {planned} declared trials are "
-                "not there. The verdict is that of the looks (gsbench report): p and intervals of tests that take the "
-                "number of seeds as fixed are too sure."
+                f"Seeds came in planned looks (launch.stop_when_decided); {missing} of the {planned} declared trials "
+                "are not there. The verdict is that of the looks (gsbench report): p and intervals of tests that take "
+                "the number of seeds as fixed are too sure."
             )
         elif missing:
             lines.append(

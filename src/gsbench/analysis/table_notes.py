@@ -53,7 +53,7 @@ def declared_notes(experiment: Experiment) -> list[str]:
 
 
 def attribution_notes(experiment: Experiment) -> list[str]:
-    """For each pair of arms that differ in more than one ingredient, in which, and what would isolate one."""
+    """A line for each pair of arms that differ in more than one ingredient: in which, and what would isolate one."""
     trials, pairs = compared_pairs(experiment)
     return [sentence for pair in pairs if (sentence := attribution_sentence(attribute(trials, *pair), *pair))]
 

@@ -1,4 +1,4 @@
-"""Which kernel of a step takes how long."""
+"""Times of the kernels of a step."""
 
 from __future__ import annotations
 

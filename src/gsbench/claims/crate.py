@@ -1,4 +1,4 @@
-"""What an archive of results is, in the terms of RO-Crate 1.1 (w3id.org/ro/crate/1.1, sections 3 to 6 and 8)."""
+"""Description of an archive of results in the terms of RO-Crate 1.1 (w3id.org/ro/crate/1.1, sections 3 to 6 and 8)."""
 
 from __future__ import annotations
 

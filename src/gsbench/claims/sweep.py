@@ -150,7 +150,7 @@ def prepare(file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequenc
 
 
 class Looked(Protocol[T]):
-    """What is looked at: questions, each with a claim, and what trials and verdicts they have at a number of seeds."""
+    """Source of looks: questions, each with a claim, and their trials and verdicts at a number of seeds."""
 
     @property
     def questions(self) -> Sequence[Question]: ...

@@ -1,4 +1,4 @@
-"""From a densifier's named switches to the runs of an ablation and back: settings of each run, and what its files say.
+"""Runs of an ablation from a densifier's named switches: the settings of each run, and what its files say.
 
 A switch is declared by the densifier's class (``SWITCHES``), by its YAML (``switches``), or on the command line. It is
 on as the densifier is configured; its ``off`` settings take that part out. Runs that differ only in what does nothing
@@ -32,7 +32,7 @@ _ABSENT = object()  # unlike any value
 
 @dataclass(frozen=True)
 class Record:
-    """Which trials an ablation consists of: for each run, the folders of its trials within the experiment.
+    """Trials of an ablation: for each run, the folders of its trials within the experiment.
 
     ``trials`` of all runs are in one order of scenes and seeds.
     """
@@ -65,7 +65,7 @@ def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> d
 
 
 def choose_switches(found: Mapping[str, Switch], names: Sequence[str], densify: str) -> dict[str, Switch]:
-    """Those of ``names``, or all; raises InputError for a name that is none, and where there is none at all."""
+    """Choose those of ``names``, or all; raises InputError for a name that is none, and where there is none at all."""
     for name in names:
         if name not in found:
             raise InputError(
@@ -112,7 +112,7 @@ def words_of(run: Run, switches: Mapping[str, Switch]) -> dict[str, Any]:
 
 
 def write_record(home: Path, record: Record) -> None:
-    """Beside the experiment's trials, for the report."""
+    """Write the record beside the experiment's trials, for the report."""
     write_json(
         home / ABLATION,
         {
@@ -172,7 +172,7 @@ def table(found: Ablation, metric: str) -> list[str]:
 
 
 def ablation_part(home: Path) -> AblationPart | None:
-    """What the report shows of the ablation in ``home``; None without one."""
+    """The part of the report on the ablation in ``home``; None without one."""
     record = read_record(home)
     if record is None:
         return None

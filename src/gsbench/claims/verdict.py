@@ -30,7 +30,7 @@ Pair = tuple[TrialResult, TrialResult]  # baseline, arm
 
 
 class Planner(Protocol):
-    """What plans the looks at a claim: a file of claims, or a sweep."""
+    """Planner of the looks at a claim: a file of claims, or a sweep."""
 
     def design(self, claim: Claim, scenes: int, sharing: int) -> Design: ...
 

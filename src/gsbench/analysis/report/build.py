@@ -38,7 +38,7 @@ from gsbench.words import signed
 
 @dataclass(frozen=True)
 class AblationPart:
-    """What the runs were, in lines, and charts as SVG."""
+    """Part of the report on an ablation: its runs in lines, and charts as SVG."""
 
     lines: Sequence[str]
     charts: Sequence[str]
