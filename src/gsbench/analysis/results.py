@@ -151,7 +151,7 @@ class TrialResult:
 
     @property
     def kind(self) -> Kind:
-        """The values that trials have in common which differ in their seeds alone."""
+        """The identity that trials share which differ in their seeds alone."""
         return self.scene, self.init, self.densify, self.config_hash
 
     @cached_property

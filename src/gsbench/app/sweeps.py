@@ -1,4 +1,4 @@
-"""Work of gsbench's sweeper: all points of its grids at once, or seed by seed until their question is decided."""
+"""The work of gsbench's sweeper: all points of its grids at once, or seed by seed until their question is decided."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Times of the kernels of a step."""
+"""Times of a step by kernel."""
 
 from __future__ import annotations
 

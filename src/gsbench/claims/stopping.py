@@ -82,11 +82,11 @@ class SweepPlan:
         return plan_looks(len(self.seeds))
 
     def design(self, claim: Claim, scenes: int, sharing: int) -> Design:
-        """The design of the looks at a claim, as a file of claims has it."""
+        """The design of a pair's looks, as a file of claims has it."""
         return Design(scenes, self.looks, self.error_rate / sharing)
 
     def claim(self, pair: PlannedPair) -> Claim:
-        """The question to the pair: whether its arm is better."""
+        """The question that the pair is asked: whether its arm is better."""
         return Claim(
             id=f"{pair.arm} against {pair.baseline}",
             says=f"{pair.arm} is better than {pair.baseline}",
@@ -100,7 +100,7 @@ class SweepPlan:
         )
 
     def verdicts(self, home: Path, declared: DeclaredPlan) -> list[Verdict]:
-        """The verdict on every pair, from the trials of the experiment in ``home`` that are done."""
+        """Verdicts of every pair, from the trials of the experiment in ``home`` that are done."""
         trials = read_experiment(home).trials if home.is_dir() else ()
         by_folder = {trial.path.relative_to(home).as_posix(): trial for trial in trials}
         return [
@@ -158,7 +158,7 @@ class Stopping(Generic[T]):
         return self.plan.verdicts(self.home, declared)
 
     def describe(self) -> str:
-        """Describe the looks for a dry run."""
+        """Lines that a dry run prints of the looks."""
         first, most = (len(self.trials(self.questions, seeds)) for seeds in (self.looks[0], self.looks[-1]))
         pairs, looks = counted(len(self.plan.pairs), "pair"), ", ".join(map(str, self.looks))
         return (

@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Wanted:
-    """Names of what is pooled: those that ``arm`` and ``baseline`` go by in the sources, and our key of the metric."""
+    """The pooled question: names that ``arm`` and ``baseline`` go by in the sources, and our key of the metric."""
 
     arm: tuple[str, ...]
     baseline: tuple[str, ...]

@@ -150,7 +150,7 @@ def prepare(file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequenc
 
 
 class Looked(Protocol[T]):
-    """Source of looks: questions, each with a claim, and their trials and verdicts at a number of seeds."""
+    """The subject of a look: questions, each with a claim, with their trials and verdicts at a number of seeds."""
 
     @property
     def questions(self) -> Sequence[Question]: ...

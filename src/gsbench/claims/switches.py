@@ -1,4 +1,4 @@
-"""Runs of an ablation from a densifier's named switches: the settings of each run, and what its files say.
+"""The way from a densifier's switches to the runs of an ablation and back: settings of each run, and its files.
 
 A switch is declared by the densifier's class (``SWITCHES``), by its YAML (``switches``), or on the command line. It is
 on as the densifier is configured; its ``off`` settings take that part out. Runs that differ only in what does nothing
@@ -32,7 +32,7 @@ _ABSENT = object()  # unlike any value
 
 @dataclass(frozen=True)
 class Record:
-    """Trials of an ablation: for each run, the folders of its trials within the experiment.
+    """The trials of an ablation: for each run, the folders of its trials within the experiment.
 
     ``trials`` of all runs are in one order of scenes and seeds.
     """
@@ -65,7 +65,7 @@ def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> d
 
 
 def choose_switches(found: Mapping[str, Switch], names: Sequence[str], densify: str) -> dict[str, Switch]:
-    """Choose those of ``names``, or all; raises InputError for a name that is none, and where there is none at all."""
+    """Choose the switches of ``names``, or all; raises InputError for an unknown name, and where there are none."""
     for name in names:
         if name not in found:
             raise InputError(
@@ -172,7 +172,7 @@ def table(found: Ablation, metric: str) -> list[str]:
 
 
 def ablation_part(home: Path) -> AblationPart | None:
-    """The part of the report on the ablation in ``home``; None without one."""
+    """The report's part on the ablation in ``home``; None without one."""
     record = read_record(home)
     if record is None:
         return None

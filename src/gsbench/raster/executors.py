@@ -54,7 +54,7 @@ class Executor:
         return self.too_old()
 
     def too_old(self) -> str | None:
-        """The mend for a package that is older than ``minimum``; None if it is not, or its version is not known."""
+        """Advice about a package that is older than ``minimum``; None if it is not, or its version is not known."""
         if self.package is None or self.minimum is None:
             return None
         try:

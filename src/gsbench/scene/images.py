@@ -18,7 +18,7 @@ from gsbench.files import require_regular
 Resample = Literal["lanczos", "area", "bicubic"]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
-# Formats that files of these names hold. Pillow would read some forty formats, whatever the name.
+# Formats of files with these names. Pillow would read some forty formats, whatever the name.
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # MPO, of several JPEGs, is one of JPEG's
 EXIF_ORIENTATION = 0x0112
 _FILTERS = {"lanczos": Image.Resampling.LANCZOS, "area": Image.Resampling.BOX, "bicubic": Image.Resampling.BICUBIC}

@@ -24,9 +24,8 @@ BLOCK_PIXELS = 128  # of raster=triton, whose lists are counted here
 
 @dataclass(frozen=True)
 class Crowding:
-    """Bounds on the (Gaussian, block) pairs of a view: of what `raster=triton` counts on the scenes of `bench`, at
-    100,000 and 1,000,000 Gaussians, 500x375 and 1600x1060 px (docs/gpu.md).
-    """
+    """Numbers of (Gaussian, block) pairs of a view: bounds of what `raster=triton` counts on the scenes of `bench`, at
+    100,000 and 1,000,000 Gaussians, 500x375 and 1600x1060 px (docs/gpu.md)."""
 
     pairs_of_gaussian: float
     pairs_of_pixel: float

@@ -38,7 +38,7 @@ from gsbench.words import signed
 
 @dataclass(frozen=True)
 class AblationPart:
-    """Part of the report on an ablation: its runs in lines, and charts as SVG."""
+    """Descriptions of the runs in lines, and charts as SVG."""
 
     lines: Sequence[str]
     charts: Sequence[str]

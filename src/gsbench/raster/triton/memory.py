@@ -26,7 +26,7 @@ def workspace_bytes(gaussians: int, units: int, pairs: int, blocks: int) -> int:
 
 
 def render_bytes(gaussians: int, units: int, pairs: int, blocks: int) -> int:
-    """The bytes that renders hold at once, with their backward passes, beside their results and gradients.
+    """Bytes that renders hold at once, with their backward passes, beside their results and gradients.
 
     ``pairs`` (Gaussian, block) stand in ``units`` rows of blocks. A buffer that has to grow becomes at least twice as
     large as it was, so that after some growth it may be up to twice what is counted here.
