@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult
-from gsbench.runs.declaration import Declaration, read_declarations, unix_time
+from gsbench.runs.declaration import STOPPING, Declaration, read_declarations, read_plans, unix_time
 from gsbench.words import counted
 
 
@@ -25,6 +25,7 @@ class ActiveDeclaration:
     seen: tuple[TrialResult, ...]
     trials: int
     earlier: tuple[Declaration, ...]
+    looked: bool = False  # seeds were added in planned looks
 
     @property
     def metric(self) -> str:
@@ -48,6 +49,11 @@ class ActiveDeclaration:
                 f"the {self._all()} had been measured, so it is adjusted with all other metrics. Trials with "
                 "other seeds under another name would test it."
             ]
+        if self.looked:
+            lines.append(
+                "Seeds came in planned looks (launch.stop_when_decided): the verdict on top of gsbench report holds its "
+                "error rate over them; tests that take numbers of seeds as fixed are too sure of this metric."
+            )
         lines += [f"Before it, {one.metric} was declared ({one.when})." for one in self.earlier]
         return lines
 
@@ -62,7 +68,8 @@ def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration |
         return None
     latest = declared[-1]
     seen = tuple(trial for trial in trials if measured(trial) < latest.time)
-    return ActiveDeclaration(latest, seen, len(trials), tuple(declared[:-1]))
+    looked = any(STOPPING in plan.plan for plan in read_plans(folder))
+    return ActiveDeclaration(latest, seen, len(trials), tuple(declared[:-1]), looked)
 
 
 def measured(trial: TrialResult) -> float:

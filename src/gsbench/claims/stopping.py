@@ -25,12 +25,11 @@ from gsbench.claims.verdict import Pair, PairKey, Verdict, judge_claim
 from gsbench.config.compose import Composed
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find
-from gsbench.runs.declaration import DeclaredPlan, read_plans
+from gsbench.runs.declaration import STOPPING, DeclaredPlan, read_plans
 from gsbench.runs.hashing import flatten, sha256_of
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.words import counted
 
-STOPPING = "stopping"  # the key of such a plan in the record of declarations
 SEED = "-seed"  # in the name of a trial's folder, before the seed
 
 

@@ -17,6 +17,7 @@ from typing import Any
 from gsbench.files import read_json_lines
 from gsbench.runs.layout import DECLARED
 
+STOPPING = "stopping"  # the key of a plan that is of a sweep's looks (launch.stop_when_decided)
 STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
 
 
