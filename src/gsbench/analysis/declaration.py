@@ -51,8 +51,8 @@ class ActiveDeclaration:
             ]
         if self.looked:
             lines.append(
-                "Seeds came in planned looks (launch.stop_when_decided): the verdict on top of gsbench report holds its "
-                "error rate over them; tests that take numbers of seeds as fixed are too sure of this metric."
+                "Seeds came in planned looks (launch.stop_when_decided): the verdict on top of gsbench report holds "
+                "its error rate over them; tests that take numbers of seeds as fixed are too sure of this metric."
             )
         lines += [f"Before it, {one.metric} was declared ({one.when})." for one in self.earlier]
         return lines
