@@ -165,7 +165,9 @@ def test_another_launcher_of_hydras_gets_one_look_at_a_time(sweep: Callable[...,
     assert [seed for ((_, seed),) in fake.batches] == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
-def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep: Callable[..., int], runs: Path) -> None:
+def test_settings_make_arms_and_the_report_opens_with_the_looks(
+    sweep: Callable[..., int], runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Arms that differ in a setting alone are told apart as in the report."""
     fake = Fake(clear)
     assert sweep(fake, "densify=adc,volumetric", "densify.max_gaussians=1000,2000", "launch.least_difference=0.5") == 0
@@ -177,6 +179,9 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep: Callable[
     text = (runs / "stop" / "report.html").read_text()
     assert "random-volumetric max_gaussians=1000 against random-adc max_gaussians=1000: better in PSNR" in text
     assert "launch.stop_when_decided" in text
+    capsys.readouterr()
+    assert cli.run(["tables", "stop"]) == 0
+    assert "too sure of this metric" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
