@@ -89,9 +89,9 @@ def test_no_file_of_ours_is_parsed_beside_its_reader() -> None:
     found = set()
     for path in package.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-                if (node.value.id, node.attr) in LOADERS:
-                    found.add(path.relative_to(package).as_posix())
+            is_loader = isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
+            if is_loader and (node.value.id, node.attr) in LOADERS:
+                found.add(path.relative_to(package).as_posix())
             if isinstance(node, ast.ImportFrom) and node.module in ("json", "yaml"):
                 assert not {alias.name for alias in node.names} & {name for _, name in LOADERS}, path
     assert found == READS_ITSELF
