@@ -89,7 +89,7 @@ def results_of(
             "sources": sources_of(values),
             "stages": {stage.name: stage.version for stage in STAGES},
             "files": dict(sorted(code.items())),
-            **_read(trained.path / MANIFEST).get("checkout", {}),
+            **training["checkout"],
         },
         "machine": training["machine"],
         "versions": versions(),
