@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 TRIAL_FOLDER = re.compile(r"(?P<hash>[0-9a-f]{8})-seed(?P<seed>\d+)")
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
 
+ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
 GROUPS = ("scene", "init", "densify")  # of a configuration: what every trial has
 
 Arm = tuple[str, str]  # initialiser, densifier
@@ -410,7 +411,9 @@ def _number(text: str) -> float:
 
 def canonical(value: object) -> str:
     """JSON text that is equal for equal values."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+    if type(value) is int or (type(value) is float and math.isfinite(value)):
+        return repr(value)  # as JSON writes it; most settings are such
+    return ENCODER.encode(value)
 
 
 def _trial_folders(folder: Path) -> Iterator[str]:
