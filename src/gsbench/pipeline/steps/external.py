@@ -105,7 +105,8 @@ def external_step(
         }
         write_json(folder / TRAINING, summary)
 
-    return step_of_code(replace(TRAIN, resumable=False), inputs, build, __name__)  # it starts from the beginning
+    stage = replace(TRAIN, version=1, resumable=False)  # it starts from the beginning, and is no training of ours
+    return step_of_code(stage, inputs, build, __name__)
 
 
 def take_result(trainer: External, pattern: str, views: Views, output: Path, folder: Path) -> dict[str, Any]:
