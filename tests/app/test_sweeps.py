@@ -19,6 +19,7 @@ from gsbench.launch.plan import add_to_plan
 from gsbench.launch.trial import Trial
 from gsbench.runs.declaration import read_plans
 from gsbench.runs.layout import CONFIG, RESULTS
+from gsbench.runs.trial_record import record_from
 from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.launch.test_declare import TINY
 
@@ -49,13 +50,13 @@ class Fake:
                 continue
             if seed == self.stops_at:
                 raise KeyboardInterrupt
-            data = {"metrics": {}}
-            if not (trial.folder / RESULTS).exists():
+            results = trial.folder / RESULTS
+            if not results.exists():
                 views = {"psnr": self.psnr(arm, seed) + np.arange(3.0)}
                 data = trial_data(Plan(experiment="stop"), "courtyard", "random", arm, seed, views)
                 write_trial(trial.paths.runs, data, views, trial.folder.name.partition("-")[0])
                 (trial.folder / CONFIG).write_text(trial.yaml)
-            outcomes.append(outcome_of_results(trial.folder, data))
+            outcomes.append(outcome_of_results(trial.folder, record_from(results.read_bytes(), results)))
         return outcomes
 
 
@@ -165,7 +166,9 @@ def test_another_launcher_of_hydras_gets_one_look_at_a_time(sweep: Callable[...,
     assert [seed for ((_, seed),) in fake.batches] == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
-def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep: Callable[..., int], runs: Path) -> None:
+def test_settings_make_arms_and_the_report_opens_with_the_looks(
+    sweep: Callable[..., int], runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Arms that differ in a setting alone are told apart as in the report."""
     fake = Fake(clear)
     assert sweep(fake, "densify=adc,volumetric", "densify.max_gaussians=1000,2000", "launch.least_difference=0.5") == 0
@@ -177,6 +180,9 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep: Callable[
     text = (runs / "stop" / "report.html").read_text()
     assert "random-volumetric max_gaussians=1000 against random-adc max_gaussians=1000: better in PSNR" in text
     assert "launch.stop_when_decided" in text
+    capsys.readouterr()
+    assert cli.run(["tables", "stop"]) == 0
+    assert "too sure of this metric" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
