@@ -15,7 +15,7 @@ CORE_TESTS := @tests/core.txt
 
 # The next version of Hydra, as far as it is released, laid over .venv for the tests of what Hydra does.
 NEXT_HYDRA := 'hydra-core>=1.4.0rc1,<1.5' 'omegaconf>=2.4.1rc1,<2.5'
-NEXT_HYDRA_TESTS := tests/app/test_joined_sweeps.py tests/config/test_schema.py
+NEXT_HYDRA_TESTS := tests/app tests/config tests/end_to_end/test_hydra.py
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-slow test-generic test-next-hydra lint docs lock

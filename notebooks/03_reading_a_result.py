@@ -29,7 +29,8 @@ from IPython.display import Markdown
 from gsbench.analysis import load_experiment, to_frame
 from gsbench.analysis.errors_by_region import errors_by_region
 from gsbench.analysis.pairing import ViewCache, pair_arms
-from gsbench.analysis.statistics import compare, seeds_needed
+from gsbench.analysis.power import seeds_needed
+from gsbench.analysis.statistics import compare
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.cli import run
@@ -108,8 +109,9 @@ plt.tight_layout()
 #
 # ## The verdict
 #
-# An arm is *better* or *worse* only if a test says p < 5 % **and** the bootstrap interval excludes zero. Otherwise
-# the verdict is *no evidence*, which is not the same as *no difference*.
+# An arm is *better* or *worse* where Student's t over the pairs of trials says p < 5 %, which is where its 95 %
+# interval leaves zero out: two readings of one test. Otherwise the verdict is *no evidence*, which is not the same as
+# *no difference*.
 
 # %%
 result = compare(paired, direction=+1)  # +1: more PSNR is better
@@ -125,11 +127,11 @@ print(f"verdict          {result.verdict}")
 
 # %%
 for difference in (0.05, 0.1, 0.2, 0.5):
-    print(f"{difference:4} dB: {seeds_needed(result.seed_deviation, 1, difference) or 'more than 1000'} seeds an arm")
+    print(f"{difference:4} dB: {seeds_needed(result.deviation, 1, difference) or 'more than 1000'} seeds an arm")
 
 # %% [markdown]
-# More seeds tell more about *this* scene only. For "scenes like these", gsbench wants at least six scenes, since
-# fewer cannot reach 5 % in an exact test.
+# More seeds tell more about *this* scene only. For "scenes like these", gsbench wants at least six scenes, which then
+# are the units.
 #
 # ## Where it helps
 #

@@ -119,7 +119,7 @@ def _by_scene(frame: pd.DataFrame, title: str, cell: Callable[[pd.DataFrame], st
 
 
 def differences_table(frame: pd.DataFrame, against: str | None = None, arms: Sequence[str] | None = None) -> list[str]:
-    """Each arm minus ``against`` in each metric: mean, 95 % interval, p adjusted over the whole table (Holm).
+    """Table of each arm minus ``against`` in each metric: mean, 95 % interval, p adjusted over the whole table (Holm).
 
     Bold is what the program would decide. Nothing is called better or worse, since no metric was declared.
     """
@@ -147,7 +147,7 @@ def _difference(c: Comparison) -> str:
 def compared(
     frame: pd.DataFrame, against: str | None = None, arms: Sequence[str] | None = None
 ) -> dict[tuple[str, str], Comparison]:
-    """By (arm, metric), each of ``arms`` (default: all others) minus ``against``, as one family of tests."""
+    """Compare each of ``arms`` (default: all others) with ``against`` in each metric, as one family of tests."""
     against = against or _baseline(frame)
     keys = [(arm, metric) for arm in arms or _arms(frame) if arm != against for metric in METRICS]
     members = [(pair(frame, arm, metric, against), _facts(metric).direction) for arm, metric in keys]
@@ -155,7 +155,7 @@ def compared(
 
 
 def events_table(frame: pd.DataFrame) -> list[str]:
-    """What the refinements did, by cause, in thousands of Gaussians, as the mean of the trials."""
+    """Table of what the refinements did, by cause, in thousands of Gaussians, as the mean of the trials."""
     causes = [c for c in frame.columns if c.startswith("event_")]
     lines = [_row(["arm", *(c.removeprefix("event_").replace("_", " ") for c in causes)])]
     lines.append(_row(["---"] + ["--:"] * len(causes)))

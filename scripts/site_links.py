@@ -36,7 +36,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Lead on the links of a page of docs/; those of generated pages have been."""
+    """Resolve the links of a page of docs/; those of generated pages are resolved already."""
     if page.file.generated_by is not None:
         return markdown
     return led_on(markdown, (DOCS / page.file.src_uri).parent, config["repo_url"])

@@ -1,4 +1,4 @@
-"""How often stopping when decided is wrong, and what it saves: simulated sweeps, for the tables of docs/verdict.md.
+"""Error rates and savings of stopping when decided, from simulated sweeps, for the tables of docs/verdict.md.
 
     python scripts/stopping_rates.py                write the tables into the page (about five minutes)
     python scripts/stopping_rates.py --sweeps 200   print them from fewer sweeps
@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from gsbench.analysis.statistics import ALPHA, MIN_SCENES, POWER, t_power
+from gsbench.analysis.power import POWER, t_power
+from gsbench.analysis.statistics import ALPHA, MIN_SCENES
 from gsbench.claims.sequential import Decision, Design, decide, most_seeds, plan_looks
 
 PAGE = Path(__file__).parents[1] / "docs" / "verdict.md"
@@ -49,7 +50,7 @@ class Size:
         return Design(self.scenes, plan_looks(self.most))
 
     def units(self, differences: Array) -> Array:
-        """What the fixed design tests, from [scenes, seeds]: the pairs, or the scenes' means."""
+        """The values that the fixed design tests, from [scenes, seeds]: the pairs, or the scenes' means."""
         own = differences[:, : self.fixed]
         return own.mean(axis=1) if self.design.by_scene else own.ravel()
 

@@ -30,6 +30,7 @@ from gsbench.runs.store import Store
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.system.stopping import Stopped
 from gsbench.verbs import doctor, export, retry, ui
+from tests.finished import write_results
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -103,7 +104,7 @@ def make_experiment(runs: Path) -> list[Path]:
     folders = [TrialPaths.of(trial.values).folder for trial in trials]
     folders[0].mkdir(parents=True)
     (folders[0] / "config.yaml").write_text(trials[0].yaml)
-    (folders[0] / "results.json").write_text(json.dumps({"status": "complete"}))
+    write_results(folders[0], trials[0].values)
     folders[1].mkdir(parents=True)
     (folders[1] / "config.yaml").write_text(trials[1].yaml)
     (folders[1] / "failed.json").write_text(json.dumps({"message": "the loss became nan"}))
@@ -162,24 +163,7 @@ def finished_trial(runs: Path, gaussians: Gaussians) -> Path:
     write_ply(gaussians, folder / "point_cloud.ply")
     (runs / "store" / "init" / "abc" / "sparse" / "0").mkdir(parents=True)
     (runs / "store" / "init" / "abc" / "sparse" / "0" / "points3D.bin").write_bytes(b"points")
-    results = {
-        "status": "complete",
-        "experiment": "x",
-        "scene": "courtyard",
-        "init": "sfm",
-        "densify": "adc",
-        "raster": "cpu",
-        "protocol": "paper-1",
-        "seed": 0,
-        "iterations": 10,
-        "num_gaussians": len(gaussians),
-        "metrics": {"psnr": 20.0},
-        "unavailable": {},
-        "seconds": {"train": 1.0},
-        "hashes": {"init": "abc"},
-        "versions": {},
-    }
-    (folder / "results.json").write_text(json.dumps(results))
+    write_results(folder, values, num_gaussians=len(gaussians), hashes={"init": "abc"})
     return folder
 
 
@@ -378,3 +362,20 @@ def test_doctor_on_a_runs_folder(runs: Path, monkeypatch: pytest.MonkeyPatch) ->
     first, last = doctor.check_store(runs)
     assert "model differs" in first.text
     assert last.text.startswith("0 results")
+
+
+def test_a_stop_while_a_native_module_is_imported_is_told_as_a_stop(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(argv: list[str]) -> int:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:  # as pybind11 and numpy do
+            raise ImportError("initialization failed") from error
+
+    monkeypatch.setattr(cli, "_trials", stopped)
+    assert cli.run(["seed=1"]) == 130
+    assert capsys.readouterr().err == "gsbench: stopped; the same command goes on from here\n"
+    monkeypatch.setattr(cli, "_trials", lambda argv: importlib.import_module("nosuch_module"))
+    with pytest.raises(ModuleNotFoundError):
+        cli.run(["seed=1"])

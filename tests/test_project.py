@@ -47,6 +47,10 @@ def test_the_lock_has_the_versions_of_the_constraints() -> None:
     assert different == {}, "make lock"
 
 
+def test_every_constraint_is_of_a_package_that_something_needs() -> None:
+    assert set(constraints()) - {normal(package["name"]) for package in locked()} == set()
+
+
 def test_the_lock_locks_what_the_project_file_asks_for() -> None:
     (own,) = (package for package in locked() if "editable" in package["source"])
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

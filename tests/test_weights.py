@@ -82,13 +82,14 @@ def test_download_is_checked_and_kept(tmp_path: Path, empty_caches: Path):
     assert find_weights(spec(b"good", source.as_uri())) == found
 
 
-def test_download_says_how_far_it_is(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_download_says_how_far_it_is(tmp_path: Path, empty_caches: Path, caplog: pytest.LogCaptureFixture):
     caplog.set_level(logging.INFO, "gsbench")
     source = tmp_path / "served.bin"
     source.write_bytes(b"g" * 2_500_000)
     find_weights(spec(source.read_bytes(), source.as_uri()))
     lines = [record.getMessage() for record in caplog.records]
     assert lines == [
+        f"downloading net.pth (2.5 MB) from {source.as_uri()} to {empty_caches}",  # before anything has come
         "weights: net.pth 1048576/2500000 1.05 MB of 2.5 MB",
         "weights: net.pth 2500000/2500000 2.5 MB of 2.5 MB",
     ]

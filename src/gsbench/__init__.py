@@ -1,10 +1,12 @@
-"""gsbench: does an idea help 3D Gaussian Splatting? Photographs in; tables, statistics and pictures out."""
+"""gsbench tests whether an idea helps 3D Gaussian Splatting. Photographs in; tables, statistics and pictures out."""
 
 import sys
+import time
 
 if sys.argv[:1] == ["-m"] and "gsbench.cli" in sys.orig_argv and not sys.flags.safe_path:
     del sys.path[0]  # `python -m` puts the current folder first, where a capture may hold a module of any name
 
 import zlib  # noqa: F401 - loaded before pycolmap brings its own, with which Pillow's PNG writer crashes
 
+IMPORTED_AT = time.time_ns()  # when this process began to load this package
 __version__ = "0.1.0"

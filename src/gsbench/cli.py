@@ -13,12 +13,13 @@ from pathlib import Path
 
 from gsbench import __version__
 from gsbench.errors import GsbenchError, InputError
-from gsbench.files import checked_runs_folder
+from gsbench.files import checked_runs_folder, storage_errors
 from gsbench.logs import printable_output, set_up_logging
 from gsbench.system.own_modules import SAFE_PATH
 from gsbench.verbs.table import VERBS
 from gsbench.words import closest
 
+HELP = ("--help", "-h")
 DONE, TRIAL_FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
 
@@ -37,13 +38,15 @@ def run(argv: list[str]) -> int:
     os.environ.setdefault(*SAFE_PATH)  # for all Python processes that we start, whoever starts them for us
     set_up_logging()
     try:
-        if argv and argv[0] in ("help", "--help", "-h"):
-            return _help()
+        if argv and argv[0] == "help":
+            return _help([])
         if argv == ["--version"]:
             print(f"gsbench {__version__}")
             return DONE
         if argv and not set(argv[0][:1]) & set("-+~") and "=" not in argv[0]:
             return _verb(argv[0], argv[1:])
+        if set(HELP) & set(argv):
+            return _help([word for word in argv if word not in HELP])
         return _trials(argv)
     except InputError as error:
         return _refuse(error, BAD_INPUT)
@@ -54,9 +57,21 @@ def run(argv: list[str]) -> int:
             f"gsbench: stopped{f' by {stop}' if str(stop) else ''}; the same command goes on from here", file=sys.stderr
         )
         return getattr(stop, "exit_code", INTERRUPTED)
+    except ImportError as error:
+        if not _is_interrupt(error):
+            raise
+        print("gsbench: stopped; the same command goes on from here", file=sys.stderr)
+        return INTERRUPTED
     except BrokenPipeError:  # the reader of our output, such as `head`, has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether a Ctrl-C is behind an error: native modules that it stops while they are imported raise ImportError."""
+    return error is not None and (
+        isinstance(error, KeyboardInterrupt) or _is_interrupt(error.__cause__ or error.__context__)
+    )
 
 
 def _refuse(error: GsbenchError, code: int) -> int:
@@ -77,7 +92,9 @@ def _verb(name: str, argv: list[str]) -> int:
             f"(verbs: {', '.join(VERBS)})"
         )
     main_function: Callable[[list[str], Path], int] = importlib.import_module(VERBS[name][0]).main
-    return main_function(argv, runs_dir())
+    runs = runs_dir()
+    with storage_errors(runs):
+        return main_function(argv, runs)
 
 
 def _trials(argv: list[str]) -> int:
@@ -90,10 +107,12 @@ def _trials(argv: list[str]) -> int:
     return launch(argv)
 
 
-def _help() -> int:
+def _help(words: list[str]) -> int:
+    from gsbench.config.command_words import parse, searched_folders
     from gsbench.config.compose import options_text
 
-    print("gsbench: does an idea help 3D Gaussian Splatting?\n")
+    folders = searched_folders(parse(words)[0])  # whose choices are listed too
+    print("gsbench tests whether an idea helps 3D Gaussian Splatting.\n")
     print("  gsbench scene=courtyard init=sfm densify=volumetric seed=0     one trial")
     print("  gsbench -m densify=adc,volumetric seed=0,1,2                   a sweep")
     print("  gsbench +experiment=demo                                       a sweep from a file")
@@ -106,7 +125,7 @@ def _help() -> int:
     print("Verbs (gsbench VERB --help):")
     for name, (_, text) in VERBS.items():
         print(f"  {name:<10} {text}")
-    print("\n" + options_text())
+    print("\n" + options_text(folders))
     return DONE
 
 

@@ -6,8 +6,8 @@ class GsbenchError(Exception):
 
 
 class InputError(GsbenchError, ValueError):
-    """The user's files or settings cannot be used (exit code 2)."""
+    """Error of the user's files or settings (exit code 2)."""
 
 
 class TrainingError(GsbenchError):
-    """A trial started well and could not go on, for example on a non-finite loss (exit code 1)."""
+    """Error of a trial that started well and could not go on, for example on a non-finite loss (exit code 1)."""

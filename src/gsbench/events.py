@@ -1,14 +1,16 @@
-"""What a refinement did, and why a Gaussian exists: the one table of both. Loads no torch."""
+"""Table of what refinements do, and of the causes of Gaussians. Loads no torch."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from enum import IntEnum
 from typing import ClassVar
 
 
 class Cause(IntEnum):
-    """Why a Gaussian exists: the number in ``lineage.npz``, words, and a colour (r, g, b) for pictures.
+    """Cause of a Gaussian's existence: the number in ``lineage.npz``, words, and a colour (r, g, b) for pictures.
 
     The colours are those of Okabe and Ito (2008), which colour-blind people can tell apart.
     """
@@ -32,7 +34,7 @@ class Cause(IntEnum):
 
     @property
     def key(self) -> str:
-        """Its name in result files."""
+        """The name of the cause in result files."""
         return self.name.lower()
 
 
@@ -73,13 +75,13 @@ class RefineEvent:
     cull: float | None = None
 
     def balances(self) -> bool:
-        """Whether the counts explain ``after``."""
+        """Return whether the counts explain ``after``."""
         grown = sum(getattr(self, name) for name in self.GROWN)
         return self.after == self.before + grown - sum(getattr(self, name) for name in self.PRUNED)
 
     def as_dict(self) -> dict[str, object]:
         """The record as written to ``events.jsonl``."""
-        return {key: value for key, value in asdict(self).items() if value is not None}
+        return {key: value for key, value in asdict(self).items() if value is not None and math.isfinite(value)}
 
     @staticmethod
     def count_names() -> tuple[str, ...]:
@@ -88,6 +90,6 @@ class RefineEvent:
         return tuple(name for name in names if name not in ("step", "before", "after"))
 
 
-def sum_events(events: list[dict[str, object]]) -> dict[str, int]:
+def sum_events(events: Sequence[Mapping[str, object]]) -> dict[str, int]:
     """Totals by cause over the records of ``events.jsonl``."""
     return {name: sum(int(event.get(name, 0)) for event in events) for name in RefineEvent.count_names()}  # type: ignore[call-overload]

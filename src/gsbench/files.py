@@ -8,6 +8,7 @@ import json
 import os
 import re
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,7 +21,7 @@ CHUNK = 1 << 20
 TEMPORARY = re.compile(r"^\..+\.tmp(-\d+)?$")  # how gsbench names a file that it is still writing
 FULL = (errno.ENOSPC, errno.EDQUOT)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
-# What libraries say without an error number when a write is cut short: numpy's tofile, torch's zip writer, SQLite.
+# Messages of libraries, without an error number, when a write is cut short: numpy's tofile, torch's zip writer, SQLite.
 FULL_TEXT = re.compile(
     r"No space left|requested and \d+ written|PytorchStreamWriter failed|unexpected pos|disk is full"
 )
@@ -28,7 +29,7 @@ NEARLY_NOTHING = 64 * 1024  # bytes free: with less, any failed write is a full 
 
 
 class DiskFullError(GsbenchError):
-    """The disk of the runs folder is full: no trial can go on (exit code 1)."""
+    """Error of a full disk of the runs folder: no trial can go on (exit code 1)."""
 
 
 @contextmanager
@@ -71,27 +72,12 @@ def link_or_copy(source: Path, target: Path) -> None:
             shutil.copyfile(source, temporary)
 
 
-def read_object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; empty where there is none that can be read."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
-def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """The objects of a JSON-lines file up to the first damaged line, as a killed writer leaves it; [] if absent."""
-    rows: list[dict[str, Any]] = []
-    try:
-        with path.open(encoding="utf-8") as file:
-            for line in file:
-                row = json.loads(line)
-                if isinstance(row, dict):
-                    rows.append(row)
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError):
-        pass
-    return rows
+def require_regular(path: Path) -> None:
+    """Raise InputError for a pipe, a device or a socket, whose reading need not end; what is not there is let pass."""
+    with suppress(OSError):
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+            raise InputError(f"{path} is no regular file: put a copy of its content there")
 
 
 def sync_to_disk(path: Path) -> None:
@@ -165,6 +151,15 @@ def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
     place = getattr(error, "filename", None) or folder
     if number in FULL or FULL_TEXT.search(str(error)) or (_is_write_error(error) and _free(folder) < NEARLY_NOTHING):
         return DiskFullError(f"the disk of {folder} is full: free some space, and the same command goes on from here")
+    if number == errno.EFBIG:
+        return InputError(
+            f"{place} may not grow any more ({os.strerror(number)}): raise `ulimit -f`, or set runs=FOLDER"
+        )
+    if number == errno.ENOLCK:
+        return InputError(
+            f"the file system of {place} has no locks ({os.strerror(number)}), without which trials would disturb each "
+            "other: set runs=FOLDER or GSBENCH_RUNS to another one, or have its lock service started"
+        )
     if number in FORBIDDEN:
         return InputError(f"{place} may not be written to ({os.strerror(number)}): set runs=FOLDER or GSBENCH_RUNS")
     return None

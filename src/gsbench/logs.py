@@ -1,4 +1,4 @@
-"""Where gsbench's log lines go: to stderr for people, and into a trial's own file."""
+"""Destinations of gsbench's log lines: stderr for people, and a trial's own file."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ SECONDS_BETWEEN_LINES = 20.0
 
 
 class Progress(Protocol):
-    """Told how far a ``phase`` of a piece of work is: ``done`` of a ``total`` that may be unknown.
+    """Receiver of a ``phase``'s progress: ``done`` of a ``total`` that may be unknown.
 
     The unit is the phase's own (images, pairs, bytes), and a phase may start anew at 0. ``note`` is shown as it is.
     """
@@ -125,7 +125,7 @@ class Progress(Protocol):
 
 
 def no_progress(phase: str, done: int, total: int | None, note: str = "") -> None:
-    """The `Progress` that tells nobody."""
+    """A `Progress` that reports nowhere."""
 
 
 @contextmanager

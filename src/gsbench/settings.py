@@ -30,13 +30,13 @@ MAX_NAME_BYTES = 100  # of a name: folders are made of two, and file systems end
 
 
 def is_folder_name(value: str) -> bool:
-    """Whether a text can name a folder, on any system and in the address of a trial (``x:scene:arm:0``)."""
+    """Return whether a text can name a folder, on any system and in the address of a trial (``x:scene:arm:0``)."""
     is_plain = value.isprintable() and not set(value) & set('/\\:*?"<>|') and value == value.strip()
     return is_plain and value[:1] not in ("", ".", "-") and len(value.encode()) <= MAX_NAME_BYTES
 
 
 def is_address(value: str) -> bool:
-    """Whether a text can be the address of a tracker."""
+    """Return whether a text can be the address of a tracker."""
     return re.fullmatch(r"[a-z][a-z0-9+.-]*://\S*", value) is not None and value.isprintable()
 
 

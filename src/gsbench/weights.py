@@ -6,6 +6,7 @@ in the torch hub cache; if it lies nowhere it is downloaded into that cache. Not
 
 from __future__ import annotations
 
+import logging
 import os
 import urllib.request
 from collections.abc import Mapping, Sequence
@@ -21,6 +22,8 @@ from gsbench.words import readable_bytes
 if TYPE_CHECKING:
     from torch import Tensor
 
+log = logging.getLogger(__name__)
+
 WEIGHTS_VARIABLE = "GSBENCH_WEIGHTS"
 DOWNLOAD_TIMEOUT_SECONDS = 10.0  # of inactivity: without a network the answer must come at once
 SHA256_DIGITS = 64
@@ -28,7 +31,7 @@ SAFETENSORS_SUFFIX = ".safetensors"
 
 
 class MissingWeights(InputError):  # noqa: N818  it says what is the matter
-    """A weights file lies nowhere and cannot be downloaded, or what lies there is not that file."""
+    """Error of a weights file that lies nowhere and cannot be downloaded, or is not the one that is wanted."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ def find_weights(spec: WeightsFile, folder: Path | None = None, download: bool =
 
 
 def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, download: bool = True) -> list[Path]:
-    """As `find_weights` for several files; one error names all that are missing."""
+    """Find several files as `find_weights` does; one error names all that are missing."""
     folders = _search_folders(folder)
     found = {spec: _find_local(spec, folders) for spec in specs}
     missing = [spec for spec, path in found.items() if path is None]
@@ -184,6 +187,7 @@ def _download(spec: WeightsFile, folder: Path) -> Path:
             progress("weights") as report,
         ):
             size = int(source.headers.get("Content-Length") or 0) or None
+            log.info("downloading %s (%s) from %s to %s", target.name, readable_bytes(size), spec.url, folder)
             while piece := source.read(CHUNK):
                 file.write(piece)
                 report(target.name, file.tell(), size, f"{readable_bytes(file.tell())} of {readable_bytes(size)}")

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 MAX_NAMED = 3  # names that an error or warning lists before it only counts
-# What a terminal obeys in place of showing: control characters, but for line feed and tab; line separators; marks that
-# turn the direction of writing (UAX #9); halves of characters, which names of files may have.
+# Characters that a terminal obeys in place of showing: control characters, but for line feed and tab; line separators;
+# marks that turn the direction of writing (UAX #9); halves of characters, which names of files may have.
 OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
@@ -57,7 +57,7 @@ def readable_bytes(count: int | None) -> str:
 
 
 def is_path(value: str) -> bool:
-    """Whether a text can be a path: not empty, no control characters, no ``~user`` that is not known."""
+    """Return whether a text can be a path: not empty, no control characters, no ``~user`` that is not known."""
     try:
         return value.strip() != "" and value.isprintable() and bool(Path(value).expanduser())
     except RuntimeError:
@@ -72,6 +72,11 @@ def printable(text: str) -> str:
         'red \\\\x1b[31m'
     """
     return OBEYED.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text.replace("\r\n", "\n"))
+
+
+def listed(names: Sequence[str]) -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
 def some_of(names: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""By these names Hydra finds gsbench's launcher and sweepers; what they do stands in ``gsbench.launch``.
+"""Plug-ins by which Hydra finds gsbench's launcher and sweepers; what they do stands in ``gsbench.launch``.
 
 Hydra imports this file at every start, of any Hydra app in the same environment, so it imports Hydra alone.
 """
@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 
 class GsbenchLauncher(Launcher):
-    """Gets all trials of a sweep at once, and runs them as the settings below ``launch`` say."""
+    """Launcher that gets all trials of a sweep at once, and runs them as the settings below ``launch`` say."""
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         self.context, self.task, self.config = hydra_context, task_function, config
@@ -64,7 +64,10 @@ class OptunaSweeper(GsbenchSweeper):
 
 LAUNCHER = {"_target_": "hydra_plugins.gsbench.GsbenchLauncher"}
 SWEEPER = {"_target_": "hydra_plugins.gsbench.GsbenchSweeper", "params": {}, "grids": []}
-SEARCH = {"metric": "psnr", "trials": 20, "seed": 0, "at_once": 1, "params": {}}  # gsbench.app.search
+SEARCH = {  # gsbench.app.search; the last two are other names of n_trials and n_jobs
+    **{"metric": "psnr", "direction": None, "n_trials": 20, "n_jobs": 1, "seed": 0, "params": {}},
+    **{"trials": None, "at_once": None},
+}
 ConfigStore.instance().store(group="hydra/launcher", name="gsbench", node=LAUNCHER, provider="gsbench")
 ConfigStore.instance().store(group="hydra/sweeper", name="gsbench", node=SWEEPER, provider="gsbench")
 ConfigStore.instance().store(

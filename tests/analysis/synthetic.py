@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +136,28 @@ def write_trial(
     _write_lines(path / "metrics.jsonl", curves(data))
     (path / "results.json").write_text(json.dumps(data))
     return path
+
+
+def write_arms(
+    runs: Path,
+    arms: dict[str, dict[str, Any]],
+    seeds: Sequence[int] = (0, 1, 2),
+    scenes: Sequence[str] = ("courtyard",),
+    experiment: str = "exp",
+    **settings: Any,
+) -> list[Path]:
+    """Trials of arms with the densifier's settings given for each, and ``group__key`` for all; results are noise."""
+    rng = np.random.default_rng(0)
+    paths = []
+    for (name, densify), scene, seed in itertools.product(arms.items(), scenes, seeds):
+        views = {m: BASE[m] + SPREAD[m] * rng.normal(0, 0.1, 3) for m in METRICS}
+        data = trial_data(Plan(experiment=experiment), scene, "sfm", name, seed, views)
+        # a hash of its own for each arm, as different settings have
+        paths.append(write_trial(runs, data, views, sha256(repr(densify).encode()).hexdigest()[:8], **settings))
+        config = json.loads((paths[-1] / "config.yaml").read_text())
+        config["densify"] = {"name": name, **densify}
+        (paths[-1] / "config.yaml").write_text(json.dumps(config))
+    return paths
 
 
 PICTURE_SIZE = (120, 160)  # rows, columns

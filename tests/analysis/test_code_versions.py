@@ -74,6 +74,39 @@ def test_a_moved_scene_is_no_other_version(tmp_path: Path) -> None:
     assert build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"]).rows[0].entries[0].text == "27.50 ± 0.71"
 
 
+def of_gsbench(**files: str) -> dict[str, Any]:
+    return code() | {"files": {f"{name}.py": state for name, state in files.items()}}
+
+
+def test_two_states_of_a_file_of_gsbench_are_refused(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, psnr=27.0, _code=of_gsbench(loss="released", ssim="a" * 16, metric="b" * 16))
+    one_trial(tmp_path, 1, psnr=27.0, _code=of_gsbench(loss="c" * 16, ssim="d" * 16, metric="b" * 16))
+    with pytest.raises(InputError) as refused:
+        build_table(load_experiment(tmp_path, "exp"))
+    for part in ("different versions of gsbench's loss.py and 1 more file: released (", "cccccccc (garden seed 1; "):
+        assert part in str(refused.value)
+
+
+def test_a_file_that_one_arm_alone_reaches_is_no_difference(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, psnr=27.0, _code=of_gsbench(loss="a" * 16))
+    one_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, _densify="mcmc", _code=of_gsbench(loss="a" * 16, mcmc="b" * 16))
+    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
+    assert [entry.bold for row in table.rows for entry in row.entries] == [False, True]
+
+
+def test_a_number_names_its_commit_and_what_was_edited(tmp_path: Path) -> None:
+    made = of_gsbench(loss="released", ssim="a" * 16) | {"commit": "0123abcd", "edited": True}
+    one_trial(tmp_path, 0, psnr=27.0, _code=made)
+    said = explain_cell("exp:garden:psnr:adc", tmp_path)
+    assert "commit    0123abcd, edited" in said
+    assert "edited    since the last release: ssim.py" in said
+    unreleased = of_gsbench(loss="b" * 16, ssim="a" * 16) | {"commit": "0123abcd", "edited": False}
+    one_trial(tmp_path / "other", 0, psnr=27.0, _code=unreleased)
+    said = explain_cell("exp:garden:psnr:adc", tmp_path / "other")
+    assert "commit    0123abcd\n" in said
+    assert "since the last release" not in said
+
+
 def superseded(runs: Path, present: dict[str, str] | None = None) -> dict[str, str]:
     """Reasons by the seed of the trial."""
     trials = read_experiment(runs / "exp").trials
@@ -101,3 +134,9 @@ def test_stages_are_superseded_by_later_trials(tmp_path: Path) -> None:
     finished_at(one_trial(tmp_path, 1, psnr=1.0, _code=code(train=2)), 2000)
     finished_at(one_trial(tmp_path, 2, psnr=1.0), 500)  # entered from elsewhere: no code of ours made it
     assert superseded(tmp_path) == {"seed0": "stage train was 1, later trials have 2"}
+
+
+def test_trials_of_an_edited_gsbench_are_superseded(tmp_path: Path) -> None:
+    finished_at(one_trial(tmp_path, 0, psnr=1.0, _code=of_gsbench(loss="a" * 16)), 1000)
+    finished_at(one_trial(tmp_path, 1, psnr=1.0, _code=of_gsbench(loss="b" * 16)), 2000)
+    assert superseded(tmp_path) == {"seed0": "gsbench's loss.py was aaaaaaaa, later trials have bbbbbbbb"}

@@ -229,7 +229,7 @@ def test_below_the_differences_stand_our_choices_as_they_were_recorded(tmp_path:
 def test_a_choice_that_differs_between_arms_names_them_and_one_that_agrees_is_not_shown(tmp_path: Path) -> None:
     own = own_trials(tmp_path, "table2_own", ("sfm", "dim_paper"), init__extractor="superpoint", train__opacity=0.025)
     for trial in own.trials:
-        trial.data["iterations"] = 30_000
+        object.__setattr__(trial.record, "iterations", 30_000)
     measured, difference = paper_tables(own, "table2")
     assert [column.heading for column in measured.columns] == ["SfM + 3DGS", "DIM + 3DGS", "SfM + Ours", "DIM + Ours"]
     assert line_about(difference, "Keypoints").startswith(

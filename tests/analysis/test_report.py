@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from plyfile import PlyData
 
 from gsbench.analysis.errors_by_region import errors_by_region, texture_energy
 from gsbench.analysis.pairing import ViewCache, pair_trials
-from gsbench.analysis.report.build import build_report
+from gsbench.analysis.report.build import build_report, trial_figures
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
 from gsbench.analysis.report.crops import choose_crops
 from gsbench.analysis.report.sections import compare_arms, mean_by_step
@@ -44,6 +45,20 @@ def experiment(runs: Path) -> Experiment:
 @pytest.fixture(scope="module")
 def page(experiment: Experiment) -> str:
     return build_report(experiment)
+
+
+def test_a_picture_that_arms_share_is_shown_once(tmp_path: Path) -> None:
+    for path in write_runs(tmp_path, Plan(scenes=["garden"], views=1)):
+        arm = path.parent.name
+        (path / "figures").mkdir()
+        for name, shade in [("initial_cloud", 90), ("ellipsoids", 10 if arm == "sfm-adc" else 200)]:
+            Image.fromarray(np.full((4, 4, 3), shade, np.uint8)).save(path / "figures" / f"{name}.png")
+    captions = [caption for caption, _ in trial_figures(load_experiment(tmp_path, "exp").trials)]
+    assert captions == [
+        "ellipsoids: garden, sfm-adc, seed 0",
+        "initial cloud: garden, sfm-adc, seed 0; sfm-volumetric, seed 0",
+        "ellipsoids: garden, sfm-volumetric, seed 0",
+    ]
 
 
 class Elements(HTMLParser):
@@ -101,7 +116,9 @@ def test_the_verdict_comes_first(page: str) -> None:
     headings = re.findall(r"<h2[^>]*>([^<]+)", page)
     assert headings[:2] == ["Verdict", "Tables"]
     assert "sfm-volumetric against sfm-adc, on these scenes: better in LPIPS VGG raw; no evidence" in page
-    assert "LPIPS Alex" not in page.split("</section>")[0].split("<tbody>")[1]  # not run: no row
+    verdicts = page.split('aria-label="Verdicts, ')[1].split("</table>")[0]
+    assert "LPIPS VGG raw" in verdicts
+    assert "LPIPS Alex" not in verdicts  # not run: no row
 
 
 def test_what_a_verdict_does_not_say_stands_beside_it(page: str) -> None:

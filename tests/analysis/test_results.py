@@ -12,7 +12,7 @@ import pytest
 
 from gsbench.analysis.results import list_experiments, load_experiment, read_views
 from gsbench.errors import InputError
-from gsbench.files import read_json_lines
+from gsbench.runs.rows import read_curve
 from tests.analysis.synthetic import Plan, write_runs
 
 
@@ -39,13 +39,13 @@ def test_hydra_and_report_files_beside_the_trials_do_not_disturb(tmp_path: Path)
 
 DAMAGES = {
     "half a file": (lambda path: (path / "results.json").write_text('{"status": "comp'), "not JSON"),
-    "binary": (lambda path: (path / "results.json").write_bytes(b"\xff\xfe\x00"), "cannot be read"),
-    "a list": (lambda path: (path / "results.json").write_text("[]"), "not an object"),
+    "binary": (lambda path: (path / "results.json").write_bytes(b"\xff\xfe\x00"), "not JSON"),
+    "a list": (lambda path: (path / "results.json").write_text("[]"), "should be an object"),
     "nan": (lambda path: rewrite(path, metrics={"psnr": float("nan")}), "metrics.psnr is nan"),
     "text for a number": (lambda path: rewrite(path, metrics={"psnr": "27"}), "metrics.psnr is '27'"),
-    "no seconds": (lambda path: rewrite(path, seconds=None), "lacks 'seconds'"),
+    "no seconds": (lambda path: rewrite(path, seconds=None), "seconds is None"),
     "no count": (lambda path: rewrite(path, num_gaussians=None), "num_gaussians"),
-    "no protocol": (lambda path: rewrite(path, protocol=None), "lacks 'protocol'"),
+    "no protocol": (lambda path: rewrite(path, protocol=None), "protocol is None"),
     "still running": (lambda path: rewrite(path, status="running"), "unfinished"),
     "another scene": (lambda path: rewrite(path, scene="kitchen"), "foreign, its results.json is of scene 'kitchen'"),
     "another experiment": (lambda path: rewrite(path, experiment="other"), "of experiment 'other'"),
@@ -107,14 +107,14 @@ def test_views_must_average_to_the_metrics_of_their_trial(tmp_path: Path) -> Non
     with pytest.raises(InputError, match="does not average"):
         read_views(trial)
     (path / "per_view.csv").unlink()
-    with pytest.raises(InputError, match="missing or damaged"):
+    with pytest.raises(InputError, match="is missing"):
         read_views(trial)
 
 
 def test_json_lines_end_at_a_damaged_line(tmp_path: Path) -> None:
     (tmp_path / "m.jsonl").write_text('{"step": 1}\n{"step": 2}\n{"st')
-    assert read_json_lines(tmp_path / "m.jsonl") == [{"step": 1}, {"step": 2}]
-    assert read_json_lines(tmp_path / "absent.jsonl") == []
+    assert read_curve(tmp_path / "m.jsonl") == [{"step": 1}, {"step": 2}]
+    assert read_curve(tmp_path / "absent.jsonl") == []
 
 
 def test_thousands_of_trials_take_seconds(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gsbench.analysis.quantities import choose_quantities
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.table_formats import escape_latex, to_csv, to_html, to_html_page, to_latex, to_markdown
 from gsbench.analysis.tables import Table, build_table, cost_change
@@ -91,6 +92,14 @@ def test_an_unavailable_metric_is_na_with_its_reason(make_experiment: Make) -> N
     table = build_table(make_experiment(), metrics=["lpips_alex"])
     assert {row.entries[0].text for row in table.rows} == {"n/a"}
     assert "LPIPS Alex: n/a, weights file alexnet.pth not found." in table.notes
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_where_another_lpips_alone_was_asked_for_it_has_the_column(there: bool, tmp_path: Path) -> None:
+    measured = {"lpips_squeeze": 0.1} if there else {}
+    one_trial(tmp_path, 0, settings={"eval__lpips": ["squeeze"]}, psnr=27.0, **measured)
+    keys = [quantity.key for quantity in choose_quantities(load_experiment(tmp_path, "exp").trials)]
+    assert [key for key in keys if key.startswith("lpips")] == ["lpips_squeeze"]
 
 
 def test_the_lpips_of_the_protocol_has_a_column_even_when_it_is_missing(tmp_path: Path) -> None:
@@ -193,7 +202,7 @@ def test_costs_are_averaged_by_both_rules(make_experiment: Make, tmp_path: Path)
         one_trial(tmp_path, 0, psnr=20.0, _scene=scene, _num_gaussians=volumetric, _densify="volumetric")
     trials = load_experiment(tmp_path, "exp").trials
     arms = [[trial for trial in trials if trial.densify == name] for name in ("adc", "volumetric")]
-    change = cost_change(*arms, lambda trial: trial.data["num_gaussians"])
+    change = cost_change(*arms, lambda trial: trial.record.num_gaussians)
     assert change == pytest.approx((5 / 4 - 1, 0.5, 2))  # totals 4M -> 5M; ratios 2 and 1
     notes = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"]).notes
     assert any("+25.0% as a ratio of totals, +50.0% as the mean of 2 scenes" in note for note in notes)

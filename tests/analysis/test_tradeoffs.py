@@ -44,7 +44,7 @@ def test_a_densifier_has_a_point_for_each_variant(make_experiment: Callable[...,
     experiment = make_experiment()
     trials = [replace(trial, variant=f"seed={trial.seed}") for trial in experiment.trials]
     for trial in trials:
-        trial.data["num_gaussians"] = 1000 * (1 + trial.seed)
+        object.__setattr__(trial.record, "num_gaussians", 1000 * (1 + trial.seed))
     psnr = quantity("psnr", trials)
     found = family_curve(trials, ("sfm", "adc"), psnr, "gaussians")
     assert found.cost.tolist() == [1000, 2000, 3000]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,7 @@ from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.plan import add_to_plan, read_plan
 from gsbench.runs.trial_files import TrialPaths
+from tests.finished import write_results
 
 # Trials of `threshold` as they were named when it was one grid with a threshold of a million in place of the baseline.
 KNOWN = {
@@ -109,7 +109,7 @@ def test_plan_dry_run_and_retry_see_one_experiment(
     assert [trial.folder for trial in read_plan(runs / "threshold")] == [first, second]
     first.mkdir(parents=True)
     (first / "config.yaml").write_text(trials[0].yaml)
-    (first / "results.json").write_text(json.dumps({"status": "complete"}))
+    write_results(first, trials[0].values)
     ran: list[Path] = []
 
     def run_trials(again: list[object]) -> int:

@@ -14,7 +14,9 @@ from gsbench.errors import GsbenchError
 from gsbench.launch import serial
 from gsbench.launch.outcome import Outcome, outcome_of_error
 from gsbench.runs.finished import Done, NotDone
+from gsbench.runs.inputs import read_results
 from gsbench.runs.trial_files import TrialPaths
+from tests.finished import write_results
 
 optuna = pytest.importorskip("optuna", reason="needs Optuna (extra search)")
 
@@ -51,8 +53,8 @@ class Trials:
             return outcome_of_error(folder, GsbenchError("no luck"))
         folder.mkdir(parents=True)
         error = abs(threshold - BEST) / max(threshold, BEST)
-        metrics = {"psnr": 30 - 10 * error + seed, "flip": error}
-        (folder / "results.json").write_text(json.dumps({"status": "complete", "metrics": metrics}))
+        metrics = {"psnr": 30 - 10 * error + seed, "flip": error, "mine": error}
+        write_results(folder, trial.values, metrics=metrics)
         return Outcome(folder, "done", "psnr", metrics=metrics)
 
 
@@ -64,7 +66,7 @@ def trials(monkeypatch: pytest.MonkeyPatch) -> Trials:
     # What a stand-in leaves has no record of what it was made of; how finished trials are known is tested elsewhere.
     def found(values: dict[str, Any], *rest: Any) -> Done | NotDone:
         path = results_of(values)
-        return Done(json.loads(path.read_text())) if path.exists() else NotDone("unfinished", "")
+        return Done(read_results(path.parent)[0]) if path.exists() else NotDone("unfinished", "")
 
     monkeypatch.setattr("gsbench.launch.batch.find_finished", found)
     return stand_in
@@ -128,12 +130,49 @@ def test_a_failed_trial_is_told_and_the_search_goes_on(
     assert "no luck" in capsys.readouterr().err
 
 
+OFFICIAL = [
+    *("-m", "hydra/sweeper=optuna", "name=x", "seed=0,1", "tracking=none", "init=random"),
+    *("hydra.sweeper.n_trials=4", "hydra.sweeper.n_jobs=2", "hydra.sweeper.direction=maximize"),
+    "densify.volume_threshold=tag(log, interval(1e-4, 1))",
+]
+
+
+def test_settings_have_the_names_of_hydras_plug_in(runs: Path, trials: Trials) -> None:
+    assert cli.run(OFFICIAL) == 0
+    official = list(trials.trained)
+    assert len(official) == 8
+    trials.trained.clear()
+    ours = [word.replace("n_trials", "trials").replace("n_jobs", "at_once") for word in OFFICIAL]
+    assert cli.run([*(word for word in ours if "direction" not in word), "name=y"]) == 0
+    assert trials.trained == official
+
+
+@pytest.mark.parametrize(("direction", "best"), [("minimize", min), ("maximize", max)])
+def test_a_metric_of_ones_own_is_made_best_in_the_direction_that_is_given(
+    direction: str, best: Any, runs: Path, trials: Trials
+) -> None:
+    """``mine`` is in the files alone: a stand-in for a class below ``eval.extra``."""
+    words = [word for word in OFFICIAL if "direction" not in word]
+    assert cli.run([*words, "hydra.sweeper.metric=mine", f"hydra.sweeper.direction={direction}"]) == 0
+    found = json.loads((runs / "x" / "search.json").read_text())
+    assert found["direction"] == (1 if direction == "maximize" else -1)
+    part = search_part(runs / "x")
+    assert part is not None
+    number = best(found["points"], key=lambda point: point["value"])["number"]
+    assert f"(point {number + 1})" in part.line
+
+
 @pytest.mark.parametrize(
     ("words", "part"),
     [
         (["hydra.sweeper.metric=psnrr"], "did you mean psnr?"),
         (["hydra.sweeper.trials=0"], "above 0, got 0"),
-        (["hydra.sweeper.trials=many"], "a whole number, got 'many'"),
+        (["hydra.sweeper.trials=many"], "a whole number above 0, got 'many'"),
+        (["hydra.sweeper.n_trials=5"], "hydra.sweeper.trials is n_trials by another name, and both are given"),
+        (["hydra.sweeper.n_job=2"], "did you mean n_jobs?"),
+        (["hydra.sweeper.direction=minimize"], "PSNR is better the other way"),
+        (["hydra.sweeper.direction=up"], "'maximize' or 'minimize' or null"),
+        (["hydra.sweeper.metric=mine"], "for a metric of your own give hydra.sweeper.direction, too"),
         (["densify.volume_threshold=0.1"], "nothing is searched"),
         (["densify.volume_threshold=tag(log, interval(0, 1))"], "densify.volume_threshold"),
         (["device=cpu,cuda"], "makes no other trial"),
@@ -150,3 +189,17 @@ def test_a_dry_run_trains_nothing(runs: Path, trials: Trials, capsys: pytest.Cap
     assert cli.run([*COMMAND, "--dry-run"]) == 0
     assert "a search of 12 points with 2 seeds each" in capsys.readouterr().out
     assert not trials.trained
+
+
+def test_a_search_says_which_views_judge_it(runs: Path, trials: Trials, caplog: pytest.LogCaptureFixture) -> None:
+    assert cli.run([*COMMAND, "hydra.sweeper.trials=1"]) == 0
+    assert any("scene.validation=true" in record.getMessage() for record in caplog.records)
+    part = search_part(runs / "x")
+    assert part is not None
+    assert "Judged by the test views" in part.line
+    caplog.clear()
+    assert cli.run([*COMMAND, "hydra.sweeper.trials=1", "name=y", "scene.validation=true"]) == 0
+    assert not any("scene.validation=true" in record.getMessage() for record in caplog.records)
+    part = search_part(runs / "y")
+    assert part is not None
+    assert "no test view was looked at" in part.line

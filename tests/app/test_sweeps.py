@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from gsbench import cli
+from gsbench.analysis.declaration import standing
+from gsbench.analysis.results import read_experiment
 from gsbench.claims.stopping import standing_verdicts
-from gsbench.launch.declare import declare, declared_metrics
-from gsbench.launch.outcome import Outcome, outcome_of_results
+from gsbench.launch.declare import declare, declared_metrics, planned_trials
+from gsbench.launch.outcome import Outcome
 from gsbench.launch.plan import add_to_plan
 from gsbench.launch.trial import Trial
 from gsbench.runs.declaration import read_plans
@@ -35,7 +37,7 @@ class Fake:
 
     def __call__(self, trials: Sequence[Trial]) -> list[Outcome]:
         add_to_plan(trials)
-        declare(declared_metrics(trials))
+        declare(declared_metrics(trials), planned_trials(trials))
         self.batches.append([])
         outcomes = []
         for trial in trials:
@@ -47,13 +49,12 @@ class Fake:
                 continue
             if seed == self.stops_at:
                 raise KeyboardInterrupt
-            data = {"metrics": {}}
             if not (trial.folder / RESULTS).exists():
                 views = {"psnr": self.psnr(arm, seed) + np.arange(3.0)}
                 data = trial_data(Plan(experiment="stop"), "courtyard", "random", arm, seed, views)
                 write_trial(trial.paths.runs, data, views, trial.folder.name.partition("-")[0])
                 (trial.folder / CONFIG).write_text(trial.yaml)
-            outcomes.append(outcome_of_results(trial.folder, data))
+            outcomes.append(Outcome(trial.folder, "done", metrics={}))
         return outcomes
 
 
@@ -98,6 +99,20 @@ def test_noise_gets_all_seeds_and_each_trial_is_launched_once(sweep: Callable[..
     assert len({trial for batch in fake.batches for trial in batch}) == 8
     (verdict,) = standing_verdicts(runs / "stop")
     assert verdict.word == "undecided"
+
+
+@pytest.mark.parametrize("psnr", [noise, clear], ids=lambda function: function.__name__)
+def test_seeds_of_planned_looks_are_declared_at_once_and_cost_the_metric_nothing(
+    sweep: Callable[..., int], runs: Path, psnr: Callable[[str, int], float]
+) -> None:
+    assert sweep(Fake(psnr)) == 0
+    experiment = read_experiment(runs / "stop")
+    found = standing(experiment.folder, experiment.trials)
+    assert found is not None
+    assert (found.beforehand, found.added) == (True, ())
+    missing = 0 if psnr is noise else 4
+    assert any(f"{missing} of the 8 declared trials are not there" in line for line in found.sentences("PSNR"))
+    assert any("that take the number of seeds as fixed are too sure" in line for line in found.sentences("PSNR"))
 
 
 def test_a_decided_pair_gets_no_seeds_and_the_pairs_share_the_error_rate(
@@ -165,7 +180,7 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(
     assert "launch.stop_when_decided" in text
     capsys.readouterr()
     assert cli.run(["tables", "stop"]) == 0
-    assert "too sure of this metric" in capsys.readouterr().out
+    assert "as fixed are too sure" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

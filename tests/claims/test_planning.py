@@ -53,13 +53,15 @@ def test_scenes_that_do_not_differ_have_no_variance_of_their_own() -> None:
 def test_power_is_the_share_of_simulated_sweeps_that_see_it(like_these: bool) -> None:
     rng = np.random.default_rng(1)
     size, effect = Size(8, 3), 0.35
-    scenes = rng.normal(0, KNOWN.between, (20_000, size.scenes, 1)) if like_these else 0.0
+    scenes = rng.normal(0, KNOWN.between, (20_000, size.scenes, 1))
+    if not like_these:  # given scenes, that spread as planned about a mean which is the effect
+        scenes = (scenes - scenes.mean(axis=1, keepdims=True)) / scenes.std(axis=1, ddof=1, keepdims=True)
+        scenes *= KNOWN.between
     values = effect + scenes + rng.normal(0, KNOWN.within, (20_000, size.scenes, size.seeds))
     if like_these:
         p = scipy.stats.ttest_1samp(values.mean(axis=2), 0, axis=1).pvalue
     else:
-        error = np.sqrt(values.var(axis=2, ddof=1).mean(axis=1) / (size.scenes * size.seeds))
-        p = 2 * scipy.stats.t.sf(np.abs(values.mean(axis=(1, 2)) / error), size.scenes * (size.seeds - 1))
+        p = scipy.stats.ttest_1samp(values.reshape(20_000, -1), 0, axis=1).pvalue
     assert power(size, effect, KNOWN, like_these) == pytest.approx(np.mean(p < 0.05), abs=0.01)
 
 

@@ -142,7 +142,7 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     words = dict(word.split("=", 1) for word in TINY)
     settings = {key: yaml.safe_load(value) for key, value in words.items()}
-    arms = {"few": {"init.count": 200}, "many": {"init.count": 300}}
+    arms = {"few": {"init.count": 200}, "many": {"init.count": 300, "train.opacity": 0.03}}
     claim = content()["claims"][0] | {"baseline": "few", "arm": "many"}
     claims = [claim | {"id": "points"}, claim | {"id": "size", "not_testable": "too large", "metric": "ssim"}]
     path = tmp_path / "claims.yaml"
@@ -160,6 +160,11 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     assert len(measured) == 4
     assert min(measured) >= plan.to_record()["time"]
     first = (home / "claims.md").read_text(), (home / "claims.html").read_text()
+    for text in first:
+        assert "opacity=0.03 differs from" in text
+        assert "by init.count and learning rates; no arm at hand isolates one of them." in text
+        assert text.index("Fairness sheet: ") < text.index("what would refute it")
+    assert "| init.count | 200 | 300 | ≠ |" in first[0]
     assert run(["check", str(path)]) == 0
     assert ((home / "claims.md").read_text(), (home / "claims.html").read_text()) == first
     assert read_plans(home) == [plan]

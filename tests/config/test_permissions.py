@@ -147,6 +147,15 @@ def test_every_program_and_variable_of_another_trainer_is_asked_for(words: list[
             check_permissions(values | {"allow_targets": rest})
 
 
+@pytest.mark.parametrize("target", ["gsbench.external.inputs.External", "gsbench.pipeline.parts.External"])
+def test_the_class_of_another_trainer_has_two_names(target: str) -> None:
+    """Permissions are asked for by these; by any other that leads to it, nothing is made."""
+    with pytest.raises(InputError):
+        build("densify", {"_target_": target, "name": "x", "command": "bash {data}", "version": "1", "result": "x"}, [])
+    with pytest.raises(InputError):
+        compose_one([*PROGRAM, f"densify._target_={target}"])
+
+
 def test_harmless_variables_need_no_permission() -> None:
     compose_one([*PROGRAM, "+densify.environment.OMP_NUM_THREADS='4'", "allow_targets=[python]"])
 

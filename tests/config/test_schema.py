@@ -11,6 +11,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from gsbench.app.hydra_app import compose_trials
 from gsbench.config.schema import check, plain, register_schemas
 from gsbench.config.trust import check_target
 from gsbench.errors import InputError
@@ -99,6 +100,12 @@ def sweep_size(experiment: str) -> int:
     for value in OmegaConf.to_container(config.hydra.sweeper.params).values():  # type: ignore[union-attr]
         size *= len(str(value).split(","))
     return size
+
+
+def test_the_demo_downloads_little_and_declares_what_it_measures() -> None:
+    trials = compose_trials(["+experiment=demo"], multirun=True)
+    asked = {(tuple(trial.values["eval"]["lpips"]), trial.values["eval"]["primary"]) for trial in trials}
+    assert asked == {(("squeeze",), "lpips_squeeze")}  # 5 MB; all four are 770
 
 
 def test_experiments_have_the_size_of_the_paper() -> None:

@@ -347,3 +347,10 @@ def test_prefixes_end_at_dots(target: str | None) -> None:
 def test_options_of_slurm_that_choose_resources_need_no_permission() -> None:
     assert not SBATCH_RESOURCES & {"wrap", "export", "export_file", "container", "bcast", "chdir", "get_user_env"}
     compose_one(["launch=slurm", "launch.sbatch={constraint: a100, mail-user: me}"])
+
+
+def test_a_module_that_ends_the_process_when_it_is_imported_is_an_error(place: Path) -> None:
+    (place / "mine.py").write_text("raise SystemExit(0)\n")
+    allow_modules(["mine"])
+    with pytest.raises(InputError, match=r"mine\.Mine cannot be imported \(SystemExit: 0\)"):
+        load_class("mine.Mine", "densify", ["mine"])

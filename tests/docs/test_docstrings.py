@@ -1,15 +1,19 @@
-"""The examples in docstrings are true, and the classes that users extend have one."""
+"""The examples in docstrings are true, what users extend has one, and docstrings begin with a verb or a noun."""
 
 from __future__ import annotations
 
+import ast
 import doctest
 import importlib
 import re
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from gsbench.densify import Densifier
 from gsbench.eval.metric import Metric
+from gsbench.external.settings import External
 from gsbench.init.base import Initializer
 from gsbench.raster import Rasterizer
 from gsbench.tracking.sink import Sink
@@ -21,6 +25,80 @@ SOURCES = {
     for path in sorted((ROOT / "src" / "gsbench").rglob("*.py"))
     if PROMPT.search(path.read_text(encoding="utf-8"))
 }
+# First words that are neither verb nor noun, nor lead to a noun: question words, pronouns, prepositions, conjunctions.
+UNPLAIN = frozenset(
+    re.findall(
+        r"\w+",
+        """what whatever whether how where wherever which whichever why when whenever who whom whose does is are can
+        nobody nothing none those these this that such it its he she they we you our here there
+        of for from in into on onto at by with within without to up out about above below behind beside between under
+        over before after until since as if because unless while than not never once and or but so""",
+    )
+)
+TITLED = (*(ROOT / "conf").rglob("*.yaml"), *(ROOT / "src").rglob("*.yaml"))
+
+
+def public_docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Line and text of a module's public docstrings: its own, and those of classes, functions and methods."""
+    pending: list[ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef] = [tree]
+    while pending:
+        node = pending.pop()
+        text = ast.get_docstring(node)
+        if text:
+            yield node.body[0].lineno, text
+        if isinstance(node, ast.Module | ast.ClassDef):
+            pending += [
+                entry
+                for entry in node.body
+                if isinstance(entry, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+                and not entry.name.startswith("_")
+            ]
+
+
+def comments(text: str) -> Iterator[tuple[int, str]]:
+    """Line and text of the comments that have lines of their own; of a block only the first line."""
+    block = False
+    for number, line in enumerate(text.splitlines(), 1):
+        stripped = line.lstrip()
+        if stripped.startswith("#") and not block:
+            yield number, stripped.lstrip("#")
+        block = stripped.startswith("#") and not stripped.startswith("# @package")
+
+
+def first_word(text: str) -> str:
+    return re.split(r"[^a-z'’]+", text.strip().lower(), maxsplit=1)[0]
+
+
+def unplain(path: Path) -> list[str]:
+    text = path.read_text(encoding="utf-8")
+    found = [] if path.suffix == ".yaml" else [*public_docstrings(ast.parse(text))]
+    bad = [(line, words) for line, words in found if first_word(words) in UNPLAIN]
+    # A comment may say when or for what something is; as a title it names it.
+    bad += [(line, words) for line, words in comments(text) if first_word(words) in {"what", "whether", "how", "which"}]
+    return [f"{path.relative_to(ROOT)}:{line}: {words.strip().splitlines()[0]}" for line, words in sorted(bad)]
+
+
+def test_docstrings_and_titles_begin_with_a_verb_or_a_noun() -> None:
+    paths = sorted({*(ROOT / "src").rglob("*.py"), *(ROOT / "scripts").rglob("*.py"), *TITLED})
+    assert len(paths) > 300
+    assert [line for path in paths for line in unplain(path)] == []
+
+
+@pytest.mark.parametrize(
+    ("source", "lines"),
+    [
+        ('"""What it is."""', [1]),
+        ('def run():\n    """Whether it runs."""', [2]),
+        ('async def run():\n    """``how`` it runs."""', []),
+        ('class A:\n    """Nobody."""\n    def a(self):\n        """\n        Of all."""', [2, 4]),
+        ('class _A:\n    """What."""\n    def a(self):\n        """What."""\ndef _b():\n    """What."""', []),
+        ('"""The file.\n\nWhat it holds."""\n# What is next\n# Which\na = 1  # what', [4]),
+    ],
+)
+def test_unplain_words_are_found(source: str, lines: list[int]) -> None:
+    found = [line for line, words in public_docstrings(ast.parse(source)) if first_word(words) in UNPLAIN]
+    found += [line for line, words in comments(source) if first_word(words) in UNPLAIN]
+    assert sorted(found) == lines
 
 
 @pytest.mark.parametrize("name", SOURCES)
@@ -32,11 +110,16 @@ def test_examples(name: str, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    "extended", [Densifier, Initializer, Metric, Rasterizer, Sink], ids=lambda extended: extended.__name__
+    ("extended", "word"),
+    [
+        *((extended, "class ") for extended in (Densifier, Initializer, Metric, Rasterizer, Sink)),
+        (External, "command="),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_what_users_extend_has_an_example(extended: type) -> None:
+def test_what_users_extend_has_an_example(extended: type, word: str) -> None:
     assert extended.__module__ in SOURCES
-    assert "class" in (extended.__doc__ or "").partition("Examples:")[2]
+    assert word in (extended.__doc__ or "").partition("Examples:")[2]
 
 
 def test_examples_are_sections_so_that_the_site_shows_them_as_code() -> None:

@@ -1,4 +1,4 @@
-"""A densifier is edited and one more seed is run: no table averages both versions, and one command forgets the old."""
+"""What a densifier needs is edited and a seed is run: no table averages both versions, one command forgets the old."""
 
 from __future__ import annotations
 
@@ -19,10 +19,14 @@ from gsbench.densify import ADC
 
 @dataclass
 class Mine(ADC):
-    pass
+    def begin(self, *given, **named):
+        from helper import said
+
+        super().begin(*given, **named)
 """
+HELPER = "said = 1\n"
 QUICK = ["train.iterations=20", "eval.lpips=[]", "eval.flip=false", "tracking=none"]
-OWN = ["densify=adc", "densify._target_=mine.Mine", "allow_targets=[mine]", "densify.name=mine", "name=edited"]
+OWN = ["densify=adc", "densify._target_=mine.Mine", "allow_targets=[mine,helper]", "densify.name=mine", "name=edited"]
 
 
 @pytest.mark.slow
@@ -45,9 +49,12 @@ def test_an_edited_densifier_is_never_averaged_with_what_it_was(
         return said.out + said.err
 
     (tmp_path / "mine.py").write_text(MINE)
+    (tmp_path / "helper.py").write_text(HELPER)
     train(0, 1)
     assert ask("status", "edited") == "2 trials: 2 done\n"
-    (tmp_path / "mine.py").write_text(MINE + "# edited\n")
+    (tmp_path / "unrelated.py").write_text("# new\n")
+    assert ask("status", "edited") == "2 trials: 2 done\n"
+    (tmp_path / "helper.py").write_text(HELPER + "# edited\n")
     assert "2 trials: 2 superseded" in ask("status", "edited")
     train(2)
 
@@ -63,18 +70,18 @@ def test_an_edited_densifier_is_never_averaged_with_what_it_was(
     assert ask("status", "edited") == "1 trial: 1 done\n"
     ask("tables", "edited")
 
-    (tmp_path / "mine.py").write_text(MINE)  # the old code comes back: its trials are in the store
+    (tmp_path / "helper.py").write_text(HELPER)  # the old code comes back: its trials are in the store
     assert "iteration" not in train(0, 1)
     assert "3 trials: 2 done, 1 superseded" in ask("status", "edited")
 
     (folder,) = (tmp_path / "runs" / "edited").glob("*/*/*-seed0")
     stale = gsbench(
-        "explain", "--stale", str(folder), "allow_targets=[mine]", GSBENCH_RUNS=runs
+        "explain", "--stale", str(folder), "allow_targets=[mine,helper]", GSBENCH_RUNS=runs
     )  # finds the class beside the user
     assert stale.returncode == 0, stale.stderr
     assert "not in the store" not in stale.stdout
     shutil.rmtree(folder)
-    again = gsbench("retry", "edited", "allow_targets=[mine]", GSBENCH_RUNS=runs)
+    again = gsbench("retry", "edited", "allow_targets=[mine,helper]", GSBENCH_RUNS=runs)
     assert again.returncode == 0, again.stderr
     assert "configuration has changed" not in again.stderr
     assert folder.is_dir()

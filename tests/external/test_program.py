@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,7 @@ from gsbench.init.base import PointCloud
 from gsbench.runs.hashing import config_hash
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
+from gsbench.system.isolate import telling_tail
 from tests.config.test_schema import composed
 
 PATIENCE = 60.0  # seconds within which what never comes is told from a slow machine
@@ -153,3 +156,18 @@ def test_bad_ends_are_one_line_with_the_log(tmp_path: Path, code: str, limit: fl
         run(tmp_path, code, limit)
     assert str(caught.value).endswith(f"log: {tmp_path / 'log'}")
     assert "\n" not in str(caught.value)
+
+
+def test_the_last_words_of_gigabytes_of_output_cost_little(tmp_path: Path) -> None:
+    log = tmp_path / "trainer.log"
+    with log.open("wb") as stream:
+        stream.truncate(3 << 30)  # sparse: it takes no space
+        stream.seek(0, os.SEEK_END)
+        stream.write(b"\nstep 30000\nRuntimeError: CUDA out of memory\n")
+    tracemalloc.start()
+    try:
+        assert telling_tail(log) == "RuntimeError: CUDA out of memory"
+        assert tracemalloc.get_traced_memory()[1] < 64 << 20
+    finally:
+        tracemalloc.stop()
+    assert telling_tail(log, log.stat().st_size) == "(no output)"

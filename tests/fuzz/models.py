@@ -1,4 +1,4 @@
-"""Damaged COLMAP models and PLY files, read one after the other; run as a program, so that a crash is seen as one.
+"""Damaged models, PLY files, pictures and archives, read one by one; a program, so that a crash is seen as one.
 
     python -m tests.fuzz.models FOLDER FIRST COUNT
 
@@ -9,20 +9,28 @@ from __future__ import annotations
 
 import sys
 import time
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
 import numpy as np
+from PIL import Image
 
+from gsbench.datasets.archive import DamagedError, extract, members_of, open_archive, runs_of
 from gsbench.errors import InputError
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.scene.colmap import read_model
+from gsbench.scene.images import exif_orientation, image_size, read_image
 from tests.fuzz.corrupt import corrupt
 from tests.gaussians.helpers import random_gaussians
 
 SLOW_SECONDS = 20.0
-KINDS = ("colmap.bin", "colmap.txt", "ply")
+KINDS = ("colmap.bin", "colmap.txt", "ply", "picture", "zip")
+PICTURES = ("a.jpg", "b.png", "c.png", "d.webp", "e.tif", "f.tif", "g.bmp", "h.png")
+MEMBERS = {
+    f"scene/images/{name}": bytes(range(256)) * size for name, size in (("a.jpg", 3), ("b.jpg", 1), ("c.jpg", 9))
+}
 
 
 def write_originals(folder: Path) -> None:
@@ -37,6 +45,22 @@ def write_originals(folder: Path) -> None:
     model.write_binary(folder / KINDS[0])
     model.write_text(folder / KINDS[1])
     write_ply(random_gaussians(5, seed=1), folder / "model.ply")
+    rng = np.random.default_rng(0)
+    rgb = Image.fromarray(rng.integers(0, 255, (9, 12, 3), dtype=np.uint8))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    rgb.save(folder / "a.jpg", exif=exif)
+    rgb.save(folder / "b.png")
+    rgb.convert("P").save(folder / "c.png", transparency=3)
+    rgb.save(folder / "d.webp")
+    rgb.save(folder / "e.tif", compression="tiff_lzw")
+    Image.fromarray(rng.integers(0, 65535, (9, 12), dtype=np.uint16)).save(folder / "f.tif")
+    rgb.save(folder / "g.bmp")
+    Image.fromarray(rng.integers(0, 65535, (9, 12), dtype=np.uint16)).save(folder / "h.png")
+    for name, packed in (("stored.zip", zipfile.ZIP_STORED), ("packed.zip", zipfile.ZIP_DEFLATED)):
+        with zipfile.ZipFile(folder / name, "w", packed) as archive:
+            for member, content in MEMBERS.items():
+                archive.writestr(member, content)
 
 
 def run_case(originals: Path, work: Path, case: int) -> bool:
@@ -47,6 +71,14 @@ def run_case(originals: Path, work: Path, case: int) -> bool:
         target = work / "case.ply"
         target.write_bytes(corrupt((originals / "model.ply").read_bytes(), rng))
         return _refused(lambda: _check_gaussians(target))
+    if kind == "picture":
+        target = work / rng.choice(PICTURES)
+        target.write_bytes(corrupt((originals / target.name).read_bytes(), rng))
+        return _refused(lambda: _check_picture(target))
+    if kind == "zip":
+        target = work / "case.zip"
+        target.write_bytes(corrupt((originals / rng.choice(("stored.zip", "packed.zip"))).read_bytes(), rng))
+        return _refused(lambda: _check_archive(target, work))
     target = work / kind
     target.mkdir(exist_ok=True)
     files = sorted((originals / kind).iterdir())
@@ -73,6 +105,29 @@ def _check_gaussians(path: Path) -> None:
     gaussians = read_ply(path)
     assert len(gaussians) > 0
     assert all(np.isfinite(tensor.numpy()).all() for tensor in gaussians.tensors().values())
+
+
+def _check_picture(path: Path) -> None:
+    width, height = image_size(path)
+    assert exif_orientation(path) >= 0
+    if width * height < 1 << 24:  # else it would take long, and is as good
+        picture = read_image(path)
+        assert picture.shape == (height, width, 3)
+        assert picture.dtype == np.uint8
+
+
+def _check_archive(path: Path, work: Path) -> None:
+    with path.open("rb") as file, open_archive(file, str(path)) as archive:
+        members = members_of(archive, "scene", ("images",), str(path))
+        found = [member for run, _ in runs_of(archive, members) for member in run]
+        assert sorted(member.name for member in found) == [member.name for member in members]
+        for number, member in enumerate(found):
+            target = work / f"member{number}"
+            try:
+                extract(archive, member, target, lambda count: None)
+            except DamagedError as error:
+                raise InputError(" ".join(str(error).split())) from error
+            assert target.stat().st_size == member.bytes
 
 
 def _refused(read: Callable[[], None]) -> bool:

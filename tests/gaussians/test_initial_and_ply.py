@@ -75,3 +75,27 @@ def test_a_torn_ply_is_named(tmp_path: Path) -> None:
         (tmp_path / "torn.ply").write_bytes(whole[:length])
         with pytest.raises(InputError, match=r"torn\.ply: not a"):
             read_ply(tmp_path / "torn.ply")
+
+
+def rewritten(path: Path, old: bytes, new: bytes) -> Path:
+    """The file with another header."""
+    content = path.read_bytes()
+    assert content.count(old) == 1
+    path.write_bytes(content.replace(old, new))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (b" f_rest_0\n", b" f_rest_50\n", r"it has 45, with f_rest_50"),
+        (b" f_rest_0\n", b" f_rest_00\n", r"it has 45, with f_rest_00"),
+        (b" f_rest_44\n", b" f_rest_145\n", r"it has 45, with f_rest_145"),
+        (b" f_rest_44\n", b" unknown\n", r"it has 44"),
+        (b"property float f_rest_43\nproperty float f_rest_44\n", b"", "it has 43"),
+    ],
+)
+def test_harmonics_that_would_shift_are_refused(tmp_path: Path, old: bytes, new: bytes, said: str) -> None:
+    write_ply(random_gaussians(4, seed=2), tmp_path / "a.ply")
+    with pytest.raises(InputError, match=said):
+        read_ply(rewritten(tmp_path / "a.ply", old, new))

@@ -14,7 +14,7 @@ from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
-from gsbench.launch.declare import declare, declare_plan, declared_metrics
+from gsbench.launch.declare import declare, declare_plan, declared_metrics, planned_trials
 from gsbench.launch.trial import Trial
 from gsbench.runs.declaration import read_declarations, read_plans
 from tests.end_to_end.conftest import SMALL
@@ -36,15 +36,38 @@ def test_a_declaration_is_kept_with_its_time_and_changes_are_added(
     undeclared, psnr, ssim = (
         composed(tmp_path, *words) for words in ([], ["eval.primary=psnr"], ["eval.primary=ssim"])
     )
-    declare(declared_metrics([undeclared]))
+    declare(declared_metrics([undeclared]), planned_trials([undeclared]))
     assert read_declarations(tmp_path / "exp") == []
     for trials in ([psnr, psnr], [psnr], [undeclared]):  # said again, or not said: it stands
-        declare(declared_metrics(trials))
+        declare(declared_metrics(trials), planned_trials(trials))
         assert [one.metric for one in read_declarations(tmp_path / "exp")] == ["psnr"]
     with caplog.at_level(logging.WARNING):
-        declare(declared_metrics([ssim]))
+        declare(declared_metrics([ssim]), planned_trials([ssim]))
     assert {one.metric for one in read_declarations(tmp_path / "exp")} == {"psnr", "ssim"}
     assert "about ssim, and the report will say that psnr was declared before" in caplog.text
+
+
+def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_added(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def say(*commands: tuple[str, ...]) -> list[dict[str, list[int]]]:
+        trials = [composed(tmp_path, *words) for words in commands]
+        declare(declared_metrics(trials), planned_trials(trials))
+        lines = (tmp_path / "exp" / "declared.jsonl").read_text().splitlines()
+        return [json.loads(line)["trials"] for line in lines]
+
+    psnr = "eval.primary=psnr"
+    (first,) = say((psnr, "densify=adc"), (psnr, "densify=adc", "seed=1"), (psnr, "densify=volumetric"))
+    assert sorted(first.values()) == [[0], [0, 1]]
+    assert {key.rpartition("/")[0] for key in first} == {"courtyard/sfm-adc", "courtyard/sfm-volumetric"}
+    assert say((psnr, "densify=adc", "seed=1")) == [first]  # a part of it: nothing new
+    assert not caplog.text
+    with caplog.at_level(logging.WARNING):  # a further seed, by a command that declares nothing
+        after = say(("densify=adc", "seed=2"))
+    assert "trials are added to those declared with psnr" in caplog.text
+    assert sorted(after[-1].values()) == [[0], [0, 1, 2]]
+    # another threshold is another arm, though it has the same name
+    assert len(say((psnr, "densify=volumetric", "densify.volume_threshold=0.1"))[-1]) == 3
 
 
 def test_one_command_cannot_declare_two(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -59,7 +82,8 @@ def test_a_plan_of_claims_is_kept_beside_declared_metrics(tmp_path: Path, caplog
     home = tmp_path / "exp"
     first = declare_plan(home, {"claims": []}, "aaaa")
     assert declare_plan(home, {"claims": []}, "aaaa") == first  # said again: it stands, with its time
-    declare(declared_metrics([composed(tmp_path, "eval.primary=psnr")]))
+    declared = [composed(tmp_path, "eval.primary=psnr")]
+    declare(declared_metrics(declared), planned_trials(declared))
     assert not caplog.text
     with caplog.at_level(logging.WARNING):
         declare_plan(home, {"claims": [1]}, "bbbb")
@@ -77,7 +101,7 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path: 
     before = file.read_bytes()
     results = json.loads(before)
     (declared,) = read_declarations(tmp_path / "exp")
-    assert results["declared"] == declared.to_record() == {"metric": "psnr", "time": declared.to_record()["time"]}
+    assert results["declared"] == declared.summary() == {"metric": "psnr", "time": declared.to_record()["time"]}
     experiment = load_experiment(tmp_path, "exp")
     found = standing(experiment.folder, experiment.trials)
     assert found is not None

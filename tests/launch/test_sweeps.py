@@ -34,13 +34,16 @@ from gsbench.launch.plan import (
 from gsbench.launch.states import states_of_experiment
 from gsbench.launch.trial import Trial
 from gsbench.runs import finished
-from gsbench.runs.finished import Done, NotDone, find_finished, record_inputs
+from gsbench.runs.finished import Done, NotDone, find_finished
 from gsbench.runs.hashing import config_hash
+from gsbench.runs.inputs import write_finished
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
 from gsbench.runs.trial_files import TrialPaths, state_of
+from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.locks import BusyError, hold, is_held
+from tests.finished import record_of
 
 
 @pytest.fixture(autouse=True)
@@ -65,7 +68,7 @@ def finish(
     seconds: float = 100.0,
     unavailable: dict[str, str] | None = None,
     awaited: Sequence[str] = (),
-) -> dict[str, Any]:
+) -> TrialRecord:
     """Make the files of a finished trial, with one stage result in the store and one source file."""
     paths = TrialPaths.of(values)
     paths.folder.mkdir(parents=True, exist_ok=True)
@@ -78,20 +81,14 @@ def finish(
     )
     (paths.folder / "table.csv").write_text("a,b")
     (paths.folder / "config.yaml").write_text("")
-    results = {
-        "status": "complete",
-        "scene": values["scene"]["name"],
-        "init": values["init"]["name"],
-        "densify": values["densify"]["name"],
-        "iterations": values["train"]["iterations"],
-        "metrics": {"psnr": 20.5},
-        "unavailable": unavailable or {},
-        "seconds": {"init": 1.0, "train": seconds, "evaluate": 0.0},
-        "hashes": {"config": config_hash(values)},
-        "awaited": list(awaited),
-    }
-    record_inputs(paths.folder, values, results, [source], {"train": entry.path}, [paths.folder / "table.csv"])
-    (paths.folder / "results.json").write_text(json.dumps(results))
+    results = record_of(
+        values,
+        unavailable=unavailable or {},
+        seconds={"init": 1.0, "train": seconds, "evaluate": 0.0},
+        hashes={"config": config_hash(values)},
+        awaited=list(awaited),
+    )
+    write_finished(paths.folder, values, results, [source], {"train": entry.path}, [paths.folder / "table.csv"])
     return results
 
 
@@ -276,10 +273,10 @@ def test_finished_trial_is_recognised_until_something_changes(runs: Path) -> Non
         ("package", "package", "made with pycolmap 0.1, and .* is installed"),
         ("results", "record", "results.json is not as it was written"),
         ("no inputs", "record", "inputs.json is not there"),
-        ("an input less", "record", "lacks what a finished trial has"),
-        ("inputs of another kind", "record", "lacks what a finished trial has"),
+        ("an input less", "record", "inputs.json is damaged: it lacks 'entries'"),
+        ("inputs of another kind", "record", "inputs.json is damaged: sources is "),
         ("weights", "metric", "it lacks lpips_vgg, which may"),
-        ("half a file", "unfinished", "results.json is not there, or not complete"),
+        ("half a file", "record", "results.json is not JSON"),
     ],
 )
 def test_changes_are_noticed_and_named(
@@ -387,11 +384,14 @@ def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs: Path) -> 
     assert len(states_of_experiment(runs / "x")) == 3
 
 
-def test_damaged_plan_is_named(runs: Path) -> None:
+def test_damaged_plan_is_named(runs: Path, caplog: pytest.LogCaptureFixture) -> None:
     (runs / "x").mkdir(parents=True)
     (runs / "x" / "plan.json").write_text("{")
-    with pytest.raises(InputError, match=r"plan\.json is damaged"):
-        read_plan(runs / "x")
+    with pytest.raises(InputError, match=r"plan\.json is not JSON .*delete it"):  # what stands there is not lost
+        add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
+    assert read_plan(runs / "x") == []
+    assert states_of_experiment(runs / "x") == []
+    assert "left out: " in caplog.text
 
 
 def test_dry_run_tells_states_and_time(runs: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from gsbench.config.compose import compose_one
 from gsbench.pipeline.parts import Parts
+from gsbench.pipeline.steps import code as code_module
 from gsbench.pipeline.steps import init as init_module
 from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs.hashing import config_hash
@@ -32,6 +33,7 @@ KEYS = [
 def test_the_keys_of_a_known_trial_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A photographs' trial without cameras: so the keys of the cameras that stand in for them are seen as well."""
     monkeypatch.setattr(init_module, "version", lambda package: "4.0.0")
+    monkeypatch.setattr(code_module, "edited", lambda files: {})  # as in a release
     values = compose_one(WORDS).values
     trial = TrialSteps(Parts(values), Store(tmp_path / "store"), lambda options, made: BARE)
     keys = [("config", config_hash(values)), *((step.stage.name, step.key) for step in trial.steps())]

@@ -4,8 +4,18 @@ run in processes of their own, which ``test_triton.py`` starts."""
 from __future__ import annotations
 
 import os
+import re
 
 INTERPRETING = os.environ.get("TRITON_INTERPRET") == "1"
+
+
+def interpreter_fault(triton: str, numpy: str) -> str | None:
+    """Why the interpreter of this version of Triton fails with this version of NumPy; None if it works."""
+    versions = [tuple(int(number) for number in re.findall(r"\d+", text)[:2]) for text in (triton, numpy)]
+    if versions[0] < (3, 7) and versions[1] >= (2, 4):
+        return f"the interpreter of Triton {triton} fails with NumPy {numpy}: it needs Triton 3.7 or NumPy below 2.4"
+    return None
+
 
 collect_ignore = [] if INTERPRETING else ["test_triton_interpreted.py"]
 
@@ -18,12 +28,13 @@ def _patch_once() -> None:
     from triton.runtime import interpreter
 
     original, seen = interpreter._patch_lang, set()
+    no_patches = getattr(interpreter, "_LangPatchScope", None)  # since Triton 3.6
 
     def patch(function):  # type: ignore[no-untyped-def]
         if function.__module__ not in seen:
             seen.add(function.__module__)
             original(function)
-        return interpreter._LangPatchScope()
+        return no_patches() if no_patches else None
 
     interpreter._patch_lang = patch
 

@@ -1,4 +1,5 @@
-"""A stand-in for the module ``gsplat`` 1.5 on the CPU: the signatures, shapes and habits that its CUDA code has.
+"""A stand-in for the module ``gsplat`` on the CPU: the signatures, shapes and habits that the CUDA code of 1.5 has;
+`head` is that of 1.6.
 
 Projection, crossings and harmonics are gsplat's own torch definitions. Compositing is written here in plain torch,
 behind an autograd function that saves the means it was given and leaves the absolute gradient on them, as gsplat's
@@ -8,7 +9,9 @@ does.
 from __future__ import annotations
 
 import itertools
+import sys
 import weakref
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -61,6 +64,71 @@ def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks
     calls.append("spherical_harmonics")
     colors = definitions._spherical_harmonics(degrees_to_use, dirs, coeffs)
     return colors if masks is None else torch.where(masks.unsqueeze(-1), colors, 0.0)
+
+
+def head() -> SimpleNamespace:
+    """gsplat 1.6, as far as it differs: its harmonics find the camera in the pose, and check every shape."""
+
+    def spherical_harmonics(
+        degrees_to_use: int, means: Tensor, viewmats: Tensor, coeffs: Tensor, masks: Tensor | None = None
+    ) -> Tensor:
+        calls.append("spherical_harmonics of 1.6")
+        cameras, count = len(viewmats), len(means)
+        assert means.shape == (count, 3)
+        assert viewmats.shape == (cameras, 4, 4)
+        assert len(coeffs) == count
+        assert masks is None or masks.shape == (cameras, count)
+        centers = -(viewmats[:, :3, :3].transpose(1, 2) @ viewmats[:, :3, 3:])[..., 0]  # [C, 3] -R^T t
+        colors = [definitions._spherical_harmonics(degrees_to_use, means - center, coeffs) for center in centers]
+        found = torch.stack(colors)  # [C, N, 3]
+        return found if masks is None else torch.where(masks.unsqueeze(-1), found, 0.0)
+
+    here = vars(sys.modules[__name__])
+    return SimpleNamespace(**here | {"spherical_harmonics": spherical_harmonics})
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,  # noqa: N803 - gsplat's name
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    absgrad: bool = False,
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """The parts in gsplat's own order, for one camera, in its dense mode."""
+    assert (packed, sh_degree is None, viewmats.shape) == (False, False, (1, 4, 4))
+    unit = torch.nn.functional.normalize(quats, dim=-1)
+    radii, means2d, depths, conics, _ = fully_fused_projection(
+        means, None, unit, scales, viewmats, Ks, width, height, eps2d=eps2d, near_plane=near_plane
+    )
+    tiles_x, tiles_y = -(-width // tile_size), -(-height // tile_size)
+    _, crossings, members = isect_tiles(means2d, radii, depths, tile_size, tiles_x, tiles_y)
+    center = -(viewmats[0, :3, :3].T @ viewmats[0, :3, 3])
+    rgb = spherical_harmonics(sh_degree, means - center, colors, (radii > 0).all(-1)[0])
+    image, alpha = rasterize_to_pixels(
+        means2d,
+        conics,
+        (rgb[None] + 0.5).clamp_min(0),
+        opacities[None],
+        width,
+        height,
+        tile_size,
+        isect_offset_encode(crossings, 1, tiles_x, tiles_y),
+        members,
+        backgrounds,
+        absgrad,
+    )
+    return image, alpha, {"radii": radii, "means2d": means2d}
 
 
 def rasterize_to_pixels(

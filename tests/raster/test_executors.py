@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.metadata
 import logging
 import re
 import subprocess
@@ -80,6 +81,28 @@ def test_what_cannot_run_is_said_with_what_can(monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(InputError, match=f"raster=gsplat needs gsplat: {re.escape(install_command('gsplat'))}"):
         resolve("gsplat", "cuda")
     assert find("gsplat").obstacle("cuda") is not None
+
+
+@pytest.mark.parametrize(
+    ("version", "is_old"), [("3.3.1", True), ("2.9", True), ("3.4.0", False), ("3.10.0+git1234", False), ("4.0", False)]
+)
+def test_triton_has_a_least_version(version: str, is_old: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    installed(monkeypatch, "triton", "gsplat")
+    monkeypatch.setattr(importlib.metadata, "version", lambda package: version)
+    assert (find("triton").obstacle("cuda") is not None) == is_old
+    assert resolve("auto", "cuda").name == ("gsplat" if is_old else "triton")
+    if is_old:
+        with pytest.raises(InputError, match=rf"raster=triton needs triton 3.4 or newer, and {version} is installed: "):
+            resolve("triton", "cuda")
+
+
+def test_a_triton_of_another_name_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(package: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(package)
+
+    installed(monkeypatch, "triton")
+    monkeypatch.setattr(importlib.metadata, "version", unknown)
+    assert resolve("triton", "cuda").name == "triton"
 
 
 def test_departures_are_told() -> None:

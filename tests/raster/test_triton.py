@@ -8,9 +8,14 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("triton")
+
+import triton
+
+from tests.raster.conftest import interpreter_fault
 
 ROOT = Path(__file__).resolve().parents[2]
 CONTRACT = "tests/raster/test_contract.py"
@@ -29,6 +34,8 @@ LIMIT = 1700  # s, for one that hangs: below the limit of a test in pyproject.to
 @pytest.fixture(scope="module")
 def interpreted(request: pytest.FixtureRequest) -> Iterator[dict[str, subprocess.Popen[str]]]:
     """The parts that this session runs, started together."""
+    if fault := interpreter_fault(triton.__version__, np.__version__):
+        pytest.skip(fault)
     here = [item for item in request.session.items if item.path == request.path]
     chosen = [item.callspec.params["part"] for item in here if hasattr(item, "callspec")]
     environment = os.environ | {
@@ -60,6 +67,21 @@ def test_in_the_interpreter(interpreted: dict[str, subprocess.Popen[str]], part:
     print(output)
     assert interpreted[part].returncode == 0, output
     assert " passed" in output
+
+
+@pytest.mark.parametrize(
+    ("versions", "works"),
+    [
+        (("3.6.0", "2.4.0"), False),
+        (("3.6.0", "2.10.1"), False),
+        (("3.6.0", "2.3.5"), True),
+        (("3.4.0", "1.26.4"), True),
+        (("3.7.1", "2.4.6"), True),
+        (("3.10.0", "2.5.2"), True),
+    ],
+)
+def test_which_interpreter_works_with_which_numpy(versions: tuple[str, str], works: bool) -> None:
+    assert (interpreter_fault(*versions) is None) == works
 
 
 @pytest.mark.slow

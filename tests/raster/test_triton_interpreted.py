@@ -20,6 +20,7 @@ from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.raster.triton import executor
 from gsbench.raster.triton.executor import TritonRasterizer
+from gsbench.raster.triton.memory import workspace_bytes
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import Scene, View
 from gsbench.train.loss import torch_photometric_loss
@@ -199,6 +200,24 @@ def test_many_blocks_are_numbered_in_more_bits(monkeypatch: pytest.MonkeyPatch) 
     expected = bits(*render_with_gradients(TritonRasterizer(), TINY, torch.float32))
     monkeypatch.setattr(executor, "MAX_INT16", 0)
     assert bits(*render_with_gradients(TritonRasterizer(), TINY, torch.float32)) == expected
+
+
+@pytest.mark.parametrize("case", [TINY, SMALL], ids=str)
+def test_the_memory_that_is_kept_is_counted_from_its_shapes(case: Case) -> None:
+    rasterizer = TritonRasterizer()
+    output = rasterizer.render(leaves(case), case.camera(), case.sh_degree, BLACK)
+    frame = output.footprint.args[1].frame
+    output.image.sum().backward()
+    count, pairs, blocks = case.count, frame.pairs, frame.grid.blocks
+    del output, frame
+    free = [workspace for pool in (rasterizer._frames, rasterizer._scratch) for workspace in pool._free.values()]
+    buffers = [tensor for (workspace,) in free for tensor in workspace._buffers.values()]
+    room = next(
+        len(tensor) for (workspace,) in free for name, tensor in workspace._buffers.items() if name == "pair_ends"
+    )
+    assert room >= 2 * count
+    assert pairs > count / 2
+    assert sum(tensor.nbytes for tensor in buffers) == workspace_bytes(count, room, pairs, blocks)
 
 
 def test_more_pairs_than_can_be_sorted_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

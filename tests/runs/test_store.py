@@ -94,8 +94,8 @@ def test_every_flipped_bit_of_a_manifest_is_noticed_or_harmless(store: Store) ->
         except ValueError:
             continue
         for key in ("stage", "version", "inputs", "key"):
-            assert manifest[key] == json.loads(sound)[key]
-        assert {name: entry["size"] for name, entry in manifest["outputs"].items()} == {"a.txt": 5, "sub/b.bin": 256}
+            assert getattr(manifest, key) == json.loads(sound)[key]
+        assert {name: entry.size for name, entry in manifest.outputs.items()} == {"a.txt": 5, "sub/b.bin": 256}
 
 
 def test_damage_that_keeps_size_and_time_is_found_by_a_thorough_look(store: Store) -> None:
@@ -143,7 +143,7 @@ def test_resumable_build_finds_what_was_left_without_temporaries(store: Store) -
 
     entry = store.get(Step(stage, {}, rest))
     assert {path.name for path in entry.path.iterdir()} == {"half.txt", "rest.txt", MANIFEST}
-    assert set(read_manifest(entry.path)["outputs"]) == {"half.txt", "rest.txt"}
+    assert set(read_manifest(entry.path).outputs) == {"half.txt", "rest.txt"}
 
 
 def test_killed_between_manifest_and_rename_is_only_published(store: Store) -> None:

@@ -13,6 +13,7 @@ from gsbench.errors import InputError
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import cameras_of, points_of, read_model, read_reference, write_model
 from gsbench.scene.readers import read_colmap, read_photos
+from gsbench.scene.split import SplitRule
 
 from .conftest import smooth_image
 
@@ -50,7 +51,7 @@ def test_cameras_follow_smaller_files(make_scene, model, params):
 
 
 def test_subset_drops_images_and_their_observations(make_scene, tmp_path: Path):
-    fitted = read_reference(read_colmap("toy", make_scene(), max_images=3, test_every=0))
+    fitted = read_reference(read_colmap("toy", make_scene(), max_images=3, split=SplitRule(test_every=0)))
     assert sorted(image.name for image in fitted.images.values()) == ["00.png", "02.png", "04.png"]
     assert {point.track.length() for point in fitted.points3D.values()} == {3}
     assert max(reprojection_errors(fitted)) < 1e-9

@@ -15,6 +15,7 @@ from gsbench.errors import InputError
 from gsbench.scene.load import load_scene
 from gsbench.scene.prepare import CameraModel, Job, prepare_all, undistort
 from gsbench.scene.readers import read_colmap
+from gsbench.scene.split import SplitRule
 
 WIDTH, HEIGHT = 200, 150
 MODELS = {
@@ -126,7 +127,7 @@ def test_centred_moves_the_principal_point_only(make_scene, tmp_path: Path):
 
 
 def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path: Path, caplog):
-    capture = read_colmap("toy", make_scene(), test_every=3)
+    capture = read_colmap("toy", make_scene(), split=SplitRule(test_every=3))
     small = make_scene(names=("00.png", "01.png", "02.png", "04.png"), root="partial")
     with caplog.at_level(logging.WARNING):
         scene = load_scene(capture, small / "sparse/0", tmp_path / "cache")

@@ -12,13 +12,14 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.scene.names import match_names, select_images, split_names
 from gsbench.scene.readers import list_images, read_colmap, read_photos
+from gsbench.scene.split import SplitRule
 
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("sparse", ["sparse/0", "sparse"])
 def test_colmap_folder(make_scene, text: bool, sparse: str):
     root = make_scene(text=text, sparse=sparse)
-    capture = read_colmap("toy", root, test_every=3)
+    capture = read_colmap("toy", root, split=SplitRule(test_every=3))
     assert capture.image_names == tuple(f"{k:02d}.png" for k in range(6))
     assert capture.test_names == ("00.png", "03.png")
     assert capture.train_names == ("01.png", "02.png", "04.png", "05.png")
@@ -69,7 +70,7 @@ def test_selection_is_even_and_comes_before_the_split(make_scene):
         gaps = {b - a for a, b in zip(chosen, [*chosen[1:], count], strict=True)}  # closed ring: back to the first
         assert len(chosen) == most
         assert max(gaps) - min(gaps) <= 1
-    capture = read_colmap("toy", make_scene(), max_images=3, test_every=2)
+    capture = read_colmap("toy", make_scene(), max_images=3, split=SplitRule(test_every=2))
     assert capture.image_names == ("00.png", "02.png", "04.png")
     assert capture.test_names == ("00.png", "04.png")
 
@@ -78,18 +79,23 @@ def test_split_lists(make_scene):
     root = make_scene()
     (root / "test.txt").write_text("01.JPG\n\n# a comment\n03\n")
     (root / "train.txt").write_text("00.png\n02.png\n")
-    capture = read_colmap("toy", root, test_list="test.txt")
+    capture = read_colmap("toy", root, split=SplitRule(test_list="test.txt"))
     assert capture.test_names == ("01.png", "03.png")
     assert len(capture.train_names) == 4
-    both = read_colmap("toy", root, test_list="test.txt", train_list="train.txt")
+    both = read_colmap("toy", root, split=SplitRule(test_list="test.txt", train_list="train.txt"))
     assert both.image_names == ("00.png", "01.png", "02.png", "03.png")
-    assert read_colmap("toy", root, train_list="train.txt").test_names == ("01.png", "03.png", "04.png", "05.png")
+    assert read_colmap("toy", root, split=SplitRule(train_list="train.txt")).test_names == (
+        "01.png",
+        "03.png",
+        "04.png",
+        "05.png",
+    )
     (root / "bad.txt").write_text("00.png\n99.png\n")
     with pytest.raises(InputError, match=r"split lists name 99\.png"):
-        read_colmap("toy", root, test_list="bad.txt")
+        read_colmap("toy", root, split=SplitRule(test_list="bad.txt"))
     (root / "both.txt").write_text("00.png\n")
     with pytest.raises(InputError, match=r"00\.png for training and for testing"):
-        read_photos("toy", root, train_list="train.txt", test_list="both.txt")
+        read_photos("toy", root, split=SplitRule(train_list="train.txt", test_list="both.txt"))
 
 
 def test_splits_without_views():

@@ -40,6 +40,12 @@ def write_trial(folder: Path, values: dict[str, Any], records: int = RECORDS, ps
     if not (folder / "config.yaml").exists():
         begin_trial(values)
     results = {
+        "status": "complete",
+        "experiment": values["name"],
+        **{group: values[group]["name"] for group in ("scene", "init", "densify")},
+        "seed": seed,
+        "unavailable": {},
+        "versions": {},
         "metrics": {"psnr": psnr},
         "num_gaussians": 10 + seed,
         "num_init_points": 5,

@@ -9,7 +9,18 @@ import torch
 
 from gsbench.errors import TrainingError
 from gsbench.gaussians.model import NUM_SH_REST
-from gsbench.train.memory_budget import BYTES_OF_MODEL, explain_full, free_bytes, room_for_images, training_bytes
+from gsbench.raster.triton.memory import render_bytes
+from gsbench.train.memory_budget import (
+    BYTES_OF_MODEL,
+    BYTES_OF_PIXEL,
+    BYTES_OF_WORK,
+    INITIAL,
+    TRAINED,
+    explain_full,
+    free_bytes,
+    room_for_images,
+    training_bytes,
+)
 from tests.gaussians.helpers import random_gaussians
 
 GB = 10**9
@@ -37,6 +48,18 @@ def test_room(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch)
     assert "4 GB are free" in caplog.text
     with pytest.raises(TrainingError, match=r"1,000,000 initial Gaussians need about .* 1 GB are free: lower"):
         room_for_images(GB, 1_000_000, None, PIXELS)
+
+
+def test_a_beginning_needs_more_lists_than_a_trained_model() -> None:
+    """Counted by the kernels on the scenes of ``gsbench bench``, a million Gaussians at 1600x1060 px."""
+    for crowding, pairs, units in ((INITIAL, 18_729_801, 5_110_000), (TRAINED, 3_987_093, 2_100_000)):
+        counted = render_bytes(10**6, units, pairs, PIXELS // 128)
+        model = 10**6 * (BYTES_OF_MODEL + BYTES_OF_WORK) + PIXELS * BYTES_OF_PIXEL
+        assert training_bytes(10**6, PIXELS, crowding) == pytest.approx(model + counted, rel=0.1)
+        assert training_bytes(10**6, PIXELS, crowding) >= model + counted
+    assert 2000 < render_bytes(10**6, 5_110_000, 18_729_801, PIXELS // 128) / 10**6 < 2300  # bytes a Gaussian
+    with pytest.raises(TrainingError, match="initial Gaussians need about"):
+        room_for_images(training_bytes(10**6, PIXELS), 10**6, None, PIXELS)  # enough for one that is trained
 
 
 def test_the_words_when_it_happens() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +14,7 @@ import torch
 from gsbench.raster.cpu import jit
 from gsbench.verbs import doctor
 from gsbench.verbs.doctor import Finding
+from tests.conftest import ROOT
 
 GB = 10**9
 
@@ -49,6 +52,12 @@ def test_gpus_with_their_memory(gpus: SimpleNamespace, monkeypatch: pytest.Monke
     assert all(verdict == "note" and "never tested" in text for verdict, text in said(doctor.check_gpu()))
 
 
+def test_every_extra_is_known() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = set(project["optional-dependencies"]) - {"dev", "docs"}
+    assert {extra for _, extra in doctor.OPTIONAL.values()} == extras
+
+
 def test_no_gpu_and_why(no_gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     assert said(doctor.check_gpu()) == [("note", "none (this torch is a build for CPUs): raster=auto uses the CPU")]
     monkeypatch.setattr(doctor, "installed_gpus", lambda: ["0"])
@@ -75,6 +84,15 @@ def test_rasterizers_on_a_gpu(gpus: SimpleNamespace, monkeypatch: pytest.MonkeyP
     assert texts["raster=triton"].startswith("on cuda: ")
     assert texts["raster=reference"].startswith("on cpu and cuda: ")
     assert texts["raster=gsplat"].startswith("needs gsplat: ")
+
+
+def test_triton_that_is_too_old_is_said_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_version", lambda package: "3.3.1")
+    monkeypatch.setattr(importlib.metadata, "version", lambda package: "3.3.1")
+    ((verdict, text),) = said(doctor.check_triton())
+    assert verdict == "note"
+    assert "needs triton 3.4 or newer, and 3.3.1 is installed" in text
+    assert "torch>=2.8" in text
 
 
 def test_kernels_are_said_to_be_where_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

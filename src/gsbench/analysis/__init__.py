@@ -1,4 +1,4 @@
-"""What result files say: tables, statistics, reports. Knows result files only, and loads no torch."""
+"""Tables, statistics and reports from result files. Knows result files only, and loads no torch."""
 
 from gsbench.analysis.frame import to_frame
 from gsbench.analysis.results import load_experiment

@@ -1,4 +1,4 @@
-"""How far two trainings of one arm lie apart: their renders of the test views, and where their Gaussians are.
+"""Agreement of two trainings of one arm: their renders of the test views, and the places of their Gaussians.
 
 Two seeds may reach one PSNR by different models. What is compared is one training with another, not with photographs.
 """
@@ -36,7 +36,7 @@ Reader = Callable[[Path], NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class CloudDistance:
-    """How far two point sets lie apart, in world units: of each point to the nearest of the other set."""
+    """Distances between two point sets, in world units: from each point to the nearest of the other set."""
 
     mean: float  # of the two sets' means: half of what is often called the Chamfer distance
     far: float  # 95 % of the points of both lie nearer
@@ -60,7 +60,7 @@ class Agreement:
 
 
 def agreements(trials: Sequence[TrialResult]) -> list[Agreement]:
-    """For each scene and arm with at least two seeds under one set of conditions, sorted by name."""
+    """The agreement of each scene and arm with at least two seeds under one set of conditions, sorted by name."""
     found = []
     read = cache(read_positions)  # a training stands in two pairs
     for (scene, arm), group in sorted(by_key(trials, lambda trial: (trial.scene, trial.arm)).items()):
@@ -95,7 +95,7 @@ def image_psnr(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
 
 
 def cloud_distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> CloudDistance:
-    """How far the points [N, 3] and [M, 3] lie apart; raises `InputError` where a set is empty."""
+    """Measure the distance between the points [N, 3] and [M, 3]; raises `InputError` where a set is empty."""
     from scipy.spatial import cKDTree  # here, since only reports need it
 
     if not (len(first) and len(second)):
@@ -125,11 +125,17 @@ def _agreement(scene: str, arm: Arm, pairs: Sequence[tuple[TrialResult, TrialRes
 
     def apart(first: TrialResult, second: TrialResult) -> tuple[float, float]:
         distance = cloud_distance(*(read(trial.path / POINT_CLOUD) for trial in (first, second)))
-        return distance.mean / first.data["scene_extent"], distance.far / first.data["scene_extent"]
+        return distance.mean / _extent(first), distance.far / _extent(first)
 
     distances = list(_measured(pairs, apart, faults))
     means, fars = [mean for mean, _ in distances], [far for _, far in distances]
     return Agreement(scene, arm, len(pairs), _mean(psnrs), _mean(means), _mean(fars), tuple(dict.fromkeys(faults)))
+
+
+def _extent(trial: TrialResult) -> float:
+    if not trial.record.scene_extent:
+        raise InputError(f"{trial.label} does not say how large its scene is")
+    return trial.record.scene_extent
 
 
 def _mean(values: Sequence[float]) -> float | None:

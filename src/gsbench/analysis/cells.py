@@ -16,6 +16,8 @@ from gsbench.analysis.differences import (
 from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
+from gsbench.runs.hashing import BEFORE, NOT_HASHED
+from gsbench.runs.splits import setting
 
 K = TypeVar("K", bound=Hashable)
 
@@ -45,18 +47,33 @@ class Cell:
 
 
 def field_value(trial: TrialResult, name: str) -> str:
-    """A field of a trial, or a dotted key of its configuration, as text; raises ``InputError`` where it has none."""
+    """A field of a trial, or a dotted key of its configuration, as text; a key that it lacks counts as unset, null."""
     if name in TRIAL_FIELDS:
-        return str(trial.data[name])
-    if name in trial.config:
-        return str(trial.config[name])
-    raise InputError(
-        f"{trial.label} has no setting {name!r}; use {', '.join(TRIAL_FIELDS)} or a key of its config.yaml"
-    )
+        return str(getattr(trial.record, name))
+    if name not in trial.config and name.startswith(NOT_HASHED):
+        return str(trial.whole_config.get(name))
+    return str(setting(trial.config, name))
+
+
+def check_fields(trials: Iterable[TrialResult], names: Iterable[str]) -> None:
+    """Raise ``InputError`` for the first of ``names`` that is no field, and no setting of any of the trials."""
+    trials = list(trials)
+    for name in names:
+        if name not in TRIAL_FIELDS and not any(_has(trial, name) for trial in trials):
+            raise InputError(
+                f"no trial has a setting {name!r}; use {', '.join(TRIAL_FIELDS)} or a key of a trial's config.yaml"
+            )
+
+
+def _has(trial: TrialResult, name: str) -> bool:
+    known = bool(trial.config) and name in BEFORE
+    return known or name in trial.config or (name.startswith(NOT_HASHED) and name in trial.whole_config)
 
 
 def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> list[TrialResult]:
     """The trials whose fields have the given values; raises ``InputError`` where none is left."""
+    trials = list(trials)
+    check_fields(trials, where)
     kept = [trial for trial in trials if all(field_value(trial, key) == value for key, value in where.items())]
     if not kept:
         raise InputError(f"no trial has {', '.join(f'{key}={value}' for key, value in where.items())}")
@@ -96,7 +113,7 @@ def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
     if not swept:
         return list(trials)
     return [
-        replace(trial, variant=" ".join(f"{key.rpartition('.')[2]}={trial.config.get(key)}" for key in swept))
+        replace(trial, variant=" ".join(f"{key.rpartition('.')[2]}={setting(trial.config, key)}" for key in swept))
         for trial in trials
     ]
 

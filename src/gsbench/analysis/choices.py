@@ -1,6 +1,6 @@
-"""Our choices where a paper is silent or chose otherwise: one line each, below a table of differences from it.
+"""Settings that a paper leaves open, or in which gsbench differs from it: one line each, below a table of differences.
 
-What we chose is read from the trials' recorded configurations; what the paper says stands with its numbers, as
+The values of gsbench are read from the trials' recorded configurations; what the paper says stands with its numbers, as
 ``setup`` of its YAML. A choice of which that says nothing is not shown, nor one in which both agree.
 """
 
@@ -14,7 +14,8 @@ from typing import Any
 from gsbench.analysis.origins import machine_of
 from gsbench.analysis.results import TrialResult
 from gsbench.eval.facts import LPIPS, find
-from gsbench.eval.protocol import PAPER, PROTOCOLS
+from gsbench.eval.protocol import PAPER, protocol_of
+from gsbench.runs.splits import BY_LISTS
 
 NOT_RECORDED = "not recorded"
 PLACES = {"sampled": "drawn from the parent's density", "parent_mean": "the parent's mean"}
@@ -27,7 +28,7 @@ ORDERS = {
 
 @dataclass(frozen=True)
 class PaperChoice:
-    """What a paper says of one choice, in words that follow "the paper"; ``value`` is set where it states all of it."""
+    """Words of a paper on one setting, to be read after "the paper"; ``value`` is set where it states all of it."""
 
     words: str
     value: str | None = None
@@ -125,8 +126,8 @@ def _cap(trial: TrialResult) -> str:
 
 
 def _hold_out(trial: TrialResult) -> str:
-    config = trial.config
-    return "by lists" if config.get("scene.test_list") else f"every {config['scene.test_every']}th image"
+    every = f"every {trial.config['scene.test_every']}th image"
+    return {"every_nth": every, BY_LISTS: "by lists"}.get(trial.split, trial.split)
 
 
 def _selection(trial: TrialResult) -> str:
@@ -169,13 +170,13 @@ def _images(trial: TrialResult) -> str:
 
 def _sizes(trials: Sequence[TrialResult]) -> str:
     """`` at 400×300 px``, or the smallest and the largest."""
-    sizes = sorted({tuple(size) for trial in trials if (size := trial.data.get("resolution"))}, key=math.prod)
+    sizes = sorted({tuple(size) for trial in trials if (size := trial.record.resolution)}, key=math.prod)
     shown = [f"{width}×{height}" for width, height in dict.fromkeys([*sizes[:1], *sizes[-1:]])]
     return f", {' to '.join(shown)} px" if shown else ""
 
 
 def _lpips(trial: TrialResult) -> str:
-    protocol = PROTOCOLS.get(str(trial.data["protocol"]).rsplit("-", 1)[0], PAPER)
+    protocol = protocol_of(trial.record.protocol) or PAPER
     facts = find(f"{LPIPS}{protocol.lpips}")
     assert facts is not None
     return f"net {facts.options['net']}, fed [{'0' if facts.options['raw'] else '−1'}, 1]"
@@ -188,7 +189,7 @@ TOPICS = (
     Topic("networks", "Matching networks", _networks),
     Topic("cap", "Cap of Gaussians", _cap),
     Topic("opacity", "Learning rate of opacity", lambda trial: str(trial.config["train.opacity"])),
-    Topic("iterations", "Iterations", lambda trial: str(trial.data["iterations"])),
+    Topic("iterations", "Iterations", lambda trial: str(trial.record.iterations)),
     Topic("images", "Images", _images, _sizes),
     Topic("hold_out", "Held out", _hold_out),
     Topic("selection", "Images of a large scene", _selection),

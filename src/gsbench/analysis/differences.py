@@ -1,21 +1,22 @@
-"""In what trials differ: the conditions, the settings, and the versions of the code that made them."""
+"""Differences between trials: the conditions, the settings, and the versions of the code that made them."""
 
 from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from gsbench.analysis.results import TrialResult, canonical
 from gsbench.runs.source import SHOWN
+from gsbench.runs.splits import setting
+from gsbench.words import counted
 
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 
 # Settings in which trials of one cell may differ: they name the trial or say where it runs, not what is computed.
 IGNORED_SETTINGS = (
     *("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path"),
-    "eval.primary",
-    "densify.switches",
+    *("eval.primary", "eval.controls", "densify.switches"),
 )
 CODE = "code of "  # how the keys of ``TrialResult.code`` start that are a user's own classes
 
@@ -41,15 +42,25 @@ def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
     if len({trial.config_hash for trial in trials}) == 1:
         return {}
     keys = {key for trial in trials for key in trial.config if not key.startswith(IGNORED_SETTINGS)}
-    values = {key: sorted({canonical(trial.config.get(key)) for trial in trials}) for key in sorted(keys)}
+    values = {key: sorted({canonical(setting(trial.config, key)) for trial in trials}) for key in sorted(keys)}
     return {key: found for key, found in values.items() if len(found) > 1}
 
 
 def differing_code(trials: Iterable[TrialResult]) -> dict[str, Versions]:
-    """The classes and stages of which the trials used several versions."""
+    """The classes, stages and files of gsbench of which the trials used several versions; of many files, one."""
+    trials = list(trials)
+    found = _several(trials, lambda trial: trial.code)
+    files = list(_several(trials, lambda trial: trial.files).items())
+    if files:
+        part, versions = files[0]
+        found[part if len(files) == 1 else f"{part} and {counted(len(files) - 1, 'more file')}"] = versions
+    return found
+
+
+def _several(trials: Iterable[TrialResult], parts: Callable[[TrialResult], Mapping[str, str]]) -> dict[str, Versions]:
     found: dict[str, Versions] = defaultdict(lambda: defaultdict(list))
     for trial in trials:
-        for part, version in trial.code.items():
+        for part, version in parts(trial).items():
             found[part][version].append(trial)
     return {part: dict(versions) for part, versions in found.items() if len(versions) > 1}
 

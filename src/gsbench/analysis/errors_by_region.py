@@ -1,4 +1,4 @@
-"""Where an arm helps: the errors of two arms' renders, binned by what the ground truth or the scene is like there.
+"""Errors of two arms' renders, binned by a property of the ground truth or of the scene: the places where an arm helps.
 
 Every pixel gets a property, such as the texture energy of the ground truth; pixels are sorted into equally filled
 bins of it, and the mean error of each arm is taken in each bin, view and trial. Differences are then tested as those of
@@ -18,7 +18,7 @@ from PIL import Image, UnidentifiedImageError
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.pairing import Paired, pair_trials
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import Comparison, compare
+from gsbench.analysis.statistics import Comparison, compare_family
 from gsbench.errors import InputError
 from gsbench.runs.layout import GROUND_TRUTH, MAPS, RENDERS
 
@@ -40,7 +40,8 @@ MAP_PROPERTIES = {
 class RegionErrors:
     """Mean absolute errors (8-bit levels) of two arms in bins of a property, from its lowest values to its highest.
 
-    ``edges`` are the inner edges of each scene's bins; ``comparisons`` are second arm minus first, one for each bin.
+    ``edges`` are the inner edges of each scene's bins; ``comparisons`` are second arm minus first, one for each bin,
+    adjusted for their number.
     """
 
     property: str
@@ -87,7 +88,7 @@ def errors_by_region(
         )  # [K, V, 2, bins]
         scenes.append(scene)
         edges[scene] = tuple(float(edge) for edge in scene_edges)
-    means, comparisons = [], []
+    means, differing = [], []
     for index in range(bins):
         inside = [array[:, np.isfinite(array[:, :, 0, index]).all(axis=0), :, index] for array in errors]  # [K, V', 2]
         kept = [(scene, array) for scene, array in zip(scenes, inside, strict=True) if array.size]
@@ -97,9 +98,9 @@ def errors_by_region(
         differences = tuple(array[:, :, 1] - array[:, :, 0] for _, array in kept)
         name = f"error in {property_name} bin {index + 1}"
         paired = Paired(name, tuple(scene for scene, _ in kept), differences, float(means[-1][0]), ())
-        comparisons.append(compare(paired, direction=-1))
+        differing.append((paired, -1))
     first_means, second_means = (tuple(float(mean[place]) for mean in means) for place in (0, 1))
-    return RegionErrors(property_name, first_means, second_means, tuple(comparisons), edges)
+    return RegionErrors(property_name, first_means, second_means, tuple(compare_family(differing)), edges)
 
 
 def view_names(trial: TrialResult) -> list[str]:

@@ -1,4 +1,4 @@
-"""How one number of a table came about."""
+"""Origin of one number of a table."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import Experiment, TrialResult, load_experiment
 from gsbench.analysis.tables import format_cell
 from gsbench.errors import InputError
+from gsbench.runs.code import AS_RELEASED
+from gsbench.words import some_of
 
 ADDRESS = "EXPERIMENT:SCENE:METRIC:ARM, such as table1:garden:lpips:volumetric or demo:courtyard:psnr:sfm-adc"
 
@@ -97,26 +99,31 @@ def _baseline_lines(experiment: Experiment, trial: TrialResult) -> list[str]:
 
 def _trial_lines(trial: TrialResult, shown: Quantity) -> list[str]:
     value = shown.read(trial)
-    data = trial.data
+    record = trial.record
     text = "n/a" if value is None else f"{value:.6g}"
     if trial.from_renders and not trial.program:
-        counts = ", ".join(f"{key} {value}" for key, value in data.get("renders", {}).items())
+        counts = ", ".join(f"{key} {value}" for key, value in record.renders.items())
     elif trial.from_renders:
         counts = "its own renders"
     else:
-        counts = f"{data['num_gaussians']:,} Gaussians from {data.get('num_init_points') or 0:,} points"
+        counts = f"{record.num_gaussians or 0:,} Gaussians from {record.num_init_points or 0:,} points"
     lines = [
         f"  seed {trial.seed}: {text}",
         f"    folder    {trial.path}",
-        f"    {data.get('test_views', '?')} test views, raster {data['raster']}, {counts}",
+        f"    {'?' if record.test_views is None else record.test_views} test views, raster {record.raster}, {counts}",
     ]
-    lines += [f"    {key:<9} {value}" for key, value in data.get("hashes", {}).items()]
-    if trial.program:
-        lines.append(f"    program   {data['trained_by']['version']}: {' '.join(data['trained_by']['command'])}")
+    lines += [f"    {key:<9} {value}" for key, value in record.hashes.items()]
+    if record.trained_by is not None:
+        lines.append(f"    program   {record.trained_by.version}: {' '.join(record.trained_by.command)}")
     if machine := machine_of(trial):
         lines.append(f"    machine   {machine}")
     if trial.code:
         versions = [f"{part} {short_version(version)}" for part, version in trial.code.items()]
         lines.append("    code      " + ", ".join(versions))
-    lines.append("    versions  " + ", ".join(f"{key} {value}" for key, value in data.get("versions", {}).items()))
+    if record.code.commit:
+        lines.append(f"    commit    {record.code.commit}{', edited' if record.code.edited else ''}")
+    files = [name.removeprefix("gsbench's ") for name, state in trial.files.items() if state != AS_RELEASED]
+    if files and len(files) < len(trial.files):  # else it was before the first release
+        lines.append(f"    edited    since the last release: {some_of(files)}")
+    lines.append("    versions  " + ", ".join(f"{key} {value}" for key, value in record.versions.items()))
     return lines

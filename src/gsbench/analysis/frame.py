@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.quantities import metric_keys
 from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.runs.splits import setting
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,16 +46,20 @@ def to_frame(trials: Experiment | Sequence[TrialResult]) -> pd.DataFrame:
 
 
 def _row(trial: TrialResult, swept: Sequence[str], metrics: Sequence[str]) -> dict[str, Any]:
-    data = trial.data
-    size = data.get("resolution") or (None, None)
-    groups = {"seconds": data["seconds"], "event": data.get("events") or {}, "hash": data.get("hashes") or {}}
+    record = trial.record
+    size = record.resolution or (None, None)
+    groups: dict[str, Mapping[str, float | str]] = {
+        "seconds": record.seconds,
+        "event": record.events,
+        "hash": record.hashes,
+    }
     return (
-        {name: data[name] for name in NAMES}
-        | {key: trial.config.get(key) for key in swept}
-        | {name: data[name] for name in CONDITIONS}
+        {name: getattr(record, name) for name in NAMES}
+        | {key: setting(trial.config, key) for key in swept}
+        | {name: getattr(record, name) for name in CONDITIONS}
         | {"width": size[0], "height": size[1]}
         | {key: trial.metrics.get(key) for key in metrics}
-        | {name: data.get(name) for name in COUNTS}
+        | {name: getattr(record, name) for name in COUNTS}
         | {f"{prefix}_{key}": value for prefix, group in groups.items() for key, value in group.items()}
         | {"folder": str(trial.path)}
     )

@@ -1,4 +1,4 @@
-"""On which machines trials ran and from which clouds they started: what may differ though settings are equal."""
+"""Machines that trials ran on and clouds that they started from, which may differ though settings are equal."""
 
 from __future__ import annotations
 
@@ -15,15 +15,14 @@ from gsbench.words import counted
 def machine_of(trial: TrialResult) -> str | None:
     """The kind of machine that trained the trial, in a phrase; None where it was not recorded."""
     try:
-        return kind_of_machine(trial.data["machine"])
-    except (KeyError, TypeError):
+        return None if trial.record.machine is None else kind_of_machine(trial.record.machine)
+    except KeyError:
         return None
 
 
 def cloud_of(trial: TrialResult) -> str | None:
     """The hash of the initial model's files (cameras, poses, points); None where it was not recorded."""
-    found = trial.data.get("hashes", {}).get("cloud")
-    return None if found is None else str(found)
+    return trial.record.hashes.get("cloud")
 
 
 def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
@@ -51,11 +50,53 @@ def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
     return notes
 
 
+def held_out_notes(trials: Sequence[TrialResult]) -> list[str]:
+    """A line for each way in which views were held out, with the scenes where there are several."""
+    notes = []
+    told = [trial for trial in trials if trial.record.held_out]
+    ways = by_key(told, lambda trial: (trial.question, trial.record.held_out))
+    for (question, words), group in sorted(ways.items(), key=lambda item: (-len(item[1]), item[0])):
+        scenes = sorted({trial.scene for trial in group})
+        counts = sorted({(trial.record.test_views or 0, trial.record.train_views or 0) for trial in group})
+        views = " and ".join(f"{test} of {test + train} views" for test, train in counts)
+        where = f", {', '.join(scenes)}" if len(ways) > 1 and len({trial.scene for trial in told}) > 1 else ""
+        notes.append(f"Held out{f' ({question})' if question else ''}{where}: {words}; {views}.")
+    return notes
+
+
+def points_notes(trials: Sequence[TrialResult]) -> list[str]:
+    """A line for each initialiser and choice of the views that made its points; none where photographs made none."""
+    notes = []
+    for (init, choice), group in sorted(by_key(trials, lambda trial: (trial.init, points_from(trial))).items()):
+        if choice == "all":
+            notes.append(f"Initial points of {init}: from all views, test views too (init.points_from=all).")
+        elif choice:
+            shares = [share for trial in group if (share := _taken(trial)) is not None]
+            taken = f", without {min(shares):.0%}" if shares else ""
+            taken += f" to {max(shares):.0%}" if shares and f"{min(shares):.0%}" != f"{max(shares):.0%}" else ""
+            of = f"{taken} of those of all views" if shares else ""
+            notes.append(f"Initial points of {init}: from training views alone (init.points_from={choice}){of}.")
+    return notes
+
+
+def points_from(trial: TrialResult) -> str:
+    """The views that made the trial's initial points: all, train or retriangulated; "" where no observations did."""
+    if "init.points_from" in trial.config:
+        return str(trial.config["init.points_from"])
+    return "all" if trial.record.init_report.get("mean_track_length") is not None else ""
+
+
+def _taken(trial: TrialResult) -> float | None:
+    """The share of points that went with the test views, where it is known."""
+    found = trial.record.init_report.get("training_points")
+    return found.get("taken") if isinstance(found, dict) else None
+
+
 def cloud_lines(trials: Sequence[TrialResult]) -> list[str]:
-    """For each scene and initialiser: the hashes of the clouds that its trials started from, and their points."""
+    """List, for each scene and initialiser, the hashes of the clouds that its trials started from, and their points."""
     lines = []
     for (scene, init), group in sorted(by_key(trials, lambda trial: (trial.scene, trial.init)).items()):
-        clouds = by_key(group, lambda trial: (cloud_of(trial), _init_key(trial), trial.data.get("num_init_points")))
+        clouds = by_key(group, lambda trial: (cloud_of(trial), _init_key(trial), trial.record.num_init_points))
         parts = []
         for cloud, key, points in clouds:
             name = f"cloud {cloud[:SHOWN]}" if cloud else "cloud not recorded"
@@ -78,7 +119,7 @@ def unlike_clouds(pairs: Sequence[tuple[TrialResult, TrialResult]]) -> list[str]
 
 
 def _init_key(trial: TrialResult) -> str:
-    return str(trial.data.get("hashes", {}).get("init"))
+    return str(trial.record.hashes.get("init"))
 
 
 def _arms(trials: Sequence[TrialResult]) -> str:

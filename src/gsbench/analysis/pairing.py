@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ class Paired:
 
 
 BASELINE = "adc"
+CONTROLS = "eval.controls."
 
 
 class ViewCache:
@@ -53,11 +55,14 @@ class ViewCache:
         return found
 
 
-def choose_pairs(arms: Sequence[Arm], baseline: str = BASELINE) -> list[tuple[Arm, Arm]]:
-    """(baseline arm, other arm) for every densifier whose initialiser also has the baseline.
+def choose_pairs(
+    arms: Sequence[Arm], baseline: str = BASELINE, controls: Mapping[str, str] = MappingProxyType({})
+) -> list[tuple[Arm, Arm]]:
+    """(baseline arm, other arm) for every densifier whose initialiser also has the baseline, then those of controls.
 
     A variant such as ``volumetric max_gaussians=30000`` is held against the baseline's own variant where there is one.
-    Without the baseline, the other arms are held against the first of ``arms``.
+    Without the baseline, the other arms are held against the first of ``arms``. ``controls`` names for a densifier
+    another one that it is held against besides (`controls_of`), where both are there.
     """
     pairs = []
     for init, name in arms:
@@ -65,7 +70,25 @@ def choose_pairs(arms: Sequence[Arm], baseline: str = BASELINE) -> list[tuple[Ar
         partners = [arm for arm in ((init, f"{baseline} {variant}".strip()), (init, baseline)) if arm in arms]
         if partners and baseline not in (densifier, name):
             pairs.append((partners[0], (init, name)))
-    return pairs or [(arms[0], arm) for arm in arms[1:]]
+    pairs = pairs or [(arms[0], arm) for arm in arms[1:]]
+    for init, name in arms:
+        densifier, _, variant = name.partition(" ")
+        control = controls.get(densifier)
+        partners = [arm for arm in ((init, f"{control} {variant}".strip()), (init, control or "")) if arm in arms]
+        if partners and control != densifier and (partners[0], (init, name)) not in pairs:
+            pairs.append((partners[0], (init, name)))
+    return pairs
+
+
+def controls_of(trials: Sequence[TrialResult]) -> dict[str, str]:
+    """The control of each densifier, another one that the trials' settings name (``eval.controls``)."""
+    firsts = [group[0] for group in by_key(trials, lambda trial: trial.arm).values()]
+    return {
+        key.removeprefix(CONTROLS): str(value)
+        for trial in firsts
+        for key, value in trial.config.items()
+        if key.startswith(CONTROLS)
+    }
 
 
 def arm_name(arm: Arm) -> str:

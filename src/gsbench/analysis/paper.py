@@ -82,7 +82,7 @@ def load_paper() -> Paper:
 
 
 def inconsistencies(paper: Paper) -> list[str]:
-    """Where the paper contradicts itself, one line each, computed from its own numbers."""
+    """List the places where the paper contradicts itself, one line each, computed from its own numbers."""
     return [
         *_cost_averages(paper),
         *_means(paper),

@@ -31,7 +31,7 @@ CONFIDENCE = 0.95
 
 
 class Agreement(Enum):
-    """How a measured cell stands to the printed number, from the closest to the farthest."""
+    """Classes of agreement between a measured cell and the printed number, from the closest to the farthest."""
 
     ROUNDING = "="  # the mean lies within half a step of the last printed digit
     INTERVAL = "≈"  # our t interval meets the range that the printed number stands for
@@ -71,7 +71,7 @@ def layout_of(name: str) -> str | None:
 
 
 def paper_init(init: str) -> str:
-    """What the paper's tables call the initialiser ``init``."""
+    """The name of the initialiser ``init`` in the paper's tables."""
     return STAND_FOR.get(init, init)
 
 
@@ -102,7 +102,7 @@ def compare_with_printed(
 
 
 def legend(tally: Counter[Agreement]) -> str:
-    """What the marks mean, and how many cells have each."""
+    """Explain the marks, with the number of cells that have each."""
     return (
         f"Δ is measured minus printed. Of {sum(tally.values())} cells {tally[Agreement.ROUNDING]} are within rounding "
         f"(=), {tally[Agreement.INTERVAL]} within our {CONFIDENCE:.0%} t interval of the mean (≈), "

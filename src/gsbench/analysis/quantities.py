@@ -1,4 +1,4 @@
-"""What a table can show of a trial: metrics, counts and costs, with their names, directions and formats."""
+"""Quantities that a table can show of a trial: metrics, counts and costs, with their names, directions and formats."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import partial
 from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS, find, from_record, known_keys
-from gsbench.eval.protocol import PAPER, PROTOCOLS
+from gsbench.eval.protocol import PAPER, protocol_of
 
 MILLION, THOUSAND, MINUTE = 1e6, 1e3, 60.0
 
@@ -44,10 +44,10 @@ AT = "@"  # psnr@7000 is the PSNR at iteration 7000 (eval.at)
 
 
 def choose_quantities(trials: Iterable[TrialResult], names: Iterable[str] | None = None) -> list[Quantity]:
-    """The quantities by name; by default all metrics that some trial has, the protocol's LPIPS, and the main costs."""
+    """The quantities by name; by default all metrics that some trial has, LPIPS as it was asked for, and main costs."""
     trials = list(trials)
     if names is None:
-        wanted = {_protocol_lpips(trial) for trial in trials}
+        wanted = {key for trial in trials for key in _lpips_asked_for(trial)}
         names = [*metric_keys(trials, wanted), "gaussians", "train_time"]
     return [quantity(name, trials) for name in names]
 
@@ -69,15 +69,15 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
     if key == "gaussians_millions":
         return _count(key, "Gaussians", "num_gaussians", trials, unit=("M", MILLION, 2))
     if key == "train_minutes":
-        return _time(key, "train", lambda trial: trial.data["seconds"].get("train"), trials, unit=("min", MINUTE))
+        return _time(key, "train", lambda trial: trial.record.seconds.get("train"), trials, unit=("min", MINUTE))
     if key == "init_points":
         return _count(key, "initial points", "num_init_points", trials)
     if key == "train_time":
-        return _time(key, "train", lambda trial: trial.data["seconds"].get("train"), trials)
+        return _time(key, "train", lambda trial: trial.record.seconds.get("train"), trials)
     if key == "total_time":
         return _time(key, "total", _total_seconds, trials)
     if key == "peak_memory_mb":
-        return Quantity(key, "peak memory (MB)", -1, 0, lambda trial: trial.data.get(key), cost=True)
+        return Quantity(key, "peak memory (MB)", -1, 0, lambda trial: trial.record.peak_memory_mb, cost=True)
     if any(metric in trial.metrics for trial in trials):  # a user's own
         return _metric(metric, step, trials)
     raise InputError(f"unknown metric {name!r}; choose among {', '.join([*metric_keys(trials, known_keys()), *COSTS])}")
@@ -97,11 +97,11 @@ def metric_keys(trials: Iterable[TrialResult], wanted: Container[str] = ()) -> l
 
 def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
     """A metric at the end, or after the iteration ``step`` (text); a user's own is described by the trials' files."""
-    records = [trial.data.get("metric_facts", {}).get(key) for trial in trials if key in trial.metrics]
+    records = [trial.record.metric_facts.get(key) for trial in trials if key in trial.metrics]
     facts = find(key) or from_record(key, records[0] if records else None)
     name, read = facts.name, partial(_final_value, key)
     if step:
-        known = sorted({int(at) for trial in trials for at in trial.data.get("metrics_at", {})})
+        known = sorted({int(at) for trial in trials for at in trial.record.metrics_at})
         if step not in map(str, known):
             there = ", ".join(map(str, known)) or "none"
             raise InputError(f"no trial was measured at iteration {step!r}; measured were (eval.at) {there}")
@@ -116,28 +116,35 @@ def _final_value(key: str, trial: TrialResult) -> float | None:
 
 
 def _value_at(key: str, step: str, trial: TrialResult) -> float | None:
-    value: float | None = trial.data.get("metrics_at", {}).get(step, {}).get("metrics", {}).get(key)
-    return value
+    earlier = trial.record.metrics_at.get(step)
+    return None if earlier is None else earlier.metrics.get(key)
 
 
 def _protocol_lpips(trial: TrialResult) -> str:
     """What the trial's protocol means by LPIPS."""
-    name = str(trial.data["protocol"]).rsplit("-", 1)[0]  # without its version
-    return f"{LPIPS}{PROTOCOLS.get(name, PAPER).lpips}"
+    protocol = protocol_of(trial.record.protocol) or PAPER
+    return f"{LPIPS}{protocol.lpips or PAPER.lpips}"
+
+
+def _lpips_asked_for(trial: TrialResult) -> list[str]:
+    """What the trial's protocol means by LPIPS, unless its configuration asks for other variants alone."""
+    protocols, setting = _protocol_lpips(trial), trial.config.get("eval.lpips")
+    asked = [f"{LPIPS}{variant}" for variant in setting] if isinstance(setting, list) else []
+    return asked if asked and protocols not in asked else [protocols]
 
 
 def _total_seconds(trial: TrialResult) -> float | None:
-    return None if trial.made_elsewhere else sum(trial.data["seconds"].values())
+    return None if trial.made_elsewhere else sum(trial.record.seconds.values())
 
 
 def _count(
     key: str, name: str, field: str, trials: list[TrialResult], unit: tuple[str, float, int] | None = None
 ) -> Quantity:
-    largest = max((trial.data.get(field) or 0 for trial in trials), default=0)
+    largest = max((getattr(trial.record, field) or 0 for trial in trials), default=0)
     symbol, scale, decimals = unit or (("M", MILLION, 2) if largest >= MILLION else ("k", THOUSAND, 1))
 
     def read(trial: TrialResult) -> float | None:
-        value = trial.data.get(field)
+        value = getattr(trial.record, field)
         return None if value is None else value / scale
 
     return Quantity(key, f"{name} ({symbol})", -1, decimals, read, cost=True)

@@ -7,51 +7,133 @@ says that it is complete. Nothing here needs torch, so that tables over thousand
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from gsbench.errors import InputError
-from gsbench.runs.hashing import flatten
+from gsbench.parsing import DamagedError, one_line, read_yaml
+from gsbench.records import MOST
+from gsbench.runs.declaration import QUESTIONS
+from gsbench.runs.hashing import NOT_HASHED, flatten
+from gsbench.runs.inputs import read_results, read_settings, read_unchanged
 from gsbench.runs.layout import CONFIG, FAILED, IN_RUNS, PER_VIEW, RESULTS
-from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
+from gsbench.runs.origin import FROM_RENDERS
+from gsbench.runs.rows import read_curve
+from gsbench.runs.splits import split_text
+from gsbench.runs.translation_record import Translation
+from gsbench.runs.trial_files import failure_of
+from gsbench.runs.trial_record import TrialRecord, UnfinishedError
 
 TRIAL_FOLDER = re.compile(r"(?P<hash>[0-9a-f]{8})-seed(?P<seed>\d+)")
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
 
 Arm = tuple[str, str]  # initialiser, densifier
 
-TEXT_KEYS = ("experiment", "scene", "init", "densify", "raster", "protocol")
-COUNT_KEYS = ("seed", "iterations", "num_gaussians")
+
+Kind = tuple[str, str, str, str]  # scene, initialiser, densifier, hash of the configuration
+
+
+class Configurations:
+    """The settings that determine the results of an experiment's trials, read once for all of one kind."""
+
+    def __init__(self) -> None:
+        self._known: dict[Kind, Mapping[str, Any]] = {}
+
+    def shared(self, kind: Kind, folder: Path) -> Mapping[str, Any]:
+        """The settings of the trial in ``folder``, as those of any other of its ``kind``; {} where unreadable."""
+        if kind not in self._known:
+            self.find(kind, [folder])
+        return self._known[kind]
+
+    def find(self, kind: Kind, folders: Iterable[Path]) -> str:
+        """Read the settings of a kind from the first of ``folders`` that has them; else why the last has not."""
+        fault = ""
+        for folder in folders:
+            try:
+                found = load_flat_config(folder)
+            except FileNotFoundError:
+                fault = f"{CONFIG} is not there"
+            except DamagedError as error:
+                fault = f"{error.path.name} {error.reason}"
+            else:
+                own = {key: value for key, value in found.items() if key.split(".")[0] not in NOT_HASHED}
+                self._known[kind] = own
+                return ""
+        self._known.setdefault(kind, {})
+        return fault
+
+
+def load_flat_config(folder: Path) -> dict[str, Any]:
+    """The configuration of the trial in ``folder`` with dotted keys; raises FileNotFoundError and DamagedError.
+
+    It is read from ``inputs.json`` where that has it, which is some twenty times quicker than YAML.
+    """
+    values = read_settings(folder)
+    if values is None:
+        values = read_yaml(folder / CONFIG)
+    if not isinstance(values, dict):
+        raise DamagedError(folder / CONFIG, "is damaged: it is no configuration")
+    return flatten(values)
 
 
 @dataclass(frozen=True)
 class TrialResult:
-    """One complete trial; ``data`` is the whole of its ``results.json``, ``config_hash`` that in its folder's name."""
+    """One complete trial; ``record`` is its ``results.json``, ``config_hash`` that in its folder's name.
+
+    ``digests`` are the sha256 of its other files where they are known, ``settings`` the configurations of its
+    experiment, each read once.
+    """
 
     path: Path
-    experiment: str
-    scene: str
-    init: str
-    densify: str
-    seed: int
     config_hash: str
-    metrics: Mapping[str, float]
-    unavailable: Mapping[str, str]
-    data: Mapping[str, Any] = field(repr=False)
+    record: TrialRecord = field(repr=False)
     variant: str = ""  # the swept settings that tell this trial from others of its initialiser and densifier
+    digests: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
+    settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
+    translation: Translation | None = None  # of the metrics, where they are those of another protocol
+    translated_from: str = ""  # the trial's own protocol then
+
+    @property
+    def experiment(self) -> str:
+        return self.record.experiment
+
+    @property
+    def scene(self) -> str:
+        return self.record.scene
+
+    @property
+    def init(self) -> str:
+        return self.record.init
+
+    @property
+    def densify(self) -> str:
+        return self.record.densify
+
+    @property
+    def seed(self) -> int:
+        return self.record.seed
+
+    @property
+    def metrics(self) -> Mapping[str, float]:
+        """Means over the test views."""
+        return self.record.metrics
+
+    @property
+    def unavailable(self) -> Mapping[str, str]:
+        """The reasons why metrics are missing."""
+        return self.record.unavailable
 
     @property
     def arm(self) -> Arm:
-        """What is compared: the initialiser, and the densifier with its variant."""
+        """The name of the compared arm: the initialiser, and the densifier with its variant."""
         return self.init, f"{self.densify} {self.variant}".strip()
 
     @property
@@ -59,79 +141,119 @@ class TrialResult:
         """Experiment, scene, arm and folder: enough to find the trial."""
         return f"{self.experiment}/{self.scene}/{self.init}-{self.densify}/{self.path.name}"
 
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """The settings that determine the result, with dotted keys; empty where they are absent or cannot be read.
+
+        They are read once for all trials that share them: a trial's own are `whole_config`.
+        """
+        return self.settings.shared(self.kind, self.path)
+
+    @property
+    def kind(self) -> Kind:
+        """The identity that trials share which differ in their seeds alone."""
+        return self.scene, self.init, self.densify, self.config_hash
+
     @cached_property
-    def config(self) -> dict[str, Any]:
-        """The trial's configuration with dotted keys; empty where ``config.yaml`` is absent or cannot be read."""
+    def whole_config(self) -> Mapping[str, Any]:
+        """Every setting of the trial, those included that have no part in the result; as `config`."""
         try:
-            content = yaml.load((self.path / CONFIG).read_text(encoding="utf-8"), Loader=_LOADER)
-        except (OSError, UnicodeDecodeError, yaml.YAMLError):
+            return load_flat_config(self.path)
+        except (FileNotFoundError, DamagedError):
             return {}
-        return flatten(content) if isinstance(content, dict) else {}
+
+    def curve(self, name: str) -> list[dict[str, bool | int | float]]:
+        """The rows of the trial's ``metrics.jsonl`` or ``events.jsonl``; see `gsbench.runs.rows`."""
+        return read_curve(self.path / name, self.digests)
 
     @cached_property
     def code(self) -> dict[str, str]:
         """The versions of the code that made the trial; empty for what another program made.
 
-        ``code of <class>`` is the hash of the file that defines a user's own class, ``stage <name>`` the version of
+        ``code of <class>`` is the hash of the files that a user's own class needs, ``stage <name>`` the version of
         one of gsbench's stages.
         """
-        recorded = self.data.get("code", {})
-        return {f"code of {target}": str(digest) for target, digest in recorded.get("sources", {}).items()} | {
-            f"stage {name}": str(version) for name, version in recorded.get("stages", {}).items()
+        code = self.record.code
+        return {f"code of {target}": digest for target, digest in code.sources.items()} | {
+            f"stage {name}": str(version) for name, version in code.stages.items()
         }
+
+    @cached_property
+    def files(self) -> dict[str, str]:
+        """The files of gsbench that had a part in the trial, with their states then (`gsbench.runs.code`)."""
+        return {f"gsbench's {file}": str(state) for file, state in self.record.code.files.items()}
 
     @property
     def finished(self) -> float:
-        """When the trial was finished, Unix time."""
+        """The Unix time at which the trial was finished."""
         return (self.path / RESULTS).stat().st_mtime
 
     def conditions(self) -> dict[str, str]:
-        """What trials must share before their numbers may be averaged, as comparable text, as far as it is known."""
+        """The known conditions that trials must share before their numbers may be averaged, as comparable text."""
         known = {
-            "protocol": str(self.data["protocol"]),
-            "resolution": _size_text(self.data.get("resolution")),
-            "data": str(self.data.get("hashes", {}).get("data")),
+            "protocol": self.record.protocol,
+            "resolution": _size_text(self.record.resolution),
+            "data": str(self.record.hashes.get("data")),
         }
+        if self.split:
+            known["split"] = self.split
         if not self.from_renders:
-            known["raster"] = str(self.data["raster"])
+            known["raster"] = self.record.raster
         if not self.made_elsewhere:
-            known["iterations"] = str(self.data["iterations"])
+            known["iterations"] = str(self.record.iterations)
         if not self.made_elsewhere and not self.program:
-            known["budget"] = canonical(self.data.get("budget"))
+            known["budget"] = "null" if self.record.budget is None else canonical(asdict(self.record.budget))
         return known
 
     @property
+    def split(self) -> str:
+        """The rule that holds views out, as short text; "" where neither a record nor the configuration says it."""
+        if self.record.split:
+            return self.record.split
+        return "" if "scene.name" not in self.config else split_text(self.config)
+
+    @property
+    def question(self) -> str:
+        """The question that held-out views ask of a model: interpolation or extrapolation; "" for a list of views."""
+        kind = re.split("[ ,]", self.split, maxsplit=1)[0]
+        return QUESTIONS.get(kind, "")
+
+    @property
     def from_renders(self) -> bool:
-        """Whether another program's renders were measured, whose model was not seen."""
-        return self.data.get("evaluated_from") == FROM_RENDERS
+        """Return whether renders of another program were measured, without a model."""
+        return self.record.evaluated_from == FROM_RENDERS
 
     @property
     def made_elsewhere(self) -> bool:
-        """Whether another program made the model or the renders, in a time and with a budget that nobody knows."""
-        return self.data.get("evaluated_from") in (FROM_MODEL, FROM_RENDERS) and not self.program
+        """Return whether another program made the model or the renders, so that time and budget are unknown."""
+        return self.record.evaluated_from is not None and not self.program
 
     @property
     def program(self) -> str:
         """The program that gsbench let train in its place, as it is called; "" where it trained itself, or nobody
         did."""
-        found = self.data.get("trained_by")
-        return str(found["program"]) if isinstance(found, dict) else ""
+        return "" if self.record.trained_by is None else self.record.trained_by.program
+
+    @property
+    def trainer_version(self) -> str:
+        """The version of that program; "" where there is none."""
+        return "" if self.record.trained_by is None else self.record.trained_by.version
 
     @property
     def budget_acted(self) -> bool:
-        """Whether the trial's budget may have changed it: a cap that refused or steers, or a limit of time."""
+        """Return whether the trial's budget may have changed it: a cap that refused or steers, or a limit of time."""
         if self.made_elsewhere or self.program:
             return False
-        budget, events = self.data.get("budget"), self.data.get("events")
-        if not isinstance(budget, dict) or not isinstance(events, dict):
+        budget, events = self.record.budget, self.record.events
+        if budget is None or not events:
             return True
-        steered = budget.get("cap") == "governor"
-        return steered or budget.get("seconds") is not None or events.get("blocked_by_cap") != 0
+        steered = budget.cap == "governor"
+        return steered or budget.seconds is not None or events.get("blocked_by_cap") != 0
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """All of an experiment that can be used, and one line for each trial folder that cannot."""
+    """Trials of an experiment that can be used, and one line for each trial folder that cannot."""
 
     name: str
     folder: Path
@@ -156,17 +278,37 @@ def load_experiment(runs_dir: Path, name: str) -> Experiment:
 
 
 def read_experiment(folder: Path) -> Experiment:
-    """Every trial of the experiment in ``folder``, which may have none yet."""
+    """Read every trial of the experiment in ``folder``, which may have none yet."""
     runs_dir = folder.parent
     trials: list[TrialResult] = []
     warnings: list[str] = []
+    settings = Configurations()
     for place in _trial_folders(folder):
         try:
-            trials.append(read_trial(Path(place), runs_dir))
+            trials.append(read_trial(Path(place), runs_dir, settings))
         except _UnusableError as reason:
-            warnings.append(f"{os.path.relpath(place, runs_dir)}: {reason}")
+            warnings.append(f"{os.path.relpath(place, runs_dir)}: {one_line(str(reason))}")
+    trials, unknown = _with_known_settings(trials, settings)
+    warnings += [f"{os.path.relpath(trial.path, runs_dir)}: damaged, {reason}" for trial, reason in unknown]
     trials.sort(key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash))
     return Experiment(folder.name, folder, tuple(trials), tuple(sorted(warnings)))
+
+
+def _with_known_settings(
+    trials: Sequence[TrialResult], settings: Configurations
+) -> tuple[list[TrialResult], list[tuple[TrialResult, str]]]:
+    """The trials whose settings are known where they are needed, and the others, each with the reason.
+
+    Settings are needed where trials of one scene, initialiser and densifier differ in them.
+    """
+    folders: dict[Kind, list[Path]] = {}
+    variants: dict[tuple[str, ...], set[str]] = {}
+    for trial in trials:
+        folders.setdefault(trial.kind, []).append(trial.path)
+        variants.setdefault(trial.kind[:3], set()).add(trial.config_hash)
+    faults = {kind: settings.find(kind, found) for kind, found in folders.items() if len(variants[kind[:3]]) > 1}
+    known = [trial for trial in trials if not faults.get(trial.kind)]
+    return known, [(trial, faults[trial.kind]) for trial in trials if faults.get(trial.kind)]
 
 
 def list_experiments(runs_dir: Path) -> list[str]:
@@ -189,41 +331,27 @@ class _UnusableError(Exception):
     """Why a folder is not a usable trial."""
 
 
-def read_trial(path: Path, runs_dir: Path) -> TrialResult:
+def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialResult:
     """Read and check one trial folder."""
     try:
-        text = (path / RESULTS).read_text(encoding="utf-8")
+        record, digests = read_results(path)
     except FileNotFoundError:
         raise _UnusableError(_why_unfinished(path)) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise _UnusableError(f"damaged, {RESULTS} cannot be read ({error})") from None
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise _UnusableError(f"damaged, {RESULTS} is not JSON ({error})") from None
-    _check_content(data)
+    except UnfinishedError as error:
+        raise _UnusableError(f"unfinished, {error.path.name} {error.reason}") from None
+    except DamagedError as error:
+        raise _UnusableError(f"damaged, {error.path.name} {error.reason}") from None
     match = TRIAL_FOLDER.fullmatch(path.name)
     if match is None:
         raise _UnusableError("foreign, the folder is not named <hash8>-seed<k>")
-    experiment, scene, arm = path.relative_to(runs_dir).parts[-4:-1]
-    said = {"experiment": data["experiment"], "scene": data["scene"], "arm": f"{data['init']}-{data['densify']}"}
-    for (key, value), place in zip(said.items(), (experiment, scene, arm), strict=True):
+    places = path.relative_to(runs_dir).parts[-4:-1]
+    said = {"experiment": record.experiment, "scene": record.scene, "arm": f"{record.init}-{record.densify}"}
+    for (key, value), place in zip(said.items(), places, strict=True):
         if value != place:
             raise _UnusableError(f"foreign, its {RESULTS} is of {key} {value!r}")
-    if data["seed"] != int(match["seed"]):
-        raise _UnusableError(f"foreign, its {RESULTS} is of seed {data['seed']}")
-    return TrialResult(
-        path=path,
-        experiment=data["experiment"],
-        scene=data["scene"],
-        init=data["init"],
-        densify=data["densify"],
-        seed=data["seed"],
-        config_hash=match["hash"],
-        metrics=data["metrics"],
-        unavailable=data.get("unavailable", {}),
-        data=data,
-    )
+    if str(record.seed) != match["seed"]:
+        raise _UnusableError(f"foreign, its {RESULTS} is of seed {record.seed}")
+    return TrialResult(path, match["hash"], record, digests=digests, settings=settings)
 
 
 def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
@@ -233,14 +361,17 @@ def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
     """
     path = trial.path / PER_VIEW
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+        text = read_unchanged(path, trial.digests).decode("utf-8")
         views = {
-            row["view"]: {key: float(value) for key, value in row.items() if key != "view" and value != ""}
-            for row in rows
+            row["view"]: {key: _number(value) for key, value in row.items() if key != "view" and value != ""}
+            for row in csv.DictReader(io.StringIO(text, newline=""))
         }
-    except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is missing or damaged ({error!r}): run `gsbench retry` on it") from None
+    except FileNotFoundError:
+        raise InputError(f"{path} is missing: give the trial's own command again") from None
+    except DamagedError as error:
+        raise InputError(f"{error}: delete it, and give the trial's own command again") from None
+    except (UnicodeDecodeError, KeyError, TypeError, ValueError, csv.Error) as error:
+        raise InputError(f"{path} is damaged ({one_line(repr(error))}): give the trial's own command again") from None
     for key, expected in trial.metrics.items():
         values = [view[key] for view in views.values() if key in view]
         mean = math.fsum(values) / len(values) if values else math.nan
@@ -253,12 +384,16 @@ def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
     return views
 
 
+def _number(text: str) -> float:
+    value = float(text)
+    if not abs(value) <= MOST:
+        raise ValueError(f"{text} is no measured number")
+    return value
+
+
 def canonical(value: object) -> str:
     """JSON text that is equal for equal values."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
-
-
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def _trial_folders(folder: Path) -> Iterator[str]:
@@ -274,41 +409,10 @@ def _folders(place: str | Path) -> list[str]:
 
 
 def _why_unfinished(path: Path) -> str:
-    try:
-        failure = json.loads((path / FAILED).read_text(encoding="utf-8"))
-        reason = str(failure.get("message") or failure.get("error") or "see failed.json").strip().splitlines()[-1]
-        return f"failed, {reason}"
-    except FileNotFoundError:
-        return "unfinished, no results.json yet" if (path / CONFIG).is_file() else "foreign, not a trial"
-    except (OSError, UnicodeDecodeError, ValueError, AttributeError, IndexError):
-        return "failed, and its failed.json is damaged"
+    if (path / FAILED).exists():
+        return f"failed, {failure_of(path)}"
+    return f"unfinished, no {RESULTS} yet" if (path / CONFIG).is_file() else "foreign, not a trial"
 
 
-def _check_content(data: object) -> None:
-    """Raise ``_UnusableError`` unless ``data`` has what every finished trial has, with finite numbers."""
-    if not isinstance(data, dict):
-        raise _UnusableError(f"damaged, {RESULTS} is not an object")
-    if data.get("status") != "complete":
-        raise _UnusableError(f"unfinished, its status is {data.get('status')!r}")
-    for key in TEXT_KEYS:
-        if not isinstance(data.get(key), str):
-            raise _UnusableError(f"damaged, {RESULTS} lacks {key!r}")
-    for key in COUNT_KEYS:
-        if key == "num_gaussians" and data.get("evaluated_from") == FROM_RENDERS:
-            continue
-        if not isinstance(data.get(key), int) or isinstance(data[key], bool):
-            raise _UnusableError(f"damaged, {RESULTS} has no whole number {key!r}")
-    for group in ("metrics", "seconds"):
-        values = data.get(group)
-        if not isinstance(values, dict):
-            raise _UnusableError(f"damaged, {RESULTS} lacks {group!r}")
-        for key, value in values.items():
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-                raise _UnusableError(f"damaged, {group}.{key} is {value!r}")
-    for key in ("unavailable", "hashes", "versions"):
-        if not isinstance(data.get(key, {}), dict):
-            raise _UnusableError(f"damaged, {key!r} is not an object")
-
-
-def _size_text(size: object) -> str:
-    return f"{size[0]}x{size[1]}" if isinstance(size, list | tuple) and len(size) == 2 else str(size)
+def _size_text(size: tuple[int, int] | None) -> str:
+    return "None" if size is None else f"{size[0]}x{size[1]}"

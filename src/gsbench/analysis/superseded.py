@@ -18,9 +18,9 @@ def find_superseded(
     the version that finished a trial last is the present one, as it is among the stages of gsbench.
     """
     reasons: dict[Path, str] = {}
-    latest = {part: version for trial in sorted(trials, key=_finished) for part, version in trial.code.items()}
+    latest = {part: version for trial in sorted(trials, key=_finished) for part, version in _code(trial).items()}
     for trial in trials:
-        for part, version in trial.code.items():
+        for part, version in _code(trial).items():
             name = part.removeprefix(CODE)
             now = present(name, trial) if part.startswith(CODE) else None
             if version != (now or latest[part]):
@@ -28,6 +28,10 @@ def find_superseded(
                 newer = short_version(now or latest[part])
                 reasons[trial.path] = f"{name} was {short_version(version)}, {words} {newer}"
     return reasons
+
+
+def _code(trial: TrialResult) -> dict[str, str]:
+    return trial.code | trial.files
 
 
 def _finished(trial: TrialResult) -> float:

@@ -38,9 +38,13 @@ def to_csv(table: Table) -> str:
 def to_latex(table: Table) -> str:
     """A ``table`` environment in booktabs style; the document needs ``\\usepackage{booktabs}``."""
     width = len(table.row_headings)
-    spec = "l" * width + "r" * len(table.columns)
+    columns = "r" * len(table.columns)
+    if table.wrapped:
+        share = f"{WRAPPED_SHARE / len(table.columns):.2f}"
+        columns = f">{{\\raggedright\\arraybackslash}}p{{{share}\\linewidth}}" * len(table.columns)
+    spec = "l" * width + columns
     lines = [
-        "% needs \\usepackage{booktabs}",
+        f"% needs \\usepackage{{booktabs{',array' if table.wrapped else ''}}}",
         "\\begin{table}",
         "\\centering",
         f"\\caption{{{escape_latex(table.title)}}}",
@@ -72,7 +76,8 @@ def to_latex(table: Table) -> str:
 
 def to_html(table: Table) -> str:
     """A ``<figure>`` with the table, its caption and notes; no styles of its own."""
-    parts = [f'<figure class="table"><table>\n<caption>{html.escape(table.title)}</caption>\n<thead>\n']
+    kind = "table wrapped" if table.wrapped else "table"
+    parts = [f'<figure class="{kind}"><table>\n<caption>{html.escape(table.title)}</caption>\n<thead>\n']
     groups = _column_groups(table)
     grouped = any(name for name, _ in groups)
     if grouped:
@@ -117,8 +122,11 @@ table { border-collapse: collapse } caption { text-align: left; font-weight: 600
 th, td { padding: .3rem .7rem; text-align: right; white-space: nowrap }
 th[scope=row], th.name { text-align: left } th[scope=row] { font-weight: normal }
 thead tr:last-child th { border-bottom: 1px solid #888 } tr.rule > * { border-top: 1px solid #888 }
+.wrapped td, .wrapped thead th { white-space: normal; text-align: left; min-width: 8rem; overflow-wrap: anywhere }
 th[scope=colgroup] { text-align: center } figcaption { font-size: .85rem; color: #555 }
 """
+
+WRAPPED_SHARE = 0.7  # of a line of LaTeX, for the columns of a table whose cells wrap
 
 _LATEX = {
     "\\": "\\textbackslash{}", "&": "\\&", "%": "\\%", "$": "\\$", "#": "\\#", "_": "\\_", "{": "\\{", "}": "\\}",

@@ -16,21 +16,22 @@ from gsbench.analysis.cells import (
     best_cells,
     by_key,
     check_averageable,
+    check_fields,
     field_value,
     make_cell,
     swept_settings,
-    with_variants,
 )
-from gsbench.analysis.declaration import standing
 from gsbench.analysis.differences import differing_conditions
-from gsbench.analysis.origins import cloud_notes, machine_notes
-from gsbench.analysis.pairing import BASELINE, ViewCache, choose_pairs
+from gsbench.analysis.origins import cloud_notes, held_out_notes, machine_notes, points_notes
+from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Experiment, TrialResult
-from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
+from gsbench.analysis.table_notes import attribution_notes, declared_notes, origin_notes
+from gsbench.analysis.translations import translation_notes
 from gsbench.words import counted, signed
 
 DEFAULT_ROWS = ("scene", "init", "densify")
+SIDE_BY_SIDE = ("scene.split", "scene.sector")
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ class Table:
     rows: tuple[Row, ...]
     notes: tuple[str, ...] = ()
     keys: tuple[tuple[str, str], ...] = field(default=(), repr=False)  # (quantity, arm) of each column
+    wrapped: bool = False  # cells hold text that may need several lines on paper
 
 
 def build_table(
@@ -83,14 +85,19 @@ def build_table(
 
     ``rows`` and ``columns`` are fields of a trial or dotted configuration keys; what stands in neither is averaged
     over: seeds as trials, scenes as means of scenes. By default, rows are scene, initialiser, densifier and every
-    setting that was swept within those. ``order`` gives the rows and the columns to show, also where nothing was run;
-    ``names`` replaces values in headings. Raises ``InputError`` where a cell would mix what may not be averaged.
+    setting that was swept within those; splits that were swept stand side by side. ``order`` gives the rows and the
+    columns to show, also where nothing was run; ``names`` replaces values in headings. Raises ``InputError`` where a
+    cell would mix what may not be averaged.
     """
     trials = list(experiment.trials if trials is None else trials)
     if rows is None:
-        rows = (*DEFAULT_ROWS, *(key for key in swept_settings(trials) if key not in columns))
+        swept = swept_settings(trials)
+        if not columns:  # what is held out asks another question, not of another arm: side by side
+            columns = tuple(key for key in SIDE_BY_SIDE if key in swept)
+        rows = (*DEFAULT_ROWS, *(key for key in swept if key not in columns))
     quantities = choose_quantities(trials, metrics)
     fields = (*rows, *columns)
+    check_fields(trials, fields)
     groups = by_key(trials, lambda trial: tuple(field_value(trial, name) for name in fields))
     for key, group in groups.items():
         check_averageable(group, " ".join(f"{name}={value}" for name, value in zip(fields, key, strict=True)))
@@ -124,10 +131,14 @@ def build_table(
     arms = [" + ".join(names.get(value, value) for value in arm) for arm in arm_keys]
     keys = tuple((quantity.key, "+".join(arm)) for quantity in quantities for arm in arm_keys)
     heads = tuple(Column(q.heading, arm) if columns else Column("", q.heading) for q in quantities for arm in arms)
-    notes += _reading_notes(grid, quantities, expected, "scene" in fields) + _origin_notes(trials)
+    notes += _reading_notes(grid, quantities, expected, "scene" in fields) + origin_notes(trials)
     notes += (
-        _declared_notes(experiment)
+        declared_notes(experiment)
+        + attribution_notes(experiment)
         + _cost_notes(trials)
+        + translation_notes(trials)
+        + held_out_notes(trials)
+        + points_notes(trials)
         + machine_notes(trials)
         + cloud_notes(trials)
         + _left_out(experiment)
@@ -157,11 +168,11 @@ def _best(
     bold: set[object] = set()
     notes: dict[str, None] = {}
     for quantity in quantities:
-        rivals: dict[str, dict[object, Cell]] = {}
+        rivals: dict[tuple[str, str], dict[object, Cell]] = {}
         for (key, name), cell in grid.items():
             if name == quantity.key:
-                rivals.setdefault("" if place is None else key[place], {})[key, name] = cell
-        for scene, cells in rivals.items():
+                rivals.setdefault(("" if place is None else key[place], _split(cell)), {})[key, name] = cell
+        for (scene, _), cells in rivals.items():
             by_scene = by_key([trial for cell in cells.values() for trial in cell.trials], lambda trial: trial.scene)
             differing = {key for group in by_scene.values() for key in differing_conditions(group)}
             if differing:
@@ -169,6 +180,11 @@ def _best(
             else:
                 bold |= best_cells(cells, quantity)
     return bold, list(notes)
+
+
+def _split(cell: Cell) -> str:
+    """What was held out for a cell; cells of different splits answer different questions, and are no rivals."""
+    return cell.trials[0].split if cell.trials else ""
 
 
 def _mean_rows(
@@ -207,7 +223,9 @@ def _mean_rows(
         return []
     bold: set[object] = set()
     for quantity in quantities if comparable else ():
-        bold |= best_cells({key: cell for key, cell in cells.items() if key[2] == quantity.key}, quantity)
+        own = {key: cell for key, cell in cells.items() if key[2] == quantity.key}
+        for split in {_split(cell) for cell in own.values()}:
+            bold |= best_cells({key: cell for key, cell in own.items() if _split(cell) == split}, quantity)
     label = f"mean of {counted(usual, 'scene')}"
     result = []
     for index, other in enumerate(others):
@@ -233,7 +251,7 @@ def _reading_notes(
     cells = grid.values()
     if any(0 < cell.count < expected or not cell.trials for cell in cells):
         notes.append(f"(k/{expected}): only k of {expected} trials have a value; —: none.")
-    protocols = {str(trial.data["protocol"]) for cell in cells for trial in cell.trials}
+    protocols = {trial.record.protocol for cell in cells for trial in cell.trials}
     notes.append(f"Protocol {', '.join(sorted(protocols))}.")
     for quantity in quantities:
         reasons = {
@@ -241,47 +259,6 @@ def _reading_notes(
         }
         notes += [f"{quantity.name}: n/a, {reason}." for reason in sorted(reasons)]
     return notes
-
-
-_BY_PROGRAM = (
-    ("Trained here by another program, its model rendered by gsbench", FROM_MODEL),
-    ("Trained here by another program, its own renders measured as they are", FROM_RENDERS),
-)
-
-
-def _origin_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """Which arms gsbench did not train, and what of them it saw."""
-    notes = []
-    for what, origin in _BY_PROGRAM:
-        own = [trial for trial in trials if trial.program and trial.data.get("evaluated_from") == origin]
-        if own:
-            versions = {(f"{trial.init}-{trial.densify}", str(trial.data["trained_by"]["version"])) for trial in own}
-            arms = ", ".join(f"{arm} (version {version})" for arm, version in sorted(versions))
-            notes.append(f"{what} (its time is that of the whole program, its budget its own): {arms}.")
-    for what, origin in (
-        ("A model that another program trained, rendered here", FROM_MODEL),
-        ("Renders of another program, measured as they are", FROM_RENDERS),
-    ):
-        own = [trial for trial in trials if trial.made_elsewhere and trial.data["evaluated_from"] == origin]
-        if own:
-            arms = ", ".join(sorted({f"{trial.init}-{trial.densify}" for trial in own}))
-            notes.append(f"{what} (its conditions are not known): {arms}.")
-    return notes
-
-
-def _declared_notes(experiment: Experiment) -> list[str]:
-    """The verdict on the declared metric, of the whole experiment; nothing where none was declared.
-
-    Which trials a table shows has no say in it, so that nobody can choose a verdict by choosing trials.
-    """
-    declared = standing(experiment.folder, experiment.trials)
-    if declared is None:
-        return []
-    from gsbench.analysis.verdicts import declared_lines, judge  # here, for a quick start of what needs no test
-
-    trials = with_variants(experiment.trials)
-    pairs = choose_pairs(sorted({trial.arm for trial in trials}))
-    return declared_lines(declared, judge(trials, pairs, ViewCache(), declared))
 
 
 def _cost_notes(trials: Sequence[TrialResult]) -> list[str]:
@@ -326,8 +303,8 @@ def change_words(of_totals: float, of_scenes: float, scenes: int) -> str:
 
 
 _COSTS: dict[str, Callable[[TrialResult], float | None]] = {
-    "Gaussians": lambda trial: trial.data.get("num_gaussians"),
-    "Training time": lambda trial: trial.data["seconds"].get("train"),
+    "Gaussians": lambda trial: trial.record.num_gaussians,
+    "Training time": lambda trial: trial.record.seconds.get("train"),
 }
 
 

@@ -13,15 +13,14 @@ from numpy.typing import NDArray
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.files import read_json_lines
 from gsbench.runs.layout import CURVES
 
 GRID = 200  # points at which two curves are compared
 
 Array = NDArray[np.float64]
 COST_READERS: dict[str, Callable[[TrialResult], float | None]] = {
-    "gaussians": lambda trial: trial.data.get("num_gaussians"),
-    "seconds": lambda trial: trial.data["seconds"].get("train"),
+    "gaussians": lambda trial: trial.record.num_gaussians,
+    "seconds": lambda trial: trial.record.seconds.get("train"),
 }
 
 
@@ -61,10 +60,9 @@ def training_curve(trials: Sequence[TrialResult], cost: str, quality: str) -> Cu
     key = {"gaussians": "num_gaussians", "seconds": "seconds"}[cost]
     by_step: dict[int, list[tuple[float, float]]] = {}
     for trial in trials:
-        for row in read_json_lines(trial.path / CURVES):
-            x, y = row.get(key), row.get(quality)
-            if isinstance(x, int | float) and isinstance(y, int | float):
-                by_step.setdefault(int(row["step"]), []).append((x, y))
+        for row in trial.curve(CURVES):
+            if key in row and quality in row:
+                by_step.setdefault(int(row["step"]), []).append((row[key], row[quality]))
     full = {step: rows for step, rows in by_step.items() if len(rows) == len(trials)}
     points = [
         (statistics.fmean(row[0] for row in rows), statistics.fmean(row[1] for row in rows), str(step))

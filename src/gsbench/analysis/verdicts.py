@@ -1,15 +1,16 @@
-"""The verdicts of an experiment: each pair of arms in each metric, by itself or as families that were fixed beforehand.
+"""The verdicts of an experiment: each pair of arms in each metric, in families that hold the chance of a false one.
 
-Where nothing was declared (``eval.primary``), every metric of every pair is tested by itself at 5 %. Where a metric was
-declared, two questions are kept apart, each with its own 5 % for the chance that any of its answers is false:
+Where nothing was declared (``eval.primary``), all metrics of all pairs are one family, adjusted by Holm (1979). Where a
+metric was declared, two questions are kept apart, each with its own 5 % for the chance that any answer is false:
 
-- the declared metric, one test for each pair of arms: of a single pair it is tested as it is, of several adjusted by
-  Holm (1979), as Demšar (2006, section 3.2.2) adjusts comparisons of many methods with one control;
+- the declared metric, at one question if one was named (``psnr@extrapolation``), one test for each pair of arms: of a
+  single pair it is tested as it is, of several adjusted by Holm, as Demšar (2006, section 3.2.2) adjusts comparisons of
+  many methods with one control;
 - all other metrics of all pairs, called secondary and adjusted by Holm for their whole number.
 
 There is no gate between the two, though one would hold both under a single 5 % (Dmitrienko and Tamhane 2007): where the
 declared metric shows nothing, a secondary one that got worse must still be seen. A metric that was declared when
-results were there has no place of its own: then all metrics of all pairs are one family.
+results were there, or to which seeds or arms were added then, has no place of its own: then all are one family.
 """
 
 from __future__ import annotations
@@ -20,24 +21,25 @@ from typing import Literal
 
 from gsbench.analysis.declaration import ActiveDeclaration
 from gsbench.analysis.pairing import Paired, ViewCache, arm_name, pair_arms
+from gsbench.analysis.power import seeds_needed
 from gsbench.analysis.quantities import Quantity, choose_quantities, metric_quantity
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import Comparison, compare, compare_family, seeds_needed
+from gsbench.analysis.statistics import Comparison, compare_family
 from gsbench.errors import InputError
-from gsbench.words import signed
+from gsbench.words import counted, signed
 
-Role = Literal["", "declared", "secondary", "one of all"]
+Role = Literal["declared", "secondary", "one of all"]
 Pair = tuple[Arm, Arm]
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One metric's comparison with what it takes to read it; ``role`` is empty where nothing was declared."""
+    """One metric's comparison with what it takes to read it, and the family that it is one of."""
 
     quantity: Quantity
     comparison: Comparison
     seeds: int | None  # that would resolve the worthwhile difference; None: unknown or beyond reach
-    role: Role = ""
+    role: Role = "one of all"
 
     @property
     def symbol(self) -> str:
@@ -62,6 +64,7 @@ class _Question:
     pair: Pair
     quantity: Quantity
     paired: Paired
+    asks: str  # interpolation, extrapolation, or "" for neither
 
 
 def judge(
@@ -82,7 +85,8 @@ def judge(
             try:
                 if one.direction == 0:
                     raise InputError("whether more of it is better is not known")
-                questions.append(_Question(pair, one, pair_arms(own, *pair, one.key, views)))
+                paired = pair_arms(own, *pair, one.key, views)
+                questions.append(_Question(pair, one, paired, own[0].question))
             except InputError as error:
                 reasons = [trial.unavailable[one.key] for trial in own if one.key in trial.unavailable]
                 faults[pair][one.key] = reasons[0] if reasons else str(error)
@@ -108,12 +112,14 @@ def declared_quantity(trials: Sequence[TrialResult], declared: ActiveDeclaration
 
 
 def declared_lines(declared: ActiveDeclaration, judged: dict[Pair, ArmVerdicts]) -> list[str]:
-    """What was declared, and the verdict on it for each pair of arms, for the notes below a table."""
+    """Lines below a table that say what was declared, and the verdict on it for each pair of arms."""
     quantity = next(iter(judged.values())).declared if judged else None
     lines = declared.sentences(declared.metric if quantity is None else quantity.name)
     for (first, second), one in judged.items():
         against = f"{arm_name(second)} against {arm_name(first)}"
         found = [verdict for verdict in one.verdicts if verdict.quantity.key == declared.metric]
+        if found and found[0].role == "secondary":
+            continue  # the other question
         lines += [f"Verdict, {against}: {_in_words(verdict)}." for verdict in found]
         if not found:
             lines.append(f"Verdict, {against}: none, since {declared.metric} has no value: {one.missing}.")
@@ -121,10 +127,10 @@ def declared_lines(declared: ActiveDeclaration, judged: dict[Pair, ArmVerdicts])
 
 
 def families(judged: Sequence[ArmVerdicts]) -> list[str]:
-    """How many tests each family had, and how it was adjusted; nothing where nothing was declared."""
+    """Lines that say how many tests each family had, and how it was adjusted."""
     sizes: dict[Role, int] = {}
     for one in judged:
-        sizes |= {verdict.role: verdict.comparison.family for verdict in one.verdicts if verdict.role}
+        sizes |= {verdict.role: verdict.comparison.family for verdict in one.verdicts}
     lines = []
     if "declared" in sizes:
         how = "tested as it is" if sizes["declared"] == 1 else f"adjusted by Holm for {sizes['declared']} pairs of arms"
@@ -135,17 +141,15 @@ def families(judged: Sequence[ArmVerdicts]) -> list[str]:
             "themselves; they do not make the verdict."
         )
     if "one of all" in sizes:
-        lines.append(
-            "No metric was declared beforehand: all metrics of all pairs of arms are one family, "
-            f"{sizes['one of all']} tests adjusted by Holm."
-        )
+        number = counted(sizes["one of all"], "test")
+        none = any(one.declared is None for one in judged)
+        opening = "No metric was declared beforehand (eval.primary): all" if none else "All"
+        lines.append(f"{opening} metrics of all pairs of arms are one family, {number} adjusted by Holm.")
     return lines
 
 
 def _answer(questions: Sequence[_Question], declared: ActiveDeclaration | None) -> list[tuple[_Question, Verdict]]:
     """Every question's verdict, in the order of ``questions``."""
-    if declared is None:
-        return [(one, _verdict(one.quantity, compare(one.paired, one.quantity.direction), "")) for one in questions]
     answers: dict[int, Verdict] = {}
     roles: list[Role] = [_role(one, declared) for one in questions]
     for role in set(roles):
@@ -156,16 +160,17 @@ def _answer(questions: Sequence[_Question], declared: ActiveDeclaration | None) 
     return [(one, answers[place]) for place, one in enumerate(questions)]
 
 
-def _role(question: _Question, declared: ActiveDeclaration) -> Role:
-    if not declared.beforehand:
+def _role(question: _Question, declared: ActiveDeclaration | None) -> Role:
+    if declared is None or not declared.beforehand:
         return "one of all"
-    return "declared" if question.quantity.key == declared.metric else "secondary"
+    asked = declared.question in ("", question.asks)
+    return "declared" if asked and question.quantity.key == declared.metric else "secondary"
 
 
 def _verdict(quantity: Quantity, comparison: Comparison, role: Role) -> Verdict:
     seeds = None
-    if comparison.seed_deviation is not None and quantity.worthwhile is not None:
-        seeds = seeds_needed(comparison.seed_deviation, len(comparison.scenes), quantity.worthwhile)
+    if comparison.deviation is not None and quantity.worthwhile is not None:
+        seeds = seeds_needed(comparison.deviation, len(comparison.scenes), quantity.worthwhile)
     return Verdict(quantity, comparison, seeds, role)
 
 
@@ -176,11 +181,20 @@ def _in_words(verdict: Verdict) -> str:
     word = "no evidence of a difference in" if one.verdict == "no evidence" else f"{one.verdict} in"
     text = f"{word} {verdict.quantity.name} on {one.scope}: {signed(one.mean, spec)}"
     if one.interval is not None:
-        text += f" (95 % interval {signed(one.interval.low, spec)} to {signed(one.interval.high, spec)})"
+        text += f" (interval {signed(one.interval.low, spec)} to {signed(one.interval.high, spec)})"
     if one.p is None or one.p_family is None:
         return f"{text}, no test: {one.test}"
-    adjusted = f", adjusted for {one.family} tests {_p_text(one.p_family)}" if one.family > 1 else ""
-    return f"{text}, p {_p_text(one.p)}{adjusted}"
+    adjusted = f", both adjusted for {one.family} tests" if one.family > 1 else ""
+    return f"{text}, p {_p_text(one.p_family)}{adjusted}{beyond_words(one)}"
+
+
+def beyond_words(comparison: Comparison) -> str:
+    """``; it holds for scenes like these (p 0.012)`` of a difference that was found in scenes enough, else nothing."""
+    beyond = comparison.beyond
+    if beyond is None or comparison.verdict == "no evidence":
+        return ""
+    word = "it holds" if beyond.holds else "not shown"
+    return f"; {word} for scenes like these (p {_p_text(beyond.p_family)} over {beyond.scenes} scenes)"
 
 
 def _p_text(p: float) -> str:

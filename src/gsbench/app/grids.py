@@ -61,7 +61,7 @@ def _checked(grids: Any) -> list[dict[str, str]]:
 def words_of_grids(
     params: Mapping[str, Any], grids: Sequence[Mapping[str, str]], given: Sequence[str]
 ) -> list[list[str]]:
-    """For each grid its words: its own, the shared ones, and of the command line those that are meant for it.
+    """List the words of each grid: its own, the shared ones, and of the command line those that are meant for it.
 
     Of two for one setting the later counts; trials are in the order of the grids, the shared settings varying fastest.
     """

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hydra._internal.callbacks import Callbacks
 from hydra.core.plugins import Plugins
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig
@@ -18,8 +17,17 @@ from gsbench.app.grids import grids_aside
 from gsbench.app.task import OWN, StopAfterListing, Task
 from gsbench.config.command_words import check_words, is_sweep
 from gsbench.config.compose import compose_master, composing, explained, ready_trial
-from gsbench.config.hydra_guard import load_callbacks
-from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, start, words_of
+from gsbench.config.hydra_guard import load_callbacks, make_callbacks
+from gsbench.config.hydra_internals import Callbacks
+from gsbench.config.hydra_job import (
+    CONFIG_NAME,
+    HydraJob,
+    begin_sweep,
+    check_output_folder,
+    record_sweep,
+    start,
+    words_of,
+)
 from gsbench.errors import InputError
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.trial import Trial
@@ -44,7 +52,7 @@ def run_app(words: Sequence[str], multirun: bool, task: Task) -> None:
         with explained(words):  # a callback that cannot be made
             if not task.look_only:
                 load_callbacks(master)
-            context = HydraContext(hydra.config_loader, Callbacks(None if task.look_only else master))
+            context = HydraContext(hydra.config_loader, Callbacks() if task.look_only else make_callbacks(master))
         try:
             (_multirun if multirun else _run)(context, start(master, RunMode(1 + multirun)), words, task)
         except StopAfterListing:
@@ -73,6 +81,10 @@ def _run(context: HydraContext, config: DictConfig, words: Sequence[str], task: 
 
 def _multirun(context: HydraContext, config: DictConfig, words: Sequence[str], task: Task) -> None:
     """As `hydra.multirun`."""
+    with explained(words):
+        begin_sweep(config)
+        if not task.look_only:
+            record_sweep(config)
     context.callbacks.on_multirun_start(config=config, config_name=CONFIG_NAME)
     with grids_aside(config) as task.grids, explained(words):  # a sweeper or launcher that cannot be made
         sweeper = Plugins.instance().instantiate_sweeper(hydra_context=context, task_function=task, config=config)
@@ -95,6 +107,8 @@ def _check(master: DictConfig, multirun: bool, look_only: bool) -> None:
         raise InputError(f"hydra/launcher={launcher} launches sweeps: add -m, or leave it out")
     if launcher != OWN and master.launch.name != "serial":
         raise InputError(f"hydra/launcher={launcher} and launch={master.launch.name} are two launchers: choose one")
+    if not look_only:
+        check_output_folder(master, multirun)
     if look_only and launcher != OWN and sweeper != OWN:
         raise InputError(f"hydra/sweeper={sweeper} does not say beforehand what hydra/launcher={launcher} will run")
     if master.launch.stop_when_decided and not multirun:

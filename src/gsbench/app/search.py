@@ -12,24 +12,28 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext
 from omegaconf import DictConfig
+from pydantic import PositiveInt
 
 from gsbench.app.task import Task, grid, launch_trials, trials_of_jobs
 from gsbench.config.command_words import check_makes_trials
 from gsbench.config.compose import explained
 from gsbench.errors import InputError
 from gsbench.eval.facts import find, known_keys
-from gsbench.files import checked_runs_folder, make_runs_folder, read_object, write_json
+from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.launch.trial import Trial
+from gsbench.parsing import DamagedError
 from gsbench.runs.hashing import config_hash, sha256_of
-from gsbench.runs.layout import RESULTS, SEARCH, SEARCH_JOURNAL
-from gsbench.settings import checked
+from gsbench.runs.inputs import read_results
+from gsbench.runs.layout import SEARCH, SEARCH_JOURNAL
+from gsbench.runs.search_record import Point, SearchRecord
+from gsbench.settings import check_settings
 from gsbench.system.install import install_command
 from gsbench.system.locks import hold
 from gsbench.words import closest, counted
@@ -42,38 +46,61 @@ log = logging.getLogger(__name__)
 
 DIGITS = 4  # significant digits of a value: a name for it that people can type
 SEED = "seed"
+ALIASES = {"trials": "n_trials", "at_once": "n_jobs"}  # other names of settings
+DIRECTIONS = {1: "maximize", -1: "minimize"}
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """``metric``: what is made best, in its own direction; ``trials``: points, each trained with every seed."""
+    """Settings of a search, by the names of Hydra's own plug-in for Optuna where that has them.
+
+    ``metric`` is made best; ``n_trials`` counts points, each trained with every seed.
+    """
 
     metric: str = "psnr"
-    trials: int = 20
+    direction: Literal["maximize", "minimize"] | None = None  # None: that in which the metric is better
+    n_trials: PositiveInt = 20
+    n_jobs: PositiveInt = 1  # points that are chosen before the next result is known
     seed: int = 0  # of the sampler
-    at_once: int = 1  # points that are chosen before the next result is known
 
     def __post_init__(self) -> None:
-        checked(SearchSettings, vars(self), "hydra.sweeper")
-        for name in ("trials", "at_once"):
-            if getattr(self, name) < 1:
-                raise InputError(f"hydra.sweeper.{name} must be a whole number above 0, got {getattr(self, name)}")
-        if self.direction == 0:
+        check_settings(self, "hydra.sweeper")
+        facts = find(self.metric)
+        if facts is None and self.direction is None:
             raise InputError(
                 f"hydra.sweeper.metric={self.metric} is no metric whose direction is known"
-                f"{closest(self.metric, known_keys())} (choose: {', '.join(known_keys())})"
+                f"{closest(self.metric, known_keys())} (choose: {', '.join(known_keys())}; for a metric of your own "
+                "give hydra.sweeper.direction, too)"
+            )
+        if facts is not None and self.direction not in (None, DIRECTIONS.get(facts.direction)):
+            raise InputError(
+                f"hydra.sweeper.direction={self.direction}: {facts.label} is better the other way; leave direction out"
             )
 
+    @classmethod
+    def given(cls, values: Mapping[str, Any]) -> SearchSettings:
+        """The settings below ``hydra.sweeper``; raises InputError where one has a value by each of its two names."""
+        values = dict(values)
+        for alias, name in ALIASES.items():
+            value = values.pop(alias, None)
+            if value is None:
+                continue
+            if values.get(name) not in (None, value, getattr(cls, name)):
+                raise InputError(f"hydra.sweeper.{alias} is {name} by another name, and both are given: leave one out")
+            values[name] = value
+        return cls(**values)
+
     @property
-    def direction(self) -> int:
-        """+1: more is better; -1: less is better; 0: not known."""
+    def sign(self) -> int:
+        """The direction as a number: +1 where more is better, -1 where less is."""
         facts = find(self.metric)
-        return facts.direction if facts else 0
+        given = next((sign for sign, name in DIRECTIONS.items() if name == self.direction), 0)
+        return given or (facts.direction if facts else 0)
 
 
 @dataclass(frozen=True)
 class Space:
-    """What is searched: the words that stay, the distribution of each searched key, and the seeds."""
+    """Space of a search: the words that stay, the distribution of each searched key, and the seeds."""
 
     fixed: tuple[str, ...]
     searched: Mapping[str, BaseDistribution]
@@ -96,16 +123,21 @@ def search(
     """Search until the study has as many points as ``settings`` ask for."""
     if task.grids:
         raise InputError("hydra.sweeper.grids lists what to train, so leave hydra/sweeper=optuna out, or the grids")
-    wanted = SearchSettings(**settings)
+    wanted = SearchSettings.given(settings)
     with explained(words):
         space = read_space(OverridesParser.create(context.config_loader).parse_overrides(list(words)))
     lowest = {key: _lowest(distribution) for key, distribution in space.searched.items()}
     first = trials_of_jobs(context, master, space.jobs(lowest))
+    unseen = all(trial.values["scene"]["validation"] for trial in first)
+    if not unseen:
+        log.warning(
+            "this search is judged by the test views, so that they choose its best and cannot test it any more: "
+            "scene.validation=true puts them away and judges by other views"
+        )
     if task.look_only:
         seeds = counted(len(space.seeds), "seed")
-        print(
-            f"a search of {counted(wanted.trials, 'point')} with {seeds} each; the point of the lowest values would be"
-        )
+        points = counted(wanted.n_trials, "point")
+        print(f"a search of {points} with {seeds} each; the point of the lowest values would be")
         task.launch(first)
     make_runs_folder(checked_runs_folder(first[0].values["runs"]))
     home = first[0].paths.home
@@ -119,8 +151,8 @@ def search(
             launch_trials(task, master, launcher, trials)
             for place, number in enumerate(batch):
                 _tell(study, number, trials[place * len(space.seeds) :][: len(space.seeds)], wanted)
-            write_json(home / SEARCH, _record(study, wanted, space))
-        write_json(home / SEARCH, _record(study, wanted, space))
+            write_json(home / SEARCH, _record(study, wanted, space, unseen).to_json())
+        write_json(home / SEARCH, _record(study, wanted, space, unseen).to_json())
     _say_best(study, wanted, home.name)
 
 
@@ -178,7 +210,8 @@ def _text(value: Any) -> str:
 def _identity(trial: Trial, wanted: SearchSettings, space: Space) -> str:
     """A study's name: searches that differ in anything that has a part in a result do not learn from each other."""
     searched = {key: repr(distribution) for key, distribution in space.searched.items()}
-    return sha256_of([config_hash(trial.values), wanted.metric, searched, list(space.seeds)])[:16]
+    own = [wanted.direction] if find(wanted.metric) is None else []
+    return sha256_of([config_hash(trial.values), wanted.metric, searched, list(space.seeds), *own])[:16]
 
 
 def _open(home: Path, wanted: SearchSettings, name: str) -> Study:
@@ -190,7 +223,7 @@ def _open(home: Path, wanted: SearchSettings, name: str) -> Study:
     from optuna.storages.journal import JournalFileBackend
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    direction = optuna.study.StudyDirection.MAXIMIZE if wanted.direction > 0 else optuna.study.StudyDirection.MINIMIZE
+    direction = optuna.study.StudyDirection.MAXIMIZE if wanted.sign > 0 else optuna.study.StudyDirection.MINIMIZE
     storage = JournalStorage(JournalFileBackend(str(home / SEARCH_JOURNAL)))
     return optuna.create_study(study_name=name, storage=storage, direction=direction, load_if_exists=True)
 
@@ -208,10 +241,10 @@ def _next_points(study: Study, wanted: SearchSettings, space: Space) -> dict[int
     if left:
         return left
     points: dict[int, dict[str, Any]] = {}
-    while len(known) + len(points) < wanted.trials and len(points) < wanted.at_once:
+    while len(known) + len(points) < wanted.n_trials and len(points) < wanted.n_jobs:
         number = len(known) + len(points)
         # A sampler for each point: what it proposes depends on the results, not on when the search was killed.
-        study.sampler = TPESampler(seed=wanted.seed + number, constant_liar=wanted.at_once > 1)
+        study.sampler = TPESampler(seed=wanted.seed + number, constant_liar=wanted.n_jobs > 1)
         asked = study.ask(dict(space.searched))
         points[asked.number] = asked.params
     return points
@@ -222,7 +255,7 @@ def _tell(study: Study, number: int, trials: Sequence[Trial], wanted: SearchSett
     from optuna.trial import TrialState
 
     folders = [trial.folder for trial in trials]
-    found = [read_object(folder / RESULTS).get("metrics", {}).get(wanted.metric) for folder in folders]
+    found = [_metric_of(folder, wanted.metric) for folder in folders]
     values = [value for value in found if value is not None]
     if len(values) < len(found):
         study.tell(number, state=TrialState.FAIL)
@@ -231,29 +264,38 @@ def _tell(study: Study, number: int, trials: Sequence[Trial], wanted: SearchSett
     done = study.get_trials(deepcopy=False)[number]
     where = ", ".join(f"{key}={_text(value)}" for key, value in done.params.items())
     came = f"{wanted.metric} {done.value:.5g}" if done.value is not None else f"failed, without {wanted.metric}"
-    log.info("search: point %d of %d: %s: %s", number + 1, wanted.trials, where, came)
+    log.info("search: point %d of %d: %s: %s", number + 1, wanted.n_trials, where, came)
 
 
-def _record(study: Study, wanted: SearchSettings, space: Space) -> dict[str, Any]:
-    """What the report shows."""
+def _metric_of(folder: Path, metric: str) -> float | None:
+    try:
+        return read_results(folder)[0].metrics.get(metric)
+    except (FileNotFoundError, DamagedError):
+        return None
+
+
+def _record(study: Study, wanted: SearchSettings, space: Space, unseen: bool) -> SearchRecord:
+    """The record that the report shows; ``unseen`` says that no point saw a test view."""
     from optuna.distributions import FloatDistribution, IntDistribution
 
-    return {
-        "metric": wanted.metric,
-        "direction": wanted.direction,
-        "wanted": wanted.trials,
-        "seeds": len(space.seeds),
-        "log": [k for k, d in space.searched.items() if isinstance(d, FloatDistribution | IntDistribution) and d.log],
-        "points": [
-            {
-                "number": trial.number,
-                "state": {"COMPLETE": "done", "FAIL": "failed"}.get(trial.state.name, "unfinished"),
-                "settings": {key: _shown(value) for key, value in trial.params.items()},
-                "value": trial.value,
-            }
+    states: dict[str, Literal["done", "failed"]] = {"COMPLETE": "done", "FAIL": "failed"}
+    return SearchRecord(
+        metric=wanted.metric,
+        direction=1 if wanted.sign > 0 else -1,
+        wanted=wanted.n_trials,
+        seeds=len(space.seeds),
+        validation=unseen,
+        log=[k for k, d in space.searched.items() if isinstance(d, FloatDistribution | IntDistribution) and d.log],
+        points=[
+            Point(
+                number=trial.number,
+                state=states.get(trial.state.name, "unfinished"),
+                settings={key: _shown(value) for key, value in trial.params.items()},
+                value=trial.value,
+            )
             for trial in study.get_trials(deepcopy=False)
         ],
-    }
+    )
 
 
 def _shown(value: Any) -> Any:

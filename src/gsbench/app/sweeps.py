@@ -1,4 +1,4 @@
-"""What gsbench's sweeper does: all points of its grids at once, or seed by seed until their question is decided."""
+"""The work of gsbench's sweeper: all points of its grids at once, or seed by seed until their question is decided."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gsbench.claims.stopping import headline, plan_sweep
 from gsbench.claims.sweep import run_looks
 from gsbench.config.compose import explained
 from gsbench.files import checked_runs_folder, make_runs_folder
-from gsbench.launch.declare import declare_plan
+from gsbench.launch.declare import declare, declare_plan, declared_metrics, planned_trials
 from gsbench.launch.trial import Trial
 
 log = logging.getLogger(__name__)
@@ -63,6 +63,7 @@ def run_until_decided(
         return task.launch(trials)
     make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
     declared = declare_plan(stopping.home, stopping.plan.to_record(), stopping.hash)
+    declare(declared_metrics(trials), planned_trials(trials))  # all at once: what a look adds was planned
     returned: list[JobReturn] = []
     launched: set[Path] = set()
 

@@ -1,4 +1,4 @@
-"""What Hydra runs: all trials of a sweep at once through gsbench's own launcher, or one a call through any other."""
+"""Task function of the Hydra app: all trials of a sweep at once through gsbench's launcher, else one a call."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ OWN = "gsbench"  # the names of gsbench's own launcher and sweeper
 
 
 class StopAfterListing(Exception):  # noqa: N818 - it is no error
-    """The trials were looked at, and none is to be run."""
+    """Signal that the trials were listed, and that none is to be run."""
 
 
 @dataclass
@@ -69,7 +69,7 @@ class Task:
 def launch_jobs(
     task: Task, context: HydraContext, master: DictConfig, jobs: Sequence[Sequence[str]], first: int
 ) -> list[JobReturn]:
-    """What gsbench's launcher does with the jobs of a sweep: each is the list of its words."""
+    """Run the jobs of a sweep for gsbench's launcher; each job is the list of its words."""
     return task.launch(trials_of_jobs(context, master, jobs, first))
 
 

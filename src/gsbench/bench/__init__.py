@@ -1,4 +1,4 @@
-"""What a training step costs with each rasterizer: times and their split, waits for a device, peak memory."""
+"""Costs of a training step with each rasterizer: times and their split, waits for a device, peak memory."""
 
 from gsbench.bench.run import run_bench
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gsbench.bench.peer import PEER, PEER_NOTE
+from gsbench.bench.peer import PEERS
 from gsbench.bench.stepper import WARM_UP_STEPS, Setting, Stepper, peak_memory
 from gsbench.logs import Progress, progress
 from gsbench.system.isolate import run_isolated
@@ -22,6 +22,7 @@ def run_bench(
     threads: int | None = None,
     memory: bool = True,
     scene: str = "trained",
+    stages: bool = False,
 ) -> list[dict[str, Any]]:
     """Time the training step with each of ``rasters`` for each image size (width, height) and count of Gaussians.
 
@@ -31,19 +32,20 @@ def run_bench(
     quotients with the first of ``rasters``. ``steps_per_second`` is that of whole training steps, which nothing is
     waited for in between; ``waits_per_step`` how often one of them makes the host wait for a GPU. ``peak_memory_mb`` is
     that of a fresh process that makes the same steps (on a GPU: of torch's allocations there), None if ``memory`` is
-    false. With ``ply`` that model is timed instead of ``counts``. Raises InputError for a raster that cannot run here.
+    false. With ``stages`` a row also has ms a step by kernel, of further steps. With ``ply`` that model is timed,
+    not ``counts``. Raises InputError for a raster that cannot run here.
     """
     rows = []
     with progress("bench") as report:
         for width, height in sizes:
             for count in counts if ply is None else [0]:
                 setting = Setting(scene, width, height, count, ply, threads)
-                rows += _compare(rasters, setting, repeats, memory, report)
+                rows += _compare(rasters, setting, repeats, memory, stages, report)
     return rows
 
 
 def _compare(
-    rasters: list[str], setting: Setting, repeats: int, memory: bool, report: Progress
+    rasters: list[str], setting: Setting, repeats: int, memory: bool, stages: bool, report: Progress
 ) -> list[dict[str, Any]]:
     model = f"{setting.count:,} Gaussians" if setting.ply is None else setting.ply.name
     what, turns = f"{setting.width}x{setting.height}, {model}", WARM_UP_STEPS + repeats
@@ -75,8 +77,11 @@ def _compare(
             "threads": stepper.threads,
             "device": stepper.device.type,
         }
-        if raster == PEER:
-            row["note"] = PEER_NOTE
+        if stages:
+            report(f"{what}, stages", turns, turns, raster)
+            row["stages"] = stepper.stages(repeats)
+        if raster in PEERS:
+            row["note"] = PEERS[raster].note
         rows.append(row)
     del steppers, stepper  # their memory: the processes below need it
     for row in rows:

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import torch
 
-from gsbench.bench.peer import PEER, TorchPeer
+from gsbench.bench.peer import PEERS
 from gsbench.bench.scenes import SEED, make_scene
+from gsbench.bench.stages import stages_of_a_step
 from gsbench.bench.waits import counting_waits
 from gsbench.densify import ADC
 from gsbench.errors import InputError
@@ -33,7 +34,7 @@ NOWHERE = Path("/nonexistent")  # a folder that is named and never used: no snap
 
 @dataclass(frozen=True)
 class Setting:
-    """What is timed."""
+    """Conditions of a measurement."""
 
     scene: str  # of `bench.scenes.SCENES`
     width: int  # px
@@ -44,7 +45,7 @@ class Setting:
 
 
 class Stepper:
-    """A training of ``setting`` with the rasterizer called ``raster``: an executor, an import path, or the peer."""
+    """A training of ``setting`` with the rasterizer called ``raster``: an executor, an import path, or a peer."""
 
     def __init__(self, raster: str, setting: Setting) -> None:
         self.threads = setting.threads or torch.get_num_threads()
@@ -54,7 +55,7 @@ class Stepper:
             keep_float32()
         gaussians, scene = make_scene(setting.scene, setting.width, setting.height, setting.count, setting.ply)
         self.count = len(gaussians)
-        self.is_peer = raster == PEER
+        self.peer = PEERS.get(raster)
         self.trainer = Trainer(
             scene,
             gaussians.map(lambda tensor: tensor.detach().to(self.device)),
@@ -73,8 +74,9 @@ class Stepper:
         marks = [self._now()]
         image = trainer.rasterizer.render(trainer.gaussians.values, camera, SH_DEGREE, trainer.background).image
         marks.append(self._now())
-        # The peer gives no image; its numbers stand in, so that something flows back.
-        loss = image.square().sum() if self.is_peer else trainer.loss(image, target)[0]
+        # A peer that gives no image has numbers to stand in, so that something flows back.
+        is_image = self.peer is None or self.peer.gives_image
+        loss = trainer.loss(image, target)[0] if is_image else image.square().sum()
         marks.append(self._now())
         loss.backward()
         marks.append(self._now())
@@ -93,9 +95,9 @@ class Stepper:
     def steps_per_second(self) -> float | None:
         """Whole training steps: the next view, render, loss, backward, statistics, Adam, losses read now and then.
 
-        None for the peer, which cannot train.
+        None for a peer, which cannot train.
         """
-        if self.is_peer:
+        if self.peer is not None:
             return None
         steps = STEPS_AT_ONCE[self.device.type]
         begin = self._now()
@@ -105,13 +107,17 @@ class Stepper:
         return steps / (self._now() - begin)
 
     def waits(self) -> Counter[str] | None:
-        """What made the host wait for the device in one whole training step; None for the peer and on a CPU."""
-        if self.is_peer or self.device.type == "cpu":
+        """Calls that made the host wait for the device in one whole training step; None for the peer and on a CPU."""
+        if self.peer is not None or self.device.type == "cpu":
             return None
         self.trainer.losses.settle()
         with counting_waits() as counts:
             self.trainer.iterate(NOWHERE)
         return counts
+
+    def stages(self, repeats: int) -> dict[str, float]:
+        """ms a step by kernel, see `gsbench.bench.stages`."""
+        return stages_of_a_step(self.step, self.device.type, repeats)
 
     def _now(self) -> float:
         if self.device.type == "cuda":
@@ -120,21 +126,22 @@ class Stepper:
 
 
 def device_of(raster: str) -> torch.device:
-    """Where ``raster`` is timed: on a GPU if it runs on nothing else, or is a user's own class and there is one."""
-    if raster == PEER:
-        return torch.device("cpu")
+    """The device on which ``raster`` is timed: a GPU if it needs one, or is a user's own class and there is one."""
     if "." in raster:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    device = torch.device("cpu" if find(raster).runs_on("cpu") else "cuda")
+    if raster in PEERS:
+        device = torch.device(PEERS[raster].device_type)
+    else:
+        device = torch.device("cpu" if find(raster).runs_on("cpu") else "cuda")
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError(f"raster={raster} runs on a CUDA device, and torch finds none here")
     return device
 
 
 def make_rasterizer(raster: str, device: torch.device, threads: int) -> Rasterizer:
-    """The executor of that name, the peer, or the class at that import path: whoever types it here trusts it."""
-    if raster == PEER:
-        return TorchPeer()
+    """The executor or peer of that name, or the class at that import path: whoever types it here trusts it."""
+    if raster in PEERS:
+        return PEERS[raster]()
     if "." in raster:
         return build_rasterizer({"_target_": raster}, [raster.partition(".")[0]], device, threads)
     return build_rasterizer({"name": raster}, [], device, threads)

@@ -1,4 +1,4 @@
-"""How often a program makes the host wait for a GPU: counted on any device, so that a test on a CPU can tell."""
+"""Counts of how often a program makes the host wait for a GPU, on any device, so that a test on a CPU can tell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which ingredient carries it: factorial designs over named switches, and each switch's share of the whole gain.
+"""Shares of ingredients in a gain: factorial designs over named switches, and each switch's share of the whole gain.
 
 Each switch is off or on; a run is a set of switches that are on. The gain of a set is its value minus that of the empty
 set. Shapley's value (1953) shares the gain of the full set among the switches: the mean, over all orders of turning
@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbench.analysis.shares import Run, shapley
 from gsbench.analysis.statistics import Interval, t_interval
 from gsbench.errors import InputError
 from gsbench.words import closest
@@ -28,13 +29,12 @@ MAX_SWITCHES = 8
 # Switches that are products of others, by number of switches: the smallest designs of resolution V (ibid., table 6.22).
 GENERATORS = {5: ("ABCD",), 6: ("ABCDE",), 7: ("ABCDEF",), 8: ("ABCD", "ABEF")}
 
-Run = frozenset[str]
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Share:
-    """What a switch adds on average over all orders, with Student's interval over trials; ``part`` of the whole gain.
+    """Mean gain from a switch over all orders of turning switches on, with Student's interval; ``part`` of the whole.
 
     ``alone`` is what it adds to nothing, ``last`` what it adds to all others. ``part`` is None where the gain's
     interval holds zero, since a part of nothing means nothing.
@@ -74,20 +74,6 @@ def plan_runs(switches: Sequence[str], fractional: bool = False) -> list[Run]:
         runs.append(frozenset(name for name, level in zip(switches, (*levels, *made), strict=True) if level > 0))
     none, every = frozenset[str](), frozenset(switches)
     return list(dict.fromkeys([none, every, *sorted(runs, key=lambda run: (len(run), sorted(run)))]))
-
-
-def shapley(switches: Sequence[str], values: Mapping[Run, float]) -> dict[str, float]:
-    """The share of each switch in ``values[all] - values[none]``, from the values of all 2^n sets."""
-    count, shares = len(switches), {}
-    for switch in switches:
-        others = [name for name in switches if name != switch]
-        total = 0.0
-        for size in range(count):
-            weight = 1 / (count * math.comb(count - 1, size))
-            for chosen in itertools.combinations(others, size):
-                total += weight * (values[frozenset((*chosen, switch))] - values[frozenset(chosen)])
-        shares[switch] = total
-    return shares
 
 
 def ablate(switches: Sequence[str], results: Mapping[Run, Sequence[float]]) -> Ablation:

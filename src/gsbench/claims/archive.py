@@ -60,7 +60,9 @@ def write_archive(experiment: Experiment, out: Path) -> list[str]:
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
     declared = experiment.folder / DECLARED
     contents = {
-        TRIALS: _json_lines({"folder": _folder(trial), "results": _without_paths(trial.data)} for trial in kept),
+        TRIALS: _json_lines(
+            {"folder": _folder(trial), "results": _without_paths(trial.record.to_json())} for trial in kept
+        ),
         CONFIGURATIONS: _configurations(kept),
         PER_VIEW: _table(rows),
     } | ({DECLARED: declared.read_bytes()} if declared.is_file() else {})

@@ -1,4 +1,4 @@
-"""What an archive of results is, in the terms of RO-Crate 1.1 (w3id.org/ro/crate/1.1, sections 3 to 6 and 8)."""
+"""Description of an archive of results in the terms of RO-Crate 1.1 (w3id.org/ro/crate/1.1, sections 3 to 6 and 8)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str,
     """The content of ``ro-crate-metadata.json``: ``sizes`` has the bytes of each file of the archive."""
     scenes = sorted({trial.scene for trial in trials})
     arms = sorted({f"{trial.init}-{trial.densify}" for trial in trials})
-    protocols = sorted({str(trial.data["protocol"]) for trial in trials})
+    protocols = sorted({trial.record.protocol for trial in trials})
     when = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime(max(map(measured, trials))))
     root = {
         "@id": "./",

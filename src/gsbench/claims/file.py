@@ -63,7 +63,7 @@ class Least:
 
     @property
     def margin(self) -> float:
-        """In the scale in which trials are compared: the metric's own, or logarithms."""
+        """The margin in the scale in which trials are compared: the metric's own, or logarithms."""
         return math.log1p(self.size) if self.relative else self.size
 
     def __str__(self) -> str:
@@ -93,7 +93,7 @@ class Claim:
 
     @property
     def sign(self) -> int:
-        """Of the claimed difference, arm minus baseline; 0 where none is claimed."""
+        """The sign of the claimed difference, arm minus baseline; 0 where none is claimed."""
         return DIRECTIONS[self.direction]
 
     @property
@@ -132,7 +132,7 @@ class ClaimsFile:
         return Design(scenes, plan_looks(self.seeds), self.error_rate / sharing)
 
     def plan(self) -> dict[str, Any]:
-        """All that decides about the verdicts, as plain values: what is written down before trials run."""
+        """The declared plan: all that decides about the verdicts, as plain values, written down before trials run."""
         questions = []
         for claim in self.claims:
             kept = {entry.name: getattr(claim, entry.name) for entry in fields(Claim) if entry.name not in UNTOUCHED}

@@ -1,4 +1,4 @@
-"""What cannot be tested on this machine, and why: captures, weights of networks and of metrics that are not here."""
+"""Reasons why a claim cannot be tested on this machine: missing captures, weights of networks and of metrics."""
 
 from __future__ import annotations
 

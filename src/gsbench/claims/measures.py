@@ -1,4 +1,4 @@
-"""What a claim may be about: any metric of a trial, its counts and times, and its error where photographs are textured.
+"""Measures that a claim may be about: a trial's metrics, counts, times, and error where photographs are textured.
 
 Every measure is one number of a trial. Counts and times are compared as ratios, metrics as differences or as ratios.
 """
@@ -46,22 +46,22 @@ def textured_error(trial: TrialResult) -> float:
 
 
 COSTS = {
-    "gaussians": Measure("gaussians", "Gaussians", lambda trial: _positive(trial.data.get("num_gaussians")), True),
+    "gaussians": Measure("gaussians", "Gaussians", lambda trial: _positive(trial.record.num_gaussians), True),
     "init_points": Measure(
-        "init_points", "initial points", lambda trial: _positive(trial.data.get("num_init_points")), True
+        "init_points", "initial points", lambda trial: _positive(trial.record.num_init_points), True
     ),
     "train_time": Measure(
-        "train_time", "training time", lambda trial: _positive(trial.data["seconds"].get("train")), True
+        "train_time", "training time", lambda trial: _positive(trial.record.seconds.get("train")), True
     ),
     "peak_memory_mb": Measure(
-        "peak_memory_mb", "peak memory", lambda trial: _positive(trial.data.get("peak_memory_mb")), True
+        "peak_memory_mb", "peak memory", lambda trial: _positive(trial.record.peak_memory_mb), True
     ),
 }
 REGIONS = {TEXTURED: Measure(TEXTURED, "error in textured parts (levels)", textured_error, decimals=2)}
 
 
 def measure_names() -> tuple[str, ...]:
-    """What the ``metric`` of a claim may be, apart from a user's own."""
+    """The names that the ``metric`` of a claim may have, apart from a user's own."""
     return (*known_keys(), *REGIONS, *COSTS)
 
 
@@ -70,7 +70,7 @@ def find_measure(key: str, trials: Sequence[TrialResult] = ()) -> Measure:
     known = REGIONS.get(key) or COSTS.get(key)
     if known is not None:
         return known
-    records = [trial.data.get("metric_facts", {}).get(key) for trial in trials if key in trial.metrics]
+    records = [trial.record.metric_facts.get(key) for trial in trials if key in trial.metrics]
     facts = find(key) or from_record(key, records[0] if records else None)
     return Measure(key, facts.name, lambda trial: trial.metrics.get(key), decimals=facts.decimals)
 

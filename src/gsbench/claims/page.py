@@ -8,10 +8,15 @@ from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
 
-from gsbench.analysis.differences import IGNORED_SETTINGS
+from gsbench.analysis.attribution import attribute, attribution_sentence
+from gsbench.analysis.cells import with_variants
+from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.report.crops import Crop, choose_crops
-from gsbench.analysis.results import TrialResult, canonical
+from gsbench.analysis.results import TrialResult
+from gsbench.analysis.table_formats import to_html as table_to_html
+from gsbench.analysis.table_formats import to_markdown as table_to_markdown
+from gsbench.analysis.tables import Table
 from gsbench.claims.file import ClaimsFile
 from gsbench.claims.verdict import Verdict, Word
 from gsbench.runs.declaration import DeclaredPlan
@@ -20,7 +25,6 @@ from gsbench.words import counted
 LARGE = 1000.0  # numbers from here on are counts or seconds, and shown whole
 CROPS = 2  # pictures each for and against an arm
 SYMBOLS: dict[Word, str] = {"supported": "✔", "refuted": "✘", "undecided": "?", "not testable here": "–"}
-NAMES = ("init.name", "densify.name", "init._target_", "densify._target_")  # settings that only say which arm it is
 
 
 @dataclass(frozen=True)
@@ -31,13 +35,13 @@ class Section:
     headline: str
     evidence: tuple[str, ...]
     scenes: tuple[tuple[str, str], ...]
-    differing: tuple[tuple[str, str, str], ...]  # setting, baseline's, arm's
+    fairness: Table | None  # None where no trial was compared
     trials: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Page:
-    """What both formats show."""
+    """Content of the verdicts' page, for both formats."""
 
     title: str
     lines: tuple[str, ...]
@@ -75,13 +79,13 @@ def to_markdown(page: Page) -> str:
     for section in page.sections:
         claim = section.verdict.claim
         parts += ["", f"## {claim.id}: {section.verdict.word}", "", f"> {claim.says}", ">", f"> {claim.where}", ""]
-        parts += [section.headline + "\n", *(f"- {line}" for line in section.evidence)]
+        parts += [section.headline + "\n"]
+        if section.fairness is not None:
+            parts.append(table_to_markdown(section.fairness))
+        parts += [f"- {line}" for line in section.evidence]
         if section.scenes:
             parts += ["", "| scene | difference |", "|---|---|"]
             parts += [f"| {scene} | {value} |" for scene, value in section.scenes]
-        if section.differing:
-            parts += ["", f"| setting | {claim.baseline} | {claim.arm} |", "|---|---|---|"]
-            parts += [f"| `{key}` | {_pipe(one)} | {_pipe(other)} |" for key, one, other in section.differing]
         if section.trials:
             parts += ["", "Trials: " + ", ".join(f"`{label}`" for label in section.trials)]
     return "\n".join(parts).rstrip() + "\n"
@@ -91,7 +95,10 @@ def to_html(page: Page) -> str:
     """The page as one HTML file, with charts and pictures in it; needs no network and no other file."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(_resource("gsbench.claims", "page.html.j2"))
-    shown = [(section, _chart(section.verdict), *_crops(section.verdict)) for section in page.sections]
+    shown = [
+        (section, _sheet(section.fairness), _chart(section.verdict), *_crops(section.verdict))
+        for section in page.sections
+    ]
     style = _resource("gsbench.analysis.report", "style.css")
     return template.render(page=page, sections=shown, symbols=SYMBOLS, style=style)
 
@@ -115,27 +122,30 @@ def _section(verdict: Verdict) -> Section:
             f"{decision.seeds} seeds, two arms; looks planned at {planned} seeds; units are {unit}",
         ]
     evidence += verdict.notes
+    fairness, mixed = _fairness(verdict)
+    if mixed:
+        headline += f". {mixed}"
     return Section(
         verdict,
         headline,
         tuple(evidence),
         tuple((scene, verdict.shown(value)) for scene, value in verdict.by_scene),
-        tuple(differing_settings_of(verdict.trials[:2])),
+        fairness,
         tuple(trial.label for trial in verdict.trials),
     )
 
 
-def differing_settings_of(pair: Sequence[TrialResult]) -> list[tuple[str, str, str]]:
-    """(setting, baseline's value, arm's value) of all in which the configurations of two trials differ."""
-    if len(pair) < 2:
-        return []
-    one, other = pair[0].config, pair[1].config
-    keys = sorted(key for key in {*one, *other} if not key.startswith(IGNORED_SETTINGS) and key not in NAMES)
-    return [
-        (key, canonical(one[key]) if key in one else "–", canonical(other[key]) if key in other else "–")
-        for key in keys
-        if one.get(key) != other.get(key)
-    ]
+def _sheet(fairness: Table | None) -> str:
+    return "" if fairness is None else table_to_html(fairness)
+
+
+def _fairness(verdict: Verdict) -> tuple[Table | None, str]:
+    """The fairness sheet of a claim's arms, and in which ingredients they differ where these are several."""
+    trials = with_variants(verdict.trials)
+    arms = [trial.arm for trial in trials[:2]]
+    if len(set(arms)) < 2:
+        return None, ""
+    return fairness_table(trials, *arms), attribution_sentence(attribute(trials, *arms), *arms)
 
 
 def _declared_line(declared: DeclaredPlan, plans: Sequence[DeclaredPlan]) -> str:
@@ -151,8 +161,8 @@ def _size_line(file: ClaimsFile, trials: Sequence[TrialResult]) -> list[str]:
     if not file.size or not trials:
         return []
     scenes = sorted({trial.scene for trial in trials})
-    steps = sorted({int(trial.data["iterations"]) for trial in trials})
-    sizes = sorted({f"{size[0]}×{size[1]}" for trial in trials if (size := trial.data.get("resolution"))})
+    steps = sorted({trial.record.iterations for trial in trials})
+    sizes = sorted({f"{size[0]}×{size[1]}" for trial in trials if (size := trial.record.resolution)})
     seeds = len({trial.seed for trial in trials})
     here = (
         f"{counted(len(scenes), 'scene')} ({', '.join(scenes)}), up to {seeds} seeds, "

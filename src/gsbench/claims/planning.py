@@ -1,9 +1,9 @@
-"""How many scenes and seeds resolve a difference, and what the hours at hand can resolve: asked of pilot trials.
+"""Planning from pilot trials: the scenes and seeds that resolve a difference, and what the hours at hand can resolve.
 
 A paired difference of scene s and seed k is ``mean + scene effect + noise``: the effect differs between scenes by a
 deviation, and trainings of one scene differ by another. From pilot trials both are estimated by the analysis of
 variance (Searle, Casella and McCulloch 1992, *Variance components*, section 3.6). More seeds shrink the noise alone; a
-statement about scenes like these needs more scenes. Power is that of a two-sided 5 % t test (`statistics.t_power`).
+statement about scenes like these needs more scenes. Power is that of a two-sided 5 % t test (`analysis.power`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.analysis.statistics import MIN_SCENES, POWER, pooled_deviation, t_power
+from gsbench.analysis.power import POWER, t_power
+from gsbench.analysis.statistics import MIN_SCENES, pooled_deviation
 from gsbench.errors import InputError
 
 MAX_SCENES, MAX_SEEDS = 30, 40  # the largest designs that are looked at
@@ -71,18 +72,23 @@ def components(differences: Sequence[NDArray[np.float64]]) -> Components:
 def power(size: Size, difference: float, found: Components, like_these: bool) -> float:
     """The chance to see ``difference``: in the mean of these scenes, or of ``scenes like these`` where scenes vary.
 
+    The test about these scenes takes pairs of trials as units (`analysis.statistics.student`), so scenes that differ
+    make it see less.
     Raises InputError where the pilot had one scene and others are asked about.
     """
     noise = found.within**2 / size.seeds
     if not like_these:
-        return t_power(abs(difference), math.sqrt(noise / size.scenes), size.scenes * (size.seeds - 1))
+        pairs = size.scenes * size.seeds
+        spread = (found.between or 0.0) ** 2 * size.seeds * (size.scenes - 1) / (pairs - 1)  # of scenes, in the test's
+        stretch = math.sqrt(1 + spread / found.within**2) if found.within else 1.0
+        return t_power(abs(difference), math.sqrt(noise / size.scenes), pairs - 1, stretch=stretch)
     if found.between is None:
         raise InputError("one scene does not tell how an effect differs between scenes: run pilot trials on two")
     return t_power(abs(difference), math.sqrt((found.between**2 + noise) / size.scenes), size.scenes - 1)
 
 
 def sizes_needed(difference: float, found: Components, like_these: bool, wanted: float = POWER) -> list[Size]:
-    """For each number of scenes the fewest seeds that see ``difference`` with the ``wanted`` power; [] beyond reach.
+    """List the fewest seeds that see ``difference`` with the ``wanted`` power, by number of scenes; [] where none do.
 
     Scenes that would need more seeds than ``MAX_SEEDS`` are left out, and so is what needs more scenes and no fewer
     seeds than a design before it. A statement about scenes like these starts at ``MIN_SCENES``.

@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Design:
-    """When to look, and with which chance of a false verdict over all looks.
+    """Design of a sequential test: its looks, and the chance of a false verdict over all of them.
 
     ``looks`` are numbers of seeds of each scene, rising; after the last one the design ends. Where a statement about
     ``scenes`` like these can be made, scenes are the units.
@@ -62,7 +62,7 @@ class Design:
 
     @property
     def by_scene(self) -> bool:
-        """Whether scenes are the units, not pairs of trials."""
+        """Return whether scenes are the units, not pairs of trials."""
         return self.scenes >= MIN_SCENES
 
     def bounds(self) -> tuple[float, ...]:
@@ -70,7 +70,7 @@ class Design:
         return t_bounds(self.scenes, self.looks, self.alpha)
 
     def equivalence_bounds(self) -> tuple[float, ...]:
-        """The same for the interval that must lie within the least effect: each of its two ends errs by alpha.
+        """The bounds of the interval that must lie within the least effect: each of its two ends errs by alpha.
 
         Two one-sided tests (Schuirmann 1987, *J. Pharmacokinet. Biopharm.* 15, 657): only one of them can be false.
         """
@@ -79,7 +79,7 @@ class Design:
 
 @dataclass(frozen=True)
 class Decision:
-    """What the looks so far say of "the difference has this sign, and is at least ``least``".
+    """State of "the difference has this sign, and is at least ``least``" after the looks so far.
 
     ``outcome``: for; against (it has the other sign); equivalent (it is smaller than the least that matters, whichever
     its sign); undecided after the last look; open before it. Of "there is no difference to speak of" (sign 0) only
@@ -154,7 +154,7 @@ def _outcome(mean: float, sign: int, error: float, bound: float, narrow: float, 
 
 
 def spending(share: float, alpha: float) -> float:
-    """How much of ``alpha`` may be used once ``share`` of the seeds are there."""
+    """The part of ``alpha`` that may be used once ``share`` of the seeds are there."""
     return float(alpha * share**SPENDING_POWER)
 
 

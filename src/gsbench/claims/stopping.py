@@ -28,6 +28,7 @@ from gsbench.eval.facts import MetricFacts, facts_of, find
 from gsbench.runs.declaration import STOPPING, DeclaredPlan, read_plans
 from gsbench.runs.hashing import flatten, sha256_of
 from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted
 
 SEED = "-seed"  # in the name of a trial's folder, before the seed
@@ -81,11 +82,11 @@ class SweepPlan:
         return plan_looks(len(self.seeds))
 
     def design(self, claim: Claim, scenes: int, sharing: int) -> Design:
-        """As a file of claims has it."""
+        """The design of a pair's looks, as a file of claims has it."""
         return Design(scenes, self.looks, self.error_rate / sharing)
 
     def claim(self, pair: PlannedPair) -> Claim:
-        """What the pair is asked: whether its arm is better."""
+        """The question that the pair is asked: whether its arm is better."""
         return Claim(
             id=f"{pair.arm} against {pair.baseline}",
             says=f"{pair.arm} is better than {pair.baseline}",
@@ -99,7 +100,7 @@ class SweepPlan:
         )
 
     def verdicts(self, home: Path, declared: DeclaredPlan) -> list[Verdict]:
-        """Of every pair, from the trials of the experiment in ``home`` that are done."""
+        """Verdicts of every pair, from the trials of the experiment in ``home`` that are done."""
         trials = read_experiment(home).trials if home.is_dir() else ()
         by_folder = {trial.path.relative_to(home).as_posix(): trial for trial in trials}
         return [
@@ -157,7 +158,7 @@ class Stopping(Generic[T]):
         return self.plan.verdicts(self.home, declared)
 
     def describe(self) -> str:
-        """What a dry run says of the looks."""
+        """Lines that a dry run prints of the looks."""
         first, most = (len(self.trials(self.questions, seeds)) for seeds in (self.looks[0], self.looks[-1]))
         pairs, looks = counted(len(self.plan.pairs), "pair"), ", ".join(map(str, self.looks))
         return (
@@ -229,28 +230,36 @@ def headline(verdict: Verdict) -> str:
 class _Expected(TrialResult):
     """A trial that need not have run: it has a configuration and no results."""
 
-    settings: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    values: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, trial: Composed) -> _Expected:
         values, folder = trial.values, TrialPaths.of(trial.values).folder
-        names = {key: values[key]["name"] for key in ("scene", "init", "densify")}
-        settings = flatten(yaml.safe_load(trial.yaml))
-        return cls(
-            folder,
-            values["name"],
-            **names,
+        record = TrialRecord(
+            status="complete",  # as the type has it: no file says so
+            experiment=values["name"],
+            scene=values["scene"]["name"],
+            init=values["init"]["name"],
+            densify=values["densify"]["name"],
             seed=values["seed"],
-            config_hash=folder.name.partition(SEED)[0],
+            raster="",
+            protocol="",
+            iterations=0,
             metrics={},
             unavailable={},
-            data={},
-            settings=settings,
+            seconds={},
+            num_init_points=None,
+            num_gaussians=0,
+            peak_memory_mb=None,
+            hashes={},
+            versions={},
         )
+        settings = flatten(yaml.safe_load(trial.yaml))
+        return cls(folder, folder.name.partition(SEED)[0], record, values=settings)
 
-    @cached_property
-    def config(self) -> dict[str, Any]:
-        return dict(self.settings)
+    @property
+    def config(self) -> Mapping[str, Any]:
+        return self.values
 
 
 def _facts(metric: str, values: Mapping[str, Any]) -> MetricFacts:

@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is pooled: the names that ``arm`` and ``baseline`` go by in the sources, and our key of the metric."""
+    """The pooled question: names that ``arm`` and ``baseline`` go by in the sources, and our key of the metric."""
 
     arm: tuple[str, ...]
     baseline: tuple[str, ...]
@@ -77,9 +77,9 @@ def _read_archive(path: Path, wanted: Wanted, name: str) -> Found:
         trials = with_variants(unpack_archive(path, Path(folder)).trials)
         views = ViewCache()
         studies, notes = [], []
-        protocols = sorted({str(trial.data["protocol"]) for trial in trials})
+        protocols = sorted({trial.record.protocol for trial in trials})
         for protocol in protocols:
-            own = [trial for trial in trials if trial.data["protocol"] == protocol]
+            own = [trial for trial in trials if trial.record.protocol == protocol]
             pairs = _pairs(own, wanted, path)
             for first, second in pairs:
                 told_apart = [protocol] * (len(protocols) > 1) + [first[0]] * (len(pairs) > 1)
@@ -127,16 +127,16 @@ def _conditions(protocol: str, metric: str) -> dict[str, str]:
 
 def _size(trials: Sequence[TrialResult]) -> str:
     """In which trials of archives may differ without being refused, for people to judge."""
-    sizes = sorted({f"{size[0]}×{size[1]}" for trial in trials if (size := trial.data.get("resolution"))})
-    steps = sorted({f"{int(trial.data['iterations']):,}" for trial in trials})
-    versions = sorted({str(trial.data.get("versions", {}).get("gsbench", "?")) for trial in trials})
+    sizes = sorted({f"{size[0]}×{size[1]}" for trial in trials if (size := trial.record.resolution)})
+    steps = sorted({f"{trial.record.iterations:,}" for trial in trials})
+    versions = sorted({trial.record.versions.get("gsbench", "?") for trial in trials})
     return f"{' or '.join(steps)} iterations, {' or '.join(sizes)} px, gsbench {' or '.join(versions)}"
 
 
 def _mark(trial: TrialResult) -> str:
     """What tells a trial from every other: made again elsewhere, it has other seconds."""
-    hashes = trial.data.get("hashes", {})
-    told = [trial.config_hash, trial.seed, hashes, trial.data["seconds"], dict(trial.metrics)]
+    record = trial.record
+    told = [trial.config_hash, trial.seed, record.hashes, record.seconds, dict(trial.metrics)]
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
 

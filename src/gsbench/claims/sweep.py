@@ -1,4 +1,4 @@
-"""From a file of claims to trials and back: what can be tested here, which trials that takes, the verdicts so far.
+"""Checks of a file of claims: what can be tested here, the trials that it takes, and the verdicts so far.
 
 The trials are ordinary ones of one experiment, found again by their folders, so a check that was killed goes on where
 it stopped and ends with the same verdicts.
@@ -44,7 +44,7 @@ class Question:
 
     @property
     def why_not(self) -> str:
-        """Why it cannot be tested here at all; "" where it can."""
+        """The reason why the question cannot be tested here at all; "" where it can."""
         return "" if self.testable else self.claim.not_testable or "; ".join(self.missing)
 
 
@@ -67,12 +67,12 @@ class Check:
 
     @property
     def sharing(self) -> int:
-        """How many tests share the error rate."""
+        """The number of tests that share the error rate."""
         return max(1, sum(question.testable for question in self.questions))
 
     @cached_property
     def plan(self) -> dict[str, Any]:
-        """What is written down before trials run: the file's plan, and what of it can be tested here."""
+        """The declared plan: the file's, with what of it can be tested here; written down before trials run."""
         tested = {question.claim.id: list(question.scenes) for question in self.questions if question.testable}
         return self.file.plan() | {"tested": tested}
 
@@ -150,7 +150,7 @@ def prepare(file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequenc
 
 
 class Looked(Protocol[T]):
-    """What is looked at: questions, each with a claim, and what trials and verdicts they have at a number of seeds."""
+    """The subject of a look: questions, each with a claim, with their trials and verdicts at a number of seeds."""
 
     @property
     def questions(self) -> Sequence[Question]: ...

@@ -1,4 +1,4 @@
-"""From a densifier's named switches to the runs of an ablation and back: settings of each run, and what its files say.
+"""The way from a densifier's switches to the runs of an ablation and back: settings of each run, and its files.
 
 A switch is declared by the densifier's class (``SWITCHES``), by its YAML (``switches``), or on the command line. It is
 on as the densifier is configured; its ``off`` settings take that part out. Runs that differ only in what does nothing
@@ -16,10 +16,12 @@ from gsbench.analysis.quantities import metric_keys, metric_quantity
 from gsbench.analysis.report.build import AblationPart
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.analysis.shares import Run
 from gsbench.analysis.statistics import Interval
-from gsbench.claims.ablation import Ablation, Run, ablate, plan_runs
+from gsbench.claims.ablation import Ablation, ablate, plan_runs
 from gsbench.errors import InputError
-from gsbench.files import read_object, write_json
+from gsbench.files import write_json
+from gsbench.parsing import read_json
 from gsbench.runs.layout import ABLATION
 from gsbench.settings import Switch, checked
 from gsbench.words import closest, counted, signed
@@ -30,7 +32,7 @@ _ABSENT = object()  # unlike any value
 
 @dataclass(frozen=True)
 class Record:
-    """Which trials an ablation consists of: for each run, the folders of its trials within the experiment.
+    """The trials of an ablation: for each run, the folders of its trials within the experiment.
 
     ``trials`` of all runs are in one order of scenes and seeds.
     """
@@ -63,7 +65,7 @@ def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> d
 
 
 def choose_switches(found: Mapping[str, Switch], names: Sequence[str], densify: str) -> dict[str, Switch]:
-    """Those of ``names``, or all; raises InputError for a name that is none, and where there is none at all."""
+    """Choose the switches of ``names``, or all; raises InputError for an unknown name, and where there are none."""
     for name in names:
         if name not in found:
             raise InputError(
@@ -110,7 +112,7 @@ def words_of(run: Run, switches: Mapping[str, Switch]) -> dict[str, Any]:
 
 
 def write_record(home: Path, record: Record) -> None:
-    """Beside the experiment's trials, for the report."""
+    """Write the record beside the experiment's trials, for the report."""
     write_json(
         home / ABLATION,
         {
@@ -127,7 +129,7 @@ def read_record(home: Path) -> Record | None:
     """The record of the experiment in ``home``; None without one. Raises InputError for one that is damaged."""
     if not (home / ABLATION).exists():
         return None
-    content = read_object(home / ABLATION)
+    content = read_json(home / ABLATION)
     try:
         if content["version"] != VERSION:
             raise InputError(f"{home / ABLATION} is of version {content['version']}: update gsbench")
@@ -170,7 +172,7 @@ def table(found: Ablation, metric: str) -> list[str]:
 
 
 def ablation_part(home: Path) -> AblationPart | None:
-    """What the report shows of the ablation in ``home``; None without one."""
+    """The report's part on the ablation in ``home``; None without one."""
     record = read_record(home)
     if record is None:
         return None

@@ -30,7 +30,7 @@ Pair = tuple[TrialResult, TrialResult]  # baseline, arm
 
 
 class Planner(Protocol):
-    """What plans the looks at a claim: a file of claims, or a sweep."""
+    """Planner of the looks at a claim: a file of claims, or a sweep."""
 
     def design(self, claim: Claim, scenes: int, sharing: int) -> Design: ...
 
@@ -127,10 +127,8 @@ def judge_claim(
 def _is_equal(pair: Pair) -> bool:
     """Whether the two models are one and the same, as far as numbers tell."""
     one, other = pair
-    return bool(one.metrics) and all(
-        a == b
-        for a, b in ((one.metrics, other.metrics), (one.data.get("num_gaussians"), other.data.get("num_gaussians")))
-    )
+    same_count = one.record.num_gaussians == other.record.num_gaussians
+    return bool(one.metrics) and one.metrics == other.metrics and same_count
 
 
 def _differences(

@@ -48,7 +48,7 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
 
 
 def search_path(folders: Sequence[Path], overrides: Sequence[str]) -> list[str]:
-    """What ``--config-dir`` means to Hydra."""
+    """The entries of Hydra's search path that ``--config-dir`` stands for."""
     if not folders:
         return []
     if len(folders) > 1 or any(word.startswith("hydra.searchpath=") for word in overrides):
@@ -100,7 +100,11 @@ def _quoted(word: str) -> str:
     key, _, value = word.partition("=")
     if not KEY.fullmatch(key):
         return ""
-    quoted = f"{key}='{value}'" if '"' in value else f'{key}="{value}"'
+    function = re.fullmatch(r"(\w+)\((.*)\)", value)
+    if function and function.group(1) != "glob":
+        return ""  # in quotes it would be a text, not a list of values
+    start, value, end = (f"{key}=glob(", function.group(2), ")") if function else (f"{key}=", value, "")
+    quoted = f"{start}'{value}'{end}" if '"' in value else f'{start}"{value}"{end}'
     return f"; special characters need quotes of their own, which the shell must leave: {shlex.quote(quoted)}"
 
 
@@ -112,7 +116,7 @@ def check_single(words: Sequence[str], mend: str) -> None:
 
 
 def is_sweep(word: str) -> bool:
-    """Whether a word lists several values."""
+    """Return whether a word lists several values."""
     return bool(parse_word(word).is_sweep_override())
 
 
@@ -136,11 +140,24 @@ def check_makes_trials(override: Override) -> None:
         raise InputError(f"{override.input_line}: {key} makes no other trial, so choose one value of it")
 
 
-def options(group: str) -> list[str]:
-    """The YAML files of a group that come with gsbench; those of other programs by their folder, ``external/NAME``."""
-    folder = Path(conf_dir(), group)
-    own = sorted(path.stem for path in folder.glob("*.yaml"))
-    return own + sorted(f"{EXTERNAL_FOLDER}/{path.stem}" for path in Path(folder, EXTERNAL_FOLDER).glob("*.yaml"))
+def options(group: str, folders: Sequence[Path] = ()) -> list[str]:
+    """The YAML files of a group that come with gsbench; those of other programs by their folder, ``external/NAME``.
+
+    Those of a user's ``folders`` follow.
+    """
+    found: dict[str, None] = {}
+    for folder in (Path(conf_dir()), *folders):
+        found |= dict.fromkeys(sorted(path.stem for path in Path(folder, group).glob("*.yaml")))
+        others = Path(folder, group, EXTERNAL_FOLDER).glob("*.yaml")
+        found |= dict.fromkeys(sorted(f"{EXTERNAL_FOLDER}/{path.stem}" for path in others))
+    return list(found)
+
+
+def searched_folders(words: Sequence[str]) -> list[Path]:
+    """The folders of a user's own that ``hydra.searchpath`` among ``words`` names."""
+    values = [parse_word(word).value() for word in words if word.startswith("hydra.searchpath=")]
+    places = [str(place) for value in values if isinstance(value, list) for place in value]
+    return [Path(place.removeprefix("file://")) for place in places if not place.startswith("pkg://")]
 
 
 def _check_experiment_word(word: str, override: Override) -> None:

@@ -9,10 +9,10 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from hydra import initialize_config_dir
-from hydra._internal.hydra import Hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import HydraContext, RunMode
@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gsbench.config.command_words import GROUPS, check_single, options
 from gsbench.config.hydra_guard import GuardedLoader, typed_permissions
+from gsbench.config.hydra_internals import VERSION_BASE
 from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, number_job, words_of
 from gsbench.config.old_names import know_old_names
 from gsbench.config.schema import Config, check, check_values, plain, register_schemas
@@ -29,11 +30,15 @@ from gsbench.system.install import conf_dir
 from gsbench.system.own_modules import allow_modules
 from gsbench.words import closest
 
+if TYPE_CHECKING:
+    from hydra._internal.hydra import Hydra
+
 MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood
 PLUGIN_HINTS = {  # where a word may name a plug-in of Hydra's that is not installed
     "hydra/launcher": "; other launchers are packages of their own, which launch=serial, local or slurm do not need",
     "hydra/sweeper": "; other sweepers are packages of their own",
 }
+ASKED = re.compile(r"\$\{hydra:\s*([\w.]+)\s*\}")
 SEED = re.compile(r"seed=(\d+)")
 
 
@@ -56,7 +61,7 @@ def composing() -> Iterator[Hydra]:
     register_schemas()
     GlobalHydra.instance().clear()
     try:
-        with initialize_config_dir(str(conf_dir()), version_base="1.3", job_name="gsbench"):
+        with initialize_config_dir(str(conf_dir()), job_name="gsbench", **VERSION_BASE):
             hydra = GlobalHydra.instance().hydra
             assert hydra is not None
             know_old_names(hydra.config_loader)
@@ -67,7 +72,7 @@ def composing() -> Iterator[Hydra]:
 
 
 def compose_master(hydra: Hydra, words: Sequence[str], mode: RunMode = RunMode.RUN) -> DictConfig:
-    """What Hydra makes of ``words``, with its own settings in the node ``hydra``. Raises InputError, one line.
+    """Compose the configuration of ``words``, with Hydra's settings in the node ``hydra``; raises InputError, one line.
 
     From here on the modules are found that ``words`` allow: they are what somebody has typed.
     """
@@ -138,9 +143,10 @@ def ready_trial(config: DictConfig, overrides: Sequence[str], job: HydraJob | No
 
 
 def settle(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
-    """What ``config`` says of the trial, checked: a copy without Hydra's own node ``hydra``."""
+    """Check ``config`` and return the trial's part of it: a copy without Hydra's own node ``hydra``."""
     with explained(overrides):  # such as an interpolation that leads nowhere
         trial = _without_hydra(config)
+        _check_asked(trial)
         check(trial)
     return trial
 
@@ -159,6 +165,17 @@ def _without_hydra(config: DictConfig) -> DictConfig:
 def _asks_hydra(trial: DictConfig) -> bool:
     """Whether a value asks Hydra (``${hydra:…}``): such a value differs from trial to trial, or may."""
     return "${hydra" in repr(OmegaConf.to_container(trial, resolve=False))
+
+
+def _check_asked(trial: DictConfig) -> None:
+    """Refuse ``${hydra:…}`` for what is not known yet, which Hydra would make None or nothing in a text."""
+    hydra: Any = HydraConfig.instance().cfg
+    for path in ASKED.findall(repr(OmegaConf.to_container(trial, resolve=False))):
+        parent, _, key = f"hydra.{path}".rpartition(".")
+        node = OmegaConf.select(hydra, parent)
+        if OmegaConf.is_missing(node, key):
+            reason = "a job has it only in a sweep: add -m" if path.startswith("job.") else "it is known in a job only"
+            raise InputError(f"${{hydra:{path}}}: {reason}")
 
 
 def _resolved(config: DictConfig, overrides: Sequence[str], job: HydraJob | None) -> Composed:
@@ -234,20 +251,22 @@ def _chain(error: BaseException | None) -> list[str]:
 
 def _keys_below(parent: str, overrides: Sequence[str]) -> list[str]:
     """The settings below ``parent`` with the group choices among ``overrides``, as far as these compose."""
-    choices = [word for word in overrides if re.fullmatch(r"\w+=[\w/-]+", word) and word.split("=")[0] in GROUPS]
+    groups = (*GROUPS, "hydra/launcher", "hydra/sweeper")
+    choices = [word for word in overrides if re.fullmatch(r"[\w/]+=[\w/-]+", word) and word.split("=")[0] in groups]
     with composing() as hydra:
         try:
             config = hydra.compose_config(CONFIG_NAME, choices, RunMode.RUN)
         except Exception:  # noqa: BLE001 - the choices may be what is wrong
             config = hydra.compose_config(CONFIG_NAME, [], RunMode.RUN)
     node = OmegaConf.select(config, parent) if parent else config
-    return [str(key) for key in node if key != "hydra"] if isinstance(node, DictConfig) else []
+    hidden = "_target_" if parent.startswith("hydra") else "hydra"  # a plug-in is chosen by its name
+    return [str(key) for key in node if key != hidden] if isinstance(node, DictConfig) else []
 
 
-def options_text() -> str:
-    """The choices of every group."""
+def options_text(folders: Sequence[Path] = ()) -> str:
+    """The choices of every group: gsbench's own, and those in the user's ``folders``."""
     lines = ["Groups:"]
     for group in GROUPS:
         prefix = "+experiment" if group == "experiment" else group
-        lines.append(f"  {prefix + '=':<13}{', '.join(options(group))}")
+        lines.append(f"  {prefix + '=':<13}{', '.join(options(group, folders))}")
     return "\n".join(lines)

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.defaults_list import DefaultsList
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
@@ -25,6 +23,7 @@ from omegaconf.errors import GrammarParseError, OmegaConfBaseException
 from omegaconf.grammar_parser import parse
 
 from gsbench.config.command_words import parse_word
+from gsbench.config.hydra_internals import WHITELIST, Callbacks, ConfigLoaderImpl
 from gsbench.config.trust import (
     PACKAGE,
     PERMISSIONS,
@@ -42,8 +41,11 @@ from gsbench.config.trust import (
 from gsbench.errors import InputError
 from gsbench.system.own_modules import allow_modules
 
-SPECIAL_KEYS = ("_partial_", "_recursive_", "_convert_", "_args_")  # what Hydra reads beside _target_
-OF_CALLBACKS = SPECIAL_KEYS[1:]
+if TYPE_CHECKING:
+    from hydra._internal.defaults_list import DefaultsList
+
+OF_CALLBACKS = ("_recursive_", "_convert_", "_args_")
+SPECIAL_KEYS = (*OF_CALLBACKS, "_partial_", "_isolate_", "_execution_whitelist_")  # what Hydra reads beside _target_
 HYDRAS_CALLBACKS = tuple(
     f"hydra.experimental.callbacks.{name}" for name in ("LogJobReturnCallback", "PickleJobInfoCallback")
 )
@@ -52,13 +54,15 @@ MADE_BY_HYDRA = ("callbacks", "launcher", "sweeper")  # nodes below `hydra` of w
 # Resolvers that make texts and numbers. Those that make mappings of texts (oc.create, oc.decode, oc.dict) could make a
 # class's name after it was looked for; others, of plug-ins, could do anything.
 RESOLVERS = ("hydra", "now", "oc.env", "oc.select", "python_version")
+# Values of Hydra 1.4's own, whose resolvers join the words of a job; with arguments they would call other resolvers.
+HYDRAS_VALUES = ("${hydra_override_dirname:}", "${hydra_deprecated_override_dirname:}")
 PUBLIC_CLASS = re.compile(rf"{PACKAGE}\.\w+\.[A-Z]\w*")  # known by its name; importing it may take seconds
 NO_LOGGING = {"version": 1, "root": None, "disable_existing_loggers": False}
 SHELL_SETTINGS = ("setup", "python", "srun_args", "additional_parameters")  # of submitit's launchers: lines and options
 
 
 def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
-    """What the words of a command line allow: those of ``allow_targets=[…]``, the last if it stands there twice."""
+    """The names that a command line allows: those of ``allow_targets=[…]``, the last if it stands there twice."""
     found: tuple[str, ...] = ()
     for word in words:
         override = parse_word(word)
@@ -85,6 +89,11 @@ class GuardedLoader(ConfigLoaderImpl):
         self.__dict__.update(state)
         allow_modules(self.allowed, self.folder)
 
+    def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
+        """Compose a job of a sweep. Hydra 1.3 does so by `load_configuration`, 1.4 does not."""
+        check_search_path(sweep_overrides, self.allowed)
+        return self._guarded(super().load_sweep_config(master_config, sweep_overrides))
+
     def load_configuration(
         self,
         config_name: str | None,
@@ -94,7 +103,11 @@ class GuardedLoader(ConfigLoaderImpl):
         validate_sweep_overrides: bool = True,
     ) -> DictConfig:
         check_search_path(overrides, self.allowed)
-        config = super().load_configuration(config_name, overrides, run_mode, from_shell, validate_sweep_overrides)
+        return self._guarded(
+            super().load_configuration(config_name, overrides, run_mode, from_shell, validate_sweep_overrides)
+        )
+
+    def _guarded(self, config: DictConfig) -> DictConfig:
         check_composed(config, self.allowed)
         with read_write(config), open_dict(config):
             config[PERMISSIONS] = list(self.allowed)
@@ -116,13 +129,17 @@ class GuardedLoader(ConfigLoaderImpl):
 
 
 def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> None:
-    """Refuse a place of configurations that Hydra would import: ``hydra.searchpath=[pkg://package]``."""
+    """Refuse a place of configurations that Hydra would import: ``hydra.searchpath=[pkg://package]``.
+
+    Hydra 1.4 takes ``hydra[searchpath]`` and ``extend_list(pkg://package)`` as well.
+    """
     for word in words:
         override = parse_word(word)
-        if override.get_key_element().lstrip("+~") != "hydra.searchpath" or override.is_sweep_override():
+        key = override.get_key_element().lstrip("+~").replace("[", ".").replace("]", "")
+        if key != "hydra.searchpath" or override.is_sweep_override():
             continue
         value: Any = override.value()
-        for place in value if isinstance(value, list) else []:
+        for place in value if isinstance(value, list) else getattr(value, "values", ()):
             scheme, colon, path = str(place).partition("://")
             if not colon or scheme == "file":
                 continue
@@ -169,6 +186,13 @@ def load_callbacks(config: DictConfig) -> None:
             raise InputError(f"{group}.{TARGET}={target} is not {wanted}")
 
 
+def make_callbacks(config: DictConfig) -> Callbacks:
+    """Make the objects of ``hydra.callbacks``; Hydra itself refuses classes of others, from its version 1.4 on."""
+    allowed = [name for name in config[PERMISSIONS] if all(part.isidentifier() for part in name.split("."))]
+    with WHITELIST([*HYDRAS_CALLBACKS, *allowed, *(f"{name}.*" for name in allowed)]):
+        return Callbacks(config)
+
+
 def _entries(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str, Any]]:
     """Every key and value at any depth, lists included, with the keys that lead there."""
     if isinstance(values, dict | list):
@@ -179,6 +203,8 @@ def _entries(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[s
 
 def _check_interpolation(place: tuple[str, ...], key: str, value: str) -> None:
     where = ".".join((*place, key))
+    if place == ("hydra", "job") and value in HYDRAS_VALUES:
+        return
     if key.startswith("_") and key.endswith("_"):
         raise InputError(f"{where}={value}: write the name itself here, since ${{…}} may become another")
     try:

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from hydra.core.utils import run_job, setup_globals
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf.errors import OmegaConfBaseException
 
+from gsbench.config.hydra_guard import make_callbacks
+from gsbench.errors import InputError
 from gsbench.logs import show_details
 
 if TYPE_CHECKING:
@@ -17,6 +24,7 @@ if TYPE_CHECKING:
     from hydra.core.config_loader import ConfigLoader
 
 CONFIG_NAME = "config"  # conf/config.yaml
+OWN_FOLDER = "${runs}/.hydra"  # of Hydra's files, as conf/config.yaml has it
 Result = TypeVar("Result")
 
 
@@ -56,8 +64,6 @@ class HydraJob:
 
         Hydra would hand an error back in place of a result, and write a line of its own on looking at it.
         """
-        from hydra._internal.callbacks import Callbacks
-
         setup_globals()  # the resolvers, in a process where nothing was composed
         config = self.composed()
         show_details(config.hydra.verbose)
@@ -72,7 +78,7 @@ class HydraJob:
                 raise
             return value_of(ended[0])
 
-        callbacks = self.callbacks if self.callbacks is not None else Callbacks(config)
+        callbacks = self.callbacks if self.callbacks is not None else make_callbacks(config)
         folder, subfolder = (
             ("hydra.run.dir", None) if self.number is None else ("hydra.sweep.dir", "hydra.sweep.subdir")
         )
@@ -90,11 +96,58 @@ def number_job(config: DictConfig, number: int) -> None:
         config.hydra.job.id = str(number)
 
 
+def begin_sweep(master: DictConfig) -> None:
+    """Resolve every ``${now:…}`` of a sweep, so that its jobs, which take over what is resolved, have one time."""
+    for place, value in _texts(OmegaConf.to_container(master, resolve=False)):
+        if "${now:" in value:
+            with suppress(OmegaConfBaseException):  # such as a part that only a job knows
+                OmegaConf.select(master, place)
+
+
+def record_sweep(master: DictConfig) -> None:
+    """Write ``multirun.yaml``, Hydra's record of a sweep, to a ``hydra.sweep.dir`` that is not gsbench's own."""
+    raw: Any = OmegaConf.to_container(master.hydra.sweep, resolve=False)
+    if raw["dir"] != OWN_FOLDER:
+        folder = Path(str(master.hydra.sweep.dir))
+        folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(master, folder / "multirun.yaml")
+
+
+def _texts(values: Any, place: str = "") -> Iterator[tuple[str, str]]:
+    """The texts at any depth, each with the key that leads to it; keys of other forms than OmegaConf's are left out."""
+    if isinstance(values, str) and place:
+        yield place, values
+    elif isinstance(values, dict | list):
+        for key, value in values.items() if isinstance(values, dict) else enumerate(values):
+            if re.fullmatch(r"[\w/-]+", str(key)):
+                yield from _texts(value, f"{place}.{key}" if place else str(key))
+
+
 def start(config: DictConfig, mode: RunMode) -> DictConfig:
     """``config`` with the mode it runs in, which Hydra takes from a command line as well as from a file."""
     with read_write(config.hydra), open_dict(config.hydra):
         config.hydra.mode = mode
     return config
+
+
+def check_output_folder(master: DictConfig, multirun: bool) -> None:
+    """Refuse a folder for Hydra's own files that cannot be made, before any work; the default is in the runs folder.
+
+    One whose name only a job knows is left to that job.
+    """
+    key = "hydra.sweep.dir" if multirun else "hydra.run.dir"
+    try:
+        folder = Path(str(OmegaConf.select(master, key))).absolute()
+    except OmegaConfBaseException:
+        return
+    if folder == Path(OWN_FOLDER.replace("${runs}", str(master.runs))).absolute():
+        return  # the runs folder is looked at by who fills it, or finds all done there
+    try:
+        existing = next(place for place in (folder, *folder.parents) if place.exists())
+        with TemporaryDirectory(prefix=".probe-", dir=existing):
+            pass
+    except (OSError, ValueError) as error:
+        raise InputError(f"{key}={folder} cannot be made ({getattr(error, 'strerror', None) or error})") from None
 
 
 def words_of(overrides: Any) -> tuple[list[str], list[str]]:

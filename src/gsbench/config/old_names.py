@@ -8,11 +8,12 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.object_type import ObjectType
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import OmegaConf
+
+from gsbench.config.hydra_internals import SourcesRegistry
 
 log = logging.getLogger(__name__)
 

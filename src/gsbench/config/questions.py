@@ -1,4 +1,4 @@
-"""What Hydra itself is asked about the configuration: to show it, and what the Tab key may offer."""
+"""Questions to Hydra about the configuration: to show it, and to complete its words."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsbench.config.command_words import parse
 from gsbench.config.compose import composing
+from gsbench.config.hydra_internals import VERSION_BASE
 from gsbench.config.hydra_job import CONFIG_NAME
 from gsbench.config.schema import register_schemas
 from gsbench.errors import InputError
@@ -32,13 +33,13 @@ def answer(argv: Sequence[str]) -> None:
     saved = sys.argv
     sys.argv = ["gsbench", *argv]
     try:
-        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=CONFIG_NAME)(task)()
+        hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=CONFIG_NAME)(task)()
     finally:
         sys.argv = saved
 
 
 def has_part(config: DictConfig, key: str) -> bool:
-    """Whether there is a part ``key``, with dots, of a configuration."""
+    """Return whether a configuration has the part ``key``, with dots."""
     return OmegaConf.select(config, key) is not None
 
 

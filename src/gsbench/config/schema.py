@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Annotated, Any, Literal
@@ -25,7 +25,17 @@ from gsbench.eval.options import EvalConfig
 from gsbench.raster.options import RasterConfig
 from gsbench.runs.layout import IN_RUNS
 from gsbench.scene.options import SceneConfig
-from gsbench.settings import MISSING, Address, FolderName, PathName, TargetName, check_settings, checked, is_folder_name
+from gsbench.settings import (
+    MISSING,
+    Address,
+    FolderName,
+    PathName,
+    TargetName,
+    check_settings,
+    checked,
+    is_folder_name,
+    unknown_setting,
+)
 from gsbench.train.options import TrainConfig
 
 NO_DENSIFIER = "gsbench.densify.NoDensifier"
@@ -34,7 +44,7 @@ MAX_SEED = 2**63 - 1  # torch's generators take no larger one
 
 ExperimentName = Annotated[
     str,
-    Predicate(lambda name: is_folder_name(name) and name not in IN_RUNS),
+    Predicate(lambda name: is_folder_name(name) and name.casefold() not in IN_RUNS),
     doc(f"a plain folder name, and none of {', '.join(IN_RUNS)}"),
 ]
 DeviceName = Annotated[
@@ -46,7 +56,7 @@ DeviceName = Annotated[
 
 @dataclass
 class ComponentConfig:
-    """What ``init`` and ``densify`` have in common; their other keys are the options of the class."""
+    """Keys that ``init`` and ``densify`` have in common; their other keys are the options of the class."""
 
     name: FolderName
     _target_: TargetName
@@ -129,8 +139,11 @@ GROUP_SCHEMAS: dict[str, type] = {
     "launch": LaunchConfig,
 }
 COMPONENTS = ("init", "densify")  # groups whose keys are the options of a class
+# Settings of a schema, as they are given, and the name of their group: the same settings, allowed and converted.
+Check = Callable[[type, Mapping[str, Any], str], dict[str, Any]]
 
 
+@cache
 def register_schemas() -> None:
     """Make the schemas known to Hydra, the groups' under ``schema/`` so that they are not offered as options."""
     store = ConfigStore.instance()
@@ -159,17 +172,12 @@ def check_values(config: DictConfig) -> None:
     The classes that ``init`` and ``densify`` name check their own options when they are made. Raises InputError naming
     the key.
     """
-    for group, schema in GROUP_SCHEMAS.items():
-        _convert(config[group], schema, _settings_of(config, group), group)
-    groups = (*GROUP_SCHEMAS, *COMPONENTS)
-    _convert(config, Config, {str(key): _unwrapped(config[key]) for key in config if key not in groups}, "")
+    _check_groups(config, checked)
 
 
 def check(config: DictConfig) -> None:
-    """`check_values`, and the rules between values: whether a trial can be made of the configuration."""
-    check_values(config)
-    for group, schema in GROUP_SCHEMAS.items():
-        schema(**_settings_of(config, group))
+    """Do as `check_values`, and apply the rules between values: a trial can then be made of the configuration."""
+    _check_groups(config, _made)
     for group in COMPONENTS:
         values = _group(config, group)
         checked(ComponentConfig, {key: values.get(key) for key in ("name", "_target_")}, group)
@@ -180,6 +188,23 @@ def check(config: DictConfig) -> None:
     if is_external(config.densify):
         check_external(config)
     check_permissions(plain(config))
+
+
+def _check_groups(config: DictConfig, check_group: Check) -> None:
+    for group, schema in GROUP_SCHEMAS.items():
+        _convert(config[group], schema, _settings_of(config, group), group, check_group)
+    groups = (*GROUP_SCHEMAS, *COMPONENTS)
+    _convert(config, Config, {str(key): _unwrapped(config[key]) for key in config if key not in groups}, "", checked)
+
+
+def _made(schema: type, given: Mapping[str, Any], group: str) -> dict[str, Any]:
+    """The settings of an object of ``schema``, whose own checks convert them and hold them against each other."""
+    known = [entry.name for entry in dataclasses.fields(schema)]
+    for name in given:
+        if name not in known:
+            raise InputError(unknown_setting(f"{group}.{name}", name, known))
+    made = schema(**given)
+    return {name: getattr(made, name) for name in given}
 
 
 def require_values(values: Mapping[str, Any], group: str) -> None:
@@ -211,20 +236,21 @@ def _unwrapped(value: Any) -> Any:
     return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
 
 
-def _convert(node: DictConfig, schema: type, given: Mapping[str, Any], group: str) -> None:
+def _convert(node: DictConfig, schema: type, given: Mapping[str, Any], group: str, check_group: Check) -> None:
     """Hold ``given``, what ``node`` has, against the fields of ``schema``, and convert it in ``node``."""
     prefix = f"{group}." if group else ""
     for name in (entry.name for entry in dataclasses.fields(schema)):
         if name not in given and name != "_target_" and name not in GROUP_SCHEMAS and name not in COMPONENTS:
             raise InputError(f"{prefix}{name} has been taken away: give it a value instead")
-    for key, value in checked(schema, given, group).items():
-        value = list(value) if isinstance(value, tuple) else value
+    for key, value in check_group(schema, given, group).items():
+        if isinstance(value, tuple) and isinstance(given[key], list):  # OmegaConf 2.3 knows no tuples, 2.4 does
+            value = list(value)
         if repr(value) != repr(given[key]):
             node[key] = value
 
 
 def check_external(config: DictConfig) -> None:
-    """What another program can be asked for."""
+    """Check what another program is asked for; raises InputError for what it cannot give."""
     settings = _group(config, "densify")
     require_values(settings, "densify")
     if config.eval.at:

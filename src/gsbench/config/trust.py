@@ -1,4 +1,4 @@
-"""What a configuration may make run: gsbench's own classes, and what the one who types has allowed. Loads no Hydra.
+"""Permissions of a configuration: it may run gsbench's own classes, and what the command line allows. Loads no Hydra.
 
 Permission is what the command line says of ``allow_targets``; no file can give it. It names modules (``mine``),
 programs (``bash``) and environment variables (``PATH``). `docs/security.md` says what this protects from.
@@ -22,7 +22,7 @@ TARGET = "_target_"
 PERMISSIONS = "allow_targets"  # the setting that says what may run; it counts on the command line only
 PACKAGE = "gsbench"
 COMPONENTS = ("init", "densify", "raster")  # groups that name one class each; `eval.extra` names any number
-EXTERNAL = "gsbench.densify.External"  # another program trains
+EXTERNAL = ("gsbench.densify.External", "gsbench.external.settings.External")  # names of the class: another program
 SHELL, SBATCH = "bash", "sbatch"  # the permissions for lines of a shell, and for unusual options of Slurm
 # Variables that a configuration may set: they choose numbers of threads and devices. No list of the dangerous ones
 # could be complete: MPLBACKEND imports a module, NUMBA_CACHE_DIR unpickles, CUDA_INJECTION64_PATH and GCONV_PATH load
@@ -51,12 +51,12 @@ BARE = re.compile(r"[\w./+-]+")  # what needs no quotes in a list on the command
 
 
 def is_allowed(target: str, allowed: Sequence[str]) -> bool:
-    """Whether ``target``, the import path of a class, is one of ``allowed`` or lies below it."""
+    """Return whether ``target``, the import path of a class, is one of ``allowed`` or lies below it."""
     return any(target == prefix or target.startswith(prefix.rstrip(".") + ".") for prefix in allowed)
 
 
 def to_type(missing: Sequence[str], allowed: Sequence[str]) -> str:
-    """What is to be typed so that ``missing`` is allowed beside what is: ``allow_targets=[mine,bash]``."""
+    """The word to be typed so that ``missing`` is allowed beside what is: ``allow_targets=[mine,bash]``."""
     names = [name if BARE.fullmatch(name) else repr(name) for name in dict.fromkeys([*allowed, *missing])]
     return f"add allow_targets=[{','.join(names)}] to the command; no file can allow it"
 
@@ -76,7 +76,7 @@ def check_target(target: str | None, group: str, allowed: Sequence[str], own: Se
 
 
 def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
-    """What stands at the import path ``target``; a class must be of gsbench or of a module that the user ``allowed``.
+    """Load the class at the import path ``target``; it must be of gsbench or of a module that the user ``allowed``.
 
     A name that a trusted module merely imported (``mine.Popen``) is somebody else's code. Raises InputError.
     """
@@ -84,7 +84,7 @@ def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
     module, _, name = target.rpartition(".")
     try:
         found = getattr(importlib.import_module(module), name)
-    except Exception as error:  # importing a user's file runs it: it may raise anything
+    except (Exception, SystemExit) as error:  # importing a user's file runs it: it may raise anything
         reason = f"{type(error).__name__}: {error}{_beside(error)}"
         raise InputError(f"{group}.{TARGET}={target} cannot be imported ({reason})") from error
     home = f"{getattr(found, '__module__', None)}.{getattr(found, '__qualname__', name)}"
@@ -94,7 +94,7 @@ def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
     return found
 
 
-def _beside(error: Exception) -> str:
+def _beside(error: BaseException) -> str:
     """The mend where a module is missing that lies in another folder, or beside an allowed one without being so."""
     if not isinstance(error, ModuleNotFoundError):
         return ""
@@ -121,7 +121,7 @@ def check_permissions(values: Mapping[str, Any]) -> None:
 
 
 def targets_in(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Every ``_target_`` at any depth, lists included, with the keys that lead to the mapping that has it."""
+    """Yield every ``_target_`` at any depth, lists included, with the keys that lead to the mapping that has it."""
     if isinstance(values, Mapping):
         if values.get(TARGET) is not None:
             yield place, values[TARGET]
@@ -143,9 +143,8 @@ def homes_of(place: Sequence[str]) -> tuple[str, ...]:
 
 
 def is_external(densify: Mapping[str, Any]) -> bool:
-    """Whether these settings are another program's, by whatever path they name gsbench's class for it."""
-    package, _, rest = str(densify.get(TARGET)).partition(".")
-    return package == PACKAGE and rest.rpartition(".")[2] == EXTERNAL.rpartition(".")[2]
+    """Return whether these settings are another program's; by a path other than `EXTERNAL` nothing builds the class."""
+    return densify.get(TARGET) in EXTERNAL
 
 
 def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
@@ -167,7 +166,7 @@ def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
 
 
 def foreign_variables(variables: Mapping[str, Any], allowed: Sequence[str]) -> dict[str, Any]:
-    """Those of ``variables`` that a configuration may not set: neither free, nor allowed, nor as they are already."""
+    """List the ``variables`` that a configuration may not set: neither free, nor allowed, nor as they are already."""
     return {
         name: value
         for name, value in variables.items()

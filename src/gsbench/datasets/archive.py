@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import lzma
+import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -12,11 +15,12 @@ from typing import IO
 from gsbench.errors import InputError
 from gsbench.files import CHUNK, atomic
 
+MAX_NAME_BYTES = 220  # file systems end at 255 for each folder, and a file that is being written has a longer name
 RUN_GAP_BYTES = 1 << 18  # members closer than this are read in one request, the gap with them
 
 
 class DamagedError(Exception):
-    """What arrived is not what the archive's directory promises."""
+    """Error of a file that is not what the archive's directory promises."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,9 @@ def open_archive(file: IO[bytes], where: str) -> zipfile.ZipFile:
     """The zip archive in ``file``; `InputError`, one line naming ``where``, if it is none or has been cut."""
     try:
         return zipfile.ZipFile(file)
-    except (zipfile.BadZipFile, ValueError, EOFError) as error:
+    except Exception as error:  # zipfile raises many kinds where the directory is damaged or of a later version
+        if isinstance(error, OSError):
+            raise
         raise InputError(f"{where} is no whole zip archive ({error}): give another address with --mirror") from error
 
 
@@ -46,7 +52,7 @@ def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], whe
     """
     members: dict[str, Member] = {}
     for info in archive.infolist():
-        if info.is_dir() or not info.filename.startswith(f"{folder}/"):
+        if not info.filename.startswith(f"{folder}/") or info.is_dir():
             continue
         name = info.filename[len(folder) + 1 :]
         if not any(name.startswith(f"{part}/") for part in wanted) or "/." in f"/{name}":
@@ -54,6 +60,13 @@ def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], whe
         if "\\" in name or "//" in name or ":" in name or PurePosixPath(name).is_absolute():
             raise InputError(f"{where}: the member {info.filename!r} has an unsafe name: give another --mirror")
         members[name] = Member(name, info)
+    for name in members:
+        if len(name.encode("utf-8", "surrogatepass")) > MAX_NAME_BYTES or not name.isprintable():
+            raise InputError(
+                f"{where}: the member {name!r:.80} has a name that no file can have: give another --mirror"
+            )
+        if folder_of := next((str(above) for above in PurePosixPath(name).parents if str(above) in members), None):
+            raise InputError(f"{where}: {folder_of} is a file and a folder in one: give another --mirror")
     for part in wanted:
         if not any(name.startswith(f"{part}/") for name in members):
             raise InputError(f"{where} has no files below {folder}/{part}: it is not the archive that was expected")
@@ -61,7 +74,7 @@ def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], whe
 
 
 def holds(path: Path, size: int, crc: int) -> bool:
-    """Whether the file ``path`` is there with this size and CRC-32."""
+    """Return whether the file ``path`` is there with this size and CRC-32."""
     try:
         if path.stat().st_size != size:
             return False
@@ -109,8 +122,15 @@ def extract(archive: zipfile.ZipFile, member: Member, target: Path, advance: Cal
                 advance(len(piece))
             if written != member.bytes:
                 raise DamagedError(f"{written} bytes instead of {member.bytes}")
-    except (zipfile.BadZipFile, zlib.error, EOFError, DamagedError) as error:
+    except (zipfile.BadZipFile, zlib.error, struct.error, lzma.LZMAError, EOFError, ValueError, DamagedError) as error:
+        if isinstance(error, InputError):
+            raise
         advance(-written)
         raise DamagedError(str(error) or type(error).__name__) from error
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # else the directory names a place before the file's beginning
+            raise
+        advance(-written)
+        raise DamagedError(str(error)) from error
     except (NotImplementedError, RuntimeError) as error:
         raise InputError(f"{member.info.filename} is packed in a way that cannot be read here ({error})") from error

@@ -18,8 +18,9 @@ CATALOG_FILE = Path(__file__).with_name("catalog.yaml")
 
 @dataclass(frozen=True)
 class Archive:
-    """One zip file: its address, about how many bytes it has, the folder of each of its scenes in it, and checksums
-    where they are published: of the whole file under ``archive``, of a scene under its record's name."""
+    """One zip file: its address, its approximate size in bytes, the folder of each of its scenes in it, and checksums
+    where they are published: of the whole file under ``archive``, of a scene under its record's name.
+    """
 
     url: str
     bytes: int | None
@@ -62,7 +63,7 @@ def _dataset(name: str, entry: Mapping[str, Any]) -> Dataset:
 
 
 def data_dir() -> Path:
-    """Where the scene files look for public data: ``$GSBENCH_DATA``, else ``data`` here."""
+    """The folder in which the scene files look for public data: ``$GSBENCH_DATA``, else ``data`` here."""
     return Path(os.environ.get(DATA_VARIABLE, "data")).expanduser()
 
 

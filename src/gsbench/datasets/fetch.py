@@ -16,7 +16,7 @@ from gsbench.datasets.plan import SceneFiles, ScenePlan, check_unchanged, descri
 from gsbench.datasets.records import RECORDS, FileRecord, SceneRecord, add_record, read_records, today
 from gsbench.datasets.remote import FetchError, Patience, RangesRefusedError, RemoteFile, download, size_of
 from gsbench.errors import InputError
-from gsbench.files import atomic, file_sha256
+from gsbench.files import atomic, file_sha256, require_regular
 from gsbench.logs import Progress
 from gsbench.words import readable_bytes, some_of
 
@@ -54,7 +54,7 @@ class Fetcher:
         return archive.url if self.mirror is None else f"{self.mirror.rstrip('/')}/{archive.name}"
 
     def plan(self, archive: Archive, scenes: Sequence[SceneFiles]) -> list[ScenePlan]:
-        """What would be fetched; asks for the archive's directory only. Raises `RangesRefusedError` where it cannot."""
+        """Plan a fetch; reads only the archive's directory. Raises `RangesRefusedError` where it cannot be read."""
         with self._opened(archive, may_fetch_whole=False) as (opened, _):
             return [self._plan(archive, opened, files) for files in scenes]
 
@@ -73,6 +73,7 @@ class Fetcher:
     ) -> Iterator[tuple[zipfile.ZipFile, RemoteFile | None]]:
         where = self.location_of(archive)
         if "://" not in where:
+            require_regular(Path(where).expanduser())
             try:
                 file = Path(where).expanduser().open("rb")
             except OSError as error:

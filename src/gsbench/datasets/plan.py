@@ -1,4 +1,4 @@
-"""What a scene wants of its archive, and what of that is here already."""
+"""Files that a scene needs of its archive, and those of them that are here already."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SCENE_PATH = re.compile(r"\$\{oc\.env:GSBENCH_DATA,data\}/(?P<folder>.+)")
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """What conf/scene/<scene>.yaml wants: its folder below the data folder, and the folders in it."""
+    """Files that conf/scene/<scene>.yaml asks for: its folder below the data folder, and the folders in it."""
 
     scene: str
     folder: str
@@ -33,7 +33,7 @@ class SceneFiles:
 
 
 def wanted_files(scene: str, images: str | None = None) -> SceneFiles:
-    """What a scene file wants; ``images`` names another image folder than it does."""
+    """The files that a scene file asks for; ``images`` names another image folder than it does."""
     settings = yaml.safe_load((conf_dir() / "scene" / f"{scene}.yaml").read_text(encoding="utf-8"))
     match = SCENE_PATH.fullmatch(settings["path"])
     if match is None:
@@ -61,7 +61,7 @@ class ScenePlan:
 
     @property
     def fetched_bytes(self) -> int:
-        """What this fetch and those that were stopped bring, in bytes."""
+        """The bytes that this fetch and those that were stopped bring."""
         return self.missing_bytes + sum(member.bytes for member in self.staged)
 
 
@@ -98,6 +98,6 @@ def plan_scene(files: SceneFiles, members: Sequence[Member], target: Path, stagi
 
 
 def describe(data: Path, files: SceneFiles, record: SceneRecord) -> str:
-    """What a record holds, in words."""
+    """Describe in words what a record holds."""
     size = f"{counted(len(record.files), 'file')}, {readable_bytes(record.bytes)}"
     return f"{size} in {data / files.folder} ({', '.join(files.parts)})"

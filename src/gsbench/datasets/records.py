@@ -1,4 +1,4 @@
-"""What was fetched into a data folder, with checksums: recorded at the first fetch, compared at every later one.
+"""Records of what was fetched into a data folder, with checksums: written at the first fetch, compared at later ones.
 
 ``<data>/fetched.json`` holds for every scene and set of folders the size, CRC-32 and sha256 of each file. Nobody
 publishes checksums of these archives' members, so the first fetch decides what later ones must be equal to.
@@ -32,7 +32,7 @@ class FileRecord:
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """What a fetch of a scene brought: from where, on which day, and its files by name below the scene's folder."""
+    """Record of a fetch of a scene: its source, its day, and its files by name below the scene's folder."""
 
     url: str
     date: str
@@ -55,7 +55,7 @@ def record_key(scene: str, parts: tuple[str, ...]) -> str:
 
 
 def read_records(data: Path) -> dict[str, SceneRecord]:
-    """All records of a data folder, by `record_key`; none where there are none. `InputError` if the file is damaged."""
+    """Read the records of a data folder, by `record_key`; {} without any. `InputError` if the file is damaged."""
     file = data / RECORDS
     try:
         content = json.loads(file.read_text(encoding="utf-8"))

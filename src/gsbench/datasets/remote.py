@@ -35,16 +35,16 @@ PROGRESS_BYTES = 1 << 12  # a failure after fewer bytes than these counts as one
 
 
 class FetchError(GsbenchError):
-    """The network or the server let us down (exit code 1); the same command goes on from here."""
+    """Error of the network or the server (exit code 1); the same command goes on from here."""
 
 
 class RangesRefusedError(Exception):
-    """The server sends the whole file only."""
+    """Error of a server that sends whole files only."""
 
 
 @dataclass(frozen=True)
 class Patience:
-    """How long to wait for a server: seconds without a byte, and failures in a row (each waits twice as long)."""
+    """Limits of waiting for a server: seconds without a byte, and failures in a row (each waits twice as long)."""
 
     timeout: float = 30.0
     tries: int = 5
@@ -93,7 +93,7 @@ class RemoteFile(io.RawIOBase):
         return self._position
 
     def expect(self, end: int) -> None:
-        """The coming reads go on up to the byte ``end``."""
+        """Say that the coming reads go on up to the byte ``end``."""
         self._expected_end = min(end, self.size)
 
     def read(self, size: int = -1) -> bytes:
@@ -195,7 +195,7 @@ def download(url: str, target: Path, patience: Patience, advance: Callable[[int,
 
 
 def size_of(url: str, patience: Patience) -> int | None:
-    """How many bytes the file at ``url`` has, where the server says so."""
+    """The size of the file at ``url`` in bytes, where the server says so."""
 
     def once() -> int | None:
         with _open(url, patience.timeout, {}) as response:

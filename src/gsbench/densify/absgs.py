@@ -53,7 +53,7 @@ class AbsGS(ADC):
         return self.statistics["absolute_sum"] / self.statistics["visible_count"].clamp_min(1)
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """Those of ADC, and the ceiling before the opacity reset."""
+        """The rules of ADC, and the ceiling before the opacity reset."""
         rules, step = super().rules(refinement), refinement.step
         if step < self.stop and step % self.ceiling_interval == 0:
             rules.insert(len(rules) - (self.reset_opacity in rules), self.lower_opacity)
@@ -64,7 +64,7 @@ class AbsGS(ADC):
         return torch.where(large, self.reaches(self.mean_absolute_gradient(), self.split_threshold), over), large
 
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
-        """Those farthest above their own threshold."""
+        """Choose the candidates farthest above their own threshold."""
         _, large = self.candidates(refinement)
         signed = self.mean_gradient() / self.gradient_threshold
         excess = torch.where(large, self.mean_absolute_gradient() / self.split_threshold, signed)  # [N]

@@ -24,7 +24,7 @@ LOCKED_ROUNDS = 5  # after an opacity reset the governor does not raise the cull
 
 
 class Grown(NamedTuple):
-    """What a Gaussian becomes in a round, before pruning."""
+    """Outcomes of a Gaussian in a round, before pruning."""
 
     number: Tensor  # [N]
     log_scales: Tensor  # [N, 3]
@@ -116,14 +116,14 @@ class ADC(Budgeted):
         return mean >= limit if self.threshold_inclusive else mean > limit
 
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
-        """Those of the ``candidates`` [N] that the budget admits, and how many it refuses: the largest mean gradients.
+        """Choose the ``candidates`` [N] of the largest mean gradients that the budget admits, and count the refused.
 
         Each adds ``gain`` Gaussians.
         """
         return admit(candidates, self.mean_gradient(), gain, self.allowance(refinement))
 
     def grown(self, refinement: Refinement) -> Grown:
-        """What growth would make of each Gaussian."""
+        """The outcome of growth for each Gaussian."""
         values = refinement.gaussians.values
         over, large = self.candidates(refinement)
         logits = torch.where(over, revised_logits(values.opacity_logits), values.opacity_logits)
@@ -170,7 +170,7 @@ class ADC(Budgeted):
         return huge
 
     def may_cull(self, step: int) -> bool:
-        """Not in the first rounds after an opacity reset."""
+        """Return whether pruning is due: not in the first rounds after an opacity reset."""
         since_reset = step % self.opacity_reset_interval
         return step <= self.opacity_reset_interval or not 0 < since_reset <= LOCKED_ROUNDS * self.interval
 

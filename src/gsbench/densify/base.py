@@ -25,7 +25,7 @@ NEVER = 10**9  # an iteration, or an interval, beyond any training
 
 @dataclass(frozen=True)
 class DensifyContext:
-    """What a densifier knows of the training that it serves."""
+    """Facts of a training that its densifier is given."""
 
     extent: float  # world units: 3DGS's cameras_extent
     white_background: bool = False
@@ -113,7 +113,7 @@ class Densifier:
 
     @property
     def most_gaussians(self) -> int | None:
-        """How many Gaussians there may be at any time, by ``max_gaussians`` where a class has that; None: no limit."""
+        """The limit on the number of Gaussians, ``max_gaussians`` where a class has that; None: no limit."""
         return getattr(self, "max_gaussians", None)
 
     def prepare(self, gaussians: Gaussians) -> Gaussians:
@@ -134,7 +134,7 @@ class Densifier:
         """Gather statistics of iteration ``step`` (1, 2, …) after its backward pass."""
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """What is due at ``refinement.step``, in the order in which it is done; usually nothing."""
+        """The rules that are due at ``refinement.step``, in the order in which they are applied; usually none."""
         return []
 
     @torch.no_grad()
@@ -150,7 +150,7 @@ class Densifier:
         return refinement.event
 
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
-        """Called after the optimiser step of iteration ``step``."""
+        """React to the optimiser step of iteration ``step``, which has just been made."""
 
     def edit(
         self,

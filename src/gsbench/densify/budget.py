@@ -1,4 +1,4 @@
-"""How many Gaussians an arm may have, shared by all densifiers."""
+"""Limits on the number of Gaussians of an arm, shared by all densifiers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def limit_at(step: int, start: int, stop: int, initial: int, max_gaussians: int 
 
 
 def allowance(num_gaussians: int, max_gaussians: int | None, cap: CapKind) -> int | None:
-    """How many Gaussians a growth step may add; None for no limit.
+    """The number of Gaussians that a growth step may add; None for no limit.
 
     ``soft``: no limit up to ``max_gaussians``, nothing beyond it, so one step may overshoot (the paper's cap, whose
     counts end at 3.41 to 3.57 M for 3.4 M). ``hard`` and ``curve``: never beyond it. ``freeze`` and ``governor`` set no

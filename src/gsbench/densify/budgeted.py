@@ -55,26 +55,26 @@ class Budgeted(Densifier):
         super().begin(gaussians, context)
 
     def due(self, step: int) -> bool:
-        """Whether a round of growth and pruning is due."""
+        """Return whether a round of growth and pruning is due."""
         return self.start < step < self.stop and step % self.interval == 0
 
     def allowance(self, refinement: Refinement) -> int | None:
-        """How many Gaussians may be added now; None for no limit."""
+        """The number of Gaussians that may be added now; None for no limit."""
         initial = self.lineage.initial_count
         limit = limit_at(refinement.step, self.start, self.stop, initial, self.max_gaussians, self.cap)
         return allowance(len(refinement.gaussians), limit, self.cap)
 
     def forecast(self, refinement: Refinement) -> int:
-        """How many Gaussians there would be after a round with the present ``strictness`` and ``cull``."""
+        """The number of Gaussians that there would be after a round with the present ``strictness`` and ``cull``."""
         raise NotImplementedError
 
     def frozen(self, refinement: Refinement) -> bool:
-        """Whether this round is left out because the count is beyond the limit (``cap=freeze``)."""
+        """Return whether this round is left out because the count is beyond the limit (``cap=freeze``)."""
         over = self.max_gaussians is not None and len(refinement.gaussians) > self.max_gaussians
         return self.cap == "freeze" and over
 
     def governing(self) -> list[Rule]:
-        """What a round starts with: `govern`, where that is the cap."""
+        """The rules that a round starts with: `govern`, where that is the cap."""
         return [self.govern] if self.cap == "governor" else []
 
     def stand_still(self, refinement: Refinement) -> None:
@@ -119,7 +119,7 @@ class Budgeted(Densifier):
         return count + round((self.max_gaussians - count) * (1 - (left / before) ** 2))
 
     def may_cull(self, step: int) -> bool:
-        """Whether opacities mean something now; not soon after they were reset."""
+        """Return whether opacities mean something now; not soon after they were reset."""
         return True
 
     def _forecast_at(self, refinement: Refinement, strictness: float = 1.0, cull: float = 1.0) -> int:

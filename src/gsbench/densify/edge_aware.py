@@ -63,7 +63,7 @@ class EdgeAware(LongAxis):
             super().observe(step, render)
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """Those of ADC, and the prunings around them."""
+        """The rules of ADC, and the prunings around them."""
         step, rules = refinement.step, super().rules(refinement)
         if self.prune in rules and step >= self.stop - self.interval:
             rules.remove(self.prune)
@@ -74,12 +74,12 @@ class EdgeAware(LongAxis):
         return rules
 
     def rounds_after_reset(self, step: int) -> float:
-        """How many rounds ago opacities were reset (or training began), while that counts; else infinity."""
+        """The number of rounds since opacities were reset (or training began), while that counts; else infinity."""
         counts = step < RESETS * self.opacity_reset_interval
         return step % self.opacity_reset_interval / self.interval if counts else math.inf
 
     def closing(self, step: int) -> bool:
-        """Whether ``step`` is in the closing rounds."""
+        """Return whether ``step`` is in the closing rounds."""
         return step > self.stop - CLOSING_ROUNDS * self.interval
 
     def allowance(self, refinement: Refinement) -> int | None:
@@ -109,7 +109,7 @@ class EdgeAware(LongAxis):
         return chosen, count - int(chosen.sum())
 
     def scores(self, gaussians: Gaussians, step: int, rng: torch.Generator) -> Tensor:
-        """By which candidates are drawn, [N]."""
+        """The scores by which candidates are drawn, [N]."""
         if self.closing(step):
             return self.mean_gradient()
         views = self.context.training_views
@@ -117,7 +117,7 @@ class EdgeAware(LongAxis):
         return edge_scores(views, draw_views(views, count, rng), gaussians, step, by_mean)
 
     def huge(self, step: int, log_scales: Tensor) -> Tensor:
-        """Nobody, [N]: these authors do not prune by size."""
+        """A mask [N] without any Gaussian: these authors do not prune by size."""
         return torch.zeros_like(log_scales[:, 0], dtype=torch.bool)
 
     def prune_early(self, refinement: Refinement) -> None:

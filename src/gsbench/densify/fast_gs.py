@@ -45,7 +45,7 @@ class FastGS(AbsGS):
     final_score: Fraction = 0.9
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """Those of ADC between the score and the ceiling; after the window, the final prunings."""
+        """The rules of ADC between the score and the ceiling; after the window, the final prunings."""
         step = refinement.step
         rules = [rule for rule in super().rules(refinement) if rule != self.lower_opacity]
         if self.grow_by_gradient in rules:
@@ -56,7 +56,7 @@ class FastGS(AbsGS):
         return rules
 
     def score(self, refinement: Refinement) -> None:
-        """The rule that counts the bad pixels of everyone."""
+        """The rule that counts the bad pixels of every Gaussian."""
         values, views = refinement.gaussians.values, self.context.training_views
         chosen = draw_views(views, self.score_views, refinement.rng)
         total, weighted = torch.zeros_like(values.opacity_logits), torch.zeros_like(values.opacity_logits)
@@ -68,7 +68,7 @@ class FastGS(AbsGS):
         self.statistics["score"] = to_unit_range(weighted).float()
 
     def bad_pixels(self, index: int, gaussians: Gaussians, step: int) -> tuple[Tensor, Tensor]:
-        """How many bad pixels of a view each Gaussian is blended into, [N], and the loss of the view."""
+        """Count the bad pixels of a view that each Gaussian is blended into, [N]; also returns the loss of the view."""
         views = self.context.training_views
         render = views.render(index, gaussians, step)
         error = (render.image - views.image(index).to(render.image) / 255).abs().mean(-1)  # [H, W]

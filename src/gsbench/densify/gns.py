@@ -72,11 +72,11 @@ class GNS(EdgeAware):
         return rounds * self.interval
 
     def pressing(self, step: int) -> bool:
-        """Whether selection is under way at ``step``."""
+        """Return whether selection is under way at ``step``."""
         return self.met_at is None and self.stop <= step <= self.stop + self.pressure_time
 
     def soft(self, step: int) -> bool:
-        """Whether the pressure of ``step`` spares the opaque."""
+        """Return whether the pressure of ``step`` spares the opaque."""
         return step < self.stop + SOFT_SHARE * self.pressure_time
 
     def observe(self, step: int, render: RenderOutput) -> None:
@@ -107,7 +107,7 @@ class GNS(EdgeAware):
                 self.weight *= STRONGER
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """Those of Improved-GS in the window, then the selection."""
+        """The rules of Improved-GS in the window, then the selection."""
         step, count = refinement.step, len(refinement.gaussians)
         if self.met_at is not None and step == self.met_at + round(SOFT_SHARE * self.pressure_time):
             return [self.restore_rate]
@@ -139,7 +139,7 @@ class GNS(EdgeAware):
         refinement.gaussians.set_rate("opacity_logits", RATE_FACTOR * refinement.gaussians.rates.opacity)
 
     def restore_rate(self, refinement: Refinement) -> None:
-        """The end of that while."""
+        """Set the usual learning rate of opacities again."""
         refinement.gaussians.set_rate("opacity_logits", refinement.gaussians.rates.opacity)
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Where every Gaussian came from."""
+"""Lineage of Gaussians: the origin of every one."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Lineage:
         self.ids = living
 
     def causes_of_living(self) -> dict[str, int]:
-        """How many of the living Gaussians each cause made."""
+        """Count the living Gaussians of each cause."""
         counts = torch.bincount(torch.cat(self._causes)[self.ids].long(), minlength=len(Cause))
         return {cause.key: int(counts[cause]) for cause in Cause}
 

@@ -66,7 +66,7 @@ class MCMC(Budgeted):
         return int((1 + self.growth / self.strictness) * len(refinement.gaussians))
 
     def may_cull(self, step: int) -> bool:
-        """Never: the dead are not pruned but moved."""
+        """Return False: dead Gaussians are not pruned but moved."""
         return False
 
     @torch.no_grad()

@@ -152,8 +152,9 @@ class MRNF(Budgeted):
 
 
 def bounds(means: Tensor) -> tuple[Tensor, float, float]:
-    """Of the box between the quantiles `BOUNDS` of ``means`` [N, 3]: its centre [3], half its longest edge, and the
-    edge of middle length (world units)."""
+    """The box between the quantiles `BOUNDS` of ``means`` [N, 3]: its centre [3], half its longest edge, and the edge
+    of middle length (world units).
+    """
     ordered = means.sort(dim=0).values
     low, high = (ordered[int(share * (len(means) - 1))] for share in BOUNDS)
     edges = (high - low).sort().values

@@ -1,4 +1,4 @@
-"""ResGS: who is to grow stays, fainter, and gets a smaller child; thresholds follow a level."""
+"""ResGS: a Gaussian that grows stays, fainter, and gets a smaller child; thresholds follow a level."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class ResGS(ADC):
         return self.start + round(fraction * (self.stop - self.start) / self.interval) * self.interval
 
     def warming_up(self, step: int) -> bool:
-        """Whether a phase has ended so shortly before that nothing is gathered yet."""
+        """Return whether a phase ended so shortly before that nothing is gathered yet."""
         length = self.iteration_at(self.warm_up) - self.start
         return any(0 < step - self.iteration_at(end) < length for end in self.phase_ends)
 
@@ -129,7 +129,7 @@ class ResGS(ADC):
         gaussians.overwrite("opacity_logits", fainter, where=parents)
 
     def huge(self, step: int, log_scales: Tensor) -> Tensor:
-        """Nobody, [N]: these authors do not prune by size."""
+        """A mask [N] without any Gaussian: these authors do not prune by size."""
         return torch.zeros_like(log_scales[:, 0], dtype=torch.bool)
 
     def reset_statistics(self, refinement: Refinement) -> None:

@@ -30,8 +30,9 @@ class TrainingViews(Protocol):
         ...
 
     def dissimilarity(self, index: int, image: Tensor) -> Tensor:
-        """At each pixel of a rendered ``image`` [H, W, 3] of a view max(0, 1 - SSIM), SSIM's mean over channels: [H,
-        W]."""
+        """The dissimilarity [H, W] of a rendered ``image`` [H, W, 3] and its view: max(0, 1 - SSIM), SSIM's mean over
+        channels.
+        """
         ...
 
     def loss(self, index: int, image: Tensor) -> Tensor:
@@ -63,7 +64,7 @@ def blended_sums(
 
 
 def edge_map(image: Tensor) -> Tensor:
-    """How strong edges are in ``image`` [H, W, 3] uint8: [H, W] float32, from 0 to 1 (or all 0).
+    """The strength of edges in ``image`` [H, W, 3] uint8: [H, W] float32, from 0 to 1 (or all 0).
 
     Eight times the luminance of a pixel minus that of its eight neighbours, in 8 bits and clipped to them, then shifted
     and scaled to [0, 1]: what Pillow calls FIND_EDGES, but for the outermost pixels, which are 0 here.
@@ -108,8 +109,9 @@ def edge_scores(
     step: int,
     normalize: Callable[[Tensor], Tensor],
 ) -> Tensor:
-    """How much of the photographs' edges each Gaussian covers, [N]: the mean over the ``chosen`` views of sum over
-    pixels of (edge strength) alpha T, each view's after ``normalize``."""
+    """The share of the photographs' edges that each Gaussian covers, [N]: the mean over the ``chosen`` views of sum
+    over pixels of (edge strength) alpha T, each view's after ``normalize``.
+    """
     total = torch.zeros_like(gaussians.opacity_logits)
     for index in chosen:
         edges = edge_map(views.image(index)).to(total.dtype).unsqueeze(-1)  # [H, W, 1]

@@ -49,14 +49,14 @@ class Taming(ADC):
     weight_edge: NonNegativeFloat = 50.0
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """Those of ADC, and before they grow the scores."""
+        """The rules of ADC, and before growth the scores."""
         rules = super().rules(refinement)
         if self.grow_by_gradient in rules:
             rules.insert(rules.index(self.grow_by_gradient), self.score)
         return rules
 
     def score(self, refinement: Refinement) -> None:
-        """The rule that gives everyone a score, which follows what the round does."""
+        """The rule that gives every Gaussian a score, which follows what the round does."""
         values, rng = refinement.gaussians.values, refinement.rng
         views, total = self.context.training_views, torch.zeros_like(values.opacity_logits)
         for index in draw_views(views, self.score_views, rng):
@@ -64,7 +64,7 @@ class Taming(ADC):
         self.statistics["score"] = (total + LEAST_SCORE).float()
 
     def score_in(self, index: int, gaussians: Gaussians, step: int) -> Tensor:
-        """What one view adds to the score, [N]."""
+        """The score [N] that one view adds."""
         views = self.context.training_views
         photograph = views.image(index)
         image = views.render(index, gaussians, step).image

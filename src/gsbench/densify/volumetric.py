@@ -79,7 +79,7 @@ class Volumetric(ADC):
             )
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """Those of ADC, and the split by volume at the place that ``volume_order`` says."""
+        """The rules of ADC, and the split by volume at the place that ``volume_order`` says."""
         rules = super().rules(refinement)
         if self.volume_due(refinement.step):
             follower = {
@@ -92,7 +92,7 @@ class Volumetric(ADC):
         return rules
 
     def volume_due(self, step: int) -> bool:
-        """Whether a round at ``step`` splits by volume."""
+        """Return whether a round at ``step`` splits by volume."""
         start = self.start if self.volume_start is None else self.volume_start
         stop = self.stop if self.volume_stop is None else self.volume_stop
         return start < step < stop and step % (self.volume_interval or self.interval) == 0
@@ -103,7 +103,7 @@ class Volumetric(ADC):
 
     @property
     def volume_gain(self) -> int:
-        """How many Gaussians a split by volume adds."""
+        """The number of Gaussians that a split by volume adds."""
         return self.volume_children - (0 if self.keep_parent else 1)
 
     def voluminous(self, log_scales: Tensor) -> Tensor:
@@ -116,7 +116,7 @@ class Volumetric(ADC):
         return (volumes > threshold) & (children <= threshold)
 
     def grown(self, refinement: Refinement) -> Grown:
-        """As if all parents were replaced."""
+        """The outcome of growth if all parents were replaced."""
         grown = super().grown(refinement)
         if not self.volume_due(refinement.step):
             return grown

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -78,18 +79,31 @@ class Evaluator:
         render holds a non-finite value.
         """
         image, target = self._prepare(render), self._prepare(ground_truth)  # [H, W, 3]
+        if border := self.protocol.crop:
+            image, target = (x[border:-border, border:-border] for x in (image, target))
         values = {}
         for key, metric in self._metrics.items():
             if key in self.unavailable:
                 continue
             try:
-                value = float(metric.measure(image, target))
+                value = self._measured(key, metric, image, target)
                 if not math.isfinite(value):
                     raise UnavailableError(f"the value of a view is {value}")
                 values[key] = value
             except UnavailableError as error:
                 self._leave_out(key, error)
         return values
+
+    def _measured(self, key: str, metric: Metric, image: Tensor, target: Tensor) -> float:
+        try:
+            value: Any = metric.measure(image, target)
+        except SystemExit as error:
+            raise InputError(f"eval.extra.{key} ended the process (exit code {error.code}): it must return") from error
+        if isinstance(value, Tensor | np.ndarray | np.generic) and math.prod(value.shape) == 1:
+            value = value.item()
+        if isinstance(value, bool) or not isinstance(value, Real):
+            raise InputError(f"eval.extra.{key} must return a number for each view, got {value!r:.80}")
+        return float(value)
 
     def _leave_out(self, key: str, error: UnavailableError) -> None:
         self.unavailable[key] = " ".join(str(error).split())

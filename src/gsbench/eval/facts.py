@@ -1,4 +1,4 @@
-"""What is known of every metric before it is computed, as one table that everything asks. Loads no torch.
+"""Facts of every metric that are known before it is computed, in one table. Loads no torch.
 
 A metric of your own needs no entry here: ``eval.extra.NAME._target_=mine.MyMetric`` (docs/metric.md).
 """
@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from gsbench.errors import InputError
+from gsbench.runs.trial_record import MetricRecord
 
 MORE = "eval.more"  # lists metrics that are computed only if named there
 GEOMETRY, FLICKER = "eval.geometry", "eval.flicker"  # ask for what is measured of a model
@@ -150,12 +151,12 @@ def known_keys() -> tuple[str, ...]:
 
 
 def lpips_variants() -> tuple[str, ...]:
-    """What ``eval.lpips`` may list."""
+    """The values that ``eval.lpips`` may list."""
     return tuple(facts.key.removeprefix(LPIPS) for facts in METRICS if facts.key.startswith(LPIPS))
 
 
 def further_keys() -> tuple[str, ...]:
-    """What ``eval.more`` may list."""
+    """The values that ``eval.more`` may list."""
     return tuple(facts.key for facts in METRICS if facts.setting == MORE)
 
 
@@ -182,24 +183,16 @@ def facts_of(key: str, metric: object) -> MetricFacts:
     return MetricFacts(key, label, direction, decimals, unit, worthwhile)
 
 
-def to_record(facts: MetricFacts) -> dict[str, Any]:
-    """What results keep of a user's metric, so that tables need not import its class."""
-    kept = ("label", "direction", "decimals", "unit", "worthwhile")
-    return {name: value for name, value in asdict(facts).items() if name in kept}
+def to_record(facts: MetricFacts) -> MetricRecord:
+    """The facts that results keep of a user's metric, so that tables need not import its class."""
+    return MetricRecord(**{entry.name: getattr(facts, entry.name) for entry in fields(MetricRecord)})
 
 
-def from_record(key: str, record: object) -> MetricFacts:
+def from_record(key: str, record: MetricRecord | None) -> MetricFacts:
     """The facts of a user's metric from its results; without a record, its key is all that is known."""
-    if not isinstance(record, Mapping):
+    if record is None:
         return MetricFacts(key, key, 0, DECIMALS)
-    return MetricFacts(
-        key,
-        str(record.get("label", key)),
-        int(record.get("direction", 0)),
-        int(record.get("decimals", DECIMALS)),
-        str(record.get("unit", "")),
-        record.get("worthwhile"),
-    )
+    return MetricFacts(key, record.label, record.direction, record.decimals, record.unit, record.worthwhile)
 
 
 def _is_count(value: object) -> bool:

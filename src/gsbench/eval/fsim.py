@@ -55,7 +55,7 @@ def fsim(image: Tensor, target: Tensor) -> Tensor:
 
 
 def phase_congruency(luminance: Tensor) -> Tensor:
-    """How far the waves at each pixel of [B, 1, H, W] (0 to 255) are in step, in [0, 1]: 1 at an ideal edge or line."""
+    """The phase congruency of each pixel of [B, 1, H, W] (0 to 255), in [0, 1]: 1 at an ideal edge or line."""
     filters = _log_gabor_filters(luminance)  # [O, S, H, W]
     spectrum = torch.fft.fft2(luminance).unsqueeze(1)  # [B, 1, 1, H, W]
     responses = torch.fft.ifft2(spectrum * filters)  # [B, O, S, H, W], real: even, imaginary: odd

@@ -1,4 +1,4 @@
-"""How far what a model shows lies from where it should be: depths, surfaces, and what floats in front of them.
+"""Errors of a model's geometry: its depths, its surfaces, and the Gaussians that float in front of them.
 
 Depths [H, W] are along z, in world units: not a number where a render shows no surface, infinite where the truth has
 none. Shares and relative errors are plain numbers (0.02 is 2 %), and not a number where there is nothing to measure.
@@ -50,7 +50,7 @@ def point_depth_error(depth: Array, camera: Camera, points: Array) -> float:
 
 
 def in_front(centers: Array, camera: Camera, surface: Array) -> NDArray[np.bool_]:
-    """Which Gaussians with ``centers`` [N, 3] lie clearly in front of the ``surface`` [H, W] that they hide; [N].
+    """The mask [N] of Gaussians whose ``centers`` [N, 3] lie clearly in front of the ``surface`` [H, W] that they hide.
 
     Judged by their centres: nearer than 0.8 of the smallest depth within two pixels. Those that lie outside the
     picture, or where no surface is known, are not.
@@ -71,7 +71,7 @@ def floater_share(front: Array, alpha: Array, surface: Array) -> float:
 
 
 def project(points: Array, camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Array]:
-    """Of points [P, 3] those before the camera and inside its picture: (index, row, column, depth), [P'] each."""
+    """Project the points [P, 3] before the camera and inside its picture: (index, row, column, depth), [P'] each."""
     in_view = points @ camera.rotation.T + camera.translation  # [P, 3]
     index = np.flatnonzero(in_view[:, 2] > 0)
     x, y, z = in_view[index].T

@@ -1,4 +1,4 @@
-"""What the metrics share: the shapes of a pair of images, and the luminance of RGB."""
+"""Helpers that metrics share: the shapes of a pair of images, and the luminance of RGB."""
 
 from __future__ import annotations
 

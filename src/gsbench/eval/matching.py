@@ -1,4 +1,4 @@
-"""Which picture of a folder belongs to which photograph: by the strictest rule on names that fits all, no guess."""
+"""Matching of a folder's pictures with photographs, by the strictest rule on names that fits all, without guesses."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ BY_ORDER = "by order"
 
 @dataclass(frozen=True)
 class Matching:
-    """For each photograph its picture; ``rule`` says by what names were equal ("" where they are the same), and
-    ``left_out`` names the pictures that belong to none."""
+    """The picture of each photograph; ``rule`` says by what names were equal ("" where they are the same), and
+    ``left_out`` names the pictures that belong to none.
+    """
 
     pairs: Mapping[str, str]
     rule: str

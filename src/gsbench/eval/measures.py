@@ -22,7 +22,7 @@ from gsbench.weights import MissingWeights
 
 @dataclass(frozen=True)
 class Conditions:
-    """What gsbench's metrics share; ``weights`` is a folder to look in first."""
+    """Conditions that gsbench's metrics share; ``weights`` is a folder to look in first."""
 
     protocol: Protocol
     device: torch.device

@@ -1,4 +1,4 @@
-"""What a metric is: a class that measures one image against another. docs/metric.md has an example."""
+"""Contract of a metric: a class that measures one image against another. docs/metric.md has an example."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from gsbench.eval.images import LUMA, as_batch, check_pair, check_size, mix_channels
 from gsbench.eval.ssim import WINDOW_SIZE, ssim_parts
 
-# How much each scale counts, from the finest: Wang, Simoncelli and Bovik 2003, section 3.2. IW-SSIM takes the same.
+# Weights of the scales, from the finest: Wang, Simoncelli and Bovik 2003, section 3.2. IW-SSIM takes the same.
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 SCALES = len(SCALE_WEIGHTS)
 MIN_SIZE = (WINDOW_SIZE - 1) * 2 ** (SCALES - 1) + 1  # px: 161, halved four times and rounded up, is the window's 11

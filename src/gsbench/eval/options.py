@@ -13,7 +13,8 @@ from pydantic import PositiveInt
 from gsbench.errors import InputError
 from gsbench.eval.facts import FLICKER, GEOMETRY, LPIPS, MORE, find, further_keys, known_keys, lpips_variants
 from gsbench.eval.protocol import PROTOCOLS
-from gsbench.settings import MISSING, PathName, check_settings
+from gsbench.runs.declaration import AT, QUESTIONS, metric_and_question
+from gsbench.settings import MISSING, FolderName, PathName, check_settings
 from gsbench.words import closest
 
 METRIC_NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -21,7 +22,7 @@ TAKEN_NAMES = (*known_keys(), "view", "lpips")  # of metrics, and what else a ta
 
 
 def are_different(values: list[Any]) -> bool:
-    """Whether no value stands twice in a list."""
+    """Return whether no value stands twice in a list."""
     return len(set(values)) == len(values)
 
 
@@ -29,6 +30,7 @@ ProtocolName = Annotated[
     str, Predicate(lambda name: name in PROTOCOLS), doc(" or ".join(f"'{name}'" for name in PROTOCOLS))
 ]
 AT_RULE = "a list of different iterations, at which the test views are measured beside the last"
+CONTROLS_RULE = "a mapping {ARM: ARM} of names of densifiers: whom else, beside the baseline, an arm is held against"
 LPIPS_RULE = f"a list of {', '.join(lpips_variants())}, each at most once"
 LpipsVariant = Annotated[str, Predicate(lambda name: name in lpips_variants())]
 MORE_RULE = f"a list of {', '.join(further_keys())}, each at most once"
@@ -46,7 +48,9 @@ class EvalConfig:
     more: Annotated[list[FurtherMetric], Predicate(are_different), doc(MORE_RULE)] = field(default_factory=list)
     extra: dict[str, Any] = field(default_factory=dict)  # metrics of your own: {name: {_target_: mine.MyMetric}}
     at: Annotated[list[PositiveInt], Predicate(are_different), doc(AT_RULE)] = field(default_factory=list)
-    primary: str | None = None  # the metric of the verdict, declared before results are seen; null: none was
+    # The metric of the verdict, declared before results are seen; psnr@extrapolation of one question; null: none was.
+    primary: str | None = None
+    controls: Annotated[dict[str, FolderName], doc(CONTROLS_RULE)] = field(default_factory=dict)  # {longaxis: absgrad}
     maps: bool = False  # keep maps of depth, volume and distance to the initial cloud: where an arm helps
     geometry: bool = False  # measure depths and surfaces of the model, and what floats in front of them
     flicker: bool = False  # measure how neighbouring renders of a camera path differ
@@ -63,8 +67,12 @@ class EvalConfig:
                 )
             if not isinstance(options, Mapping) or "_target_" not in options:
                 raise InputError(f"eval.extra.{name} must name a class, as eval.extra.{name}._target_=mine.MyMetric")
-        if self.primary is not None and self.primary not in self.extra:
-            self._check_primary(self.primary)
+        if self.primary is not None:
+            metric, question = metric_and_question(self.primary)
+            if question not in QUESTIONS.values() and (question or AT in self.primary):
+                raise InputError(f"eval.primary={self.primary}: after {AT} comes {' or '.join(QUESTIONS.values())}")
+            if metric not in self.extra:
+                self._check_primary(metric)
 
     def _check_primary(self, key: str) -> None:
         """Raise InputError unless one of gsbench's own metrics, which these settings ask for, has this key."""

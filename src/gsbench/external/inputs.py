@@ -1,4 +1,4 @@
-"""What another program gets of a trial: its training views, and of its test views the cameras alone."""
+"""Inputs of another program: the trial's training views, and of its test views the cameras alone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsbench.files import write_json
 from gsbench.init.base import MODEL_FOLDER, PointCloud
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import write_model
-from gsbench.scene.names import png_name
+from gsbench.scene.names import check_picture_names, png_name
 from gsbench.scene.types import View
 
 IMAGES = "images"
@@ -27,6 +27,7 @@ def write_training_views(folder: Path, views: Sequence[View], cloud: PointCloud)
 
     The points have no observations: which test views saw them, and where, stays here.
     """
+    check_picture_names([view.name for view in views], folder / IMAGES)
     (folder / IMAGES).mkdir(parents=True)
     for view in views:
         Image.fromarray(view.image).save(folder / IMAGES / png_name(view.name), compress_level=FAST_PNG)

@@ -1,4 +1,4 @@
-"""What another program left: one model, or a picture of every test view; checked before anything is kept."""
+"""Outputs of another program: one model, or a picture of every test view; checked before anything is kept."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 
 from gsbench.errors import TrainingError
-from gsbench.system.isolate import CrashError, describe_exit, run_isolated, telling_lines
+from gsbench.system.isolate import CrashError, describe_exit, run_isolated, telling_tail
 from gsbench.system.memory import MIB, peak_child_mb
 from gsbench.words import readable_time
 
@@ -25,7 +25,7 @@ SECONDS_TO_END = 5.0  # patience with a program that was asked to end
 
 @dataclass(frozen=True)
 class Ended:
-    """How a program ended: its exit code (negative: by a signal), whether its time was up, and what it took."""
+    """End of a program: its exit code (negative: by a signal), whether its time was up, and what it took."""
 
     code: int
     timed_out: bool
@@ -50,7 +50,7 @@ def run_program(
         ended = run_isolated(watch, list(command), folder, dict(environment), limit, what=name, log=log)
     except CrashError as error:
         raise TrainingError(f"{error}; log: {log}") from error
-    said = f"its last words: {telling_lines(log.read_bytes())}; log: {log}"
+    said = f"its last words: {telling_tail(log)}; log: {log}"
     if ended.timed_out:
         assert limit is not None
         raise TrainingError(f"{name} still ran after {readable_time(limit)} (densify.time_limit_minutes); {said}")

@@ -9,7 +9,8 @@ import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 from annotated_types import MinLen, Predicate, doc
@@ -19,15 +20,36 @@ from gsbench.errors import InputError
 from gsbench.external.placeholders import fill, names_in, program_of, words_of
 from gsbench.settings import MISSING, check_settings
 
-# What a command may ask for beside the options of its YAML.
+# Placeholders of a command beside the options of its YAML.
 DATA = "data"  # folder of the training views: images/ and the COLMAP model sparse/0
 TEST_CAMERAS = "test_cameras"  # folder of the test views' cameras: transforms.json and the COLMAP model sparse/0
 OUTPUT = "output"  # empty folder, in which the program also starts
 KNOWN = (DATA, TEST_CAMERAS, OUTPUT, "iterations", "seed", "device", "threads")
+PLACES = (DATA, TEST_CAMERAS, OUTPUT)  # folders, which are absolute
 MODEL_SUFFIX = ".ply"
 
 Text = Annotated[str, MinLen(1), Predicate(lambda text: text != MISSING and bool(text.strip())), doc("a text")]
 CommandLine = Annotated[list[str] | str, doc("a list of words, or a text that is split as a shell would")]
+
+
+def check_pattern(pattern: str) -> None:
+    """Raise InputError for a pattern that can fit no file below a folder."""
+    key = f"densify.result={pattern}"
+    parts = PurePosixPath(pattern).parts
+    if (
+        not parts
+        or PurePosixPath(pattern).is_absolute()
+        or PureWindowsPath(pattern).drive
+        or {"..", "\0"} & {*parts, *pattern}
+    ):
+        raise InputError(f"{key}: give a pattern of files below the program's output folder, such as point_cloud/*.ply")
+    try:
+        with TemporaryDirectory() as empty:
+            list(Path(empty).glob(pattern))
+    except (ValueError, NotImplementedError, IndexError, OSError, RecursionError) as error:
+        raise InputError(
+            f"{key} is no pattern of files ({error}): ** stands for folders, so it is a part of its own"
+        ) from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +61,21 @@ class External:
     folder: of one 3DGS PLY, or of the pictures of the test views, whose names are matched (or ``by_order``).
     ``version`` names the program's version: it is part of the results' key. ``version_command`` prints something that
     must contain it.
+
+    Examples:
+        A program ``train.py`` that writes ``point_cloud.ply``:
+
+        >>> trainer = External(
+        ...     command="python train.py --data {data} --out {output} --steps {iterations} --rate {rate}",
+        ...     result="point_cloud.ply",
+        ...     version="1.2",
+        ...     options={"rate": 0.01},
+        ... )
+        >>> trainer.program, trainer.leaves_model
+        ('python', True)
+        >>> External(command="python train.py", result="*.png", version="1.2")
+        Traceback (most recent call last):
+        gsbench.errors.InputError: densify.command has no {data}: the folder that the program is to train on
     """
 
     command: CommandLine
@@ -59,6 +96,9 @@ class External:
                 raise InputError(
                     f"densify.options.{name}: an option is one value with a name of its own, none of {', '.join(KNOWN)}"
                 )
+        check_pattern(
+            fill(self.result, dict.fromkeys(KNOWN, "1") | dict.fromkeys(PLACES, "/") | self.options, "densify.result")
+        )
         known = dict.fromkeys((*KNOWN, *self.options))
         for key, text in [("command", word) for word in self.words] + [("result", self.result)]:
             fill(text, known, f"densify.{key}")
@@ -72,7 +112,7 @@ class External:
 
     @property
     def leaves_model(self) -> bool:
-        """Whether the result is a model; else it is pictures."""
+        """Return whether the result is a model; else it is pictures."""
         return self.result.lower().endswith(MODEL_SUFFIX)
 
     @property
@@ -85,7 +125,7 @@ class External:
         return program_of(self.command, self.options)
 
     def executable(self) -> str:
-        """Where the program lies. Raises InputError where this machine has none."""
+        """The path of the program. Raises InputError where this machine has none."""
         path = self.environment.get("PATH", os.environ.get("PATH"))
         found = shutil.which(Path(self.program).expanduser(), path=path)
         if found is None:

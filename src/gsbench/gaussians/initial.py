@@ -1,4 +1,4 @@
-"""From a point cloud to the first Gaussians, as 3DGS does it."""
+"""First Gaussians of a training, made of a point cloud as 3DGS does it."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,8 +13,8 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from gsbench.errors import InputError
-from gsbench.files import atomic
-from gsbench.gaussians.model import NUM_SH_REST, Gaussians
+from gsbench.files import atomic, require_regular
+from gsbench.gaussians.model import MAX_SH_DEGREE, NUM_SH_REST, Gaussians
 
 NUM_REST = 3 * NUM_SH_REST  # f_rest is stored channel by channel: 15 of red, 15 of green, 15 of blue
 COLUMNS = (
@@ -27,7 +26,8 @@ COLUMNS = (
     + [f"rot_{i}" for i in range(4)]
 )
 
-REST = re.compile(r"f_rest_\d{1,2}")
+REST = "f_rest_"
+REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1))
 MAX_HEADER = 1 << 16  # bytes
 MIN_TEXT_BYTES = 2  # of a value in an ASCII file: a digit and a space
 SIZES = {"short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4}
@@ -77,6 +77,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 def _check_length(path: Path) -> None:
     """Raise ValueError where the header promises more than the file can hold, which would be allocated unread."""
+    require_regular(path)
     with path.open("rb") as stream:
         header, found, _ = stream.read(MAX_HEADER).partition(b"end_header")
     if not found:
@@ -102,11 +103,17 @@ def read_ply(path: Path, device: torch.device | str = "cpu") -> Gaussians:
     """
     vertices = _read_vertices(path)
     present = set(vertices.dtype.names or ())
-    rest = sorted((name for name in present if REST.fullmatch(name)), key=lambda name: int(name.split("_")[2]))
+    found = {name for name in present if name.startswith(REST)}
+    rest = [f"{REST}{i}" for i in range(len(found))]
     required = [name for name in COLUMNS if not name.startswith(("f_rest_", "n"))]
     missing = [name for name in required if name not in present]
-    if missing or len(rest) % 3 or len(rest) > NUM_REST or len(vertices) == 0:
-        odd = ", ".join(missing) or ("f_rest_*" if len(vertices) else "all, for it is empty")
+    if found != set(rest) or len(rest) not in REST_COUNTS:
+        raise InputError(
+            f"{path}: not a 3DGS PLY; its harmonics must be f_rest_0 to 8, to 23 or to 44 (degree 1 to 3), or none; "
+            f"it has {len(found)}" + (f", with {min(found - set(rest))}" if found != set(rest) else "")
+        )
+    if missing or len(vertices) == 0:
+        odd = ", ".join(missing) or "all, for it is empty"
         raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {odd}")
     for name in (*required, *rest):
         if vertices[name].dtype.kind not in "fiu" or not np.isfinite(vertices[name]).all():

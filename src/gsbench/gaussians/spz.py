@@ -79,7 +79,7 @@ def warn_of_far_points(reach: NDArray[np.float64], size: float, fraction_bits: i
 
 
 def fraction_bits_for(largest: float) -> int:
-    """How many bits of a position may be behind the point, so that ``largest`` fits before it."""
+    """The number of bits of a position that may be behind the point, so that ``largest`` fits before it."""
     before = max(0, math.frexp(largest)[1]) + 1  # and the sign
     return max(0, min(MAX_FRACTION_BITS, POSITION_BITS - before))
 

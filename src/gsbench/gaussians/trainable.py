@@ -145,7 +145,7 @@ class TrainableGaussians:
         return next(group for group in self.optimizer.param_groups if group["name"] == name)
 
     def state_dict(self) -> dict[str, object]:
-        """Everything that a resumed training needs, sharing memory with this object: save it before the next step."""
+        """The state that a resumed training needs, sharing memory with this object: save it before the next step."""
         return {
             "gaussians": {name: tensor.detach() for name, tensor in self.values.tensors().items()},
             "optimizer": self.optimizer.state_dict(),

@@ -1,4 +1,4 @@
-"""What an initialiser is: capture in, a COLMAP model and a report out."""
+"""Contract of an initialiser: it takes a capture, and gives a COLMAP model and a report."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ from gsbench.scene.types import Capture
 
 MODEL_FOLDER = Path("sparse", "0")  # below the output folder: where COLMAP users and 3DGS trainers look
 OWN_GAUGE_FOLDER = Path("sparse_own_gauge", "0")  # the same model as its own mapper scaled it, before alignment
+WORK_FOLDER = "work"  # below the output folder, while a run lasts
 REPORT_FILE = "report.json"
 GAUSSIANS_FILE = "gaussians.ply"  # optional: the Gaussians to start from, where there is more than points
 PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
 MIN_IMAGES = 3  # two views have no third that could contradict a wrong geometry
 Poses = Literal["shared", "own"]
+PointsFrom = Literal["all", "train", "retriangulated"]
 Seed = Annotated[int, Interval(ge=0, le=2**31 - 1)]  # COLMAP takes no larger one
 
 
@@ -93,7 +95,7 @@ class PoseErrors:
 
 @dataclass(frozen=True)
 class Gauge:
-    """What a volume threshold in raw model units means in a model's unit of length.
+    """Volume threshold in raw model units, expressed in a model's unit of length.
 
     COLMAP scales each model as it likes, so one threshold selects different Gaussians in another model of a scene.
     """
@@ -108,8 +110,22 @@ class Gauge:
 
 
 @dataclass(frozen=True)
+class TrainingPoints:
+    """Record of a cloud in which test views have no say (``init.points_from``): what is left of it.
+
+    ``taken`` is the share of the ``of`` points that went (negative where more came); None where test photographs were
+    never matched, so that nobody knows how many there would have been.
+    """
+
+    choice: PointsFrom
+    kept: int
+    of: int | None
+    taken: float | None
+
+
+@dataclass(frozen=True)
 class InitReport:
-    """What came out of an initialiser; `to_dict` is what ``report.json`` holds."""
+    """Results of an initialiser; `to_dict` is the content of ``report.json``."""
 
     init: str
     poses: str  # shared: the reference's; own: estimated here
@@ -131,6 +147,7 @@ class InitReport:
     warnings: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)  # features, pairs, verified pairs, inlier matches
     mapped_by: str | None = None  # the way that placed the cameras (init.mapper); None where they were given
+    training_points: TrainingPoints | None = None  # None where all views made the points
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -143,7 +160,7 @@ class InitReport:
 
 @dataclass(frozen=True)
 class Preparation:
-    """What was done before COLMAP: its time, its counts and settings for the report, and what deserves a warning."""
+    """Preparation before COLMAP: its time, its counts and settings for the report, and what deserves a warning."""
 
     seconds: Mapping[str, float] = field(default_factory=dict)
     counts: Mapping[str, int] = field(default_factory=dict)
@@ -178,11 +195,11 @@ class Initializer(ABC):
     name: ClassVar[str]  # as reports call it
 
     def needs_reference(self, capture: Capture) -> bool:
-        """Whether `run` needs a ``reference`` model for this capture because it came without cameras."""
+        """Return whether `run` needs a ``reference`` model for this capture because it came without cameras."""
         return False
 
     def content(self) -> str | None:
-        """What the result depends on beside the options and the capture: the hash of a file that an option names."""
+        """The hashes of files that options name, on which the result depends beside the options and the capture."""
         return None
 
     @abstractmethod

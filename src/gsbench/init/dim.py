@@ -50,7 +50,7 @@ class FeatureInitializer(ColmapInitializer):
 
     @abstractmethod
     def feature_settings(self) -> FeatureSettings:
-        """What features and matches depend on."""
+        """The settings that features and matches depend on."""
 
     @abstractmethod
     def find_weights(self) -> tuple[Path | None, Path | None]:

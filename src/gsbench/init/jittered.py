@@ -40,7 +40,7 @@ class Jittered(Sfm):
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """As `Sfm`, with the copies in the model and counted in the report."""
+        """Run as `Sfm` does, with the copies in the model and counted in the report."""
         report = super().run(capture, output_dir, progress, reference, work_dir)
         return run_with_progress(_add_copies, (self, report, output_dir), progress, what=self.name)
 

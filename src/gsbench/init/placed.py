@@ -1,4 +1,4 @@
-"""What initialisers share that put points of their own under reference cameras."""
+"""Base of initialisers that put points of their own under reference cameras."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class PlacedCloud(Initializer):
         check_settings(self, "init")
 
     def needs_reference(self, capture: Capture) -> bool:
-        """Whether `run` needs a ``reference`` because the capture came without cameras."""
+        """Return whether `run` needs a ``reference`` because the capture came without cameras."""
         return capture.model is None
 
     def run(

@@ -27,7 +27,7 @@ def plot_cloud(model_dir: Path, path: Path, title: str | None = None) -> None:
 
 
 def draw_cloud(model: pycolmap.Reconstruction, path: Path, title: str | None = None) -> None:
-    """As `plot_cloud`, for a model in memory: points in their colours, cameras in red with their lines of sight."""
+    """Draw a model as `plot_cloud` does: points in their colours, cameras in red with their lines of sight."""
     points, colors = points_of(model)
     if len(points) > MAX_POINTS:
         chosen = np.random.default_rng(0).permutation(len(points))[:MAX_POINTS]

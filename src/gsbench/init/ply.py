@@ -54,7 +54,7 @@ class Ply(PlacedCloud):
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """As `PlacedCloud.run`, and the Gaussians in `GAUSSIANS_FILE`."""
+        """Run as `PlacedCloud.run` does, and write the Gaussians to `GAUSSIANS_FILE`."""
         result = super().run(capture, output_dir, progress, reference, work_dir)
         shutil.copyfile(self.file, output_dir / GAUSSIANS_FILE)
         return result

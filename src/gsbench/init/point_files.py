@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyParseError
 
 from gsbench.errors import InputError
+from gsbench.files import require_regular
 from gsbench.init.colmap.alignment import Array, Similarity
 
 COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -24,6 +25,7 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
     read, holds no point, or a coordinate or colour that is no finite number.
     """
     suffix = path.suffix.lower()
+    require_regular(path)
     try:
         if suffix == ".ply":
             points, colors = _read_ply(path)
@@ -52,6 +54,7 @@ def read_similarity(path: Path) -> Similarity:
 
     Raises ``InputError`` where it is none: another shape, a shear, a mirror image.
     """
+    require_regular(path)
     try:
         matrix = np.loadtxt(path, ndmin=2)
     except (OSError, ValueError) as error:

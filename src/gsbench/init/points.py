@@ -109,9 +109,9 @@ def seen_colors(points: Array, capture: Capture, model: pycolmap.Reconstruction)
 
 
 def in_view(points: Array, name: str, model: pycolmap.Reconstruction) -> tuple[NDArray[np.int64], Array, Array]:
-    """Which of ``points`` [P, 3] the image ``name`` has in view: their indices [V], pixels [V, 2] and distances [V].
+    """The ``points`` [P, 3] that the image ``name`` has in view: their indices [V], pixels [V, 2] and distances [V].
 
-    Nobody for an image that the model does not place. What stands between is not looked for.
+    All three are empty for an image that the model does not place. Occlusion is not looked for.
     """
     image = model.find_image_with_name(name)
     if image is None or not image.has_pose:

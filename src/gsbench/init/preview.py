@@ -1,4 +1,4 @@
-"""Which pairs of images are worth matching, told by a quick match of their few strongest features.
+"""Choice of the pairs of images that are worth matching, by a quick match of their few strongest features.
 
 Wu, "Towards Linear-time Incremental Structure from Motion" (3DV 2013), matches the features of the largest scales first
 and leaves out pairs in which few of them agree. Here the agreement ranks each image's partners, and the best are kept:
@@ -22,7 +22,7 @@ QUANTUM = 512.0  # a descriptor of unit length in whole numbers, as COLMAP's SIF
 
 
 def best_pairs(descriptors: Sequence[NDArray[np.generic]], partners: int = PARTNERS) -> list[Pair]:
-    """Each image with the ``partners`` that agree best with it; sorted pairs (i, j), i < j.
+    """Pair each image with the ``partners`` that agree best with it; sorted pairs (i, j), i < j.
 
     ``descriptors`` are those of each image's strongest features [K, D], at most `STRONGEST` of which are read: whole
     numbers, or floats of unit length. Of equal partners those nearer in the order of images come first.
@@ -38,7 +38,7 @@ def best_pairs(descriptors: Sequence[NDArray[np.generic]], partners: int = PARTN
 
 
 def proposed_pairs(names: Sequence[str], strongest: Callable[[str], NDArray[np.generic]]) -> list[tuple[str, str]]:
-    """What ``pairs=auto`` matches of the images ``names``: all pairs of a few, of more the `best_pairs`.
+    """The pairs of the images ``names`` that ``pairs=auto`` matches: all pairs of a few, of more the `best_pairs`.
 
     ``strongest`` gives the descriptors of an image's strongest features.
     """
@@ -50,7 +50,7 @@ def proposed_pairs(names: Sequence[str], strongest: Callable[[str], NDArray[np.g
 
 
 def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.int64]:
-    """How many features of images i < j are each other's nearest and pass the ratio test; [N, N], upper triangle.
+    """Count the features of images i < j that are each other's nearest and pass the ratio test; [N, N], upper triangle.
 
     Descriptors are whole numbers here, and their products stay below 2^24: exact in float32, so every machine and any
     number of threads count the same.

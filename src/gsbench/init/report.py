@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
-from gsbench.init.base import MODEL_FOLDER, PICTURE_FILE, REPORT_FILE, Gauge, InitReport, PoseErrors
+from gsbench.init.base import MODEL_FOLDER, PICTURE_FILE, REPORT_FILE, Gauge, InitReport, PoseErrors, TrainingPoints
 from gsbench.init.colmap.alignment import Similarity, rotation_angles, transformed_rotations
 from gsbench.init.colmap.reconstruct import common_poses, poses_by_name, save_reconstruction
 from gsbench.init.plot import draw_cloud
@@ -37,7 +37,7 @@ def training_extent(model: pycolmap.Reconstruction, capture: Capture) -> float:
 
 
 def measure_gauge(extent: float, scale_to_reference: float | None) -> Gauge:
-    """What the paper's V_th is in a model with this scene extent."""
+    """Express the paper's V_th in a model with this scene extent."""
     radius = (3 * VOLUME_THRESHOLD / (4 * math.pi)) ** (1 / 3)
     return Gauge(
         scene_extent=extent,
@@ -89,6 +89,7 @@ def make_report(
     counts: Mapping[str, int] | None = None,
     mapped_by: str | None = None,
     warnings: Sequence[str] = (),
+    training_points: TrainingPoints | None = None,
 ) -> InitReport:
     """The report on ``model`` as it is written; ``packages`` are those whose installed versions it states."""
     placed = set(poses_by_name(model))
@@ -111,6 +112,7 @@ def make_report(
         pose_errors=pose_errors,
         counts=counts or {},
         mapped_by=mapped_by,
+        training_points=training_points,
     )
     return replace(report, warnings=(*warnings, *find_warnings(report, model)))
 
@@ -124,7 +126,7 @@ def write_result(model: pycolmap.Reconstruction, report: InitReport, output_dir:
 
 
 def find_warnings(report: InitReport, model: pycolmap.Reconstruction) -> tuple[str, ...]:
-    """What in a model should make its reader doubt it, each in one line; that all images are placed is no proof."""
+    """List the reasons to doubt a model, each in one line; that all images are placed is no proof."""
     found = []
     if report.num_registered < REGISTERED_SHARE * report.num_images:
         missing = ", ".join(report.unregistered[:5]) + (" …" if len(report.unregistered) > 5 else "")

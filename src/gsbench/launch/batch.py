@@ -11,8 +11,8 @@ from typing import Any
 
 from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
-from gsbench.files import checked_runs_folder, make_runs_folder, storage_errors
-from gsbench.launch.declare import declare, declared_metrics
+from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
+from gsbench.launch.declare import declare, declared_metrics, planned_trials
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
 from gsbench.launch.preflight import check_parts, check_trackers, missing_folders, missing_weights
@@ -52,7 +52,7 @@ def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
 
 
 def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
-    """All that precedes the first trial where a launcher of somebody else's will run them, several at once perhaps."""
+    """Do all that precedes the first trial where another launcher will run them, perhaps several at once."""
     from gsbench.launch.jobs import prepare_tracking
 
     values = trials[0].values
@@ -74,10 +74,16 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
         drop_parts(unfinished)
     if launcher != "slurm":
         check_trackers(unfinished)
-    make_runs_folder(runs)
+    try:
+        make_runs_folder(runs)
+    except OSError as error:
+        if unfinished or error.errno not in FORBIDDEN:
+            raise
+        log.info("%s may not be written to (%s), so its plan stays as it is", runs, error.strerror)
+        return
     Store(runs / STORE).sweep(STAGES)
     add_to_plan(trials)
-    declare(metrics)
+    declare(metrics, planned_trials(trials))
 
 
 def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]:

@@ -1,4 +1,4 @@
-"""Writing down which metric, or which plan of looks, a command declares before its trials run. Loads no torch."""
+"""Writing down the metric with its trials, or the plan, that a command declares before trials run. Loads no torch."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 from gsbench.errors import InputError
 from gsbench.files import write_text
 from gsbench.launch.trial import Trial
-from gsbench.runs.declaration import Declaration, DeclaredPlan, read_declarations, read_plans
+from gsbench.runs.declaration import Declaration, DeclaredPlan, Planned, read_declarations, read_plans, trial_key
 from gsbench.runs.layout import DECLARED
 from gsbench.system.locks import hold
 
@@ -37,27 +37,56 @@ def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
     return found
 
 
-def declare(metrics: Mapping[Path, str | None]) -> None:
-    """Add to each experiment's record what its trials declare (`declared_metrics`), where it does not stand there yet.
+def planned_trials(trials: Sequence[Trial]) -> dict[Path, Planned]:
+    """The trials that a command asks for, by the folder of their experiment, whether they are done or not."""
+    found: dict[Path, dict[str, set[int]]] = {}
+    for trial in trials:
+        scene, arm, leaf = trial.folder.parts[-3:]
+        key = trial_key(scene, arm, leaf.partition("-seed")[0])
+        found.setdefault(trial.paths.home, {}).setdefault(key, set()).add(trial.values["seed"])
+    return {home: {key: tuple(sorted(seeds)) for key, seeds in planned.items()} for home, planned in found.items()}
 
-    A declaration is not taken back by a command without one.
+
+def declare(metrics: Mapping[Path, str | None], planned: Mapping[Path, Planned]) -> None:
+    """Add to each experiment's record what its trials declare, where it does not stand there yet.
+
+    That is a metric (`declared_metrics`) and the trials that a command asks for (`planned_trials`). A declaration is
+    not taken back by a command without one: the trials that such a command adds are added to it, with their time.
     """
-    for home, metric in metrics.items():
+    for home, given in metrics.items():
         home.mkdir(parents=True, exist_ok=True)
         with hold(home / f".{DECLARED}.lock", "the declarations"):
             known = read_declarations(home)
-            if known and metric is None:
-                log.info("%s: %s stays declared, since %s", home.name, known[-1].metric, known[-1].when)
-            if metric is None or (known and known[-1].metric == metric):
+            standing = known[-1] if known else None
+            metric = standing.metric if given is None and standing is not None else given
+            if metric is None:
                 continue
-            _write(home, [*known, Declaration(int(time.time()), metric)], read_plans(home))
-        if known:
+            if given is None and standing is not None:
+                log.info("%s: %s stays declared, since %s", home.name, standing.metric, standing.when)
+            before = standing.trials if standing is not None else {}
+            together = None if before is None else _together(before, planned[home])
+            same = standing is not None and standing.metric == metric
+            if same and (together is None or together == before):
+                continue
+            _write(home, [*known, Declaration(int(time.time()), metric, together)], read_plans(home))
+        if same:
+            log.warning(
+                "%s: trials are added to those declared with %s; where results were there before, it loses its place",
+                home.name,
+                metric,
+            )
+        elif standing is not None:
             log.warning(
                 "%s: the verdict is from now on about %s, and the report will say that %s was declared before",
                 home.name,
                 metric,
-                known[-1].metric,
+                standing.metric,
             )
+
+
+def _together(one: Planned, other: Planned) -> Planned:
+    """The trials of both."""
+    return {key: tuple(sorted({*one.get(key, ()), *other.get(key, ())})) for key in {**one, **other}}
 
 
 def declare_plan(home: Path, plan: Mapping[str, Any], plan_hash: str) -> DeclaredPlan:

@@ -104,7 +104,7 @@ def need_submitit(launcher: str) -> None:
 
 
 def job_folder(values: dict[str, Any]) -> Path:
-    """Where the jobs of an experiment write what they print; made if it is not there."""
+    """The folder in which the jobs of an experiment write what they print; made if it is not there."""
     folder = TrialPaths.of(values).runs / JOBS / values["name"]
     folder.mkdir(parents=True, exist_ok=True)
     return folder

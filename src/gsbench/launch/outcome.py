@@ -1,16 +1,17 @@
-"""How a trial ended, as plain values that travel between processes."""
+"""End of a trial, as plain values that travel between processes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import DiskFullError
 from gsbench.runs.layout import LOG
 from gsbench.runs.trial_files import label_of
+from gsbench.runs.trial_record import TrialRecord
 
 OBJECTIVE = "psnr"  # what a trial returns to Hydra's sweepers
 Status = Literal["done", "failed", "queued"]
@@ -35,10 +36,10 @@ class Outcome:
         return label_of(self.folder)
 
 
-def outcome_of_results(folder: Path, results: dict[str, Any]) -> Outcome:
+def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:
     """The outcome of a trial that is complete."""
-    metrics = "  ".join(f"{key} {value:.4g}" for key, value in results["metrics"].items())
-    return Outcome(folder, "done", metrics, metrics=results["metrics"])
+    metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
+    return Outcome(folder, "done", metrics, metrics=results.metrics)
 
 
 def outcome_of_error(folder: Path, error: Exception) -> Outcome:
@@ -50,5 +51,5 @@ def outcome_of_error(folder: Path, error: Exception) -> Outcome:
 
 
 def objective(metrics: Mapping[str, float]) -> float | None:
-    """What a trial with these metrics returns to Hydra's sweepers and callbacks."""
+    """The values that a trial with these metrics returns to Hydra's sweepers and callbacks."""
     return metrics.get(OBJECTIVE)

@@ -5,28 +5,31 @@
 
 from __future__ import annotations
 
-import json
+import logging
 import os
 import shutil
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from gsbench.errors import GsbenchError, InputError
-from gsbench.files import read_object, write_json
 from gsbench.launch.queue import ask_queue, state_in_queue
 from gsbench.launch.trial import Trial
+from gsbench.parsing import DamagedError
 from gsbench.runs.finished import NotDone, find_finished
 from gsbench.runs.hashing import sha256_of
+from gsbench.runs.inputs import read_results
 from gsbench.runs.layout import PLAN, RESULTS, STORE, TRIAL_GLOB
+from gsbench.runs.plan_file import Entry, Sweep, read_entries, write_entries
 from gsbench.runs.trial_files import TrialPaths, stage_and_step, state_of
+from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.locks import hold
 from gsbench.words import counted, readable_time
 
-PLAN_VERSION = 1
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -41,27 +44,25 @@ class Planned:
 
 def add_to_plan(trials: Sequence[Trial]) -> None:
     """Write the trials into the plans of their experiments; those that were there stay."""
-    by_plan: dict[Path, dict[str, Any]] = {}
+    by_plan: dict[Path, dict[str, Entry]] = {}
     for trial in trials:
         paths = trial.paths
-        entry = {"overrides": list(trial.overrides), "cwd": os.getcwd(), "time": time.time()}
+        entry = Entry(overrides=tuple(trial.overrides), cwd=os.getcwd(), time=time.time())
         by_plan.setdefault(paths.home, {})[paths.folder.relative_to(paths.home).as_posix()] = entry
     for home, entries in by_plan.items():
         if len(entries) > 1:  # the same command is the same sweep, whenever it is given
-            sweep = {"id": sha256_of(sorted(entries))[:8], "count": len(entries)}
-            entries = {name: entry | {"sweep": sweep} for name, entry in entries.items()}
+            sweep = Sweep(id=sha256_of(sorted(entries))[:8], count=len(entries))
+            entries = {name: replace(entry, sweep=sweep) for name, entry in entries.items()}
         home.mkdir(parents=True, exist_ok=True)
         with hold(home / f".{PLAN}.lock", "the plan"):
-            known = _read(home)
-            write_json(home / PLAN, {"version": PLAN_VERSION, "trials": known | entries})
+            write_entries(home, read_entries(home) | entries)
 
 
 def forget(home: Path, folders: Iterable[Path]) -> None:
     """Drop trials from the plan of the experiment in ``home``."""
     doomed = {folder.relative_to(home).as_posix() for folder in folders}
     with hold(home / f".{PLAN}.lock", "the plan"):
-        kept = {name: entry for name, entry in _read(home).items() if name not in doomed}
-        write_json(home / PLAN, {"version": PLAN_VERSION, "trials": kept})
+        write_entries(home, {name: entry for name, entry in read_entries(home).items() if name not in doomed})
 
 
 def remove(home: Path, folders: Iterable[Path]) -> None:
@@ -77,29 +78,27 @@ def remove(home: Path, folders: Iterable[Path]) -> None:
 
 
 def read_plan(home: Path) -> list[Planned]:
-    """The planned trials of the experiment in ``home``; none if it has no plan."""
-    return [
-        Planned(home / name, tuple(entry["overrides"]), entry["cwd"], float(entry["time"]))
-        for name, entry in sorted(_read(home).items())
-    ]
-
-
-def _read(home: Path) -> dict[str, Any]:
+    """The planned trials of the experiment in ``home``; none if it has no plan, or a damaged one, which is named."""
     try:
-        plan = json.loads((home / PLAN).read_text(encoding="utf-8"))
-        return dict(plan["trials"])
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{home / PLAN} is damaged ({error}): delete it, and give the sweep's command again"
-        ) from error
+        entries = read_entries(home)
+    except InputError as error:
+        log.warning("left out: %s", error)
+        entries = {}
+    return [Planned(home / name, entry.overrides, entry.cwd, entry.time) for name, entry in sorted(entries.items())]
+
+
+def _finished(folder: Path) -> TrialRecord | None:
+    """The results of the trial in ``folder``; None where it has none that can be relied on."""
+    try:
+        return read_results(folder)[0]
+    except (FileNotFoundError, DamagedError):
+        return None
 
 
 def same_trial_elsewhere(paths: TrialPaths) -> str | None:
     """The other experiment, if any, that has finished the same trial: its stages are reused, not computed again."""
     for results in paths.runs.glob(f"*/*/*/{paths.folder.name}/{RESULTS}"):
-        if results.parent != paths.folder and read_object(results).get("status") == "complete":
+        if results.parent != paths.folder and _finished(results.parent) is not None:
             return results.relative_to(paths.runs).parts[0]
     return None
 
@@ -113,14 +112,11 @@ class Estimate:
 
 
 class Estimator:
-    """Tells a trial's time from finished ones: most alike first (same scene and densifier), per iteration."""
+    """Estimate of a trial's time from finished ones: most alike first (same scene and densifier), per iteration."""
 
     def __init__(self, runs: Path) -> None:
-        self.finished: list[dict[str, Any]] = []
-        for path in runs.glob(f"*/{TRIAL_GLOB}/{RESULTS}"):
-            results = read_object(path)
-            if results.get("status") == "complete" and results.get("iterations"):
-                self.finished.append(results)
+        found = (_finished(path.parent) for path in runs.glob(f"*/{TRIAL_GLOB}/{RESULTS}"))
+        self.finished = [results for results in found if results is not None and results.iterations]
 
     def estimate(self, values: dict[str, Any]) -> Estimate:
         """Seconds for the whole trial with ``values``."""
@@ -130,10 +126,13 @@ class Estimator:
             "densify": values["densify"]["name"],
         }
         for keys in (("scene", "init", "densify"), ("scene", "densify"), ("scene",), ("densify",), ()):
-            alike = [r for r in self.finished if all(r.get(key) == wanted[key] for key in keys)]
+            alike = [r for r in self.finished if all(getattr(r, key) == wanted[key] for key in keys)]
             if alike:
                 iterations = values["train"]["iterations"]
-                times = [r["seconds"]["train"] * iterations / r["iterations"] + r["seconds"]["evaluate"] for r in alike]
+                times = [
+                    r.seconds.get("train", 0.0) * iterations / r.iterations + r.seconds.get("evaluate", 0.0)
+                    for r in alike
+                ]
                 return Estimate(statistics.fmean(times), len(alike))
         return Estimate(0.0, 0)
 
@@ -163,7 +162,7 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
         [],
         0.0,
         0,
-        dict.fromkeys(("done", "partial", "missing", "running", "queued", "failed"), 0),
+        dict.fromkeys(("done", "partial", "missing", "running", "queued", "failed", "damaged"), 0),
     )
     estimator = Estimator(trials[0].paths.runs) if trials else None
     learned = 0

@@ -1,4 +1,4 @@
-"""What is refused before any trial starts: wrong options of components, folders and devices that are not there."""
+"""Checks before any trial starts: wrong options of components, folders and devices that are not there."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def check_trackers(trials: Sequence[Trial]) -> None:
 
 
 def need_no_check(trials: Sequence[Trial]) -> bool:
-    """Whether the trials take their components as they ship, whose options gsbench's own tests have checked.
+    """Return whether the trials take their components as they ship, whose options gsbench's own tests have checked.
 
     A dry run then answers without loading torch.
     """

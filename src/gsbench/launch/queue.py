@@ -1,4 +1,4 @@
-"""What Slurm was given, by a note in a trial's folder, and what it still has, by its queue. Loads no torch."""
+"""Jobs that Slurm was given, by notes in trials' folders, and those that it still has, by its queue. Loads no torch."""
 
 from __future__ import annotations
 
@@ -8,13 +8,26 @@ import subprocess
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from gsbench.files import read_object, write_json
+from pydantic import Field
+
+from gsbench.files import write_json
+from gsbench.parsing import DamagedError
+from gsbench.records import Part, read_typed
 from gsbench.runs.layout import SUBMITTED
 
 SECONDS_TO_ANSWER = 60.0
 WAITING = ("PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED", "RESV_DEL_HOLD", "SPECIAL_EXIT")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Note(Part):
+    """``.submitted.json``: the job that a trial was given to, its log, whose job it is."""
+
+    job: Annotated[str, Field(pattern=r"^[\w.\[\]%-]+$")]
+    log: str = "unknown"
+    user: Annotated[str, Field(pattern=r"^[\w.@\\+-]*$")] = ""
 
 
 @dataclass(frozen=True)
@@ -36,7 +49,7 @@ class QueuedJob:
 
     @property
     def waits(self) -> bool:
-        """Whether it has not begun, or not begun again."""
+        """Return whether the job has not begun, or not begun again."""
         return self.state in WAITING
 
     @property
@@ -51,20 +64,20 @@ Queue = Mapping[str, QueuedJob]
 def record_submission(folder: Path, job: str, log: Path) -> None:
     """Note in the trial's ``folder`` that Slurm was given it as ``job``."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / SUBMITTED, {"job": job, "log": str(log), "user": current_user()})
+    write_json(folder / SUBMITTED, Note(job=job, log=str(log), user=current_user()).to_json())
 
 
 def read_submission(folder: Path) -> Submission | None:
     """The job that was last given the trial in ``folder``; None if there is none, or it has ended by itself."""
-    record = read_object(folder / SUBMITTED)
-    if not record.get("job"):
+    try:
+        note = read_typed(folder / SUBMITTED, Note)
+    except (FileNotFoundError, DamagedError):
         return None
-    log, user = record.get("log", "unknown"), record.get("user", current_user())
-    return Submission(str(record["job"]), str(log), str(user), folder / SUBMITTED)
+    return Submission(note.job, note.log, note.user or current_user(), folder / SUBMITTED)
 
 
 def forget_submission(folder: Path) -> None:
-    """The job of the trial in ``folder`` has ended."""
+    """Record that the job of the trial in ``folder`` has ended."""
     (folder / SUBMITTED).unlink(missing_ok=True)
 
 

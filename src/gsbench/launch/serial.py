@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 from gsbench.launch.outcome import Outcome, objective, outcome_of_error, outcome_of_results
 from gsbench.launch.trial import Trial, drop_parts
 from gsbench.runs.layout import LOCK
 from gsbench.runs.trial_files import label_of
+from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.locks import BusyError, describe_holder, is_held
 
 log = logging.getLogger(__name__)
@@ -47,7 +47,7 @@ def run_one(trial: Trial, wait: bool) -> Outcome:
             return outcome_of_results(folder, _run(trial, wait))
         if not wait and is_held(folder / LOCK):  # before Hydra's callbacks hear of a start
             raise BusyError(f"{label_of(folder)}: {describe_holder(folder / LOCK)} is at it")
-        results = trial.job.run(partial(_run, trial, wait), lambda results: objective(results["metrics"]))
+        results = trial.job.run(partial(_run, trial, wait), lambda results: objective(results.metrics))
         return outcome_of_results(folder, results)
     except BusyError:
         raise
@@ -55,7 +55,7 @@ def run_one(trial: Trial, wait: bool) -> Outcome:
         return outcome_of_error(folder, error)
 
 
-def _run(trial: Trial, wait: bool) -> dict[str, Any]:
+def _run(trial: Trial, wait: bool) -> TrialRecord:
     from gsbench.pipeline.trial import run_trial  # here, because a sweep that is done needs no torch
 
     return run_trial(trial.parts, trial.yaml, wait)

@@ -5,14 +5,19 @@ Loads no torch.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+from gsbench.errors import InputError
 from gsbench.launch.plan import read_plan
 from gsbench.launch.queue import Queue, ask_queue, read_submission, state_in_queue
+from gsbench.parsing import DamagedError
+from gsbench.runs.hashing import determining
+from gsbench.runs.inputs import read_results
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, TRIAL_GLOB
-from gsbench.runs.trial_files import State, failure_of, stage_and_step, state_of
+from gsbench.runs.trial_files import State, failure_of, read_config, stage_and_step, state_of
 from gsbench.system.locks import read_holder
 
 
@@ -21,7 +26,7 @@ class TrialState:
     """A trial's state with what people want to know of it: since when (Unix time), and a note.
 
     A trial is ``queued`` where Slurm has it and it has not begun. One that is done is ``superseded`` where the code
-    that made it is no longer the present one.
+    that made it is no longer the present one, one that failed where later code has taken its place.
     """
 
     folder: Path
@@ -36,7 +41,46 @@ def states_of_experiment(home: Path) -> list[TrialState]:
     found = {path for path in home.glob(TRIAL_GLOB) if path.is_dir() and (path / CONFIG).exists()}
     folders = sorted({*planned, *found})
     queue = ask_queue(folders)
-    return [_state(folder, planned.get(folder), queue) for folder in folders]
+    return _without_mended([_state(folder, planned.get(folder), queue) for folder in folders])
+
+
+def _without_mended(trials: Sequence[TrialState]) -> list[TrialState]:
+    """The states; a trial that failed or stopped is superseded where one of the same settings has got further.
+
+    Such trials differ in a user's class alone, which was mended meanwhile.
+    """
+    others: dict[tuple[Path, str], list[TrialState]] = {}
+    for trial in trials:
+        if trial.state in ("done", "running", "queued"):
+            others.setdefault(_twins(trial.folder), []).append(trial)
+    return [
+        replace(
+            trial, state="superseded", note=f"{found.folder.name} is {found.state}, made by later code: {trial.note}"
+        )
+        if trial.state in ("failed", "partial")
+        and (found := _same_settings(trial.folder, others.get(_twins(trial.folder), [])))
+        else trial
+        for trial in trials
+    ]
+
+
+def _twins(folder: Path) -> tuple[Path, str]:
+    """What trials of one arm and seed share."""
+    return folder.parent, folder.name.partition("-")[2]
+
+
+def _same_settings(folder: Path, others: Sequence[TrialState]) -> TrialState | None:
+    """The one of ``others`` whose configuration is that of the trial in ``folder``."""
+    if not others or (own := _settings(folder)) is None:
+        return None
+    return next((other for other in others if _settings(other.folder) == own), None)
+
+
+def _settings(folder: Path) -> dict[str, Any] | None:
+    try:
+        return determining(read_config(folder))
+    except InputError:
+        return None
 
 
 def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialState:
@@ -46,9 +90,10 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
         return TrialState(folder, state, _changed(folder / RESULTS), "")
     if state == "running":
         holder = read_holder(folder / LOCK)
-        within = f", Slurm job {holder['slurm']}" if holder.get("slurm") else ""
-        where = f"process {holder.get('pid', '?')} on {holder.get('host', '?')}{within}"
-        return TrialState(folder, state, holder.get("since"), f"{_reached(folder)} {where}".strip())
+        since, where = (None, "process ? on ?") if holder is None else (holder.since, holder.words)
+        return TrialState(folder, state, since, f"{_reached(folder)} {where}".strip())
+    if state == "damaged":
+        return TrialState(folder, state, _changed(folder / RESULTS), _damage(folder))
     submission = read_submission(folder)
     lost = ""
     if submission:
@@ -63,6 +108,14 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
     if state == "partial":
         return TrialState(folder, state, _changed(folder / CONFIG), f"stopped {_reached(folder)}".strip() + lost)
     return TrialState(folder, state, planned, "never started" + lost)
+
+
+def _damage(folder: Path) -> str:
+    try:
+        read_results(folder)
+    except (FileNotFoundError, DamagedError) as error:
+        return f"{error.path.name} {error.reason}" if isinstance(error, DamagedError) else ""
+    return ""
 
 
 def _reached(folder: Path) -> str:

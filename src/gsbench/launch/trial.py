@@ -27,7 +27,7 @@ class Trial(Composed):
 
     @cached_property
     def paths(self) -> TrialPaths:
-        """Where its files lie."""
+        """The paths of the trial's files."""
         return TrialPaths.of(self.values)
 
     @property
@@ -37,7 +37,7 @@ class Trial(Composed):
 
     @cached_property
     def parts(self) -> Parts:
-        """What its configuration describes, as objects."""
+        """The objects that the trial's configuration describes."""
         from gsbench.pipeline.parts import Parts
 
         return Parts(self.values)

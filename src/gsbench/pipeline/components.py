@@ -1,10 +1,11 @@
-"""From configuration to objects: components, evaluators and devices, with errors that name the key."""
+"""Objects of a configuration: components, evaluators and devices, with errors that name the key."""
 
 from __future__ import annotations
 
 import dataclasses
 import inspect
 import logging
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -13,7 +14,7 @@ from typing import Any
 import torch
 
 from gsbench.config.schema import require_values
-from gsbench.config.trust import EXTERNAL, check_program, check_target, homes_of, load_class, targets_in
+from gsbench.config.trust import check_program, check_target, homes_of, is_external, load_class, targets_in
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import facts_of
@@ -22,13 +23,13 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import get_protocol
 from gsbench.external.settings import External
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
-from gsbench.runs.hashing import WITHOUT_EFFECT
-from gsbench.runs.source import OWN, has_changed_since_import, source_of
+from gsbench.runs.declaration import metric_and_question
+from gsbench.runs.hashing import WITHOUT_EFFECT, as_before
+from gsbench.runs.source import OWN, has_changed_since_import, source_of, unseen_imports
 from gsbench.settings import checked, unknown_setting
 
 log = logging.getLogger(__name__)
 
-MOVED = {EXTERNAL: "gsbench.external.settings.External"}  # how configurations name a class, and where it stands
 RESERVED = ("_target_", "name", "switches")  # keys of a group that are not options of its class
 METHODS = {
     "init": ("needs_reference", "content", "run"),
@@ -48,9 +49,10 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     target = values["_target_"]
     for place, named in targets_in(values, tuple(group.split("."))):
         check_target(named, ".".join(place), allow_targets, homes_of(place))
-    cls = locate(target, group, allow_targets)
-    if cls is External:
+    external = group == "densify" and is_external(values)
+    if external:
         check_program(values, allow_targets)
+    cls = External if external else locate(target, group, allow_targets)
     require_values(values, group)
     options = {key: value for key, value in values.items() if key not in RESERVED}
     own = target.startswith(OWN)
@@ -69,7 +71,7 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
         raise
     except (TypeError, ValueError) as error:
         raise InputError(f"{group}: {error}") from error
-    except Exception as error:  # a user's class may raise anything
+    except (Exception, SystemExit) as error:  # a user's class may raise anything
         if own:
             raise
         raise InputError(f"{group}: {target} cannot be made ({type(error).__name__}: {error})") from error
@@ -117,10 +119,11 @@ def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str,
     metrics: dict[str, Metric] = {}
     for name, options in values.get("extra", {}).items():
         metrics[name] = build(f"eval.extra.{name}", options, allow_targets)
-        if facts_of(name, metrics[name]).direction == 0 and values.get("primary") == name:
+        primary = values.get("primary") or ""
+        if facts_of(name, metrics[name]).direction == 0 and metric_and_question(primary)[0] == name:
             raise InputError(
-                f"eval.primary={name}: {options['_target_']} does not say whether more or less is better (direction), "
-                "so no verdict can be about it"
+                f"eval.primary={primary}: {options['_target_']} does not say whether more or less is better "
+                "(direction), so no verdict can be about it"
             )
     return metrics
 
@@ -144,14 +147,19 @@ def _check_names(cls: Any, options: dict[str, Any], group: str) -> None:
 
 def locate(target: str, group: str, allow_targets: list[str]) -> type:
     """The class at the import path ``package.module.Class``, which must be one that ``group`` can use."""
-    found = load_class(MOVED.get(target, target), group, allow_targets)
-    methods = () if found is External else METHODS[group.partition(".")[0]]
-    lacking = [method for method in methods if not callable(getattr(found, method, None))]
+    before = set(sys.modules)
+    found = load_class(target, group, allow_targets)
+    lacking = [method for method in METHODS[group.partition(".")[0]] if not callable(getattr(found, method, None))]
     if not isinstance(found, type) or lacking:
         without = f": it has no {', '.join(lacking)}()" if lacking else ""
         raise InputError(f"{group}._target_={target} is not a class for {group}{without}")
     if has_changed_since_import(target):  # the first call also notes the file as it is now, while it is what runs
-        log.warning("the file of %s has changed since it was imported: this process goes on with what it was", target)
+        log.warning("the code of %s has changed since it was imported: this process goes on with what it was", target)
+    if not target.startswith(OWN) and (unseen := unseen_imports(target, before)):
+        log.warning(
+            "%s imports %s by a name or from a folder that its text does not give: results do not know their versions",
+            *(target, ", ".join(unseen)),
+        )
     return found
 
 
@@ -164,7 +172,7 @@ def options_of(group: str, component: Any) -> dict[str, Any]:
         fields = [
             field.name for field in dataclasses.fields(component) if field.init and field.name not in WITHOUT_EFFECT
         ]
-        values |= {name: _plain(getattr(component, name)) for name in fields}
+        values |= as_before(group, {name: _plain(getattr(component, name)) for name in fields})
     return values
 
 

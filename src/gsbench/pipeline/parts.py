@@ -31,7 +31,7 @@ from gsbench.train.options import TrainConfig
 
 
 class Parts:
-    """What the resolved configuration ``values`` describes; each part is made when it is first asked for, and kept.
+    """Objects that the resolved configuration ``values`` describes; each is made when it is first asked for, and kept.
 
     Asking for one raises InputError that names a wrong key; a part of the user's own class runs its code then.
     """
@@ -61,13 +61,13 @@ class Parts:
 
     @cached_property
     def trainer(self) -> Densifier | External:
-        """What the group densify describes: a densifier of gsbench's own trainer, or another program."""
+        """The trainer that the group densify describes: a densifier of gsbench's own trainer, or another program."""
         made: Densifier | External = build("densify", self.values["densify"], self._allowed)
         return made
 
     @property
     def densifier(self) -> Densifier:
-        """What edits the Gaussians where gsbench trains."""
+        """The densifier that edits the Gaussians where gsbench trains."""
         assert isinstance(self.trainer, Densifier)
         return self.trainer
 
@@ -108,7 +108,7 @@ class Parts:
 
     @cached_property
     def evaluator(self) -> Evaluator:
-        """What measures the renders; looks for the weights of networks."""
+        """The evaluator that measures the renders; looks for the weights of networks."""
         return make_evaluator(self.eval, self.device, self.metrics)
 
     @property

@@ -13,20 +13,23 @@ from typing import Any
 import pycolmap  # noqa: F401 - here, so that what its import does to signals can be undone
 import torch
 
-from gsbench.errors import GsbenchError
-from gsbench.files import link_or_copy, read_object, remove_temporaries, storage_errors, write_json, write_text
+from gsbench.errors import GsbenchError, TrainingError
+from gsbench.files import link_or_copy, remove_temporaries, storage_errors, write_json, write_text
 from gsbench.init.base import PICTURE_FILE, REPORT_FILE
 from gsbench.logs import log_to
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.results import results_of
 from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs import layout
-from gsbench.runs.finished import Done, find_finished, record_inputs
-from gsbench.runs.layout import BUILDING, CONFIG, FAILED, LOG, RESULTS
+from gsbench.runs.code import WIRING, state_of
+from gsbench.runs.finished import Done, find_finished
+from gsbench.runs.inputs import write_finished
+from gsbench.runs.layout import BUILDING, CONFIG, FAILED, LOG
 from gsbench.runs.stages import EVALUATE, GROUND_TRUTH, INIT, TRAIN
 from gsbench.runs.step import Stage
 from gsbench.runs.store import Entry, Store
 from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_record import TrialRecord
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture
 from gsbench.system.locks import hold
@@ -40,7 +43,7 @@ PUBLISHED_TRAINING = (
 )  # fmt: skip
 
 
-def run_trial(parts: Parts, config_yaml: str, wait: bool = True) -> dict[str, Any]:
+def run_trial(parts: Parts, config_yaml: str, wait: bool = True) -> TrialRecord:
     """Run the trial with these parts, or find it done; returns what ``results.json`` holds.
 
     On failure ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again. Where
@@ -65,6 +68,11 @@ def _recorded_failures(values: dict[str, Any], paths: TrialPaths) -> Iterator[No
     try:
         with storage_errors(paths.runs):
             yield
+    except SystemExit as ended:  # whose exit code might be that of a success
+        error = TrainingError(f"code of the trial ended the process (exit code {ended.code}) instead of returning")
+        error.__cause__ = ended
+        _record_failure(error, values, paths)
+        raise error from ended
     except Exception as error:
         _record_failure(error, values, paths)
         raise
@@ -79,7 +87,7 @@ def _record_failure(error: Exception, values: dict[str, Any], paths: TrialPaths)
         write_json(paths.folder / FAILED, record | {"time": time.time(), "seed": values["seed"]})
 
 
-def _run(parts: Parts, config_yaml: str, paths: TrialPaths) -> dict[str, Any]:
+def _run(parts: Parts, config_yaml: str, paths: TrialPaths) -> TrialRecord:
     """Build every step, show its files in the trial's folder, write the results."""
     values = parts.values
     with _recorded_failures(values, paths):
@@ -95,23 +103,22 @@ def _run(parts: Parts, config_yaml: str, paths: TrialPaths) -> dict[str, Any]:
         (paths.folder / FAILED).unlink(missing_ok=True)
         trial = TrialSteps(parts, store)
     entries: dict[str, Entry] = {}
+    code = {file: state_of(file) for file in WIRING}
     with mirror, _recorded_failures(values, paths):
         for step in trial.steps():
             entries[step.stage.name] = entry = store.get(step)
+            code |= step.code
             if step.stage is INIT:
                 link_or_copy(entry.path / REPORT_FILE, paths.folder / layout.INIT_REPORT)
         scene = trial.views.scene
         log.info("%s: %d training and %d test views", paths.label, len(scene.train), len(scene.test))
-        results = results_of(values, trial.capture.fingerprint, scene, parts.rasterizer.name, entries)
-        again = read_object(paths.folder / RESULTS) == results
+        results = results_of(values, trial.capture, scene, parts.rasterizer.name, entries, code)
         published = _publish(paths.folder, entries)
         made_of = {stage.name: entries[stage.name].path for stage in (INIT, TRAIN, GROUND_TRUTH, EVALUATE)}
-        record_inputs(paths.folder, values, results, source_files(trial.capture, store), made_of, published)
-        if not again:
-            write_json(paths.folder / RESULTS, results)
+        again = write_finished(paths.folder, values, results, source_files(trial.capture, store), made_of, published)
         (paths.folder / BUILDING).unlink(missing_ok=True)
-    metrics = "  ".join(f"{key} {value:.4g}" for key, value in results["metrics"].items())
-    size = "" if results["num_gaussians"] is None else f"  {results['num_gaussians']} Gaussians"
+    metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
+    size = "" if results.num_gaussians is None else f"  {results.num_gaussians} Gaussians"
     log.info("%s: %s%s%s", paths.label, metrics, size, "  (was done)" if again else "")
     return results
 

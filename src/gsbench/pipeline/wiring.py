@@ -91,7 +91,7 @@ class TrialSteps:
 
 
 class StepFinder:
-    """Tells which steps of trials are in the store; reads the photographs of a scene once for all of them."""
+    """Finder of the steps of trials that are in the store; reads the photographs of a scene once for all of them."""
 
     def __init__(self, store: Store) -> None:
         self.store = store

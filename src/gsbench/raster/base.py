@@ -32,7 +32,7 @@ CONSTANTS = RasterConstants()
 
 
 class FootprintOf(Protocol):
-    """The question after a footprint, for one view that was rendered."""
+    """A request for a footprint, for one view that was rendered."""
 
     def __call__(self, values: Tensor | None = None) -> Footprint: ...
 

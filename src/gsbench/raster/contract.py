@@ -1,4 +1,4 @@
-"""Whether a rasterizer keeps the contract of ``raster.base``: seeded scenes against the float64 reference.
+"""Test of the contract of ``raster.base``: a rasterizer's seeded scenes against the float64 reference.
 
 gsbench's own executors are tested with the same scenes. For a rasterizer of your own, in a test of yours:
 
@@ -104,7 +104,7 @@ def render_with_gradients(
 
 
 def departures(rasterizer: Rasterizer, device: str = "cpu", cases: tuple[Case, ...] = CASES) -> list[str]:
-    """What ``rasterizer``, in float32 on ``device``, does otherwise than the contract, in one line each; [] if nothing.
+    """List the departures of ``rasterizer``, in float32 on ``device``, from the contract, one line each; [] if none.
 
     Compares image, alpha, radii, all gradients and, where there is one, the footprint of ``cases`` with the reference,
     and looks at a scene without Gaussians. Takes seconds.
@@ -147,7 +147,7 @@ def _compare(rasterizer: Rasterizer, case: Case, device: str) -> list[str]:
 
 
 def footprint_errors(output: RenderOutput, expected: RenderOutput) -> dict[str, float]:
-    """How far each part of the footprint of ``output`` is from that of ``expected``, relative to the sum of all."""
+    """The error of each part of ``output``'s footprint against that of ``expected``, relative to the sum of all."""
     height, width = expected.alpha.shape
     values = torch.rand(height, width, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
     assert output.footprint is not None

@@ -5,9 +5,11 @@ A rasterizer of your own needs no entry here: ``raster._target_=mine.MyRasterize
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import logging
 import os
+import re
 from dataclasses import dataclass
 
 from gsbench.errors import InputError
@@ -20,7 +22,7 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class Executor:
-    """What is known of an executor before it is loaded."""
+    """Facts of an executor that are known before it is loaded."""
 
     name: str  # as in ``raster=NAME``, in results and in tables
     target: str  # import path of its class
@@ -28,26 +30,42 @@ class Executor:
     text: str  # what it is, in one line
     package: str | None = None  # what it imports beyond gsbench's own requirements
     install: str = ""  # how to get that package
+    minimum: tuple[int, int] | None = None  # the oldest version of it that works
+    upgrade: str = ""  # how to get that version
     takes_threads: bool = False  # its class has an argument ``threads``
     has_footprint: bool = True  # its renders say which pixels each Gaussian covers
 
     @property
     def is_installed(self) -> bool:
-        """Whether its package can be found; nothing is imported."""
+        """Return whether the executor's package can be found; nothing is imported."""
         return self.package is None or importlib.util.find_spec(self.package) is not None
 
     def runs_on(self, device_type: str) -> bool:
         return not self.devices or device_type in self.devices
 
     def obstacle(self, device_type: str) -> str | None:
-        """Why it cannot run here on a device of this type and what to do about it; None if it can."""
+        """The reason why it cannot run here on a device of this type, and what to do about it; None if it can."""
         if not self.runs_on(device_type):
             needed = " or ".join(self.devices)
             others = ", ".join(other.name for other in EXECUTORS if other.runs_on(device_type))
             return f"runs on device={needed}, not on {device_type}; choose from {others}, or set device={needed}"
         if not self.is_installed:
             return f"needs {self.package}: {self.install}"
-        return None
+        return self.too_old()
+
+    def too_old(self) -> str | None:
+        """Advice about a package that is older than ``minimum``; None if it is not, or its version is not known."""
+        if self.package is None or self.minimum is None:
+            return None
+        try:
+            found = importlib.metadata.version(self.package)
+        except importlib.metadata.PackageNotFoundError:  # for one GPU or another it goes by other names
+            return None
+        numbers = [int(number) for number in re.findall(r"\d+", found)[:2]]
+        if tuple(numbers) >= self.minimum:
+            return None
+        wanted = ".".join(map(str, self.minimum))
+        return f"needs {self.package} {wanted} or newer, and {found} is installed: {self.upgrade}"
 
 
 EXECUTORS = (
@@ -71,6 +89,8 @@ EXECUTORS = (
         text="Triton kernels, compiled at first use by what torch brings along; the same bits on every run",
         package="triton",
         install="pip install triton, in the version that your torch asks for",
+        minimum=(3, 4),  # 3.3 has no `knobs`, and its kernels take no named tuple
+        upgrade="pip install 'torch>=2.8', which brings it along",
     ),
     Executor(
         "gsplat",
@@ -82,12 +102,12 @@ EXECUTORS = (
         has_footprint=False,
     ),
 )
-# What ``auto`` takes: the first that is installed. Other types of devices have the reference alone.
+# Executors that ``auto`` takes: the first that is installed. Other types of devices have the reference alone.
 PREFERRED = {"cpu": ("cpu",), "cuda": ("triton", "gsplat")}
 
 
 def names() -> tuple[str, ...]:
-    """What ``raster=`` accepts."""
+    """The names that ``raster=`` accepts."""
     return (AUTO, *(executor.name for executor in EXECUTORS))
 
 

@@ -1,4 +1,4 @@
-"""Which pixels each Gaussian covers in one view: what some densifiers ask a rasterizer beyond the render."""
+"""Footprints, the pixels that each Gaussian covers in one view: some densifiers ask a rasterizer for them."""
 
 from __future__ import annotations
 

@@ -2,10 +2,12 @@
 
 gsplat's parts are put together here so that the conventions of 3DGS hold where its own ``rasterization`` has others:
 the near plane is 0.2, and a Gaussian reaches the tiles of a square of 3 sigma along its larger axis, whatever its
-opacity. What still differs, since it stands in gsplat's kernels, in the terms of ``RenderOutput``:
+opacity. It works with gsplat 1.5.3 and with 1.6, whose harmonics take other arguments. What still
+differs, since it stands in gsplat's kernels, in the terms of ``RenderOutput``:
 
-- ``image`` and ``alpha``: a contribution is clamped to 0.999 instead of 0.99, and no gradient passes the clamp. A tile
-  at the edge of the square is taken in when any part of it is reached, not only its first pixel.
+- ``image`` and ``alpha``: gsplat 1.5 clamps a contribution to 0.999 (1.6, as the contract, to 0.99), and no gradient
+  passes the clamp. A tile at the edge of the square is taken in when any part of it is reached, not only its first
+  pixel.
 - ``radii`` and ``visible``: a Gaussian is culled by a box of 3.33 sigma along each image axis, not by the square. One
   whose square reaches the image but whose box does not has radius 0 here; it would contribute less than 1/255 anywhere.
   Densifiers that count the iterations in which a Gaussian was visible count fewer.
@@ -15,6 +17,7 @@ opacity. What still differs, since it stands in gsplat's kernels, in the terms o
 from __future__ import annotations
 
 import importlib
+import inspect
 from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -52,6 +55,8 @@ class GsplatRasterizer:
                 raise InputError(f"raster=gsplat needs gsplat: {find('gsplat').install}") from error
         self.library = library
         self.constants = constants
+        # gsplat 1.5 takes directions, 1.6 means and poses.
+        self._takes_directions = "dirs" in inspect.signature(library.spherical_harmonics).parameters
         self._cameras: WeakKeyDictionary[Camera, _DeviceCamera] = WeakKeyDictionary()
 
     def render(
@@ -62,7 +67,7 @@ class GsplatRasterizer:
         background: Tensor,
         absolute_gradient: bool = False,
     ) -> RenderOutput:
-        """See ``raster.base.Rasterizer``; raises ValueError naming the parameter that cannot be used."""
+        """Render as ``raster.base.Rasterizer`` says; raises ValueError naming the parameter that cannot be used."""
         check_settings(gaussians, camera, sh_degree, background)
         points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         absolute = torch.zeros_like(points) if absolute_gradient else None
@@ -92,7 +97,7 @@ class GsplatRasterizer:
             raise_for_values(gaussians, background)
         offsets = self.library.isect_offset_encode(crossings, 1, tiles_x, tiles_y)
         frame = _Frame(width, height, constants.tile, offsets, members, on_device.half_size, absolute)
-        colors = self._colors(gaussians, on_device.center, sh_degree, seen[0])  # [N, 3]
+        colors = self._colors(gaussians, on_device, sh_degree, seen)  # [N, 3]
         image, alpha = _Composite.apply(
             self.library,
             frame,
@@ -113,11 +118,14 @@ class GsplatRasterizer:
             known = self._cameras[camera] = _DeviceCamera.of(camera, like)
         return known
 
-    def _colors(self, gaussians: Gaussians, center: Tensor, sh_degree: int, seen: Tensor) -> Tensor:
-        directions = gaussians.means - center  # [N, 3]; gsplat normalises
+    def _colors(self, gaussians: Gaussians, camera: _DeviceCamera, sh_degree: int, seen: Tensor) -> Tensor:
         used = gaussians.sh_rest[:, : COEFFICIENTS[sh_degree] - 1]
         coefficients = torch.cat([gaussians.sh_dc.unsqueeze(1), used], dim=1)  # [N, K, 3]
-        rgb = self.library.spherical_harmonics(sh_degree, directions, coefficients, masks=seen)
+        harmonics = self.library.spherical_harmonics
+        if self._takes_directions:  # [N, 3]; gsplat normalises
+            rgb = harmonics(sh_degree, gaussians.means - camera.center, coefficients, masks=seen[0])
+        else:
+            rgb = harmonics(sh_degree, gaussians.means, camera.view, coefficients, masks=seen)[0]
         return (rgb + 0.5).clamp_min(0)
 
 

@@ -31,7 +31,7 @@ class Readback:
 
     @property
     def arrived(self) -> bool:
-        """Whether ``values`` would not wait."""
+        """Return whether ``values`` would not wait."""
         return self._event is None or self._event.query()
 
     def values(self) -> Tensor:

@@ -191,7 +191,7 @@ def tile_rectangles(projected: Projection, camera: Camera, tile: int) -> tuple[T
 
 
 def bin_gaussians(depths: Tensor, tile_min: Tensor, tile_max: Tensor, tiles_x: int) -> list[tuple[int, Tensor]]:
-    """For every tile that is reached: its row-major number and its Gaussians [K], front to back (ties by index)."""
+    """List every tile that is reached: its row-major number and its Gaussians [K], front to back (ties by index)."""
     order = torch.sort(depths, stable=True).indices  # [M]
     low, size = tile_min[order], (tile_max - tile_min)[order].clamp_min(0)  # [M, 2]
     counts = size.prod(-1)  # [M]

@@ -1,1 +1,1 @@
-"""Renders of other programs: measured as they are, or entered as trials."""
+"""Renders of other programs: measured as they are, or imported as trials."""

@@ -18,24 +18,31 @@ from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.pictures import Pair
-from gsbench.files import atomic, file_sha256, write_json, write_text
-from gsbench.pipeline.results import EVALUATED, versions
+from gsbench.files import atomic, file_sha256, write_text
+from gsbench.pipeline.results import versions
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.renders.reference_images import Truth
+from gsbench.runs.code import files_of
 from gsbench.runs.hashing import sha256_of
-from gsbench.runs.layout import CONFIG, GROUND_TRUTH, PER_VIEW, RENDERS, RESULTS
+from gsbench.runs.inputs import write_finished
+from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, PER_VIEW, RENDERS
 from gsbench.runs.origin import FROM_RENDERS, RENDERS_ALONE
 from gsbench.runs.stages import EVALUATE
+from gsbench.runs.trial_record import Code, TrialRecord
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
 from gsbench.settings import is_folder_name
 
+MEASURING = [
+    ("gsbench.renders.measure", None),
+    ("gsbench.eval.evaluator", None),
+]  # what makes an entered trial's numbers
 KEPT_GROUPS = ("scene", "eval", "tracking", "launch")  # of the configuration: what is true of renders too
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where renders are to stand: an experiment, a scene, an arm (initialiser and densifier), a seed."""
+    """Place of renders among the results: an experiment, a scene, an arm (initialiser and densifier), a seed."""
 
     experiment: str
     scene: str
@@ -54,6 +61,14 @@ def find_place(word: str, scene: str | None, seed: int, truth: Truth, runs: Path
     where = scene or truth.scene
     if not is_folder_name(experiment) or not is_folder_name(arm):
         raise InputError(f"--as {word} is not EXPERIMENT:ARM, such as table1:sfm-mine")
+    if experiment.casefold() in IN_RUNS:
+        raise InputError(f"--as {word}: {experiment} is gsbench's own folder of {runs}: name an experiment")
+    if seed < 0:
+        raise InputError(f"--seed {seed}: must be 0 or more")
+    if scene is not None and not is_folder_name(scene):
+        raise InputError(f"--scene {scene}: must be a plain folder name")
+    if scene is not None and truth.scene not in (None, scene):
+        raise InputError(f"--scene {scene}: the photographs are {truth.what}, of the scene {truth.scene}: leave it out")
     if where is None:
         raise InputError("--as: a folder of photographs has no scene's name: give it with --scene")
     init, dash, name = arm.partition("-")
@@ -83,7 +98,7 @@ def check_place(place: Place, truth: Truth, runs: Path) -> None:
 
 
 def is_entered(config: Mapping[str, Any]) -> bool:
-    """Whether ``config`` is that of a trial that was entered here."""
+    """Return whether ``config`` is that of a trial made of imported renders."""
     return config["densify"].get("evaluated_from") == FROM_RENDERS
 
 
@@ -117,9 +132,10 @@ def enter(
         for target, file in files.items():
             with atomic(folder / name / target, sync=False) as temporary:
                 Image.fromarray(read_image(file)).save(temporary, format="PNG")
-    write_text(folder / CONFIG, yaml.safe_dump(_config(place, truth, runs), sort_keys=False))
+    config = _config(place, truth, runs)
+    write_text(folder / CONFIG, yaml.safe_dump(config, sort_keys=False))
     write_per_view(folder / PER_VIEW, per_view)
-    write_json(folder / RESULTS, _results(place, truth, identity, per_view, evaluator, source))
+    write_finished(folder, config, _results(place, truth, identity, per_view, evaluator, source))
     return folder
 
 
@@ -130,36 +146,35 @@ def _results(
     per_view: Mapping[str, Mapping[str, float]],
     evaluator: Evaluator,
     source: Mapping[str, str],
-) -> dict[str, Any]:
-    summary = summary_of(evaluator, per_view)
+) -> TrialRecord:
+    evaluation = summary_of(evaluator, per_view)
     unknown = dict.fromkeys(("gaussians", "train_time", "init_points", "total_time", "peak_memory_mb"), RENDERS_ALONE)
-    return {
-        "status": "complete",
-        "experiment": place.experiment,
-        "scene": place.scene,
-        "init": place.init,
-        "densify": place.densify,
-        "seed": place.seed,
-        "evaluated_from": FROM_RENDERS,
-        "raster": "unknown",
-        "protocol": evaluator.protocol.id,
-        "iterations": 0,
-        "metrics": summary["metrics"],
-        "unavailable": summary["unavailable"] | unknown,
-        **{key: summary[name] for name, key in EVALUATED.items() if name in summary},
-        "num_init_points": None,
-        "num_gaussians": None,
-        "seconds": {},
-        "peak_memory_mb": None,
-        "budget": None,
-        "test_views": len(per_view),
-        "resolution": list(truth.resolution),
-        "events": {},
-        "renders": dict(source),
-        "hashes": {"config": identity, "data": truth.data},
-        "code": {"sources": {}, "stages": {EVALUATE.name: EVALUATE.version}},
-        "versions": versions(),
-    }
+    return TrialRecord(
+        status="complete",
+        experiment=place.experiment,
+        scene=place.scene,
+        init=place.init,
+        densify=place.densify,
+        seed=place.seed,
+        evaluated_from=FROM_RENDERS,
+        raster="unknown",
+        protocol=evaluator.protocol.id,
+        iterations=0,
+        metrics=evaluation.metrics,
+        unavailable=evaluation.unavailable | unknown,
+        awaited=evaluation.awaited,
+        metric_facts=evaluation.facts,
+        num_init_points=None,
+        num_gaussians=None,
+        seconds={},
+        peak_memory_mb=None,
+        test_views=len(per_view),
+        resolution=truth.resolution,
+        renders=dict(source),
+        hashes={"config": identity, "data": truth.data},
+        code=Code(stages={EVALUATE.name: EVALUATE.version}, files=files_of(MEASURING)),
+        versions=versions(),
+    )
 
 
 def _config(place: Place, truth: Truth, runs: Path) -> dict[str, Any]:

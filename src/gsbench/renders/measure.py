@@ -1,4 +1,4 @@
-"""The work of ``gsbench evaluate``: renders of any program measured, and entered beside the arms of an experiment."""
+"""The work of ``gsbench evaluate``: renders of any program measured, and imported beside the arms of an experiment."""
 
 from __future__ import annotations
 

@@ -65,12 +65,20 @@ def find_truth(place: str, settings: Sequence[str], runs: Path) -> Truth:
 
 
 def truth_of_trial(trial: TrialResult) -> Truth:
-    """What a finished trial was tested on, under the names and in the order of its own evaluation."""
+    """The reference images of a finished trial, under the names and in the order of its own evaluation."""
     photographs = {view: trial.path / GROUND_TRUTH / png_name(view) for view in read_views(trial)}
-    width, height = trial.data["resolution"]
-    data = str(trial.data["hashes"]["data"])
+    if trial.record.resolution is None or "data" not in trial.record.hashes:
+        raise InputError(f"{trial.label} does not say what it was tested on: run this trial again")
     what = f"the test views of {trial.label}"
-    return Truth(photographs, what, data, (width, height), read_config(trial.path), trial.scene, trial.init)
+    return Truth(
+        photographs,
+        what,
+        trial.record.hashes["data"],
+        trial.record.resolution,
+        read_config(trial.path),
+        trial.scene,
+        trial.init,
+    )
 
 
 def _scene(name: str, settings: Sequence[str]) -> Truth:

@@ -1,4 +1,4 @@
-"""The record of which metric an experiment's verdict was declared to be about (``eval.primary``), and when.
+"""The record of the metric that an experiment's verdict was declared to be about (``eval.primary``): trials and time.
 
 Every change of the declaration is a line of ``<runs>/<experiment>/declared.jsonl``, written when a command is given; a
 trial's ``results.json`` repeats what stood when it was run. Plans of claims stand in the same file, each a line of its
@@ -8,38 +8,67 @@ own. `gsbench.analysis.declaration` judges by it.
 from __future__ import annotations
 
 import calendar
+import logging
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from gsbench.files import read_json_lines
+from pydantic import Field
+
+from gsbench.parsing import DamagedError, fault_of, read_bytes
+from gsbench.records import Count, Part, iterate_rows
 from gsbench.runs.layout import DECLARED
+from gsbench.runs.trial_record import Declared
 
-STOPPING = "stopping"  # the key of a plan that is of a sweep's looks (launch.stop_when_decided)
+log = logging.getLogger(__name__)
+
+INTERPOLATION, EXTRAPOLATION = "interpolation", "extrapolation"
+QUESTIONS = {"every_nth": INTERPOLATION, "sector": EXTRAPOLATION}  # what a split (scene.split) asks of a model
+AT = "@"  # psnr@extrapolation
 STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
+
+
+TrialKey = Annotated[str, Field(pattern=r"^[^/]*/[^/]*/[^/]*$")]
+STOPPING = "stopping"  # the key of a plan of looks at a sweep, among plans of claims
+Planned = Mapping[str, tuple[int, ...]]  # seeds by scene, arm and hash of the configuration (`trial_key`)
+
+
+def trial_key(scene: str, arm: str, config_hash: str) -> str:
+    """The name that tells a trial from others of its experiment but for the seed: ``garden/sfm-adc/3fa9c1d2``."""
+    return f"{scene}/{arm}/{config_hash}"
 
 
 @dataclass(frozen=True)
 class Declaration:
-    """The metric ``metric`` was declared at ``time`` (Unix, whole seconds)."""
+    """The metric ``metric``, perhaps of one question, declared at ``time`` (Unix, whole seconds) with all ``trials``
+    that were to be run.
+
+    ``trials`` is None where they are not known: in what a trial repeats, and in records of earlier versions.
+    """
 
     time: int
     metric: str
+    trials: Planned | None = field(default=None, compare=False, repr=False)
 
     @property
     def when(self) -> str:
         """``2026-11-21 20:05 UTC``"""
         return _readable(self.time)
 
+    def summary(self) -> Declared:
+        """The part that a trial repeats: all but the trials."""
+        return Declared(metric=self.metric, time=time.strftime(STAMP, time.gmtime(self.time)))
+
     def to_record(self) -> dict[str, Any]:
-        return {"metric": self.metric, "time": time.strftime(STAMP, time.gmtime(self.time))}
+        trials = {} if self.trials is None else {"trials": {key: list(seeds) for key, seeds in self.trials.items()}}
+        return self.summary().to_json() | trials
 
 
 @dataclass(frozen=True)
 class DeclaredPlan:
-    """The plan of claims with this hash, all that decides about their verdicts, was written down at ``time``."""
+    """Plan of claims with this hash, all that decides about their verdicts, as written down at ``time``."""
 
     time: int
     hash: str
@@ -47,26 +76,40 @@ class DeclaredPlan:
 
     @property
     def when(self) -> str:
-        """As that of a `Declaration`."""
+        """The time, as that of a `Declaration`."""
         return _readable(self.time)
 
     def to_record(self) -> dict[str, Any]:
         return {"plan": self.plan, "hash": self.hash, "time": time.strftime(STAMP, time.gmtime(self.time))}
 
 
-def read_declarations(folder: Path, repeated: Iterable[object] = ()) -> list[Declaration]:
-    """Every declaration for the experiment in ``folder``, the oldest first.
+def metric_and_question(primary: str) -> tuple[str, str]:
+    """The metric that ``eval.primary`` names, and the question that it is about; "" for all that were asked.
+
+    Examples:
+        >>> metric_and_question("psnr@extrapolation")
+        ('psnr', 'extrapolation')
+        >>> metric_and_question("psnr")
+        ('psnr', '')
+    """
+    metric, _, question = primary.partition(AT)
+    return metric, question
+
+
+def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) -> list[Declaration]:
+    """Read every declaration for the experiment in ``folder``, the oldest first.
 
     Those that only results of its trials record are ``repeated``.
     """
-    records = [*read_json_lines(folder / DECLARED), *repeated]
-    found = [declaration for declaration in map(_from_record, records) if declaration is not None]
-    return sorted(dict.fromkeys(found), key=lambda declaration: declaration.time)
+    found = [declared for one in repeated if (declared := _from_record(one)) is not None]
+    found += [line.declaration for line in _lines(folder) if line.declaration is not None]
+    last = {one: one for one in found}  # of one metric and second the last, which the file says in full
+    return sorted(last.values(), key=lambda declaration: declaration.time)
 
 
 def read_plans(folder: Path) -> list[DeclaredPlan]:
-    """Every plan of claims that was declared for the experiment in ``folder``, the oldest first."""
-    found = [_plan_from_record(record) for record in read_json_lines(folder / DECLARED)]
+    """Read every plan of claims that was declared for the experiment in ``folder``, the oldest first."""
+    found = (line.declared_plan for line in _lines(folder))
     return sorted((plan for plan in found if plan is not None), key=lambda plan: plan.time)
 
 
@@ -74,22 +117,51 @@ def unix_time(text: object) -> int | None:
     """The moment that a stamp names; None for what is none."""
     try:
         return calendar.timegm(time.strptime(str(text), STAMP))
-    except ValueError:
+    except (ValueError, OverflowError):
         return None
 
 
-def _from_record(record: object) -> Declaration | None:
-    if not isinstance(record, dict) or not isinstance(record.get("metric"), str):
-        return None
-    moment = unix_time(record.get("time"))
-    return None if moment is None else Declaration(moment, record["metric"])
+@dataclass(frozen=True, kw_only=True)
+class _Line(Part):
+    """A line of ``declared.jsonl``: a metric with its trials' seeds, or a plan of claims with its hash; and when."""
+
+    time: str
+    metric: str | None = None
+    trials: dict[TrialKey, tuple[Count, ...]] | None = None
+    plan: dict[str, Any] | None = None
+    hash: str | None = None
+
+    def __post_init__(self) -> None:
+        if unix_time(self.time) is None:
+            raise ValueError("time is no moment")
+        if fault := fault_of(self.plan):
+            raise ValueError(f"in plan {fault}")
+
+    @property
+    def declaration(self) -> Declaration | None:
+        return None if self.metric is None else Declaration(unix_time(self.time) or 0, self.metric, self.trials)
+
+    @property
+    def declared_plan(self) -> DeclaredPlan | None:
+        known = self.plan is not None and self.hash is not None
+        return DeclaredPlan(unix_time(self.time) or 0, self.hash or "", self.plan or {}) if known else None
 
 
-def _plan_from_record(record: dict[str, Any]) -> DeclaredPlan | None:
-    moment = unix_time(record.get("time"))
-    if moment is None or not isinstance(record.get("hash"), str) or not isinstance(record.get("plan"), dict):
-        return None
-    return DeclaredPlan(moment, record["hash"], record["plan"])
+def _lines(folder: Path) -> list[_Line]:
+    path = folder / DECLARED
+    try:
+        content = read_bytes(path)
+    except FileNotFoundError:
+        return []
+    except DamagedError as error:
+        log.warning("left out: %s", error)
+        return []
+    return [line for _, line in iterate_rows(content, _Line, path)]
+
+
+def _from_record(record: Declared | None) -> Declaration | None:
+    moment = None if record is None else unix_time(record.time)
+    return None if record is None or moment is None else Declaration(moment, record.metric)
 
 
 def _readable(moment: int) -> str:

@@ -1,4 +1,4 @@
-"""Which steps of a trial are in the store, and why the others are not."""
+"""Report on the steps of a trial that are in the store, and on why the others are not."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from gsbench.parsing import DamagedError
+from gsbench.records import read_typed
 from gsbench.runs.hashing import flatten
 from gsbench.runs.layout import MANIFEST
 from gsbench.runs.step import Step
-from gsbench.runs.store import Store, read_manifest
+from gsbench.runs.store import Manifest, Store, read_manifest
 
 KEY = re.compile(r'"[0-9a-f]{64}"')
 MAX_SHOWN = 80  # characters of a value
@@ -41,10 +43,10 @@ def _differences(store: Store, step: Step) -> list[str]:
     best: dict[str, str] | None = None
     for path in (store.root / step.stage.name).glob(f"*/{MANIFEST}"):
         try:
-            manifest = json.loads(path.read_text(encoding="utf-8"))
-            found = flat({"version": manifest["version"], "inputs": manifest["inputs"]})
-        except (OSError, ValueError, KeyError, TypeError):
+            manifest = read_typed(path, Manifest)
+        except (FileNotFoundError, DamagedError):
             continue
+        found = flat({"version": manifest.version, "inputs": manifest.inputs})
         if best is None or _distance(found, wanted) < _distance(best, wanted):
             best = found
     if best is None:

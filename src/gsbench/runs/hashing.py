@@ -1,4 +1,4 @@
-"""What of a configuration determines a result, and its hash. Loads neither Hydra nor torch."""
+"""Parts of a configuration that determine a result, and their hash. Loads neither Hydra nor torch."""
 
 from __future__ import annotations
 
@@ -11,18 +11,36 @@ from gsbench.runs.source import source_of
 
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")  # options that cannot change a result
 # Settings of a group that say how results will be read, or what may be varied, whatever they are.
-DECLARED = {"eval": ("primary",), "densify": ("switches",)}
+DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",)}
+# Settings that are younger than results that people keep, with the value at which all is as it was before them: at
+# that value they have no part in a hash or key, and a configuration without them means it.
+LATER: dict[str, dict[str, Any]] = {
+    "scene": {"split": "every_nth", "sector": 0, "sectors": 8, "match_views": False, "validation": False},
+    "init": {"points_from": "all"},
+}
+BEFORE = {f"{group}.{name}": value for group, values in LATER.items() for name, value in values.items()}
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
 
 
 def config_hash(values: dict[str, Any]) -> str:
     """sha256 of what determines a result apart from the seed: not names, devices, folders, tracking or launchers."""
+    return sha256_of(_with_sources(determining(values)))
+
+
+def determining(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings among ``values`` that determine a result, apart from the seed and the code of a user's classes."""
     kept = {key: value for key, value in values.items() if key not in NOT_HASHED}
     for key, group in kept.items():
         if isinstance(group, dict):
             dropped = (*WITHOUT_EFFECT, *DECLARED.get(key, ()))
-            kept[key] = {name: value for name, value in group.items() if name not in dropped}
-    return sha256_of(_with_sources(kept))
+            kept[key] = {name: value for name, value in as_before(key, group).items() if name not in dropped}
+    return kept
+
+
+def as_before(group: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """``values`` of a group without the settings of `LATER` that stand at the value of before them."""
+    later = LATER.get(group, {})
+    return {name: value for name, value in values.items() if name not in later or value != later[name]}
 
 
 def _with_sources(values: Any) -> Any:

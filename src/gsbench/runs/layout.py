@@ -38,6 +38,7 @@ INPUTS = "inputs.json"  # what the results were made of: a finished trial is rec
 BUILDING = "building.json"  # the stage that an unfinished trial is at, and where
 INIT_REPORT = "init_report.json"
 PER_VIEW = "per_view.csv"
+PROTOCOLS = "protocols.json"  # the same renders under the conventions of others, where somebody asked
 CURVES = "metrics.jsonl"  # of the training
 EVENTS = "events.jsonl"  # what every refinement did
 HISTOGRAMS = "volume_histograms.jsonl"

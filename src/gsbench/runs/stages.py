@@ -3,14 +3,11 @@ torch."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from gsbench.runs.step import Stage
 
 CAPTURE = Stage("scene", 1)
 INIT = Stage("init", 1, resumable=True)
 TRAIN = Stage("train", 1, resumable=True, scratch=("checkpoint-*.pt",))
-EXTERNAL = replace(TRAIN, resumable=False)  # a training by another program, which starts from the beginning
 GROUND_TRUTH = Stage("ground_truth", 1)
 EVALUATE = Stage("evaluate", 1)
 

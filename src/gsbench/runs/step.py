@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -32,13 +32,19 @@ class Stage:
 @dataclass(frozen=True)
 class Step:
     """One piece of a trial: ``build(folder)`` computes its result, which ``inputs`` determine (upstream keys among
-    them)."""
+    them).
+
+    ``code`` are the files of gsbench that have a part in it, with their states (`gsbench.runs.code`). ``check``, called
+    when it is built, raises where other code may have built it than ``inputs`` say.
+    """
 
     stage: Stage
     inputs: dict[str, Any]
     build: Callable[[Path], None] = field(repr=False)
+    code: Mapping[str, str] = field(default_factory=dict, repr=False)
+    check: Callable[[], None] = field(default=lambda: None, repr=False)
 
     @cached_property
     def key(self) -> str:
-        """What its result is stored under."""
+        """The key under which the step's result is stored."""
         return self.stage.key(self.inputs)

@@ -7,27 +7,59 @@ where it is built, and what a killed build leaves; ``.<key>.lock`` lets one proc
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import shutil
+import stat
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from gsbench import __version__
 from gsbench.files import file_sha256, remove_temporaries, storage_errors, sync_to_disk, write_json
+from gsbench.parsing import DamagedError, fault_of
+from gsbench.records import Amount, Count, Part, read_typed
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import MANIFEST, VIEWS
 from gsbench.runs.step import Stage, Step
+from gsbench.system.checkout import checkout_of
 from gsbench.system.locks import BusyError, hold
 
 log = logging.getLogger(__name__)
 
 LEFTOVER_AGE = 24 * 3600.0  # seconds: temporary files outside the locks are swept when older
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output(Part):
+    """A file of a result as it was written; the time of change is in ns."""
+
+    size: Count
+    mtime_ns: int
+    sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest(Part):
+    """``manifest.json`` of a finished result: what made it, and a checksum of every file."""
+
+    stage: str
+    version: int
+    key: str
+    inputs: dict[str, Any]
+    outputs: dict[str, Output]
+    seconds: Amount
+    gsbench: str
+    created: str
+    checkout: dict[str, Any] = field(default_factory=dict)  # of gsbench: its commit, and whether it was edited
+
+    def __post_init__(self) -> None:
+        if fault := fault_of(self.inputs):
+            raise ValueError(f"in inputs {fault}")
 
 
 @dataclass(frozen=True)
@@ -47,15 +79,15 @@ class Store:
         self.root, self.on_build = root, on_build
 
     def folder(self, stage: Stage, key: str) -> Path:
-        """Where the finished result of ``stage`` under ``key`` lies."""
+        """The folder of the finished result of ``stage`` under ``key``."""
         return self.root / stage.name / key
 
     def path(self, step: Step) -> Path:
-        """Where the result of ``step`` lies once it is finished."""
+        """The folder of the result of ``step`` once it is finished."""
         return self.folder(step.stage, step.key)
 
     def partial(self, stage: Stage, key: str) -> Path:
-        """Where it is built."""
+        """The folder in which the result of ``step`` is built."""
         return self.root / stage.name / f".{key}.partial"
 
     def find(self, step: Step) -> Entry | None:
@@ -86,7 +118,7 @@ class Store:
                 return self._build(step)
 
     def _read(self, path: Path) -> Entry:
-        return Entry(path, path.name, float(read_manifest(path)["seconds"]), cached=True)
+        return Entry(path, path.name, read_manifest(path).seconds, cached=True)
 
     def _build(self, step: Step) -> Entry:
         """Build or finish the partial folder and publish it; the caller holds the lock of the step's key."""
@@ -101,6 +133,7 @@ class Store:
             self.on_build(stage, partial)
             started = time.perf_counter()
             step.build(partial)
+            step.check()
             seconds = time.perf_counter() - started
             write_manifest(partial, step, seconds)
         for pattern in stage.scratch:
@@ -144,42 +177,47 @@ def write_manifest(folder: Path, step: Step, seconds: float) -> None:
         "outputs": outputs,
         "seconds": seconds,
         "gsbench": __version__,
+        "checkout": _checkout(),
         "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
     write_json(folder / MANIFEST, manifest)
 
 
-def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) -> dict[str, Any]:
+@cache
+def _checkout() -> dict[str, Any]:
+    """The commit of gsbench's checkout, and whether files that git follows had changed; empty without one."""
+    found = checkout_of(Path(__file__).parent, Path(__file__).name)
+    return {} if found is None else {"commit": found.commit, "edited": found.edited}
+
+
+def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) -> Manifest:
     """The manifest of the result of ``key`` (else the folder's name); raises ValueError naming what is damaged.
 
     A file whose size and time of change are as recorded counts as sound unless ``thorough``; others are read whole.
     """
     try:
-        manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        outputs = manifest["outputs"].items()
-        if manifest["key"] != (key or folder.name):
-            raise ValueError(f"{MANIFEST} belongs to another key")
-        expected = sha256_of({name: manifest[name] for name in ("stage", "version", "inputs")})
-        if expected != manifest["key"]:
-            raise ValueError(f"{MANIFEST} does not match its key")
-        float(manifest["seconds"])
-    except (OSError, KeyError, TypeError, AttributeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        manifest = read_typed(folder / MANIFEST, Manifest)
+    except (FileNotFoundError, DamagedError) as error:
         raise ValueError(f"{MANIFEST} is missing or unreadable") from error
-    for name, recorded in outputs:
+    if manifest.key != (key or folder.name):
+        raise ValueError(f"{MANIFEST} belongs to another key")
+    if manifest.key != sha256_of({"stage": manifest.stage, "version": manifest.version, "inputs": manifest.inputs}):
+        raise ValueError(f"{MANIFEST} does not match its key")
+    for name, recorded in manifest.outputs.items():
         if not _is_sound(folder / name, recorded, thorough):
             raise ValueError(f"{name} differs from what was written")
     return manifest
 
 
-def _is_sound(path: Path, recorded: dict[str, Any], thorough: bool) -> bool:
+def _is_sound(path: Path, recorded: Output, thorough: bool) -> bool:
     try:
         state = path.stat()
-        if state.st_size != recorded["size"]:
+        if not stat.S_ISREG(state.st_mode) or state.st_size != recorded.size:
             return False
-        if not thorough and state.st_mtime_ns == recorded["mtime_ns"]:
+        if not thorough and state.st_mtime_ns == recorded.mtime_ns:
             return True
-        return file_sha256(path) == recorded["sha256"]
-    except (OSError, KeyError, TypeError):
+        return file_sha256(path) == recorded.sha256
+    except (OSError, ValueError):  # ValueError: a NUL in the name
         return False
 
 
@@ -188,7 +226,7 @@ def _finished_seconds(partial: Path, key: str) -> float | None:
     if not (partial / MANIFEST).exists():
         return None
     try:
-        return float(read_manifest(partial, key)["seconds"])
+        return read_manifest(partial, key).seconds
     except ValueError:
         return None
 

@@ -2,28 +2,84 @@
 
 from __future__ import annotations
 
-import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
+from pydantic_core import to_json
 
 from gsbench.errors import InputError
-from gsbench.files import read_object
+from gsbench.parsing import DamagedError, one_line, read_tail, read_yaml
+from gsbench.records import Amount, Count, Part, read_typed, typed
 from gsbench.runs.hashing import config_hash
-from gsbench.runs.layout import BUILDING, CONFIG, CURVES, FAILED, LOCK, RESULTS
+from gsbench.runs.inputs import read_results
+from gsbench.runs.layout import BUILDING, CONFIG, CURVES, FAILED, LOCK
+from gsbench.settings import FolderName
 from gsbench.system.locks import is_held
 
 TAIL_BYTES = 4096
 
-State = Literal["done", "running", "failed", "partial", "missing"]
+State = Literal["done", "running", "failed", "partial", "damaged", "missing"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Named(Part):
+    """A group of the configuration, of which the name is asked for."""
+
+    name: FolderName
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracked(Part):
+    """Settings of the group ``tracking`` that mirroring a trial later needs."""
+
+    uri: str | None
+    flush_seconds: Amount
+    patience_seconds: Amount
+    images: Count
+
+
+@dataclass(frozen=True, kw_only=True)
+class Configured(Part):
+    """Keys that a trial's ``config.yaml`` must have to be used at all; `gsbench.config.schema` has the rest."""
+
+    name: FolderName
+    seed: Count
+    runs: str
+    scene: Named
+    init: Named
+    densify: Named
+    tracking: Tracked
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure(Part):
+    """``failed.json``: the kind of the error, its text, where it came from, and when (Unix time)."""
+
+    error: str = ""
+    message: str = ""
+    traceback: str = field(default="", repr=False)
+    time: Amount = 0.0
+    seed: Count = 0
+
+    @property
+    def reason(self) -> str:
+        """The failure in one line."""
+        return one_line(self.message or self.error) or "no reason was given"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Building(Part):
+    """``building.json``: the stage that an unfinished trial is at, and the folder where it is built."""
+
+    stage: str = ""
+    folder: str = ""
 
 
 @dataclass(frozen=True)
 class TrialPaths:
-    """Where a trial's files lie."""
+    """Paths of a trial's files."""
 
     runs: Path
     folder: Path
@@ -58,11 +114,16 @@ def label_of(folder: Path) -> str:
 
 
 def state_of(folder: Path) -> State:
-    """How far a trial is, from its folder alone."""
+    """The state of a trial, from its folder alone."""
     if is_held(folder / LOCK):
         return "running"
-    if read_object(folder / RESULTS).get("status") == "complete":
+    try:
+        read_results(folder)
         return "done"
+    except FileNotFoundError:
+        pass
+    except DamagedError:
+        return "damaged"
     if (folder / FAILED).exists():
         return "failed"
     return "partial" if (folder / CONFIG).exists() else "missing"
@@ -70,30 +131,37 @@ def state_of(folder: Path) -> State:
 
 def read_config(folder: Path) -> dict[str, Any]:
     """The configuration that a trial wrote, which allows nothing to run; raises InputError where it cannot be read."""
+    path = folder / CONFIG
     try:
-        values = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise InputError(f"{folder / CONFIG} cannot be read ({error})") from error
-    if not isinstance(values, dict) or not isinstance(values.get("tracking"), dict):
-        raise InputError(f"{folder / CONFIG} is not the configuration of a trial")
+        values = read_yaml(path)
+    except FileNotFoundError:
+        raise InputError(f"{path} is not there: give the command of the trial again") from None
+    typed(to_json(values), Configured, path)
     return values | {"allow_targets": []}  # permission comes from the one who types
 
 
 def failure_of(folder: Path) -> str:
-    """Why a trial failed, in one line."""
-    record = read_object(folder / FAILED)
-    text = str(record.get("message") or record.get("error") or "failed.json cannot be read").strip()
-    return text.splitlines()[0] if text else "no reason was given"
+    """The reason why a trial failed, in one line."""
+    try:
+        return read_typed(folder / FAILED, Failure).reason
+    except (FileNotFoundError, DamagedError):
+        return f"{FAILED} cannot be read"
+
+
+def read_building(folder: Path) -> Building:
+    """The stage that the trial in ``folder`` is at; nothing said where it is at none, or that cannot be read."""
+    try:
+        return read_typed(folder / BUILDING, Building)
+    except (FileNotFoundError, DamagedError):
+        return Building()
 
 
 def stage_and_step(folder: Path) -> tuple[str, int]:
     """The stage that an unfinished trial is at ("" if none has begun), and the last iteration that it logged."""
-    building = read_object(folder / BUILDING)
+    building = read_building(folder)
     try:
-        with Path(building["folder"], CURVES).open("rb") as stream:
-            stream.seek(0, os.SEEK_END)
-            stream.seek(max(0, stream.tell() - TAIL_BYTES))
-            steps = re.findall(rb'"step": (\d+)', stream.read())
-    except (OSError, KeyError, TypeError):
-        steps = []
-    return str(building.get("stage", "")), int(steps[-1]) if steps else 0
+        tail = read_tail(Path(building.folder, CURVES), TAIL_BYTES) if building.folder else b""
+    except (FileNotFoundError, DamagedError):
+        tail = b""
+    steps = re.findall(rb'"step": (\d{1,18})', tail)
+    return building.stage, int(steps[-1]) if steps else 0

@@ -18,6 +18,7 @@ from gsbench.scene.names import match_names
 from gsbench.scene.types import Capture
 
 PINHOLE_MODELS = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
+UNIT_TOLERANCE = 1e-9  # of the length of a quaternion that stays as it is
 MIN_TRACK = 2  # a 3D point of COLMAP is seen by at least two images
 
 
@@ -29,6 +30,7 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     check_model(folder)
     try:
         model = pycolmap.Reconstruction(folder)
+        _normalize(model)
         for image in model.images.values():
             if image.has_pose and not np.isfinite(image.cam_from_world().matrix()).all():
                 raise ValueError(f"image {image.name} has no finite pose")
@@ -39,6 +41,22 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
         if not camera.verify_params() or not np.isfinite(camera.params).all() or camera.width < 1 or camera.height < 1:
             raise InputError(f"{folder}: camera {camera.camera_id} of the COLMAP model is damaged: export it again")
     return model
+
+
+def _normalize(model: pycolmap.Reconstruction) -> None:
+    """Make the quaternions of rigs and frames unit ones, as COLMAP does with those of images alone."""
+    for rig in model.rigs.values():
+        for sensor, pose in rig.non_ref_sensors.items():
+            if pose is not None and abs(pose.rotation.norm() - 1) > UNIT_TOLERANCE:
+                rig.set_sensor_from_rig(sensor, _unit(pose))
+    for frame in model.frames.values():
+        if frame.has_pose() and abs(frame.rig_from_world.rotation.norm() - 1) > UNIT_TOLERANCE:
+            frame.rig_from_world = _unit(frame.rig_from_world)
+
+
+def _unit(pose: pycolmap.Rigid3d) -> pycolmap.Rigid3d:
+    quaternion = np.asarray(pose.rotation.quat)
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion)), pose.translation)
 
 
 def registered_names(model: pycolmap.Reconstruction) -> list[str]:
@@ -154,6 +172,21 @@ def cameras_of(model: pycolmap.Reconstruction) -> dict[str, Camera]:
     """The cameras of all registered images by name, sorted; `InputError` if one is not (SIMPLE_)PINHOLE."""
     cameras = {image.name: camera_of(model, image) for image in model.images.values() if image.has_pose}
     return dict(sorted(cameras.items()))
+
+
+def reference_cameras(model: pycolmap.Reconstruction, names: Iterable[str]) -> list[Camera]:
+    """The poses of the registered images ``names``, with the focal lengths of their cameras, distorted or not.
+
+    They are for asking where cameras stand and look, not for rendering.
+    """
+    found = []
+    for name in names:
+        image = model.find_image_with_name(name)
+        camera, pose = model.cameras[image.camera_id], image.cam_from_world()
+        size, focal = (camera.width, camera.height), camera.mean_focal_length()
+        places = (focal, focal, camera.width / 2, camera.height / 2)
+        found.append(Camera(*size, *places, pose.rotation.matrix(), np.array(pose.translation)))
+    return found
 
 
 def rigid_pose(camera: Camera) -> pycolmap.Rigid3d:

@@ -20,6 +20,9 @@ OPTIONAL = ("rigs", "frames")  # since COLMAP 3.12
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters as doubles
 _IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, camera id; then the name, zero-terminated
+_RIG = struct.Struct("<II")  # id, number of its sensors
+_SENSOR = struct.Struct("<iI")  # type, id
+_POSE = struct.Struct("<7d")
 _FRAME = struct.Struct("<II7dI")  # id, rig id, pose; then the number of its images
 _FRAME_DATA_BYTES = 16  # sensor type, sensor id, image id
 _POINT2D_BYTES = 24  # x, y, id of the 3D point
@@ -124,6 +127,20 @@ def _binary_frames(data: bytes, count: int, checks: ModelChecks) -> int:
     return offset
 
 
+def _binary_rigs(data: bytes, count: int, checks: ModelChecks) -> int:
+    offset = _COUNT.size
+    for _ in range(count):
+        rig_id, sensors = _RIG.unpack_from(data, offset)
+        offset += _RIG.size + (_SENSOR.size if sensors else 0)  # the first is the reference, which has no pose
+        for _ in range(1, sensors):
+            (has_pose,) = struct.unpack_from("<B", data, offset + _SENSOR.size)
+            offset += _SENSOR.size + 1
+            if has_pose:
+                checks.pose(f"a sensor of rig {rig_id}", _POSE.unpack_from(data, offset))
+                offset += _POSE.size
+    return offset
+
+
 def _lines(file: Path) -> Iterator[list[str]]:
     """The words of every line that is no comment; empty lines give no words."""
     for line in file.read_text(encoding="utf-8").split("\n"):
@@ -163,6 +180,16 @@ def _text_points(file: Path, checks: ModelChecks) -> None:
         checks.point(int(words[0]), (x, y, z), zip(track[::2], track[1::2], strict=True))
 
 
+def _text_rigs(file: Path, checks: ModelChecks) -> None:
+    for words in filter(None, _lines(file)):
+        sensors, at = int(words[1]), 4
+        for _ in range(1, sensors):
+            has_pose = int(words[at + 2])
+            if has_pose:
+                checks.pose(f"a sensor of rig {words[0]}", _numbers(words[at + 3 : at + 10]))
+            at += 10 if has_pose else 3
+
+
 def _text_frames(file: Path, checks: ModelChecks) -> None:
     for words in filter(None, _lines(file)):
         checks.pose(f"frame {words[0]}", _numbers(words[2:9]))
@@ -173,11 +200,16 @@ _BINARY_WALKS = {
     "cameras": _walk_binary(_binary_cameras),
     "images": _walk_binary(_binary_images),
     "points3D": _walk_binary(_binary_points),
+    "rigs": _walk_binary(_binary_rigs),
     "frames": _walk_binary(_binary_frames),
 }
-_TEXT_WALKS = {"cameras": _text_cameras, "images": _text_images, "points3D": _text_points, "frames": _text_frames}
+_TEXT_WALKS = {
+    "cameras": _text_cameras, "images": _text_images, "points3D": _text_points, "rigs": _text_rigs,
+    "frames": _text_frames,
+}  # fmt: skip
 
 
+MAX_LENGTH = 1e6  # of a quaternion, and of its inverse: COLMAP takes those of any length, which stand for rotations
 MAX_SIDE = 1_000_000  # px
 MAX_ID = 2**32 - 2  # COLMAP's ids of cameras and images are unsigned, and the last stands for none
 TWO_FOCAL_LENGTHS = (
@@ -216,7 +248,8 @@ class ModelChecks:
 
     def pose(self, owner: str, pose: Sequence[float]) -> None:
         """``pose``: quaternion (w, x, y, z) and translation."""
-        if len(pose) != 7 or not all(map(math.isfinite, pose)) or not math.hypot(*pose[:4]) > 0:
+        sound = len(pose) == 7 and all(map(math.isfinite, pose))
+        if not sound or not 1 / MAX_LENGTH < math.hypot(*pose[:4]) < MAX_LENGTH:
             raise InputError(f"{owner} has no pose that can be used ({', '.join(f'{value:g}' for value in pose)})")
 
     def point(self, point_id: int, position: Sequence[float], track: Iterable[Sequence[int]]) -> None:

@@ -1,4 +1,4 @@
-"""From a capture and the COLMAP model of its initialisation to a `Scene`: pinhole cameras, final size, in memory.
+"""Loading of a `Scene` from a capture and the COLMAP model of its initialisation: pinhole cameras, final size.
 
 Prepared images are kept below ``cache_dir`` as PNG files, each set in a folder named after all that it depends on and
 published by one rename, so a set is either whole or absent. Images that need no change are read from where they lie.

@@ -1,4 +1,4 @@
-"""Which image names mean which files, which images are kept, and which are held out."""
+"""Names of images: the files that they mean, and the choice of images to keep and to hold out."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from pathlib import Path, PurePosixPath
 
 from gsbench.errors import InputError
 from gsbench.scene.images import IMAGE_SUFFIXES
+from gsbench.scene.split import TEST_EVERY
 from gsbench.words import some_of
 
 MAX_IMAGES = 200  # the paper's limit per scene
-TEST_EVERY = 8  # Mip-NeRF 360 and 3DGS hold out every 8th image, from the first
 MIN_IMAGES = 3
+MAX_NAME_BYTES = 220  # of a picture's name; file systems end at 255, and a file that is being written has a longer one
 
 
 def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
-    """For each wanted image name the file that it means, for those that have one.
+    """Find the file that each wanted image name means, for those that have one.
 
     The same name wins; else the one file with the same path but for its extension (``images_4/a.png`` for ``a.JPG``). A
     name that several files fit, or a file that several names claim, stays without a match.
@@ -37,8 +38,8 @@ def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
     return matches
 
 
-def select_images(names: Sequence[str], max_images: int) -> list[str]:
-    """At most ``max_images`` of the names, evenly spaced: the k-th of m is the one at index ``k * n // m``.
+def select_images(names: Sequence[str], max_images: int, least: int = MIN_IMAGES) -> list[str]:
+    """Select at most ``max_images`` of the names, evenly spaced: the k-th of m is the one at index ``k * n // m``.
 
     The first is always kept, and a closed ring of views stays evenly spaced. This comes before the split.
 
@@ -46,8 +47,8 @@ def select_images(names: Sequence[str], max_images: int) -> list[str]:
         >>> select_images(["a", "b", "c", "d", "e"], 3)
         ['a', 'b', 'd']
     """
-    if max_images < MIN_IMAGES:
-        raise InputError(f"scene.max_images must be at least {MIN_IMAGES}, got {max_images}")
+    if max_images < least:
+        raise InputError(f"scene.max_images must be at least {least}, got {max_images}")
     if len(names) <= max_images:
         return list(names)
     return [names[k * len(names) // max_images] for k in range(max_images)]
@@ -95,6 +96,22 @@ def split_names(
 def _stem(name: str) -> str:
     path = PurePosixPath(name)
     return (path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path).as_posix()
+
+
+def check_picture_names(names: Iterable[str], folder: Path) -> None:
+    """Raise `InputError` where the pictures of two views would have one name, or a name that no file can have."""
+    taken: dict[str, str] = {}
+    for name in names:
+        picture = png_name(name)
+        if len(picture.encode()) > MAX_NAME_BYTES:
+            raise InputError(
+                f"{folder / name}: a name of more than {MAX_NAME_BYTES} bytes, folders included: shorten it"
+            )
+        if picture in taken:
+            raise InputError(
+                f"{folder}: the pictures of {taken[picture]} and {name} would both be {picture}: rename one"
+            )
+        taken[picture] = name
 
 
 def png_name(view_name: str) -> str:

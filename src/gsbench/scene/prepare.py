@@ -1,4 +1,4 @@
-"""From a photograph on disk to an undistorted image at its final size, one file at a time.
+"""Preparation of a photograph on disk: an undistorted image at its final size, one file at a time.
 
 Undistortion is COLMAP's own with the defaults of its ``image_undistorter``, which INRIA's ``convert.py`` uses too: the
 largest pinhole image without blank pixels, at the focal length of the original. It runs on pixels in memory, so nothing

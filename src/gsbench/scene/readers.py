@@ -10,9 +10,12 @@ from pathlib import Path
 
 from gsbench.datasets.catalog import how_to_get
 from gsbench.errors import InputError
+from gsbench.files import require_regular
 from gsbench.scene.colmap_files import model_files
+from gsbench.scene.hold_out import Cameras, hold_out
 from gsbench.scene.images import IMAGE_SUFFIXES
-from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, TEST_EVERY, match_names, select_images, split_names
+from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, check_picture_names, match_names, select_images
+from gsbench.scene.split import EVERY_NTH, TEST_LIST, TRAIN_LIST, SplitRule
 from gsbench.scene.types import Capture
 from gsbench.words import some_of
 
@@ -27,24 +30,23 @@ def read_colmap(
     images: str | None = None,
     sparse: str | None = None,
     max_images: int = MAX_IMAGES,
-    test_every: int = TEST_EVERY,
-    train_list: str | None = None,
-    test_list: str | None = None,
+    split: SplitRule = EVERY_NTH,
     exact_poses: bool = False,
 ) -> Capture:
     """Read a COLMAP folder: ``path/<images>`` (else "images") and ``path/<sparse>`` (else "sparse/0" or "sparse").
 
     The photos are those that the model has a pose for and that are in the folder; a file may have another extension
-    than the model says. See `select_images` for which are kept and `split_names` for which are held out.
+    than the model says. See `select_images` for which are kept and `SplitRule` for which are held out.
 
     Raises `InputError` if a folder is missing, the model is damaged, or fewer than three photos are usable.
     """
-    from gsbench.scene.colmap import read_model, registered_names  # here, because photos alone need no pycolmap
+    from gsbench.scene.colmap import read_model, reference_cameras, registered_names  # photos alone need no pycolmap
 
     root = existing_folder(name, path)
     model_folder = _find_sparse(root, sparse)
     folder = _subfolder(root, images or "images", "scene.images")
-    wanted = registered_names(read_model(model_folder))
+    model = read_model(model_folder)
+    wanted = registered_names(model)
     matches = match_names(wanted, list_images(folder))
     missing = [image for image in wanted if image not in matches]
     if missing:
@@ -52,9 +54,10 @@ def read_colmap(
             "%s: %d of %d images of the model have no file: %s", folder, len(missing), len(wanted), some_of(missing)
         )
     _require_enough(len(matches), folder, f"that the model {model_folder} has a pose for")
+    files = {file: image for image, file in matches.items()}
     return _capture(
-        name, folder, sorted(matches.values()), model_folder, exact_poses,
-        max_images=max_images, test_every=test_every, lists=_read_lists(root, train_list, test_list),
+        name, folder, sorted(matches.values()), model_folder, exact_poses, max_images, split, root,
+        lambda names: reference_cameras(model, [files[file] for file in names]),
     )  # fmt: skip
 
 
@@ -63,9 +66,7 @@ def read_photos(
     path: Path | str,
     images: str | None = None,
     max_images: int = MAX_IMAGES,
-    test_every: int = TEST_EVERY,
-    train_list: str | None = None,
-    test_list: str | None = None,
+    split: SplitRule = EVERY_NTH,
 ) -> Capture:
     """Read bare photographs: all images in ``path/<images>``, or ``path/images`` if there is one, or ``path``.
 
@@ -80,10 +81,7 @@ def read_photos(
         folder = root / "images" if (root / "images").is_dir() else root
     names = list_images(folder)
     _require_enough(len(names), folder, f"({', '.join(sorted(s[1:] for s in IMAGE_SUFFIXES))})")
-    return _capture(
-        name, folder, names, None, False,
-        max_images=max_images, test_every=test_every, lists=_read_lists(root, train_list, test_list),
-    )  # fmt: skip
+    return _capture(name, folder, names, None, False, max_images, split, root)
 
 
 def existing_folder(name: str, path: Path | str) -> Path:
@@ -97,19 +95,43 @@ def existing_folder(name: str, path: Path | str) -> Path:
 
 
 def missing_folder(name: str, root: Path) -> str:
-    """What is wrong with the folder ``root`` of the scene ``name``, which is not there."""
+    """Explain that the folder ``root`` of the scene ``name`` is not there, and what to do about it."""
     return f"scene {name}: the folder {root} {'is a file' if root.exists() else 'does not exist'}"
 
 
 def list_images(folder: Path) -> list[str]:
-    """The sorted image files in a folder and its sub-folders, relative, with "/" as separator; hidden ones left out."""
-    names = []
-    for parent, folders, files in os.walk(folder, followlinks=True):
-        folders[:] = sorted(entry for entry in folders if not entry.startswith("."))
-        for file in files:
-            if Path(file).suffix.lower() in IMAGE_SUFFIXES and not file.startswith("."):
-                names.append((Path(parent) / file).relative_to(folder).as_posix())
+    """The sorted image files in a folder and its sub-folders, relative, with "/" as separator; hidden ones left out.
+
+    Links to folders are followed, and no folder is read twice.
+    """
+    names: list[str] = []
+    waiting, links, seen = [folder], list[Path](), set[tuple[int, int]]()
+    while waiting or links:
+        parent = waiting.pop() if waiting else links.pop(0)  # a folder goes by its own name rather than by a link's
+        if (place := _identity(parent)) in seen:
+            continue
+        seen.add(place)
+        for entry in sorted(_entries(parent), key=lambda entry: entry.name):
+            if entry.name.startswith("."):
+                continue
+            if entry.is_dir():
+                (links if entry.is_symlink() else waiting).append(Path(entry.path))
+            elif Path(entry.name).suffix.lower() in IMAGE_SUFFIXES:
+                names.append(Path(entry.path).relative_to(folder).as_posix())
     return sorted(names)
+
+
+def _identity(folder: Path) -> tuple[int, int]:
+    found = folder.stat()
+    return found.st_dev, found.st_ino
+
+
+def _entries(folder: Path) -> list[os.DirEntry[str]]:
+    try:
+        with os.scandir(folder) as entries:
+            return list(entries)
+    except PermissionError:  # as if it were not there
+        return []
 
 
 def fingerprint(folder: Path, names: Iterable[str], model_files: Iterable[Path] = ()) -> str:
@@ -118,6 +140,7 @@ def fingerprint(folder: Path, names: Iterable[str], model_files: Iterable[Path] 
     entries = [(f"image/{name}", folder / name) for name in sorted(names)]
     entries += [(f"model/{file.name}", file) for file in sorted(model_files)]
     for label, file in entries:
+        require_regular(file)
         try:
             with file.open("rb") as stream:
                 content = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -134,24 +157,27 @@ def _capture(
     model: Path | None,
     exact_poses: bool,
     max_images: int,
-    test_every: int,
-    lists: tuple[list[str] | None, list[str] | None],
+    split: SplitRule,
+    root: Path,
+    cameras: Cameras | None = None,
 ) -> Capture:
+    lists = _read_lists(root, split)
     train, test = (None if wanted is None else _resolve(wanted, names, folder) for wanted in lists)
     if train is not None and test is not None:
         names = sorted({*train, *test})
-    selected = select_images(names, max_images)
-    training, testing = split_names(selected, test_every, train, test)
-    kept = tuple(sorted([*training, *testing]))
-    _require_enough(len(kept), folder, "in the split lists")
+    held_out = hold_out(select_images(names, max_images), split, (train, test), cameras)
+    kept = tuple(sorted([*held_out.train, *held_out.test]))
+    check_picture_names(held_out.test, folder)
+    _require_enough(len(kept), folder, "in the split lists" if split.by_lists else "left by the split")
     return Capture(
         name=name,
         images=folder,
         image_names=kept,
-        test_names=tuple(testing),
+        test_names=held_out.test,
         model=model,
         exact_poses=exact_poses,
         fingerprint=fingerprint(folder, kept, model_files(model) if model is not None else ()),
+        held_out=held_out.words,
     )
 
 
@@ -165,7 +191,16 @@ def _resolve(wanted: Sequence[str], names: Sequence[str], folder: Path) -> list[
     return sorted(matches.values())
 
 
-def _read_lists(root: Path, train: str | None, test: str | None) -> tuple[list[str] | None, list[str] | None]:
+def _read_lists(root: Path, split: SplitRule) -> tuple[list[str] | None, list[str] | None]:
+    """The training and the test list; ``split=list`` without names finds those that nerfbaselines writes."""
+    train, test = split.train_list, split.test_list
+    if split.split == "list" and train is None and test is None:
+        train, test = (name if (root / name).is_file() else None for name in (TRAIN_LIST, TEST_LIST))
+        if train is None and test is None:
+            raise InputError(
+                f"scene.split=list: neither {TRAIN_LIST} nor {TEST_LIST} is in {root}: name the files with "
+                "scene.train_list and scene.test_list"
+            )
     return _read_list(root, train, "scene.train_list"), _read_list(root, test, "scene.test_list")
 
 
@@ -173,6 +208,7 @@ def _read_list(root: Path, file: str | None, key: str) -> list[str] | None:
     if file is None:
         return None
     path = root / file  # an absolute path stays as it is
+    require_regular(path)
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -1,4 +1,4 @@
-"""What a scene is: photographs on disk before initialisation, views with cameras after it."""
+"""Types of a scene: photographs on disk before initialisation, views with cameras after it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Capture:
     ``images`` is the folder; ``image_names`` are the selected files in it (relative, sorted) and ``test_names`` those
     of them held out. ``model`` is a COLMAP sparse folder with reference cameras, or None for bare photographs;
     ``exact_poses`` says that its poses are the truth (a procedural scene), not an estimate. ``fingerprint`` is a sha256
-    over names and contents of all that was selected.
+    over names and contents of all that was selected. ``held_out`` says in words which views are the test views.
     """
 
     name: str
@@ -32,6 +32,7 @@ class Capture:
     model: Path | None
     exact_poses: bool
     fingerprint: str
+    held_out: str = ""
 
     @property
     def train_names(self) -> tuple[str, ...]:

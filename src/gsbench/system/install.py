@@ -1,4 +1,4 @@
-"""How gsbench is installed, and the command that adds to it what is missing."""
+"""Installation of gsbench, and the command that adds to it what is missing."""
 
 from __future__ import annotations
 

@@ -37,12 +37,13 @@ _BOOTSTRAP = (
 )
 _SECONDS_TO_END = 10.0  # patience with a child that ends what it started, before it is killed
 _TAIL_LINES = 3
+_TAIL_BYTES = 1 << 20  # in which they are looked for: a program may print gigabytes
 _STACK_LINE = re.compile(r"^\s*(@|PC:|\*\*\* )|^\s*File |^\s*$")  # glog's crash dump, blank lines
 _REASON_LINE = re.compile(r"what\(\)|terminate called|Check failed|Error|error|free\(\)|malloc|corrupt")
 
 
 class CrashError(GsbenchError):
-    """An isolated function ended without a result: its process crashed, was killed, or ran out of memory."""
+    """Error of an isolated function without a result: its process crashed, was killed, or ran out of memory."""
 
 
 def run_isolated(
@@ -72,7 +73,7 @@ def run_isolated(
             start = stream.seek(0, os.SEEK_END)
             code = _run_child(call, result, stream)
         if code != 0 or not result.is_file():
-            raise CrashError(f"{what} {describe_exit(code)}; its last words: {_telling_tail(output, start)}")
+            raise CrashError(f"{what} {describe_exit(code)}; its last words: {telling_tail(output, start)}")
         succeeded, value, trace = pickle.loads(result.read_bytes())
     if succeeded:
         return value
@@ -151,7 +152,7 @@ def _portable(error: Exception) -> Exception:
 
 
 def describe_exit(code: int) -> str:
-    """How a process ended that should not have, by its exit code: "crashed (SIGSEGV)", "ended early (exit code 1)"."""
+    """Describe the unexpected end of a process by its exit code: "crashed (SIGSEGV)", "ended early (exit code 1)"."""
     if code < 0:
         try:
             name = signal.Signals(-code).name
@@ -161,10 +162,11 @@ def describe_exit(code: int) -> str:
     return f"ended early (exit code {code})"
 
 
-def _telling_tail(output: Path, start: int) -> str:
+def telling_tail(output: Path, start: int = 0) -> str:
+    """`telling_lines` of the end of a file of output, of which what is before ``start`` does not count."""
     with output.open("rb") as stream:
-        stream.seek(start)
-        return telling_lines(stream.read())
+        stream.seek(max(start, stream.seek(0, os.SEEK_END) - _TAIL_BYTES))
+        return telling_lines(stream.read(_TAIL_BYTES))
 
 
 def telling_lines(output: bytes) -> str:

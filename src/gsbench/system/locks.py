@@ -9,10 +9,14 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
+
+from gsbench.parsing import DamagedError
+from gsbench.records import Amount, Part, read_typed
 
 try:
     import fcntl
@@ -25,7 +29,7 @@ SECONDS_BETWEEN_TRIES = 0.25
 
 
 class BusyError(Exception):
-    """Another process holds the lock."""
+    """Error of a lock that another process holds."""
 
 
 @contextmanager
@@ -55,7 +59,7 @@ def hold(path: Path, what: str, wait: bool = True) -> Iterator[None]:
 
 
 def is_held(path: Path) -> bool:
-    """Whether a process holds the lock ``path``; needs no right to write."""
+    """Return whether a process holds the lock ``path``; needs no right to write."""
     if fcntl is None:
         lock = FileLock(path)
         try:
@@ -79,21 +83,34 @@ def is_held(path: Path) -> bool:
     return False
 
 
-def read_holder(path: Path) -> dict[str, Any]:
-    """What the holder of the lock ``path`` wrote about itself: host, pid, since (s), Slurm job; empty if nothing."""
+@dataclass(frozen=True, kw_only=True)
+class Holder(Part):
+    """Record that a lock's holder writes of itself: host, process, Slurm job, time of start (Unix), its work."""
+
+    host: str
+    pid: int
+    since: Amount
+    slurm: str | None = None
+    what: str = ""
+
+    @property
+    def words(self) -> str:
+        """``process 17 on node3, Slurm job 5``"""
+        return f"process {self.pid} on {self.host}{f', Slurm job {self.slurm}' if self.slurm else ''}"
+
+
+def read_holder(path: Path) -> Holder | None:
+    """Read what the holder of the lock ``path`` wrote about itself; None where nothing can be read."""
     try:
-        content = json.loads(_holder_file(path).read_text())
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
+        return read_typed(_holder_file(path), Holder)
+    except (FileNotFoundError, DamagedError):
+        return None
 
 
 def describe_holder(path: Path) -> str:
+    """The holder of a lock, for people."""
     holder = read_holder(path)
-    if not holder:
-        return "another process"
-    job = f", Slurm job {holder['slurm']}" if holder.get("slurm") else ""
-    return f"process {holder.get('pid')} on {holder.get('host')}{job}"
+    return "another process" if holder is None else holder.words
 
 
 def this_process() -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""On what a result was computed: what may change its last digits although code, settings and seed are equal.
+"""Description of the machine, which may change a result though code, settings and seed are equal.
 
 Compiled kernels, torch and the linear algebra libraries choose their instructions by the processor; fused and wider
 ones round differently. So results are equal to the bit on one kind of machine, and close on two (see
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 CPU_INFO = Path("/proc/cpuinfo")
 CPU_NAME_KEYS = ("model name", "Processor", "cpu model", "Model", "cpu")  # x86, old ARM, MIPS, Raspberry Pi, POWER
-# What x86-64-v2 to -v4 ask for beyond the level below, as far as it tells processors apart (x86-64 psABI, table 3.1);
-# names are LLVM's.
+# Features that x86-64-v2 to -v4 ask for beyond the level below, as far as they tell processors apart (x86-64 psABI,
+# table 3.1); names are LLVM's.
 X86_LEVELS = {
     "x86-64-v2": ("cx16", "sahf", "popcnt", "sse3", "sse4.1", "sse4.2", "ssse3"),
     "x86-64-v3": ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"),
@@ -32,7 +32,7 @@ SECONDS_FOR_SYSCTL = 10
 
 
 def describe_machine(device: torch.device) -> dict[str, str]:
-    """What results name as their machine: ``cpu``, ``architecture``, ``kernels``, ``torch``, ``device``.
+    """Describe this machine as results name it: ``cpu``, ``architecture``, ``kernels``, ``torch``, ``device``.
 
     ``kernels`` is the processor type that the compiled kernels are made for, and its instruction set; ``torch`` the
     instruction set that torch uses; ``device`` the GPU's name, or "cpu".
@@ -107,7 +107,7 @@ def numba_target() -> tuple[str, str]:
 
 
 def kernel_target() -> str:
-    """What numba compiles for, this processor unless ``NUMBA_CPU_NAME`` is set: LLVM's name and the x86-64 level."""
+    """The target of numba, LLVM's name and the x86-64 level: this processor, or ``NUMBA_CPU_NAME``."""
     name, features = numba_target()
     if platform.machine().lower() not in ("x86_64", "amd64"):
         return name

@@ -1,4 +1,4 @@
-"""Where Python finds a user's own modules: by the names that were allowed, in one folder, behind what is installed.
+"""Import of a user's own modules: by the names that were allowed, in one folder, behind what is installed.
 
 The current folder as such is no place of Python's here: a capture may hold a ``plyfile.py``.
 """
@@ -14,6 +14,7 @@ from types import ModuleType
 
 # Python's switch against the current folder as a place of modules, with a value that tells ours from the user's.
 SAFE_PATH = ("PYTHONSAFEPATH", "gsbench")
+PATH_AT_START = tuple(sys.path)  # where Python looked for modules before any code of a user's could add to it
 
 
 class AllowedModules(MetaPathFinder):

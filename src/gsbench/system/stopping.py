@@ -16,7 +16,7 @@ SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR2
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal asked the program to end; what was done so far is kept."""
+    """Signal to the program to end; what was done so far is kept."""
 
     def __init__(self, signum: int) -> None:
         super().__init__(signal.Signals(signum).name)
@@ -35,7 +35,7 @@ class _State:
 
 
 def requested() -> bool:
-    """Whether a signal came that the present ``deferred`` block has still to act on."""
+    """Return whether a signal came that the present ``deferred`` block has still to act on."""
     return _State.requested is not None
 
 
@@ -65,7 +65,7 @@ def take_signals_back() -> None:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Within the block a first signal only sets `requested`, a second stops at once; raises `Stopped` at the end."""
+    """Defer signals within the block: a first sets `requested`, a second stops at once; raises `Stopped` at its end."""
     take_signals_back()
     _State.deferring += 1
     try:

@@ -23,7 +23,7 @@ ADVISORY_LOCK = 0x67736265_6E6368  # "gsbench": the number of our lock in a Post
 KIND = {"mlflow.experimentKind": "custom_model_development"}  # else its page opens as that of a chat program
 SWEEP_TAG = "gsbench.sweep"
 SECONDS_FOR_SQLITE = 20.0  # patience with a writer
-# What would print, phone home or hang for minutes.
+# Settings against printing, phoning home and hanging for minutes.
 SETTINGS = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_LOGGING_LEVEL": "WARNING",

@@ -1,4 +1,4 @@
-"""What runs in the mirror's own process: it follows a trial's files until the trial, or its process, is gone.
+"""Follower of a trial's files until the trial, or its process, is gone; runs in the mirror's own process.
 
 The files are the truth: what a trial is, how far it has come and how it ended is read there. The end of the input
 says that it has ended.
@@ -54,7 +54,10 @@ def sync() -> NoReturn:
     def work(ended: threading.Event, out: TextIO) -> None:
         new = known = 0
         for folder in (folder for home in homes for folder in sorted(Path(home).glob(TRIAL_GLOB))):
-            if state_of(folder) not in ("done", "failed"):
+            state = state_of(folder)
+            if state == "damaged":
+                print(f"left out: {label_of(folder)}: damaged, see gsbench status", file=out, flush=True)
+            if state not in ("done", "failed"):
                 continue
             try:
                 values = read_config(folder)

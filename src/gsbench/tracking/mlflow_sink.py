@@ -13,12 +13,14 @@ import uuid
 from collections.abc import Sequence
 from typing import Any
 
-from gsbench.files import read_object, write_json
+from gsbench.files import write_json
 from gsbench.runs import layout
+from gsbench.runs.trial_record import TrialRecord
 from gsbench.tracking.client import connect, default_uri, ensure_experiment, ensure_parent
-from gsbench.tracking.record import TrialRecord
+from gsbench.tracking.record import TrackedFiles
 from gsbench.tracking.sink import Point, Summary
 from gsbench.tracking.source import source_tags, user_tags
+from gsbench.tracking.state import read_state
 
 STATE = "mlflow.json"  # in the trial's folder: the run that mirrors it and how far
 OWN_DATABASE = "runs/mlflow.db"
@@ -40,7 +42,7 @@ class MlflowSink:
 
     state_file = STATE
 
-    def __init__(self, options: dict[str, Any], record: TrialRecord, program: str | None) -> None:
+    def __init__(self, options: dict[str, Any], record: TrackedFiles, program: str | None) -> None:
         self._options, self._record, self._program = options, record, program
         self.client = connect(options["uri"], record.runs)
         self.run_id = ""
@@ -48,7 +50,7 @@ class MlflowSink:
         self._monitor: Any = None
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """See `gsbench.tracking.sink.Sink`; a deleted run, and one in another tracker, is as none."""
+        """Open the run (see `gsbench.tracking.sink.Sink`); a deleted one, and one in another tracker, count as none."""
         state = self._known(state, results) or self._create_run()
         self.run_id, self._started = state["run_id"], state["started"]
         if state["complete"] is None:
@@ -140,22 +142,23 @@ class MlflowSink:
     def _begin(self) -> dict[str, Any]:
         """Note, before a run is created, by what it is found again if nobody hears of its creation."""
         file = self._record.folder / STATE
-        state = read_object(file)
+        state = read_state(file)
         if state.get("uri") == self._uri() and "token" in state and "run_id" not in state:
             return state
         begun = {"uri": self._uri(), "token": uuid.uuid4().hex, "started": int(time.time() * 1000)}
         write_json(file, begun)
         return begun
 
-    def _log_datasets(self, results: dict[str, Any]) -> None:
+    def _log_datasets(self, results: TrialRecord) -> None:
         """The photographs, once for each split: MLflow tells data sets apart by name and digest."""
         from mlflow.entities import Dataset, DatasetInput, InputTag
 
-        digest = results["hashes"].get("data")
+        digest = results.hashes.get("data")
         if digest is None:
             return
         scene = self._record.values["scene"]
         source = json.dumps({"uri": str(scene.get("path") or scene["name"])})
+        views = {"train": results.train_views, "test": results.test_views}
         inputs = [
             DatasetInput(
                 Dataset(
@@ -163,12 +166,12 @@ class MlflowSink:
                     digest=f"{digest[:DIGEST_CHARACTERS]}-{split}",
                     source_type="local",
                     source=source,
-                    profile=json.dumps({"views": results[f"{split}_views"], "split": split}),
+                    profile=json.dumps({"views": count, "split": split}),
                 ),
                 [InputTag("mlflow.data.context", split)],
             )
-            for split in ("train", "test")
-            if f"{split}_views" in results  # of renders that another program made, the tests alone are known
+            for split, count in views.items()
+            if count is not None  # of renders that another program made, the tests alone are known
         ]
         for tries_left in reversed(range(TRIES)):
             try:

@@ -24,7 +24,7 @@ TRACKER_FAILED = 3  # exit code where the tracker, or a file, is at fault: the l
 
 
 class MirrorError(Exception):
-    """What was to be mirrored is not; the text is the reason, in one line."""
+    """Error of a mirror that could not be written; the text is the reason, in one line."""
 
 
 class MirrorProcess:
@@ -47,7 +47,7 @@ class MirrorProcess:
             yield line.decode("utf-8", "replace").rstrip("\n")
 
     def finish(self, seconds: float | None) -> None:
-        """Tell it that the end has come, and wait for its own.
+        """Tell the process that its input has ended, and wait for its own end.
 
         Raises TimeoutError where it takes longer than ``seconds``, and MirrorError where it failed. In each case, and
         where a signal interrupts the wait, it is gone afterwards.
@@ -70,7 +70,7 @@ class MirrorProcess:
             raise MirrorError(f"the mirror {describe_exit(code)}; its last words: {telling_lines(said)}")
 
     def kill(self) -> None:
-        """End it, whatever it is at."""
+        """End the process, whatever it is doing."""
         if self._process.poll() is None:
             self._process.kill()
         self._process.wait()

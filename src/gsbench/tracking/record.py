@@ -1,17 +1,22 @@
-"""What the files of a trial say, in the terms of a tracker: names, settings, curves, results, pictures."""
+"""Record of a trial, read from its files, in the terms of a tracker: names, settings, curves, results, pictures."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbench.files import read_object
+from gsbench.errors import InputError
+from gsbench.parsing import DamagedError
 from gsbench.runs import layout
 from gsbench.runs.hashing import flatten, sha256_of
+from gsbench.runs.inputs import read_results
+from gsbench.runs.plan_file import read_entries
+from gsbench.runs.rows import read_curve
 from gsbench.runs.stages import TRAIN
+from gsbench.runs.trial_files import read_building
+from gsbench.runs.trial_record import TrialRecord
 from gsbench.tracking.sink import Point, Summary
 
 FILES = (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS)
@@ -21,7 +26,7 @@ CURVES = {layout.CURVES: "train", layout.EVENTS: "events"}
 
 
 @dataclass(frozen=True)
-class TrialRecord:
+class TrackedFiles:
     """A trial in ``folder``, below the runs folder ``runs``, with the configuration ``values``."""
 
     runs: Path
@@ -44,70 +49,73 @@ class TrialRecord:
         return self.folder.relative_to(self.runs).as_posix()
 
     def tags(self) -> dict[str, str]:
-        """What the trial is found by."""
+        """The tags by which the trial is found."""
         names = {group: self.values[group]["name"] for group in ("scene", "init", "densify")}
         return {"kind": "trial", **names, "seed": str(self.values["seed"]), "folder": self.path}
 
     def params(self) -> dict[str, str]:
-        """Every setting that has a value, by its dotted key; the arm is first in charts."""
+        """The settings that have a value, by their dotted keys; the arm is first in charts."""
         return {"arm": self.arm} | {key: str(value) for key, value in flatten(self.values).items() if str(value)}
 
     def sweep(self) -> dict[str, Any]:
         """The sweep that asked for the trial: its ``id`` and ``count`` of trials; empty for one trial alone."""
         home = self.folder.parents[2]
-        trials = read_object(home / layout.PLAN).get("trials")
-        entry = trials.get(self.folder.relative_to(home).as_posix()) if isinstance(trials, dict) else None
-        found = entry.get("sweep") if isinstance(entry, dict) else None
-        return found if isinstance(found, dict) else {}
+        try:
+            entry = read_entries(home).get(self.folder.relative_to(home).as_posix())
+        except InputError:  # a damaged plan: who reads it says so
+            entry = None
+        return {} if entry is None or entry.sweep is None else entry.sweep.to_json()
 
-    def results(self) -> dict[str, Any]:
-        """What ``results.json`` holds; empty where there is none."""
-        return read_object(self.folder / layout.RESULTS)
+    def results(self) -> TrialRecord | None:
+        """The content of ``results.json``; empty where there is none."""
+        try:
+            return read_results(self.folder)[0]
+        except (FileNotFoundError, DamagedError):
+            return None
 
     def results_hash(self) -> str | None:
         """The hash of the results, by which a mirror knows whether it shows them."""
         results = self.results()
-        return sha256_of(results) if results else None
+        return None if results is None else sha256_of(results.to_json())
 
     def curves(self, logged: dict[str, int]) -> Iterator[tuple[str, int, list[Point]]]:
-        """For each file of curves its name, its newest iteration, and what it says of those after ``logged[name]``."""
-        building = read_object(self.folder / layout.BUILDING)  # a training in progress writes elsewhere
-        sources = [Path(str(building.get("folder")))] if building.get("stage") == TRAIN.name else []
+        """Read each file of curves: its name, its newest iteration, and its points after ``logged[name]``."""
+        building = read_building(self.folder)  # a training in progress writes elsewhere
+        sources = [Path(building.folder)] if building.stage == TRAIN.name else []
         for name, prefix in CURVES.items():
             source = next((folder / name for folder in (*sources, self.folder) if (folder / name).exists()), None)
-            records = [] if source is None else [r for r in _records(source) if r["step"] > logged.get(name, 0)]
+            records = [] if source is None else [r for r in read_curve(source) if r["step"] > logged.get(name, 0)]
             if records:
                 points = [
-                    Point(f"{prefix}/{key}", float(value), record["step"], _seconds(record))
+                    Point(f"{prefix}/{key}", float(value), int(record["step"]), _seconds(record))
                     for record in records
                     for key, value in record.items()
-                    if key != "step" and isinstance(value, (int, float))
+                    if key != "step"
                 ]
-                yield name, records[-1]["step"], points
+                yield name, int(records[-1]["step"]), points
 
-    def summary(self, images: int, with_model: bool) -> Summary:
-        """What is shown of the finished trial, with ``images`` test views at most, and the model if ``with_model``."""
-        results = self.results()
-        step, seconds = results["iterations"], float(results["seconds"].get("train", results["iterations"] / 1000))
-        numbers = dict(results["metrics"]) | {
-            key: results[key]
+    def summary(self, results: TrialRecord, images: int, with_model: bool) -> Summary:
+        """The summary of the finished trial, with ``images`` test views at most, and the model if ``with_model``."""
+        step, seconds = results.iterations, results.seconds.get("train", results.iterations / 1000)
+        numbers = dict(results.metrics) | {
+            key: value
             for key in ("num_gaussians", "num_init_points", "peak_memory_mb")
-            if results[key] is not None  # not known of renders that another program made
+            if (value := getattr(results, key)) is not None  # not known of renders that another program made
         }
-        numbers |= {f"seconds_{key}": value for key, value in results["seconds"].items()}
-        numbers |= {f"total/{key}": value for key, value in results["events"].items()}
-        numbers |= {f"init/{key}": value for key, value in _numbers(results.get("init_report", {}), INIT_FIELDS)}
+        numbers |= {f"seconds_{key}": value for key, value in results.seconds.items()}
+        numbers |= {f"total/{key}": value for key, value in results.events.items()}
+        numbers |= {f"init/{key}": value for key, value in _numbers(results.init_report, INIT_FIELDS)}
         points = [
             Point(key, float(value), int(at), seconds * int(at) / max(1, step))
-            for at, measured in results.get("metrics_at", {}).items()
-            for key, value in measured["metrics"].items()
+            for at, measured in results.metrics_at.items()
+            for key, value in measured.metrics.items()
         ]
-        tags = {"protocol": results["protocol"], "raster": results["raster"]}
+        tags = {"protocol": results.protocol, "raster": results.raster}
         names = (*FILES, *([layout.POINT_CLOUD] if with_model else []))
         files = [("", self.folder / name) for name in names if (self.folder / name).exists()]
         return Summary(
             points=points + [Point(key, float(value), step, seconds) for key, value in numbers.items()],
-            tags=tags | {f"hash_{key}": value for key, value in results["hashes"].items()},
+            tags=tags | {f"hash_{key}": value for key, value in results.hashes.items()},
             pictures={
                 f"{kind}/{path.stem}": path
                 for kind in (layout.RENDERS, layout.GROUND_TRUTH)
@@ -123,15 +131,7 @@ class TrialRecord:
         return sorted((self.folder / kind).glob("*.png"))[:images]
 
 
-def _records(path: Path) -> Iterator[dict[str, Any]]:
-    for line in path.read_text().splitlines():
-        try:
-            yield json.loads(line)
-        except json.JSONDecodeError:  # the last line, still being written
-            return
-
-
-def _seconds(record: dict[str, Any]) -> float:
+def _seconds(record: Mapping[str, float]) -> float:
     """The training time of a record, or else a function of its iteration: the same whenever it is read."""
     return float(record.get("seconds", record["step"] / 1000))
 

@@ -1,4 +1,4 @@
-"""What a tracker has to take so that trials are mirrored there."""
+"""Contract of a tracker to which trials are mirrored."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
+
+from gsbench.runs.trial_record import TrialRecord
 
 DEFAULT = "mlflow"
 NAMES = {DEFAULT: "MLflow", "tensorboard": "TensorBoard", "wandb": "Weights & Biases"}
@@ -23,14 +25,15 @@ class Point:
 
 @dataclass(frozen=True)
 class Summary:
-    """What is shown of a complete trial: final numbers, tags, pictures of the test views by name, other files by
-    folder ("" for none)."""
+    """Summary of a complete trial: final numbers, tags, pictures of the test views by name, other files by
+    folder ("" for none).
+    """
 
     points: Sequence[Point]
     tags: dict[str, str]
     pictures: dict[str, Path]
     files: Sequence[tuple[str, Path]]
-    results: dict[str, Any]
+    results: TrialRecord
     step: int
     seconds: float
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from gsbench.runs.layout import TENSORBOARD
-from gsbench.tracking.record import TrialRecord
+from gsbench.tracking.record import TrackedFiles
 from gsbench.tracking.sink import Point, Summary
 
 
@@ -17,14 +17,14 @@ class TensorBoardSink:
 
     state_file = "tensorboard.json"
 
-    def __init__(self, record: TrialRecord) -> None:
+    def __init__(self, record: TrackedFiles) -> None:
         self._record = record
         self._folder = record.runs / TENSORBOARD / record.path
         self._started = time.time()
         self._writer: Any = None
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """See `gsbench.tracking.sink.Sink`."""
+        """Open the run as `gsbench.tracking.sink.Sink` says."""
         if self._folder.is_dir() and state.get("complete") is not None and state["complete"] == results:
             return state
         from torch.utils.tensorboard import SummaryWriter

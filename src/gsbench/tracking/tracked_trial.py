@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from gsbench.files import read_object, write_json
+from gsbench.files import write_json
 from gsbench.runs import layout
 from gsbench.runs.trial_files import failure_of
 from gsbench.system.locks import hold
-from gsbench.tracking.record import TrialRecord
+from gsbench.tracking.record import TrackedFiles
 from gsbench.tracking.sink import DEFAULT, Sink
+from gsbench.tracking.state import read_state
 
 LOCK = ".mlflow.lock"  # one process at a time mirrors a trial, to whichever tracker
 
@@ -21,19 +22,19 @@ class TrackedTrial:
     def __init__(
         self, options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any], program: str | None = None
     ) -> None:
-        self.record = TrialRecord(runs, folder, values)
+        self.record = TrackedFiles(runs, folder, values)
         self.sink = make_sink(options, self.record, program)
         self._options = options
         self._file = folder / self.sink.state_file
         self._open()
 
     def _open(self) -> None:
-        self.state = self.sink.open(read_object(self._file), self.record.results_hash())
+        self.state = self.sink.open(read_state(self._file), self.record.results_hash())
         self._save()
 
     @property
     def is_complete(self) -> bool:
-        """Whether the run shows the present results."""
+        """Return whether the run shows the present results."""
         return self.state["complete"] is not None and self.state["complete"] == self.record.results_hash()
 
     def add_curves(self) -> None:
@@ -55,10 +56,11 @@ class TrackedTrial:
         folder = self.record.folder
         if (folder / layout.FAILED).exists():
             self.sink.stop("FAILED", failure_of(folder))
-        elif self.record.results_hash() is None:
+        elif (results := self.record.results()) is None:
             self.sink.stop("KILLED", None)
         else:
-            self.sink.complete(self.record.summary(int(self._options["images"]), bool(self._options.get("model"))))
+            images, with_model = int(self._options["images"]), bool(self._options.get("model"))
+            self.sink.complete(self.record.summary(results, images, with_model))
             self.state["complete"] = self.record.results_hash()
         self._save()
 
@@ -87,7 +89,7 @@ def mirror_trial(options: dict[str, Any], runs: Path, folder: Path, values: dict
     return True
 
 
-def make_sink(options: dict[str, Any], record: TrialRecord, program: str | None) -> Sink:
+def make_sink(options: dict[str, Any], record: TrackedFiles, program: str | None) -> Sink:
     """The trial's place in the tracker that ``tracking.sink`` names.
 
     ``program`` is what runs the trial at this moment; None where the trial has ended.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from gsbench.runs.layout import WANDB
-from gsbench.tracking.record import TrialRecord
+from gsbench.tracking.record import TrackedFiles
 from gsbench.tracking.sink import Point, Summary
 
 STEP = "iteration"  # the axis of our curves: their own counter only goes up, and we read two files
@@ -19,14 +19,14 @@ class WandbSink:
 
     state_file = "wandb.json"
 
-    def __init__(self, options: dict[str, Any], record: TrialRecord) -> None:
+    def __init__(self, options: dict[str, Any], record: TrackedFiles) -> None:
         self._record = record
         if options["uri"]:
             os.environ["WANDB_BASE_URL"] = options["uri"]
         self._run: Any = None
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """See `gsbench.tracking.sink.Sink`. A run that shows former results stays beside the new one."""
+        """Open the run (see `gsbench.tracking.sink.Sink`). One that shows former results stays beside the new one."""
         if state.get("complete") is not None:
             if state["complete"] == results:
                 return state

@@ -62,7 +62,7 @@ class CheckpointWriter:
             under_way.result()
 
     def close(self) -> None:
-        """`finish`, and end the thread."""
+        """Close the writer: `finish`, and end its thread."""
         try:
             self.finish()
         finally:

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
+from gsbench.raster.triton.launch import launch_grid
 from gsbench.raster.triton.toolchain import load_driver
 from gsbench.raster.triton.workspace import WorkspacePool
 
@@ -227,7 +228,7 @@ class _Loss(torch.autograd.Function):
             derivatives = memory.take("derivatives", 3 * image.numel() if differentiated else 0, torch.float32)
             sums = memory.take("sums", 2 * grid[0] * grid[1], torch.float32)
             values = torch.empty(3, dtype=torch.float32, device=image.device)
-            measure_similarity[grid](
+            launch_grid(measure_similarity, *grid)(
                 image,
                 target,
                 scale,
@@ -239,7 +240,7 @@ class _Loss(torch.autograd.Function):
                 STRIP=STRIP,
                 ROWS=ROWS,
             )
-            add_up[(1,)](sums, grid[0] * grid[1], float(image.numel()), loss.ssim_weight, values, GROUP=1024)
+            launch_grid(add_up, 1)(sums, grid[0] * grid[1], float(image.numel()), loss.ssim_weight, values, GROUP=1024)
         ctx.weight, ctx.scale, ctx.derivatives = loss.ssim_weight, scale, derivatives
         ctx.save_for_backward(image, target)
         ctx.set_materialize_grads(False)
@@ -257,7 +258,7 @@ class _Loss(torch.autograd.Function):
         gradient = torch.empty_like(image)
         grid = -(-numbers // STRIP), -(-height // ROWS)
         with torch.cuda.device_of(image):
-            differentiate[grid](
+            launch_grid(differentiate, *grid)(
                 image,
                 target,
                 ctx.scale,

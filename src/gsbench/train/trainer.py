@@ -27,6 +27,7 @@ from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster import Rasterizer
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
+from gsbench.runs.rows import whole_lines
 from gsbench.scene.types import Scene
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
@@ -45,7 +46,7 @@ STREAMS = ("cameras", "densify")  # every random draw of a training belongs to o
 
 @dataclass(frozen=True)
 class Status:
-    """What a progress bar shows."""
+    """Values that a progress bar shows."""
 
     step: int
     loss: float
@@ -68,7 +69,7 @@ class CameraOrder:
 
     @property
     def following(self) -> int | None:
-        """What `next` will give, or None where that is not drawn yet."""
+        """The camera that `next` will give, or None where that is not drawn yet."""
         return self.remaining[-1] if self.remaining else None
 
 
@@ -167,7 +168,7 @@ class Trainer:
                     break
 
     def iterate(self, folder: Path) -> RefineEvent | None:
-        """One iteration in 3DGS's order: rates, SH degree, render, backward, statistics, refinement, optimiser step.
+        """Run one iteration in 3DGS's order: rates, SH degree, render, backward, statistics, refinement, Adam.
 
         Its losses go to ``losses``, perhaps later; ``folder`` takes the snapshots. Raises TrainingError where a
         parameter is out of range or no Gaussian is left.
@@ -275,7 +276,7 @@ def sh_degree_at(options: TrainConfig, step: int) -> int:
 
 
 def learning_rates(options: TrainConfig) -> LearningRates:
-    """Those among the settings of a training."""
+    """The learning rates among the settings of a training."""
     return LearningRates(**{field.name: getattr(options, field.name) for field in fields(LearningRates)})
 
 
@@ -290,16 +291,8 @@ def drop_after(path: Path, step: int) -> None:
 
     A kill meanwhile leaves the file as it was: what is lost here is in no checkpoint.
     """
-    if not path.exists():
-        return
-    kept = []
-    for line in path.read_text().splitlines():
-        try:
-            if json.loads(line)["step"] <= step:
-                kept.append(line)
-        except (json.JSONDecodeError, KeyError, TypeError):
-            break
-    write_text(path, "".join(line + "\n" for line in kept))
+    if path.exists():
+        write_text(path, "".join(f"{line}\n" for line, at in whole_lines(path) if at <= step))
 
 
 def _append(stream: Any, record: dict[str, Any]) -> None:

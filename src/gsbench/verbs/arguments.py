@@ -1,4 +1,4 @@
-"""How verbs read their words: argparse, whose errors are gsbench's, one line long."""
+"""Parsing of a verb's words by argparse, with gsbench's errors of one line."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ MARKDOWN, HTML = "claims.md", "claims.html"
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: 0 whatever the verdicts are; raises InputError for bad input."""
+    """Run the verb: 0 whatever the verdicts are; raises InputError for bad input."""
     parser = ArgumentParser(
         prog="gsbench check",
         description="Test the claims of a file (docs/claims.md): write the plan down, run trials until each claim is "
@@ -57,7 +57,7 @@ def _permissions(words: Sequence[str]) -> Sequence[str]:
 
 
 def describe(check: Check) -> list[str]:
-    """What a dry run shows: each claim with its question or why it is not testable, the trials, and the time."""
+    """Describe a dry run: each claim with its question or why it is not testable, the trials, and the time."""
     lines = [f"{check.file.paper}: plan {check.plan_hash[:12]}"]
     for question in check.questions:
         claim = question.claim

@@ -26,7 +26,7 @@ CHOICES = r"(?<![\w-]){option}[ =]\{{([^}}]*)\}}"  # as argparse shows them: --f
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: print the script of a shell, or answer one."""
+    """Run the verb: print the script of a shell, or answer one."""
     if argv[:1] == [QUERY]:
         print("\n".join(complete(argv[1] if len(argv) > 1 else "", runs)))
         return 0
@@ -41,7 +41,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 
 def complete(line: str, runs: Path) -> list[str]:
-    """What the last word of a command ``line`` may become, whole words in order; the line starts with the program."""
+    """Complete the last word of a command ``line``: whole words in order; the line starts with the program."""
     words = line.split()[1:]
     word = words.pop() if words and not line[-1:].isspace() else ""
     if words and words[0] in VERBS:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import importlib.util
+import math
+import random
 import shutil
 import sys
 import tempfile
@@ -14,7 +17,8 @@ from pathlib import Path
 from typing import Literal
 
 from gsbench.datasets.catalog import DATA_VARIABLE, data_dir, read_catalog
-from gsbench.raster.executors import EXECUTORS, resolve
+from gsbench.errors import InputError
+from gsbench.raster.executors import EXECUTORS, find, resolve
 from gsbench.runs.layout import DATABASE, STORE
 from gsbench.system.install import install_command
 from gsbench.system.resources import available_threads, installed_gpus
@@ -27,8 +31,11 @@ TRITON_CAPABILITY = (8, 0)  # "NVIDIA GPUs (Compute Capability 8.0+)", in Triton
 OPTIONAL = {  # package -> what needs it, and the extra that brings it
     "transformers": ("init=dim", "dim"),
     "gsplat": ("raster=gsplat and export --to compressed", "gsplat"),
+    "optuna": ("hydra/sweeper=optuna", "search"),
     "submitit": ("launch=local and launch=slurm", "slurm"),
+    "tensorboard": ("tracking=tensorboard", "tensorboard"),
     "viser": ("gsbench view", "view"),
+    "wandb": ("tracking=wandb", "wandb"),
 }
 
 
@@ -42,12 +49,17 @@ class Finding:
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: 1 if something is bad."""
+    """Run the verb: 1 if something is bad."""
     parser = ArgumentParser(prog="gsbench doctor", description="Check this machine and say what is missing.")
     parser.add_argument(
         "--store", action="store_true", help="also read every stored result whole and name damaged ones"
     )
+    parser.add_argument(
+        "--sample", type=_percent, metavar="PERCENT", help="with --store: only so many of the results, chosen by chance"
+    )
     options = parser.parse_args(argv)
+    if options.sample is not None and not options.store:
+        raise InputError("--sample says how much of the store is read: give --store too")
     checks: list[Callable[[], Iterator[Finding]]] = [
         check_python,
         check_torch,
@@ -63,7 +75,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         check_weights,
     ]
     if options.store:
-        checks.append(lambda: check_store(runs))
+        checks.append(lambda: check_store(runs, options.sample or 100.0))
     bad = 0
     for check in checks:
         for finding in check():
@@ -141,13 +153,15 @@ def check_packages() -> Iterator[Finding]:
 
 
 def check_triton() -> Iterator[Finding]:
-    """What raster=triton compiles with at its first run on a GPU."""
+    """Check the compiler that raster=triton needs at its first run on a GPU."""
     from gsbench.raster.triton.toolchain import missing_tools
 
     installed = _version("triton")
     if installed is None:  # torch for CUDA would have brought it along
         return
-    if missing := missing_tools():
+    if old := find("triton").too_old():
+        yield Finding("note", "triton", f"raster=triton {old}")
+    elif missing := missing_tools():
         yield Finding("note", "triton", f"{installed}; at its first run on a GPU it needs {' and '.join(missing)}")
     else:
         text = f"{installed}; the C compiler and Python.h that it needs at its first run on a GPU are here"
@@ -155,7 +169,7 @@ def check_triton() -> Iterator[Finding]:
 
 
 def check_kernels() -> Iterator[Finding]:
-    """Where the CPU's compiled kernels are kept; without such a place every start compiles anew."""
+    """Check the place of the CPU's compiled kernels; without one every start compiles anew."""
     from gsbench.raster.cpu.jit import TEMPORARY_PREFIX, cache_base
 
     place = cache_base()
@@ -167,7 +181,7 @@ def check_kernels() -> Iterator[Finding]:
 
 
 def check_executors() -> Iterator[Finding]:
-    """Which rasterizers run here, and which is taken if none is chosen."""
+    """Check which rasterizers run here, and which is taken if none is chosen."""
     import torch
 
     here = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -249,22 +263,33 @@ def check_weights() -> Iterator[Finding]:
             yield Finding("note", "weights", f"{purpose}: {text}")
 
 
-def check_store(runs: Path) -> Iterator[Finding]:
-    """Every stored result, read whole."""
+def check_store(runs: Path, percent: float = 100.0) -> Iterator[Finding]:
+    """Check stored results by reading them whole: ``percent`` of them, drawn anew each time."""
     from gsbench.runs.stages import STAGES
     from gsbench.runs.store import read_manifest
 
+    there = sorted(folder for stage in STAGES for folder in (runs / STORE / stage.name).glob("[0-9a-f]*"))
+    chosen = sorted(random.sample(there, math.ceil(len(there) * percent / 100)))
     sound = 0
-    for stage in STAGES:
-        for folder in sorted((runs / STORE / stage.name).glob("[0-9a-f]*")):
-            try:
-                read_manifest(folder, thorough=True)
-                sound += 1
-            except ValueError as error:
-                yield Finding(
-                    "note", "store", f"{folder}: {error}; delete the folder, and the next run builds it again"
-                )
-    yield Finding("ok", "store", f"{sound} results are as they were written")
+    for folder in chosen:
+        try:
+            read_manifest(folder, thorough=True)
+            sound += 1
+        except ValueError as error:
+            yield Finding("note", "store", f"{folder}: {error}; delete the folder, and the next run builds it again")
+    part = "" if len(chosen) == len(there) else f", of {len(there):,} in all"
+    yield Finding("ok", "store", f"{sound:,} results are as they were written{part}")
+
+
+def _percent(text: str) -> float:
+    """``5%`` or ``5``: above 0, at most 100."""
+    try:
+        value = float(text.removesuffix("%"))
+    except ValueError:
+        value = math.nan
+    if not 0 < value <= 100:
+        raise argparse.ArgumentTypeError(f"must be a share such as 5%, got {text!r}")
+    return value
 
 
 def _is_writable(folder: Path) -> bool:

@@ -13,7 +13,7 @@ from gsbench.verbs.arguments import ArgumentParser
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb; raises InputError for bad input."""
+    """Run the verb; raises InputError for bad input."""
     if "--stale" in argv:
         return _stale([word for word in argv if word != "--stale"], runs)
     parser = ArgumentParser(
@@ -21,7 +21,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         description="The runs, settings, data and code versions behind a cell of a table.",
         epilog="gsbench explain --stale FOLDER tells why a stage of a trial is computed anew.",
     )
-    parser.add_argument("cell", help=ADDRESS)
+    parser.add_argument("cell", metavar="CELL", help=f"a number of a table: {ADDRESS}")
     print(explain_cell(parser.parse_args(argv).cell, runs))
     return 0
 

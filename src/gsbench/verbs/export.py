@@ -12,6 +12,7 @@ from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.runs.layout import STORE
+from gsbench.runs.stages import INIT
 from gsbench.verbs.arguments import ArgumentParser, path
 from gsbench.view import ADDRESS
 
@@ -34,7 +35,7 @@ SOG = (
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: 0 if the file, or folder, was written."""
+    """Run the verb: 0 if the file, or folder, was written."""
     parser = ArgumentParser(
         prog="gsbench export",
         description="Write a trained model for other programs; `gsbench export init TRIAL --out DIR` copies the COLMAP "
@@ -68,7 +69,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         if is_init:
-            export_init(trial.path.parents[3] / STORE / "init" / trial.data["hashes"]["init"], out)
+            export_init(trial.path.parents[3] / STORE / INIT.name / trial.record.hashes[INIT.name], out)
         else:
             export_model(model_file(trial), options.to or _format_of(out), out)
     except OSError as error:
@@ -111,13 +112,16 @@ def export_model(ply: Path, form: str, out: Path) -> None:
 
 
 def export_init(entry: Path, out: Path) -> None:
-    """Copy the COLMAP model of the stage result ``entry`` as ``out/sparse/0``, where 3DGS trainers look for it."""
-    model = entry / "sparse" / "0"
+    """Copy the COLMAP model of the stage result ``entry`` to `MODEL_FOLDER` of ``out``, as 3DGS trainers read it."""
+    from gsbench.init.base import MODEL_FOLDER
+
+    model = entry / MODEL_FOLDER
     if not model.is_dir():
         raise InputError(f"the initial model is no longer in the store ({model}): run the trial again")
-    if (out / "sparse").exists():
-        raise InputError(f"{out / 'sparse'} exists already: give another --out")
-    shutil.copytree(model, out / "sparse" / "0")
+    first = out / MODEL_FOLDER.parts[0]
+    if first.exists():
+        raise InputError(f"{first} exists already: give another --out")
+    shutil.copytree(model, out / MODEL_FOLDER)
 
 
 def splat_bytes(gaussians: Gaussians) -> bytes:

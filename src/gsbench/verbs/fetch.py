@@ -23,7 +23,7 @@ LOCK = ".fetch.lock"
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: 0 if all that was asked for is here."""
+    """Run the verb: 0 if all that was asked for is here."""
     catalog = read_catalog()
     options = _parser(list(catalog)).parse_args(argv)
     data = data_dir()

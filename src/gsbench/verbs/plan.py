@@ -29,7 +29,7 @@ MOST_SHOWN = 5  # designs
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb; raises InputError for bad input."""
+    """Run the verb; raises InputError for bad input."""
     parser = ArgumentParser(
         prog="gsbench plan",
         description="From an experiment's trials: the scenes and seeds that resolve a difference with 80 % power.",
@@ -80,7 +80,7 @@ def _lines(found: Components, shown: Quantity, difference: float) -> list[str]:
 
 
 def _hours_lines(found: Components, shown: Quantity, hours: float, trials: Sequence[TrialResult]) -> list[str]:
-    timed = [sum(trial.data["seconds"].values()) for trial in trials if not trial.made_elsewhere]
+    timed = [sum(trial.record.seconds.values()) for trial in trials if not trial.made_elsewhere]
     if not timed:
         return ["  hours: no trial tells how long one takes"]
     seconds = statistics.fmean(timed)

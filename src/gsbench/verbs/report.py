@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,7 +19,7 @@ FILE_SUFFIXES = (".html", ".htm")
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb; raises InputError for bad input."""
+    """Run the verb; raises InputError for bad input."""
     from gsbench.analysis.report.build import build_report  # here, for a quick answer to --help
 
     parser = ArgumentParser(prog="gsbench report", description="One HTML file with the evidence of an experiment.")
@@ -33,6 +34,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
     if options.baseline is not None and options.baseline not in densifiers:
         raise InputError(f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}")
     file = experiment.folder / REPORT_NAME if options.out is None else file_at(options.out, experiment.name)
+    for warning in experiment.warnings:
+        print(f"left out: {warning}", file=sys.stderr)
     looked = [headline(verdict) for verdict in standing_verdicts(experiment.folder)]
     text = build_report(experiment, options.baseline or BASELINE, looked, ablation_part(experiment.folder))
     try:

@@ -17,6 +17,7 @@ from gsbench.errors import InputError
 from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.launch.trial import Trial
+from gsbench.runs.origin import FROM_RENDERS
 from gsbench.runs.trial_files import TrialPaths, label_of, read_config
 from gsbench.system.own_modules import allow_modules
 from gsbench.verbs.arguments import ArgumentParser
@@ -25,11 +26,11 @@ log = logging.getLogger(__name__)
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: as the sweep's own command, the exit code says whether some trial failed."""
+    """Run the verb: as the sweep's own command, the exit code says whether some trial failed."""
     from gsbench.app.command import run_trials
 
     parser = ArgumentParser(
-        prog="gsbench retry", description="Run the failed, stopped and missing trials of an experiment again."
+        prog="gsbench retry", description="Run the failed, stopped, damaged and missing trials of an experiment again."
     )
     parser.add_argument("experiment")
     parser.add_argument(
@@ -43,7 +44,9 @@ def main(argv: Sequence[str], runs: Path) -> int:
     options = parser.parse_args(argv)
     home = experiment_home(runs, options.experiment)
     unfinished = [
-        trial.folder for trial in states_of_experiment(home) if trial.state in ("failed", "partial", "missing")
+        trial.folder
+        for trial in states_of_experiment(home)
+        if trial.state in ("failed", "partial", "damaged", "missing")
     ]
     if not unfinished:
         print(f"nothing to retry: all trials of {options.experiment} are done, running or queued")
@@ -91,6 +94,8 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
         )
     allow_modules(allowed, here)
     values = read_config(folder) | {"runs": str(runs), PERMISSIONS: list(allowed)}
+    if values["densify"].get("evaluated_from") == FROM_RENDERS:
+        raise InputError(f"{label_of(folder)} was entered from renders: give the command of `gsbench evaluate` again")
     check_permissions(values)
     return Trial(values, yaml.safe_dump(values, sort_keys=False), ())
 

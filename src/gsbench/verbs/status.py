@@ -17,11 +17,11 @@ from gsbench.runs.trial_files import label_of
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
-ORDER = ("failed", "running", "queued", "partial", "missing", "superseded", "done")
+ORDER = ("failed", "damaged", "running", "queued", "partial", "missing", "superseded", "done")
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: 0 if all trials are done, or will be, 1 if some failed or are missing."""
+    """Run the verb: 0 if all trials are done, or will be, 1 if some failed or are missing."""
     parser = ArgumentParser(prog="gsbench status", description="The state of every trial of an experiment.")
     parser.add_argument("experiment", nargs="?", help="its name; without one, a line for each experiment")
     parser.add_argument("--all", action="store_true", help="list the finished trials too")
@@ -89,7 +89,7 @@ def lines_of(trials: list[TrialState], everything: bool) -> list[str]:
 
 
 def summary_of(trials: list[TrialState]) -> str:
-    """How many trials are in which state, in one line."""
+    """Count the trials in each state, in one line."""
     counts = {state: sum(trial.state == state for trial in trials) for state in reversed(ORDER)}
     return f"{counted(len(trials), 'trial')}: " + ", ".join(
         f"{count} {state}" for state, count in counts.items() if count

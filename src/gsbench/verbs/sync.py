@@ -13,7 +13,7 @@ from gsbench.verbs.arguments import ArgumentParser
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: 1 if the tracker cannot be reached."""
+    """Run the verb: 1 if the tracker cannot be reached."""
     parser = ArgumentParser(prog="gsbench sync", description="Mirror ended trials to their tracker, once.")
     parser.add_argument("experiment", nargs="?", help="its name; without one, all")
     parser.add_argument("--uri", help="the tracker, such as http://127.0.0.1:5000; without it, each trial's own")

@@ -3,28 +3,35 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import select_trials, with_variants
+from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.frame import to_frame
+from gsbench.analysis.pairing import arm_name
 from gsbench.analysis.paper import inconsistencies, load_paper
 from gsbench.analysis.paper_tables import PAPER_TABLES, layout_of, paper_tables
 from gsbench.analysis.published import published_names, published_table
-from gsbench.analysis.results import Experiment, TrialResult, load_experiment
+from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experiment
 from gsbench.analysis.table_formats import FORMATS
+from gsbench.analysis.table_notes import compared_pairs
 from gsbench.analysis.tables import DEFAULT_ROWS, build_table
+from gsbench.analysis.translations import by_protocol
 from gsbench.errors import InputError
+from gsbench.eval.protocol import ALL
 from gsbench.files import write_text
 from gsbench.verbs.arguments import ArgumentParser, names, path
 
 TRIALS = "trials"
+FAIRNESS = "fairness"
 PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsistencies
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb; raises InputError for bad input."""
+    """Run the verb; raises InputError for bad input."""
     options = _parser().parse_args(argv)
     if options.experiment == PAPER_NOTES and not (runs / PAPER_NOTES).exists():
         print("\n".join(f"- {line}" for line in inconsistencies(load_paper())))
@@ -32,6 +39,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
     experiment = load_experiment(runs, options.experiment)
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
+    if options.protocol is not None:
+        experiment = by_protocol(experiment, options.protocol)
     trials = select_trials(experiment.trials, _conditions(options.where))
     texts = _trials(trials, options) if options.format == TRIALS else _tables(experiment, trials, options)
     _write(texts, options.out, experiment.name)
@@ -50,6 +59,8 @@ def _tables(experiment: Experiment, trials: Sequence[TrialResult], options: argp
     """The tables as text, each with what its file's name ends in."""
     layout = options.layout or (_is_plain(options) and layout_of(experiment.name)) or "plain"
     metrics = options.metrics
+    if layout == FAIRNESS:
+        return _fairness_sheets(experiment, options.format)
     if layout == "plain":
         rows, columns = options.rows, options.columns or ()
         if set(rows or ()) & set(columns):
@@ -64,6 +75,23 @@ def _tables(experiment: Experiment, trials: Sequence[TrialResult], options: argp
     if options.paper is not None:
         named[f"-{options.paper}"] = published_table(with_variants(trials), options.paper)
     return {f"{end}.{suffix}": writer(table) for end, table in named.items()}
+
+
+def _fairness_sheets(experiment: Experiment, format_name: str) -> dict[str, str]:
+    """The sheet of every pair of arms that is compared, whichever trials a table would show."""
+    trials, pairs = compared_pairs(experiment)
+    if not pairs:
+        raise InputError(f"experiment {experiment.name} has one arm, so there is nothing to compare")
+    suffix, writer = FORMATS[format_name]
+    return {
+        f"-{FAIRNESS}-{_as_file(second)}-{_as_file(first)}.{suffix}": writer(fairness_table(trials, first, second))
+        for first, second in pairs
+    }
+
+
+def _as_file(arm: Arm) -> str:
+    """An arm as a part of a file's name, its variant included."""
+    return re.sub(r"[^\w.=-]+", "_", arm_name(arm))
 
 
 def _parser() -> ArgumentParser:
@@ -96,7 +124,18 @@ def _parser() -> ArgumentParser:
         metavar="NAME",
         help=f"also hold the trials against published numbers: {', '.join(published_names())}",
     )
-    parser.add_argument("--layout", choices=[*PAPER_TABLES, "plain"], help="the paper's layout for any experiment")
+    parser.add_argument(
+        "--protocol",
+        choices=list(ALL),
+        help="the metrics of the same renders by this protocol, once `gsbench evaluate EXPERIMENT --protocol all` "
+        "measured them",
+    )
+    parser.add_argument(
+        "--layout",
+        choices=[*PAPER_TABLES, "plain", FAIRNESS],
+        help=f"the paper's layout for any experiment; {FAIRNESS}: for each pair of arms in what they differ, what was "
+        "tuned, and whose defaults those are",
+    )
     return parser
 
 

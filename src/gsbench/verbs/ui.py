@@ -16,7 +16,7 @@ DEFAULT_PORT = 5000
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: serves until Ctrl-C."""
+    """Run the verb: it serves until Ctrl-C."""
     parser = ArgumentParser(prog="gsbench ui", description="The MLflow dashboard, on this machine only.")
     parser.add_argument("experiment", nargs="?", help="print the address that compares its trials")
     parser.add_argument(

@@ -33,7 +33,7 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Layers:
-    """What is drawn: ``max_gaussians`` keeps the most opaque (None: all), ellipsoids are those above a volume."""
+    """Settings of a picture: ``max_gaussians`` keeps the most opaque (None: all), ellipsoids those above a volume."""
 
     sh_degree: int = MAX_SH_DEGREE
     max_gaussians: int | None = None
@@ -76,7 +76,7 @@ class TrialPainter:
         return self._by_volume[:count]
 
     def counts_above(self, log10_volume: float) -> dict[Cause, int]:
-        """How many of them each cause made."""
+        """Count the Gaussians above the volume by their causes."""
         counts = np.bincount(self.trial.causes[self.above(log10_volume)], minlength=len(Cause))
         return {cause: int(counts[cause]) for cause in Cause}
 

@@ -71,7 +71,7 @@ class Viewer:
         return side_by_side(panes)
 
     def layers(self) -> Layers:
-        """What the controls ask for."""
+        """The layers that the controls ask for."""
         return Layers(
             sh_degree=int(self._degree.value),
             ellipsoids=bool(self._ellipsoids.value),
@@ -264,7 +264,7 @@ def level_up(camera: Camera, up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def orbit_distance(views: Sequence[View]) -> float:
-    """How far ahead a page's camera has its pivot: the mean distance of the views to their centre, world units."""
+    """The distance from a page's camera to its pivot: the mean distance of the views to their centre, world units."""
     centers = np.stack([view.camera.center for view in views])  # [V, 3]
     return max(float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()), 1e-3)
 

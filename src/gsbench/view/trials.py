@@ -1,4 +1,4 @@
-"""What the viewer needs of a trial, read from its folder and from the initial model in the store."""
+"""Trials as the viewer needs them, read from their folders and from the initial models in the store."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
     """Read what the viewer draws of ``trial``; raises InputError naming the file that is missing or damaged."""
     gaussians = read_ply(model_file(trial), device)
     runs = trial.path.parents[3]
-    model_dir = Store(runs / STORE).folder(INIT, str(trial.data["hashes"]["init"])) / MODEL_FOLDER
+    model_dir = Store(runs / STORE).folder(INIT, trial.record.hashes.get("init", "")) / MODEL_FOLDER
     if not model_dir.is_dir():
         raise InputError(f"{model_dir} is gone, which has the cameras of {trial.label}: run this trial again")
     background = trial.config.get("train.background", (0.0, 0.0, 0.0))

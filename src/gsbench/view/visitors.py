@@ -1,4 +1,4 @@
-"""Who may talk to the viewer: its own page, and programs of this machine that are no page of a browser.
+"""Visitors that the viewer admits: its own page, and programs of this machine that are no page of a browser.
 
 A browser lets any web page connect to this machine. Of a page it tells the server where it came from (``Origin``), and
 what the server was called (``Host``), which a name of the page's own that leads here gives away (DNS rebinding).
@@ -20,7 +20,7 @@ SERVE = "websockets.asyncio.server.serve"  # what viser starts its server with
 
 
 def is_welcome(hosts: list[str], origins: list[str]) -> bool:
-    """Whether a request with these ``Host`` and ``Origin`` headers comes from the viewer's own page, or from no page.
+    """Return whether ``Host`` and ``Origin`` headers are those of the viewer's own page, or of no page.
 
     The port may be another one, as where a connection is forwarded, but page and server must have the same.
     """

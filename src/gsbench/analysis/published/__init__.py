@@ -60,7 +60,7 @@ def load_published(name: str) -> Published:
 
 
 def published_table(trials: Sequence[TrialResult], name: str) -> Table:
-    """Each of our arms on the paper's scenes beside the printed numbers, with the differences.
+    """Table of our arms on the paper's scenes beside the printed numbers, with the differences.
 
     Raises InputError where no trial is of a scene of the paper, or where a cell would mix what may not be averaged.
     """

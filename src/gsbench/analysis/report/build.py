@@ -13,10 +13,11 @@ from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.errors_by_region import read_image
 from gsbench.analysis.origins import cloud_lines
-from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs
+from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs, controls_of
 from gsbench.analysis.paper import inconsistencies, load_paper
 from gsbench.analysis.paper_tables import layout_of, paper_tables
 from gsbench.analysis.report.crops import data_uri
+from gsbench.analysis.report.question_charts import question_part
 from gsbench.analysis.report.search_charts import search_part
 from gsbench.analysis.report.sections import (
     compare_arms,
@@ -37,7 +38,7 @@ from gsbench.words import signed
 
 @dataclass(frozen=True)
 class AblationPart:
-    """What the runs were, in lines, and charts as SVG."""
+    """Descriptions of the runs in lines, and charts as SVG."""
 
     lines: Sequence[str]
     charts: Sequence[str]
@@ -56,8 +57,10 @@ def build_report(
     views = ViewCache()
     declared = standing(experiment.folder, trials)
     search = search_part(experiment.folder)
-    pairs = [] if search else choose_pairs(arms, baseline)  # among points that were chosen by results no test holds
+    # Among points of a search, which were chosen by results, no test holds.
+    pairs = [] if search else choose_pairs(arms, baseline, controls_of(trials))
     judged = judge(trials, pairs, views, declared)
+    questions = question_part(trials, judged, views)
     versus = [compare_arms(trials, *pair, views, own) for pair, own in judged.items()]
     quantity = next((one.declared for one in judged.values() if one.declared is not None), None)
     layout = layout_of(experiment.name)
@@ -82,11 +85,13 @@ def build_report(
         tables=[to_html(table) for table in tables],
         contradictions=[] if layout is None else inconsistencies(load_paper()),
         search=search,
+        questions=questions,
         sweeps=[] if search else sweep_charts(trials),
         tradeoffs=tradeoff_charts(trials),
         gaps=tradeoff_gaps(trials, baseline),
         agreements=agreements(trials),
         arm_name=arm_name,
+        to_html=to_html,
         training=training_charts(trials, arms),
         events=event_charts(trials, arms),
         volumes=volumes,
@@ -100,14 +105,17 @@ def build_report(
 
 
 def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
-    """(caption, data URI) of the pictures that trials left for the report; one seed of each scene and arm."""
-    found = []
+    """(caption, data URI) of the pictures that trials left for the report; one seed of each scene and arm.
+
+    A picture that several arms of a scene share, such as that of their initial cloud, is there once.
+    """
+    found: dict[tuple[str, str, str], list[str]] = {}  # by name, scene and picture: the arms and seeds
     for group in by_key(trials, lambda trial: (trial.scene, trial.arm)).values():
         trial = group[0]
         for path in sorted((trial.path / FIGURES).glob("*.png")):
-            caption = f"{path.stem.replace('_', ' ')}: {trial.scene}, {trial.init}-{trial.densify}, seed {trial.seed}"
-            found.append((caption, data_uri(read_image(path))))
-    return found
+            key = path.stem.replace("_", " "), trial.scene, data_uri(read_image(path))
+            found.setdefault(key, []).append(f"{trial.init}-{trial.densify}, seed {trial.seed}")
+    return [(f"{name}: {scene}, {'; '.join(arms)}", uri) for (name, scene, uri), arms in found.items()]
 
 
 def _resource(name: str) -> str:

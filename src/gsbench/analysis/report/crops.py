@@ -38,7 +38,7 @@ class Crop:
 def choose_crops(
     pairs: Sequence[tuple[TrialResult, TrialResult]], count: int
 ) -> tuple[list[Crop], list[Crop], list[str]]:
-    """Up to ``count`` places each where the second arm gains most and loses most, and what could not be read.
+    """Choose up to ``count`` places each where the second arm gains and loses most; also lists what cannot be read.
 
     One seed of each scene is looked at, and at most one place in a view is taken for each list.
     """

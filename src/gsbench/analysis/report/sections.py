@@ -1,29 +1,30 @@
-"""What the report says and draws, section by section, from result files only."""
+"""Sections of the report, each made from result files only."""
 
 from __future__ import annotations
 
 import statistics
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from gsbench.analysis.attribution import attribute, attribution_sentence
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import short_version
 from gsbench.analysis.errors_by_region import MAP_PROPERTIES, RegionErrors, errors_by_region
+from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.origins import machine_of, unlike_clouds
 from gsbench.analysis.pairing import ViewCache, arm_name, pair_trials
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart, short_number
 from gsbench.analysis.report.crops import Crop, choose_crops
+from gsbench.analysis.report.headlines import by_scene_lines, headline, secondary
 from gsbench.analysis.report.volumes import share_above, volume_histogram
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import ALPHA
-from gsbench.analysis.tables import change_words, cost_change
+from gsbench.analysis.tables import Table, change_words, cost_change
 from gsbench.analysis.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve
 from gsbench.analysis.verdicts import ArmVerdicts, Verdict, judge
 from gsbench.errors import InputError
 from gsbench.events import Cause, RefineEvent
-from gsbench.files import read_json_lines
 from gsbench.runs import layout
+from gsbench.runs.rows import read_histograms
 from gsbench.words import signed
 
 CROPS = 4  # places of each kind
@@ -39,12 +40,14 @@ CURVES = (  # key of metrics.jsonl, title, y axis
 
 @dataclass(frozen=True)
 class Versus:
-    """Everything about one pair of arms."""
+    """All results about one pair of arms."""
 
     first: Arm
     second: Arm
     verdicts: tuple[Verdict, ...]
     headline: str
+    attribution: str  # in which ingredients the arms differ, where these are several
+    fairness: Table
     secondary: str  # what else was found, where a metric was declared
     by_scene: tuple[str, ...]
     costs: tuple[str, ...]
@@ -57,6 +60,11 @@ class Versus:
     @property
     def title(self) -> str:
         return f"{arm_name(self.second)} against {arm_name(self.first)}"
+
+    @property
+    def beyond(self) -> bool:
+        """Return whether there are scenes enough to ask about scenes like these."""
+        return any(verdict.comparison.beyond is not None for verdict in self.verdicts)
 
     @property
     def tests(self) -> list[str]:
@@ -94,9 +102,11 @@ def compare_arms(
         first,
         second,
         verdicts,
-        _headline(judged, first, second),
-        _secondary(judged),
-        tuple(_by_scene([verdict for verdict in verdicts if verdict.role in ("", "declared")])),
+        headline(judged, first, second),
+        attribution_sentence(attribute(trials, first, second), first, second),
+        fairness_table(trials, first, second),
+        secondary(judged),
+        tuple(by_scene_lines([verdict for verdict in verdicts if verdict.role in ("one of all", "declared")])),
         tuple(_costs(own, first, second)),
         tuple(_forest(verdict) for verdict in verdicts),
         tuple(regions),
@@ -123,7 +133,7 @@ def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str
     """Events by cause: totals of every arm, and over the iterations of each arm."""
     totals = []
     for arm in arms:
-        logged = [trial.data.get("events") or {} for trial in trials if trial.arm == arm]
+        logged = [trial.record.events for trial in trials if trial.arm == arm]
         totals.append(
             (arm_name(arm), {c: statistics.fmean(float(events.get(c, 0)) for events in logged) for c in EVENT_CAUSES})
         )
@@ -157,7 +167,7 @@ def _strictness_chart(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> str
 
 def _origin_chart(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> str:
     """What made the Gaussians that are left at the end, as the mean of a trial."""
-    origins = {arm: [trial.data.get("causes") or {} for trial in trials if trial.arm == arm] for arm in arms}
+    origins = {arm: [trial.record.causes for trial in trials if trial.arm == arm] for arm in arms}
     causes = list(dict.fromkeys(cause for logged in origins.values() for counts in logged for cause in counts))
     means = {
         arm: [statistics.fmean(float(counts.get(cause, 0)) for counts in logged) for cause in causes]
@@ -212,77 +222,16 @@ def provenance(trials: Sequence[TrialResult]) -> list[dict[str, str]]:
     return [
         {
             "trial": trial.label,
-            "raster": str(trial.data["raster"]),
-            "protocol": str(trial.data["protocol"]),
-            "iterations": str(trial.data["iterations"]),
-            **{f"{key} hash": str(value)[:12] for key, value in trial.data.get("hashes", {}).items()},
+            "raster": trial.record.raster,
+            "protocol": trial.record.protocol,
+            "iterations": str(trial.record.iterations),
+            **{f"{key} hash": str(value)[:12] for key, value in trial.record.hashes.items()},
             "code": ", ".join(f"{part} {short_version(version)}" for part, version in trial.code.items()),
             "machine": machine_of(trial) or "",
-            "versions": ", ".join(f"{key} {value}" for key, value in trial.data.get("versions", {}).items()),
+            "versions": ", ".join(f"{key} {value}" for key, value in trial.record.versions.items()),
         }
         for trial in trials
     ]
-
-
-def _headline(judged: ArmVerdicts, first: Arm, second: Arm) -> str:
-    verdicts, against = judged.verdicts, f"{arm_name(second)} against {arm_name(first)}"
-    if not verdicts:
-        return f"{arm_name(second)} and {arm_name(first)} cannot be compared: no metric has paired trials."
-    scope = verdicts[0].comparison.scope
-    if all(scene.mean == 0 for verdict in verdicts for scene in verdict.comparison.scenes):
-        return (
-            f"{against}, on {scope}: equal in every metric, to the last bit. What "
-            "they differ in never acted: look at the events, and at train.densify_start and densify_stop."
-        )
-    if all(verdict.comparison.p is None for verdict in verdicts):
-        return f"{against}: no verdict, one trial of each on {scope}; run more seeds."
-    if judged.declared is None:
-        return f"{against}, on {scope}: {_in_words(verdicts)}."
-    if judged.missing:
-        return (
-            f"{against}: no verdict, since {judged.declared.name}, which was declared, has no value ({judged.missing})."
-        )
-    if verdicts[0].role != "declared":
-        return f"{against}, on {scope}, all metrics adjusted for their number: {_in_words(verdicts)}."
-    return f"{against}, on {scope}: {_in_words(verdicts[:1])}, which was declared beforehand."
-
-
-def _secondary(judged: ArmVerdicts) -> str:
-    others = [verdict for verdict in judged.verdicts if verdict.role == "secondary"]
-    decidable = any(verdict.comparison.p is not None for verdict in others)
-    return f"Secondary, adjusted for their number: {_in_words(others)}." if decidable else ""
-
-
-def _in_words(verdicts: Sequence[Verdict]) -> str:
-    """``better in PSNR; no evidence of a difference in SSIM, FLIP``"""
-    words = []
-    for word, opening in (
-        ("better", "better in"),
-        ("worse", "worse in"),
-        ("no evidence", "no evidence of a difference in"),
-    ):
-        names = [v.quantity.name for v in verdicts if v.comparison.verdict == word]
-        if names:
-            words.append(f"{opening} {', '.join(names)}")
-    return "; ".join(words)
-
-
-def _by_scene(verdicts: Sequence[Verdict]) -> list[str]:
-    """For each metric in which single scenes are decided (p below 5 % after Holm), a line that names them.
-
-    A mean over scenes that disagree hides both sides of what was found.
-    """
-    lines = []
-    for verdict in verdicts:
-        scenes = verdict.comparison.scenes
-        decided = [scene for scene in scenes if scene.p_holm is not None and scene.p_holm < ALPHA]
-        better = [scene.scene for scene in decided if scene.mean * verdict.quantity.direction > 0]
-        worse = [scene.scene for scene in decided if scene.mean * verdict.quantity.direction < 0]
-        found = [f"{word} on {', '.join(names)}" for word, names in (("better", better), ("worse", worse)) if names]
-        if len(scenes) > 1 and found:
-            warning = ": the scenes disagree, so their mean says little" if len(found) > 1 else ""
-            lines.append(f"{verdict.quantity.name} by scene: {', '.join(found)}{warning}")
-    return lines
 
 
 def _costs(trials: Sequence[TrialResult], first: Arm, second: Arm) -> list[str]:
@@ -341,11 +290,7 @@ def _region_chart(errors: RegionErrors, first: Arm, second: Arm) -> str:
 
 
 def _rows(trial: TrialResult, name: str, key: str) -> list[tuple[float, float]]:
-    return [
-        (float(row["step"]), float(row[key]))
-        for row in read_json_lines(trial.path / name)
-        if _is_number(row.get("step")) and _is_number(row.get(key))
-    ]
+    return [(float(row["step"]), float(row[key])) for row in trial.curve(name) if key in row]
 
 
 def _is_number(value: object) -> bool:
@@ -354,12 +299,12 @@ def _is_number(value: object) -> bool:
 
 def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, list[tuple[float, float]]]:
     """Pooled counts of ``volume_histograms.jsonl`` by iteration, as (volume at the bin's centre, share)."""
-    pooled: dict[int, Counter[float]] = {}
+    pooled: dict[int, dict[float, float]] = {}
     for trial in trials:
-        for row in read_json_lines(trial.path / layout.HISTOGRAMS):
-            edges, counts = row.get("log10_edges", []), row.get("counts", [])
-            for low, high, count in zip(edges, edges[1:], counts, strict=False):
-                pooled.setdefault(int(row["step"]), Counter())[10 ** ((low + high) / 2)] += count
+        for row in read_histograms(trial.path / layout.HISTOGRAMS, trial.digests):
+            for low, high, count in zip(row.log10_edges, row.log10_edges[1:], row.counts, strict=False):
+                bins, volume = pooled.setdefault(row.step, {}), 10 ** ((low + high) / 2)
+                bins[volume] = bins.get(volume, 0.0) + count
     return {
         step: [(volume, count / total) for volume, count in sorted(bins.items()) if count]
         for step, bins in sorted(pooled.items())

@@ -17,14 +17,19 @@ FAMILY = ("init.name", "densify._target_")
 
 
 def sweep_charts(trials: Sequence[TrialResult]) -> list[str]:
-    """For each initialiser and class of densifier of which one setting was varied, a chart for each quantity.
+    """Draw a chart of each quantity for each initialiser and class of densifier of which one setting was varied.
 
     A line is a scene, relative to its own mean over the values, so that scenes of unlike levels share an axis and each
     scene's best value can be seen: a threshold in scene units need not suit all scenes. The baseline, which has no such
     setting, stands beside the values.
     """
     charts = []
-    for family, swept in by_key(trials, lambda trial: tuple(trial.config.get(key) for key in FAMILY)).items():
+    several = len({trial.split for trial in trials}) > 1  # what is held out is another question, not another value
+
+    def family_of(trial: TrialResult) -> tuple[object, ...]:
+        return (*(trial.config.get(key) for key in FAMILY), trial.split if several else None)
+
+    for family, swept in by_key(trials, family_of).items():
         setting = _varied(swept)
         if setting is None:
             continue
@@ -49,7 +54,8 @@ def _baseline(trials: Sequence[TrialResult], swept: Sequence[TrialResult], setti
     """The trials of the baseline beside those ``swept``, where it is one arm and has no such setting."""
     if any(trial.config.get(setting) is None for trial in swept):
         return []
-    found = [trial for trial in trials if (trial.init, trial.densify) == (swept[0].init, BASELINE)]
+    wanted = (swept[0].init, BASELINE, swept[0].split)
+    found = [trial for trial in trials if (trial.init, trial.densify, trial.split) == wanted]
     scenes = by_key(found, lambda trial: trial.scene).values()
     one_arm = not any(differing_settings(own) for own in scenes)
     return found if one_arm and not any(setting in trial.config for trial in found) else []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from gsbench.analysis.cells import by_key
 from gsbench.analysis.pairing import BASELINE, arm_name
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.report.charts import Series, line_chart, short_number
@@ -18,35 +19,44 @@ COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time (s)"}
 def tradeoff_charts(trials: Sequence[TrialResult]) -> list[str]:
     """One chart for each pair of main metric and cost; a densifier's variants are the points of its line."""
     charts = []
-    for metric in _main_metrics(trials):
-        for cost, label in COST_LABELS.items():
-            curves = _curves(trials, metric, cost)
-            series = [
-                Series(arm_name(family), list(zip(curve.cost.tolist(), curve.quality.tolist(), strict=True)))
-                for family, curve in curves.items()
-            ]
-            charts.append(line_chart(f"{metric.name} against {label}", series, label, metric.heading, log_x=True))
+    for where, own in _by_split(trials):
+        for metric in main_metrics(own):
+            for cost, label in COST_LABELS.items():
+                curves = _curves(own, metric, cost)
+                series = [
+                    Series(arm_name(family), list(zip(curve.cost.tolist(), curve.quality.tolist(), strict=True)))
+                    for family, curve in curves.items()
+                ]
+                title = f"{metric.name} against {label}{where}"
+                charts.append(line_chart(title, series, label, metric.heading, log_x=True))
     return [chart for chart in charts if chart]
 
 
 def tradeoff_gaps(trials: Sequence[TrialResult], baseline: str = BASELINE) -> list[str]:
     """The area between every densifier's curve and the baseline's, in words, where both have several points."""
     lines = []
-    for metric in _main_metrics(trials):
-        for cost, label in COST_LABELS.items():
-            curves = _curves(trials, metric, cost)
-            for (init, densify), curve in curves.items():
-                first = curves.get((init, baseline))
-                gap = curve_gap(first, curve) if first is not None and densify != baseline else None
-                if gap is not None:
-                    amount = signed(gap.gap, f".{metric.decimals + 1}f")
-                    arms = f"{init}-{densify} at the same {label} as {init}-{baseline}"
-                    scale = f"from {short_number(gap.low)} to {short_number(gap.high)}, log scale"
-                    lines.append(f"{metric.name} of {arms}: {amount} on average ({scale}).")
+    for where, own in _by_split(trials):
+        for metric in main_metrics(own):
+            for cost, label in COST_LABELS.items():
+                curves = _curves(own, metric, cost)
+                for (init, densify), curve in curves.items():
+                    first = curves.get((init, baseline))
+                    gap = curve_gap(first, curve) if first is not None and densify != baseline else None
+                    if gap is not None:
+                        amount = signed(gap.gap, f".{metric.decimals + 1}f")
+                        arms = f"{init}-{densify} at the same {label} as {init}-{baseline}{where}"
+                        scale = f"from {short_number(gap.low)} to {short_number(gap.high)}, log scale"
+                        lines.append(f"{metric.name} of {arms}: {amount} on average ({scale}).")
     return lines
 
 
-def _main_metrics(trials: Sequence[TrialResult]) -> list[Quantity]:
+def _by_split(trials: Sequence[TrialResult]) -> list[tuple[str, list[TrialResult]]]:
+    """The trials by what was held out, with words for it where that is not one way for all."""
+    groups = by_key(trials, lambda trial: trial.split)
+    return [(f", {split}" if len(groups) > 1 else "", own) for split, own in groups.items()]
+
+
+def main_metrics(trials: Sequence[TrialResult]) -> list[Quantity]:
     """PSNR, and the first perceptual metric that is at hand, beginning with the protocol's LPIPS."""
     for name in ("lpips", *(facts.key for facts in METRICS if facts.perceptual)):
         perceptual = quantity(name, trials)

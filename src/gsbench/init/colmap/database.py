@@ -156,7 +156,7 @@ def verify_pairs(
 
 
 def cameras_without_prior(path: Path) -> bool:
-    """Whether some camera's focal length is a guess, neither given nor in the EXIF data."""
+    """Return whether some camera's focal length is a guess, neither given nor in the EXIF data."""
     with pycolmap.Database.open(path) as database:
         return any(not camera.has_prior_focal_length for camera in database.read_all_cameras())
 
@@ -189,7 +189,7 @@ def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
 
 @contextmanager
 def image_ids_as_names(path: Path) -> Iterator[dict[str, str]]:
-    """Within the context the images are named by their ids; gives the new names by the old ones.
+    """Name the images by their ids within the context; gives the new names by the old ones.
 
     COLMAP's pair lists are divided at spaces, which the names of photographs often contain.
     """
@@ -227,7 +227,7 @@ def strongest_descriptors(path: Path, name: str, count: int) -> NDArray[np.uint8
 
 
 def database_counts(path: Path) -> dict[str, int]:
-    """How many features, matched and verified pairs and inlier matches the database holds."""
+    """Count the features, matched and verified pairs and inlier matches of the database."""
     with pycolmap.Database.open(path) as database:
         _, inliers = database.read_two_view_geometry_num_inliers()  # pairs that failed are there too, with 0
         return {

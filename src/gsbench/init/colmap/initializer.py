@@ -1,4 +1,4 @@
-"""What runs an initialiser that ends in COLMAP: checks, preparation, and its job in a process of its own."""
+"""Base of initialisers that end in COLMAP: checks, preparation, and the job in a process of its own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from gsbench.errors import InputError
-from gsbench.init.base import MIN_IMAGES, Initializer, InitReport, Preparation
+from gsbench.init.base import MIN_IMAGES, WORK_FOLDER, Initializer, InitReport, Preparation
 from gsbench.init.colmap.options import ColmapOptions
 from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.logs import Progress, no_progress
@@ -18,7 +18,6 @@ from gsbench.scene.types import Capture
 logger = logging.getLogger(__name__)
 
 LOG_FILE = "colmap.log"
-WORK_FOLDER = "work"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +30,7 @@ class ColmapInitializer(ColmapOptions, Initializer):
     is_own_reference: ClassVar[bool] = False  # with poses=shared and no reference: estimate the poses here
 
     def needs_reference(self, capture: Capture) -> bool:
-        """Whether `run` needs a ``reference`` because the capture came without cameras."""
+        """Return whether `run` needs a ``reference`` because the capture came without cameras."""
         shared_without = self.poses == "shared" and not self.is_own_reference
         return capture.model is None and (shared_without or self.intrinsics == "reference")
 

@@ -1,4 +1,4 @@
-"""From photographs and options to a reported COLMAP model. Calls native code that can abort: run it isolated."""
+"""Reconstruction of a reported COLMAP model from photographs. Calls native code that can abort: run it isolated."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import pycolmap
 
 from gsbench.errors import InputError
 from gsbench.init import report
-from gsbench.init.base import OWN_GAUGE_FOLDER, InitReport, Preparation, Timer
+from gsbench.init.base import OWN_GAUGE_FOLDER, InitReport, Preparation, Timer, TrainingPoints
 from gsbench.init.colmap import database as colmap_database
 from gsbench.init.colmap import mapping, reconstruct
 from gsbench.init.colmap.alignment import Similarity
 from gsbench.init.colmap.options import ColmapOptions, DatabaseTask
+from gsbench.init.colmap.training_points import keep_training_points, retriangulate
 from gsbench.logs import Progress
 from gsbench.scene.types import Capture
 
@@ -39,14 +40,16 @@ def build_model(job: Job, progress: Progress) -> InitReport:
     timer = Timer(dict(job.preparation.seconds))
     reference = reconstruct.load_reference(capture, job.reference)
     database = job.work_dir / "database.db"
-    images = colmap_database.readable_images(capture.images, capture.image_names, job.work_dir)
+    seen = capture.train_names if options.leaves_out(reference) else capture.image_names
+    images = colmap_database.readable_images(capture.images, seen, job.work_dir)
     if reference is not None and options.takes_reference_cameras:
         cameras = colmap_database.reference_groups(reference)
     else:
         cameras = colmap_database.guessed_groups(
             images, capture.image_names, options.camera, options.camera_model, options.focal_length
         )
-    names = list(colmap_database.create_database(database, cameras))
+    placed = colmap_database.create_database(database, cameras)
+    names = [name for name in placed if name in set(seen)]
     pairs = reconstruct.select_pairs(capture.images, names, options, reference)
     task = DatabaseTask(database, images, names, pairs, capture, job.work_dir)
     counts = options.fill_database(task, progress, timer)
@@ -66,14 +69,22 @@ def build_model(job: Job, progress: Progress) -> InitReport:
     shutil.rmtree(scratch, ignore_errors=True)
     if options.poses == "shared" and reference is not None:
         with timer.phase("triangulate"):
-            model = reconstruct.triangulate(database, images, scratch, reference, settings, progress)
-        return _finish(job, "shared", model, reference, None, timer, counts)
+            model = reconstruct.triangulate(database, images, scratch, reference, names, settings, progress)
+        left = TrainingPoints(options.points_from, model.num_points3D(), None, None)
+        points = left if options.leaves_out(reference) else None
+        return _finish(job, "shared", model, reference, None, timer, counts, points=points)
     with timer.phase("map"):
         verification = reconstruct.Verification(options.seed, options.min_inliers, options.min_inlier_ratio)
         mapped = mapping.map_images(database, images, scratch, settings, verification, options.mapper, progress)
+    points = None
+    if options.points_from == "train":
+        points = keep_training_points(mapped.model, capture.train_names, images)
+    elif options.points_from == "retriangulated":
+        with timer.phase("triangulate"):
+            points = retriangulate(mapped.model, capture.train_names, database, images, scratch, settings)
     similarity = None if reference is None else reconstruct.similarity_to(mapped.model, reference)
     counts["models"] = mapped.models
-    return _finish(job, "own", mapped.model, reference, similarity, timer, counts, mapped)
+    return _finish(job, "own", mapped.model, reference, similarity, timer, counts, mapped, points)
 
 
 def _finish(
@@ -85,6 +96,7 @@ def _finish(
     timer: Timer,
     counts: Mapping[str, int],
     mapped: mapping.Mapped | None = None,
+    points: TrainingPoints | None = None,
 ) -> InitReport:
     """Align the model where it has poses of its own, write it, and report."""
     options, capture = job.options, job.capture
@@ -116,6 +128,7 @@ def _finish(
         counts=counts,
         mapped_by=None if mapped is None else mapped.way,
         warnings=warnings,
+        training_points=points,
     )
     report.write_result(model, result, job.output_dir)
     return result

@@ -1,4 +1,4 @@
-"""From a database of verified matches to cameras and points, by the first of several ways that places the photographs.
+"""Mapping of a database of verified matches: cameras and points, by the first of several ways that succeeds.
 
 COLMAP's defaults want an initial pair that sees points under 16 degrees. Forward-facing captures of a small baseline
 and without a known focal length have none; other ways of the same library place them. Everything here calls native
@@ -45,7 +45,7 @@ class Mapped:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the reader of a report should know where COLMAP's defaults were not enough; one line, or none."""
+        """The warnings of a report where COLMAP's defaults were not enough; one line, or none."""
         if len(self.tried) < 2:
             return ()
         others = ", ".join(f"{way} {count}" for way, count in self.tried)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
 
-from gsbench.init.base import Poses, Seed, Timer
+from gsbench.init.base import PointsFrom, Poses, Seed, Timer
 from gsbench.init.colmap.pairs import Pairing
 from gsbench.logs import Progress
 from gsbench.scene.types import Capture
@@ -28,7 +28,7 @@ MIN_DETECTION_SIZE = 32  # px: below it no detector finds anything
 
 @dataclass(frozen=True)
 class DatabaseTask:
-    """What is to be filled: the database with cameras and images in it, and the pairs of images to be matched.
+    """Database to be filled, with cameras and images in it, and the pairs of images to be matched.
 
     ``images`` is a folder with the same names as the capture's in which COLMAP can read every file.
     """
@@ -47,6 +47,10 @@ class ColmapOptions(ABC):
 
     With ``poses=shared`` the points are triangulated under the reference cameras; with ``poses=own`` cameras and points
     are estimated and then, where a reference exists, moved into its gauge by a similarity (``align``).
+
+    Unless ``points_from`` is ``all``, test views have no part in the points: under given cameras their photographs are
+    not looked at; where cameras are estimated, all photographs make these, and of the points those of the training
+    views are kept (``train``) or triangulated anew from them (``retriangulated``).
     """
 
     name: ClassVar[str]
@@ -65,6 +69,7 @@ class ColmapOptions(ABC):
     mapper: Literal["auto", "incremental", "global"] = "auto"
     min_model_size: Annotated[int, Ge(2)] = 3
     two_view_tracks: bool = False
+    points_from: PointsFrom = "all"
     seed: Seed = 0
     threads: PositiveInt | Literal["auto"] = "auto"
     mapper_threads: PositiveInt = 1
@@ -87,11 +92,17 @@ class ColmapOptions(ABC):
 
     @property
     def takes_reference_cameras(self) -> bool:
-        """Whether the cameras (intrinsics at least) are the reference's where there is one."""
+        """Return whether the cameras (intrinsics at least) are the reference's where there is one."""
         return self.poses == "shared" or self.intrinsics == "reference"
 
     def select_images(self, capture: Capture, reference: pycolmap.Reconstruction | None) -> list[str]:
         """The sorted names of the images to be used: all, or those of the reference where its cameras are taken."""
         if reference is None or not self.takes_reference_cameras:
             return sorted(capture.image_names)
-        return sorted(image.name for image in reference.images.values() if image.has_pose)
+        names = sorted(image.name for image in reference.images.values() if image.has_pose)
+        test = set(capture.test_names) if self.leaves_out(reference) else set()
+        return [name for name in names if name not in test]
+
+    def leaves_out(self, reference: pycolmap.Reconstruction | None) -> bool:
+        """Return whether test photographs are not even looked at, which are not needed where the cameras are given."""
+        return self.points_from != "all" and self.poses == "shared" and reference is not None

@@ -1,4 +1,4 @@
-"""Which pairs of images are matched. All functions return index pairs (i, j), i < j, sorted."""
+"""Pairs of images to be matched. All functions return index pairs (i, j), i < j, sorted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _GPS_LATITUDE_REF, _GPS_LATITUDE, _GPS_LONGITUDE_REF, _GPS_LONGITUDE, _GPS_ALTIT
 
 
 def exhaustive_pairs(count: int) -> list[Pair]:
-    """Every pair of ``count`` images.
+    """List every pair of ``count`` images.
 
     Examples:
         >>> exhaustive_pairs(3)
@@ -27,7 +27,7 @@ def exhaustive_pairs(count: int) -> list[Pair]:
 
 
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
-    """Each image with the next ``overlap`` ones, and with those 1, 2, 4, … 2^(overlap - 1) further on, as COLMAP does.
+    """Pair each image with the next ``overlap`` ones, and those 1, 2, 4, … 2^(overlap - 1) further on, as COLMAP does.
 
     Examples:
         >>> sequential_pairs(6, 3)
@@ -38,7 +38,7 @@ def sequential_pairs(count: int, overlap: int) -> list[Pair]:
 
 
 def spatial_pairs(positions: NDArray[np.float64], neighbors: int) -> list[Pair]:
-    """Each image with its ``neighbors`` nearest ones; ``positions`` [N, 3] in any unit of length."""
+    """Pair each image with its ``neighbors`` nearest ones; ``positions`` [N, 3] in any unit of length."""
     pairs: set[Pair] = set()
     for i, position in enumerate(positions):
         distances = np.linalg.norm(positions - position, axis=1)  # [N]
@@ -54,14 +54,16 @@ def gps_positions(paths: list[Path]) -> NDArray[np.float64] | None:
 
     geodetic = []
     for path in paths:
-        with Image.open(path) as image:
-            gps = image.getexif().get_ifd(_GPS_IFD)
         try:
+            with Image.open(path) as image:
+                gps = image.getexif().get_ifd(_GPS_IFD)
             latitude = _degrees(gps[_GPS_LATITUDE], gps[_GPS_LATITUDE_REF] == "S")
             longitude = _degrees(gps[_GPS_LONGITUDE], gps[_GPS_LONGITUDE_REF] == "W")
             geodetic.append((latitude, longitude, float(gps.get(_GPS_ALTITUDE, 0.0))))
-        except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        except Exception:  # noqa: BLE001 - Pillow raises many kinds on damaged fields, as if there were none
             return None
+    if not np.isfinite(geodetic).all():
+        return None
     latitudes, longitudes, altitudes = np.array(geodetic).reshape(-1, 3).T
     radians = np.radians
     east = EARTH_RADIUS_M * radians(longitudes - longitudes.mean()) * np.cos(radians(latitudes.mean()))

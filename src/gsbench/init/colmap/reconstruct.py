@@ -1,11 +1,11 @@
-"""From a database of verified matches to a model: cameras and points, or points under known cameras.
+"""Reconstruction from a database of verified matches: cameras and points, or points under known cameras.
 
 Everything here calls native code that can abort the process: run it isolated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -41,7 +41,7 @@ class Verification:
     min_inlier_ratio: float = 0.0  # … and as a share of all of the pair
 
     def options(self) -> pycolmap.TwoViewGeometryOptions:
-        """As COLMAP takes them."""
+        """The options in COLMAP's own type."""
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = self.seed
         options.min_num_inliers = self.min_inliers
@@ -51,7 +51,7 @@ class Verification:
 
 @dataclass(frozen=True)
 class MappingSettings:
-    """How COLMAP's mapper and triangulator run; see the fields of `gsbench.init.Sfm`."""
+    """Settings of COLMAP's mapper and triangulator; see the fields of `gsbench.init.Sfm`."""
 
     seed: int
     threads: int
@@ -97,24 +97,27 @@ def triangulate(
     images: Path,
     output: Path,
     reference: pycolmap.Reconstruction,
+    names: Collection[str],
     settings: MappingSettings,
     progress: Progress,
 ) -> pycolmap.Reconstruction:
-    """Points from the verified matches under the reference's cameras, which stay as they are, to the bit."""
+    """Points from the verified matches of the images ``names`` under the reference's cameras, which stay to the bit.
+
+    The other images of the database are in the model with their cameras, and see no point.
+    """
     progress("triangulate", 0, 1)
-    pycolmap.set_random_seed(settings.seed)
-    output.mkdir(parents=True, exist_ok=True)
-    known = pycolmap.Reconstruction()  # its ids must be the database's
+    known, others = pycolmap.Reconstruction(), []  # its ids must be the database's
     with pycolmap.Database.open(database) as opened:
         for camera in opened.read_all_cameras():
             known.add_camera_with_trivial_rig(camera)
         for stored in opened.read_all_images():
             pose = reference.find_image_with_name(stored.name).cam_from_world()
             image = pycolmap.Image(name=stored.name, camera_id=stored.camera_id, image_id=stored.image_id)
-            known.add_image_with_trivial_frame(image, pose)
-    model = pycolmap.triangulate_points(
-        known, database, images, output, clear_points=True, options=pipeline_options(settings), refine_intrinsics=False
-    )
+            if stored.name in names:
+                known.add_image_with_trivial_frame(image, pose)
+            else:
+                others.append((image, pose))
+    model = triangulate_known(known, database, images, output, settings)
     progress("triangulate", 1, 1)
     if model.num_points3D() == 0:
         raise InputError(
@@ -123,7 +126,20 @@ def triangulate(
         )
     for image in model.images.values():  # the solver turns them by a rounding error, on some processors
         image.frame.set_cam_from_world(image.camera_id, reference.find_image_with_name(image.name).cam_from_world())
+    for image, pose in others:
+        model.add_image_with_trivial_frame(image, pose)
     return model
+
+
+def triangulate_known(
+    known: pycolmap.Reconstruction, database: Path, images: Path, output: Path, settings: MappingSettings
+) -> pycolmap.Reconstruction:
+    """Points from the matches in ``database`` under the cameras and poses of ``known``, whose ids are those there."""
+    pycolmap.set_random_seed(settings.seed)
+    output.mkdir(parents=True, exist_ok=True)
+    return pycolmap.triangulate_points(
+        known, database, images, output, clear_points=True, options=pipeline_options(settings), refine_intrinsics=False
+    )
 
 
 def poses_by_name(model: pycolmap.Reconstruction) -> dict[str, tuple[Array, Array]]:

@@ -36,7 +36,7 @@ IdPair = tuple[int, int]
 
 @dataclass(frozen=True)
 class MatchingJob:
-    """What one process matches: ``parts``, lists of pairs of image ids, whose matches go into ``result``.
+    """Job of one matching process: ``parts``, lists of pairs of image ids, whose matches go into ``result``.
 
     ``features`` is the database with keypoints and descriptors, ``empty`` the same without them and with images that
     are named by their ids (COLMAP's pair lists are divided at spaces, which names of photographs often contain).

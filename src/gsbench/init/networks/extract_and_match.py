@@ -33,7 +33,7 @@ LOWRES_MATCHES = 20  # a pair with more is matched at full size
 
 @dataclass(frozen=True)
 class NetworkJob:
-    """What the isolated process needs; the weights are checked files, None where none are needed."""
+    """Inputs of the isolated process; the weights are checked files, None where none are needed."""
 
     options: ColmapOptions
     settings: FeatureSettings
@@ -105,7 +105,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
 
 
 def choose_pairs(job: NetworkJob, names: Sequence[str], pairs: list[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Those of ``pairs`` to be matched, now that the features of the images ``names`` are in the store."""
+    """Choose the ``pairs`` to be matched, once the features of the images ``names`` are in the store."""
     if job.options.pairs == "auto":
         store = open_store(job)
         return proposed_pairs(names, lambda name: store.require_features(name).strongest(STRONGEST).descriptors)

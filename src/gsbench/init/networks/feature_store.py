@@ -25,7 +25,7 @@ FORMAT_VERSION = 1  # to be raised when the same settings give other features
 
 
 class FeatureStore:
-    """Below ``folder``: ``features/<key>.npz`` and ``matches/<key>.npy``.
+    """Store of features and matches below ``folder``: ``features/<key>.npz`` and ``matches/<key>.npy``.
 
     ``extraction`` and ``matching`` are the settings (plain values) that features and matches depend on.
     """
@@ -38,11 +38,11 @@ class FeatureStore:
         self._image_key = cache(self._hash_image)
 
     def features_path(self, name: str) -> Path:
-        """Where the features of the image ``name`` are kept."""
+        """The file of the features of the image ``name``."""
         return self.folder / "features" / f"{self._image_key(name)}.npz"
 
     def matches_path(self, first: str, second: str) -> Path:
-        """Where the matches of a pair of images are kept."""
+        """The file of the matches of a pair of images."""
         key = _key([FORMAT_VERSION, self._image_key(first), self._image_key(second), self._matching])
         return self.folder / "matches" / f"{key}.npy"
 

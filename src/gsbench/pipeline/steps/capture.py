@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.logs import progress
+from gsbench.pipeline.steps.code import step_of_code
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.stages import CAPTURE
 from gsbench.runs.step import Step
@@ -27,17 +28,12 @@ def capture_step(options: SceneConfig) -> Step | None:
         with progress("scene") as report:
             render_courtyard(folder, progress=report, **inputs)
 
-    return Step(CAPTURE, inputs, build)
+    return step_of_code(CAPTURE, inputs, build, __name__)
 
 
 def read_capture(options: SceneConfig, made: Path | None) -> Capture:
     """The photographs of ``options``, selected and split; ``made`` is the folder that ``capture_step`` filled."""
-    selection: dict[str, Any] = {
-        "max_images": options.max_images,
-        "test_every": options.test_every,
-        "train_list": options.train_list,
-        "test_list": options.test_list,
-    }
+    selection: dict[str, Any] = {"max_images": options.max_images, "split": options.split_rule}
     if made is not None:
         return read_colmap(options.name, made, exact_poses=True, **selection)
     path = Path(str(options.path)).expanduser()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -24,6 +25,7 @@ from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.logs import progress
 from gsbench.pipeline.components import options_of, rasterizer_inputs
+from gsbench.pipeline.steps.code import step_of_code
 from gsbench.pipeline.steps.figures import draw_ellipsoids
 from gsbench.pipeline.steps.maps import view_maps
 from gsbench.pipeline.steps.model_metrics import (
@@ -35,10 +37,13 @@ from gsbench.pipeline.steps.model_metrics import (
 from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
 from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, MAPS, METRICS, PER_VIEW, POINT_CLOUD, RENDERS
+from gsbench.runs.stage_records import Evaluation
 from gsbench.runs.stages import EVALUATE
 from gsbench.runs.step import Step
+from gsbench.runs.trial_record import Earlier
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
+from gsbench.scene.nearness import nearness
 from gsbench.scene.types import Scene
 from gsbench.train.trainer import snapshot_file
 
@@ -92,14 +97,14 @@ def evaluate_step(
                 report(phase, done, len(scene.test))
             return per_view
 
-        at = {}
+        at: dict[str, Earlier] = {}
         with progress("evaluate") as report:
             per_view = measure(gaussians, "views", folder / RENDERS)
             for step in earlier:
                 if (snapshot := training / snapshot_file(step)).exists():  # else a limit of time came first
                     model = read_ply(snapshot, device)
                     means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
-                    at[str(step)] = {"metrics": means, "num_gaussians": len(model)}
+                    at[str(step)] = Earlier(metrics=means, num_gaussians=len(model))
         if maps:
             write_maps(folder / MAPS, scene, views.store.path(views.init), gaussians, rasterizer)
             draw_figures(folder / FIGURES, folder / RENDERS, scene, training, gaussians)
@@ -108,9 +113,9 @@ def evaluate_step(
             found.append(measure_geometry(rasterizer, gaussians, views))
         if flicker:
             found.append(measure_flicker(rasterizer, gaussians, scene, color))
-        _write_metrics(folder, evaluator, per_view, found, {"at": at} if at else {})
+        _write_metrics(folder, evaluator, per_view, found, scene, at)
 
-    return Step(EVALUATE, inputs, build)
+    return step_of_code(EVALUATE, inputs, build, __name__, (rasterizer, *evaluator.extra.values()))
 
 
 def measure_step(
@@ -135,9 +140,9 @@ def measure_step(
                 )
                 report("views", done, len(scene.test))
         unknown = nothing_known(geometry, flicker, "another program's renders are known, not its model")
-        _write_metrics(folder, evaluator, per_view, [unknown])
+        _write_metrics(folder, evaluator, per_view, [unknown], scene)
 
-    return Step(EVALUATE, inputs, build)
+    return step_of_code(EVALUATE, inputs, build, __name__, tuple(evaluator.extra.values()))
 
 
 def _further_metrics(evaluator: Evaluator) -> dict[str, Any]:
@@ -157,34 +162,36 @@ def _write_metrics(
     evaluator: Evaluator,
     per_view: Mapping[str, Mapping[str, float]],
     of_model: Sequence[ModelMetrics],
-    more: Mapping[str, Any] = MappingProxyType({}),
+    scene: Scene,
+    at: Mapping[str, Earlier] = MappingProxyType({}),
 ) -> None:
-    """Write the metrics of images and of the model, by view and as means."""
+    """Write the metrics of images and of the model, by view and as means; views with their nearest training views."""
     rows = {view: dict(row) for view, row in per_view.items()}
     for found in of_model:
         for view, row in found.per_view.items():
             rows[view] |= row
-    write_per_view(folder / PER_VIEW, rows)
-    summary = summary_of(evaluator, rows)
+    cameras, training = ([view.camera for view in views] for views in (scene.test, scene.train))
+    near = nearness(cameras, training, scene.extent)
+    places = {view.name: place for view, place in zip(scene.test, near, strict=True)}  # no metrics: they are in no mean
+    write_per_view(folder / PER_VIEW, {view: row | places.get(view, {}) for view, row in rows.items()})
+    summary = replace(summary_of(evaluator, rows), at=dict(at))
     for found in of_model:
-        summary["unavailable"] = summary["unavailable"] | found.unavailable
-    write_json(folder / METRICS, {**summary, **more})
+        summary = replace(summary, unavailable=summary.unavailable | found.unavailable)
+    write_json(folder / METRICS, summary.to_json())
 
 
-def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
-    """What results keep of an evaluation: the means, what is missing and why, and the facts of a user's metrics."""
-    summary: dict[str, Any] = {
-        "metrics": summarize(per_view, evaluator.unavailable),
-        "unavailable": evaluator.unavailable,
-        "awaited": sorted(evaluator.awaited),
-    }
-    if evaluator.own:
-        summary["facts"] = {name: to_record(facts) for name, facts in evaluator.own.items()}
-    return summary
+def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]) -> Evaluation:
+    """Summary of an evaluation: the means, what is missing and why, and the facts of a user's metrics."""
+    return Evaluation(
+        metrics=summarize(per_view, evaluator.unavailable),
+        unavailable=dict(evaluator.unavailable),
+        awaited=sorted(evaluator.awaited),
+        facts={name: to_record(facts) for name, facts in evaluator.own.items()},
+    )
 
 
 def write_maps(folder: Path, scene: Scene, init: Path, gaussians: Gaussians, rasterizer: Rasterizer) -> None:
-    """One ``<view>.npz`` for each test view (see ``view_maps``)."""
+    """Write one ``<view>.npz`` for each test view (see ``view_maps``)."""
     folder.mkdir(exist_ok=True)
     points = cKDTree(read_cloud(init / MODEL_FOLDER).points)
     for view in scene.test:
@@ -204,7 +211,7 @@ def draw_figures(folder: Path, renders: Path, scene: Scene, training: Path, gaus
 
 
 def write_per_view(path: Path, per_view: Mapping[str, Mapping[str, float]]) -> None:
-    """One row a view, in order; a metric that a view lacks is left empty."""
+    """Write one row for each view, in order; a metric that a view lacks is left empty."""
     names = sorted({name for row in per_view.values() for name in row})
     with path.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, ["view", *names])

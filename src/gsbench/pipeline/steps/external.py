@@ -9,6 +9,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,11 @@ from gsbench.files import write_json
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.components import options_of
+from gsbench.pipeline.steps.code import step_of_code
 from gsbench.pipeline.steps.views import Views
 from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG, TRAINING
 from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
-from gsbench.runs.stages import EXTERNAL
+from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
 from gsbench.system.machine import describe_machine
 from gsbench.system.own_modules import SAFE_PATH
@@ -101,7 +103,7 @@ def external_step(
         }
         write_json(folder / TRAINING, summary)
 
-    return Step(EXTERNAL, inputs, build)
+    return step_of_code(replace(TRAIN, resumable=False), inputs, build, __name__)  # it starts from the beginning
 
 
 def take_result(trainer: External, pattern: str, views: Views, output: Path, folder: Path) -> dict[str, Any]:
@@ -138,7 +140,7 @@ def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str,
 
 
 def check_version(trainer: External, values: Mapping[str, object], environment: Mapping[str, str]) -> str | None:
-    """What ``densify.version_command`` prints, in one line; raises `InputError` unless it contains the version."""
+    """Run ``densify.version_command`` and return its line; raises `InputError` unless that contains the version."""
     if trainer.version_command is None:
         return None
     key = "densify.version_command"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from gsbench.pipeline.steps.code import step_of_code
 from gsbench.pipeline.steps.views import Views
 from gsbench.runs.stages import GROUND_TRUTH
 from gsbench.runs.step import Step
@@ -19,4 +20,4 @@ def ground_truth_step(views: Views) -> Step:
         for view in views.scene.test:
             Image.fromarray(view.image).save(folder / png_name(view.name))
 
-    return Step(GROUND_TRUTH, {"scene": views.inputs, "init": views.init.key}, build)
+    return step_of_code(GROUND_TRUTH, {"scene": views.inputs, "init": views.init.key}, build, __name__)

@@ -10,6 +10,7 @@ from gsbench.init.base import MODEL_FOLDER, Initializer
 from gsbench.logs import Progress, progress
 from gsbench.pipeline.components import options_of
 from gsbench.pipeline.steps.capture import split_of
+from gsbench.pipeline.steps.code import step_of_code
 from gsbench.runs.stages import INIT
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
@@ -36,7 +37,7 @@ def init_step(store: Store, capture: Capture, initializer: Initializer, referenc
             cameras = None if reference is None else store.path(reference) / MODEL_FOLDER
             initializer.run(capture, folder, report, reference=cameras)
 
-    return Step(INIT, inputs, build)
+    return step_of_code(INIT, inputs, build, __name__, (initializer,), in_processes=True)
 
 
 def check_readable(capture: Capture, report: Progress) -> None:

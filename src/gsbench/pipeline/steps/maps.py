@@ -1,5 +1,4 @@
-"""What each pixel of a test view shows: its depth, how far the initial cloud is, and how voluminous the Gaussians
-are."""
+"""Maps of a test view: each pixel's depth, its distance from the initial cloud, and the volume of its Gaussians."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is measured of a trained model rather than of pairs of images: its geometry, and its flicker along a path."""
+"""Metrics of a trained model rather than of pairs of images: its geometry, and its flicker along a path."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class ModelMetrics:
 
 
 def nothing_known(geometry: bool, flickering: bool, reason: str) -> ModelMetrics:
-    """All that was asked for, as unavailable for one reason."""
+    """Results that say of everything asked for that it is unavailable, for one reason."""
     asked = {GEOMETRY: geometry, FLICKER: flickering}
     return ModelMetrics(unavailable={facts.key: reason for facts in OF_MODELS if asked[facts.setting]})
 
@@ -126,8 +126,7 @@ def measure_flicker(rasterizer: Rasterizer, gaussians: Gaussians, scene: Scene, 
 
 
 def unused_points(views: Views) -> dict[str, Array]:
-    """For each test view the points [P, 3], of the COLMAP model that came with the photographs, that it sees and no
-    training view does.
+    """The points [P, 3] of the capture's own COLMAP model that each test view sees and no training view does.
 
     Raises `InputError`, in one line, where there are too few or where test views helped to make the initial cloud.
     """
@@ -165,7 +164,7 @@ def observations(model: pycolmap.Reconstruction) -> list[tuple[Array, set[str]]]
 
 
 def seen_by_test_alone(observed: Iterable[tuple[Array, set[str]]], train: set[str], test: set[str]) -> dict[str, Array]:
-    """For each of the views ``test`` the points [P, 3] that it sees and none of ``train`` does."""
+    """The points [P, 3] that each of the views ``test`` sees and none of ``train`` does."""
     by_view: dict[str, list[Array]] = {name: [] for name in test}
     for point, seen in observed:
         if not seen & train:

@@ -19,6 +19,7 @@ from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.logs import progress
 from gsbench.pipeline.components import options_of, rasterizer_inputs
+from gsbench.pipeline.steps.code import step_of_code
 from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
@@ -80,12 +81,13 @@ def train_step(
         }
         write_json(folder / TRAINING, summary)
 
-    return Step(TRAIN, inputs, build)
+    return step_of_code(TRAIN, inputs, build, __name__, (densifier, rasterizer))
 
 
 def initial_gaussians(init: Path, device: torch.device) -> Gaussians:
-    """What the training starts from: the Gaussians that the initialiser left in the folder ``init``, or one for each of
-    its points."""
+    """The Gaussians that training starts from: those that the initialiser left in the folder ``init``, or one for each
+    of its points.
+    """
     if (init / GAUSSIANS_FILE).exists():
         return read_ply(init / GAUSSIANS_FILE, device)
     cloud = read_cloud(init / MODEL_FOLDER)

@@ -17,14 +17,14 @@ from gsbench.scene.types import Capture, Scene
 
 
 class Views:
-    """What the views of a trial depend on, and the views themselves, which are loaded when first asked for."""
+    """Views of a trial, loaded when first asked for, and what they depend on."""
 
     def __init__(self, store: Store, capture: Capture, init: Step, options: SceneConfig) -> None:
         self.store, self.capture, self.init, self.options = store, capture, init, options
 
     @property
     def inputs(self) -> dict[str, Any]:
-        """What the views depend on besides the cameras, which are those of ``init``."""
+        """The inputs that the views depend on besides the cameras, which are those of ``init``."""
         return {
             "capture": self.capture.fingerprint,
             "test": split_of(self.capture),

@@ -1,4 +1,4 @@
-"""From the gradient sums of compositing to the gradients of the parameters, derived by hand, 8 records at a time."""
+"""Gradients of the parameters from the gradient sums of compositing, derived by hand, 8 records at a time."""
 
 from __future__ import annotations
 

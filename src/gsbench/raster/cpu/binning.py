@@ -1,4 +1,4 @@
-"""Which records each tile composites, front to back.
+"""Lists of the records that each tile composites, front to back.
 
 The records are sorted once by depth; shards of the sorted order are then counted and filled in that order, so the list
 of every tile comes out sorted. A tile that the contour alpha = 1/255 does not reach is left out: nothing there could be

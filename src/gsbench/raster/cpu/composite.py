@@ -186,7 +186,7 @@ def composite_tiles(
 
 @inlined
 def place_in_tile(x: int, y: int) -> int:
-    """Where pixel (x, y) of a tile stands in the order by block and lane."""
+    """The place of pixel (x, y) of a tile in the order by block and lane."""
     return (((y >> 2) * 4 + (x >> 2)) << 4) + (y & 3) * 4 + (x & 3)
 
 

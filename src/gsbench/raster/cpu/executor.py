@@ -61,7 +61,7 @@ class CpuRasterizer:
         background: Tensor,
         absolute_gradient: bool = False,
     ) -> RenderOutput:
-        """See ``raster.base.Rasterizer``. Raises ValueError naming the parameter that cannot be used."""
+        """Render as ``raster.base.Rasterizer`` says. Raises ValueError naming the parameter that cannot be used."""
         check_settings(gaussians, camera, sh_degree, background)
         if gaussians.means.dtype != torch.float32 or gaussians.means.device.type != "cpu":
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Which pixels each Gaussian was blended into, from what the forward pass leaves; runs only when it is asked for."""
+"""Footprints, the pixels that each Gaussian was blended into, from the forward pass's output; run on request."""
 
 from __future__ import annotations
 

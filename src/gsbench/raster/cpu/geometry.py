@@ -99,7 +99,7 @@ def covariance(m0: Any, m1: Any, blur: Any) -> Any:
 
 @inlined
 def direction_from_camera(mean: Any, v: Any) -> Any:
-    """From the camera centre to the mean, of length 1; the inverse distance."""
+    """The direction from the camera centre to the mean, of length 1, and the inverse distance."""
     dx, dy, dz = mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
     inverse = 1 / square_root(dx * dx + dy * dy + dz * dz)
     return dx * inverse, dy * inverse, dz * inverse, inverse

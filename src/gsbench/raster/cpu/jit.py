@@ -46,7 +46,7 @@ def cache_base() -> Path:
 
 
 def cache_folder(source: Path, package: Path = PACKAGE) -> Path:
-    """Where the kernels of the file ``source`` are kept: a folder of its own for each state of what they are made of.
+    """The folder of the kernels of the file ``source``: another one for each state of what they are made of.
 
     numba looks at the file of a kernel, not at what that file imports, so a changed helper would leave stale machine
     code in use. The folder's name is a digest of all that the file imports of gsbench, constants included, and of the

@@ -1,4 +1,4 @@
-"""What the kernels pass to each other: the camera as numbers, and the places inside a record and a gradient row."""
+"""Layout of what the kernels pass to each other: the camera as numbers, the places in a record and a gradient row."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From Gaussians to records.
+"""Projection of Gaussians to records.
 
 One call handles a shard: the Gaussians ``begin`` to ``end``. Its visible ones become the records ``begin``,
 ``begin + 1``, ... in the order of their index.

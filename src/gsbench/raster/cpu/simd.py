@@ -401,8 +401,7 @@ SUM_LANES = tuple(int(f"{k:04b}"[::-1], 2) for k in range(LANES))
 
 @intrinsic
 def lane_sums(typing_context: Any, vectors: Any) -> Any:
-    """One vector with the 16-lane sums of a tuple of up to 16 vectors; the k-th in lane ``SUM_LANES[k]``, the rest
-    zero.
+    """Sum the 16 lanes of each of up to 16 vectors; the k-th sum stands in lane ``SUM_LANES[k]``, the rest is 0.
 
     A tree of shuffles and additions: each level joins two vectors into one, so that the sums of eleven vectors cost
     about as much as three single sums.

@@ -1,4 +1,4 @@
-"""From the gradient sums of compositing to the gradients of the parameters, derived by hand.
+"""Gradients of the parameters from the gradient sums of compositing, derived by hand.
 
 Sums are made in a fixed order and without atomics, so they have the same bits on every run.
 """

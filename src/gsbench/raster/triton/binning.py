@@ -1,4 +1,4 @@
-"""Which Gaussians each block composites, front to back.
+"""Lists of the Gaussians that each block composites, front to back.
 
 A Gaussian's blocks are found row by row: the contour alpha = 1/255 cuts a span of blocks from each row of blocks. One
 (Gaussian, row) is a *unit*, one (Gaussian, block) a *pair*. Units and pairs are numbered front to back and, within a
@@ -117,7 +117,7 @@ def summarise(unit_ends, count, pair_ends, capacity, flags, background, status):
 
 @triton.jit(do_not_specialize=["units"])
 def write_pairs(unit_owners, unit_blocks, unit_widths, pair_ends, units, keys, owners, GROUP: tl.constexpr):
-    """For each slot its block (``keys``) and its Gaussian (``owners``), both [pairs]; a lane a unit."""
+    """Write each slot's block (``keys``) and Gaussian (``owners``), both [pairs]; a lane a unit."""
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = unit < units
     width = tl.load(unit_widths + unit, mask=inside, other=0)

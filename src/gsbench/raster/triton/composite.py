@@ -41,8 +41,9 @@ TO_PRECISION = tl.constexpr(2 * math.log(2.0))  # -curve to entry of the inverse
 
 @triton.jit
 def block_pixels(block, blocks_x, width, height):
-    """Of the pixels of a block: which are in the image, their numbers in it (both [STEPS, LANES]), and the column of
-    each lane's first and the row of all (both [LANES], px)."""
+    """The pixels of a block: a mask of those in the image, their numbers in it (both [STEPS, LANES]), and the column of
+    each lane's first and the row of all (both [LANES], px).
+    """
     lane, step = tl.arange(0, LANES), tl.arange(0, STEPS)
     x = block % blocks_x * BLOCK_WIDTH + lane % LANE_COLUMNS
     y = block // blocks_x * BLOCK_HEIGHT + lane // LANE_COLUMNS
@@ -53,7 +54,7 @@ def block_pixels(block, blocks_x, width, height):
 
 @triton.jit
 def block_places():
-    """Where the pixels of a block stand in its memory, [STEPS, LANES]: those of a lane side by side.
+    """The places of a block's pixels in its memory, [STEPS, LANES]: those of a lane side by side.
 
     Triton then lays out all [STEPS, LANES] so that sums over steps stay within a lane.
     """

@@ -18,8 +18,9 @@ from gsbench.raster.triton.backprojection import backproject, sum_units
 from gsbench.raster.triton.binning import find_units, summarise, write_pairs
 from gsbench.raster.triton.composite import composite, decomposite
 from gsbench.raster.triton.footprint import cover, sum_cover
-from gsbench.raster.triton.launch import launch
+from gsbench.raster.triton.launch import launch, launch_grid
 from gsbench.raster.triton.layout import BLOCK_PIXELS, RECORD, ROW, TILE, Grid, View, make_grid, make_view
+from gsbench.raster.triton.memory import UNITS_AT_FIRST
 from gsbench.raster.triton.projection import project
 from gsbench.raster.triton.toolchain import load_driver
 from gsbench.raster.triton.workspace import Workspace, WorkspacePool
@@ -27,7 +28,6 @@ from gsbench.raster.validate import check_settings, raise_for_values
 from gsbench.scene.camera import Camera
 
 MAX_INT16, MAX_INT32 = 2**15 - 1, 2**31 - 1
-UNITS_AT_FIRST = 2  # rows of blocks that a Gaussian has, before it is known
 
 
 class TritonRasterizer:
@@ -53,7 +53,7 @@ class TritonRasterizer:
         background: Tensor,
         absolute_gradient: bool = False,
     ) -> RenderOutput:
-        """See ``raster.base.Rasterizer``. Raises ValueError naming the parameter that cannot be used."""
+        """Render as ``raster.base.Rasterizer`` says. Raises ValueError naming the parameter that cannot be used."""
         check_settings(gaussians, camera, sh_degree, background)
         if gaussians.means.dtype != torch.float32:
             raise ValueError(f"means: raster=triton needs float32, got {gaussians.means.dtype}")
@@ -144,7 +144,7 @@ def _forward(
         )
         torch.cumsum(widths, 0, out=pair_ends)
         status = scratch.take("status", 3, torch.int64)
-        summarise[(1,)](unit_ends, count, pair_ends, capacity, flags, background, status)
+        launch_grid(summarise, 1)(unit_ends, count, pair_ends, capacity, flags, background, status)
         units, pairs, bad = Readback(status).values().tolist()  # the one wait for the device
         if bad:
             raise_for_values(gaussians, background)
@@ -189,7 +189,7 @@ def _forward(
         frame_memory.take("last", blocks * BLOCK_PIXELS.value, torch.int32),
         frame_memory.take("past", blocks, torch.int32),
     )
-    composite[(blocks,)](
+    launch_grid(composite, blocks)(
         order,
         starts,
         entries,
@@ -221,7 +221,7 @@ def _backward(
     """The gradients of the six tensors and of ``screen_points``; fills ``absolute`` [N, 2] if it is given."""
     grid, count = frame.grid, len(gaussians)
     rows = scratch.take("rows", frame.pairs * ROW.value, torch.float32)
-    decomposite[(grid.blocks,)](
+    launch_grid(decomposite, grid.blocks)(
         frame.order,
         frame.starts,
         frame.entries,
@@ -281,7 +281,7 @@ def _footprint(
     with torch.cuda.device_of(covered):
         scratch = rasterizer._scratch.lease(holder, device)
         rows = scratch.take("rows", frame.pairs * ROW.value, torch.float32).zero_()  # ``cover`` fills three of 16
-        cover[(frame.grid.blocks,)](
+        launch_grid(cover, frame.grid.blocks)(
             frame.starts,
             frame.entries,
             frame.slots,

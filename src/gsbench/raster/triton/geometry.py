@@ -70,7 +70,7 @@ def scaled(row, scales):
 
 @triton.jit
 def from_camera(mean, v):
-    """From the camera centre to the mean, in world axes.
+    """The vector from the camera centre to the mean, in world axes.
 
     Everything goes through this difference: rotating it loses no digits however far the scene is from its origin.
     """
@@ -98,7 +98,7 @@ def image_axes(slope_x, slope_y, inverse_z, v):
 
 @triton.jit
 def spread(m0, m1):
-    """For the rows of M: xx, xy, yy of the covariance C = M M^T + blur I, and a = yy / det C.
+    """The covariance C = M M^T + blur I of the rows of M, as xx, xy, yy, and a = yy / det C.
 
     1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows; dividing a row by the square
     root of yy first gives 1/a without cancellation and without overflow.

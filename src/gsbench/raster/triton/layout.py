@@ -1,4 +1,4 @@
-"""What the kernels pass to each other: the camera as numbers, the blocks, and the places inside a record and a row."""
+"""Layout of what the kernels pass to each other: the camera as numbers, blocks, places in a record and a row."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From Gaussians to records, a lane a Gaussian."""
+"""Projection of Gaussians to records, a lane a Gaussian."""
 
 from __future__ import annotations
 

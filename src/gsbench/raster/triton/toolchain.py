@@ -1,4 +1,4 @@
-"""What Triton needs when it first runs on a machine: it compiles the piece of C that starts its kernels."""
+"""Tools that Triton needs when it first runs on a machine: it compiles the piece of C that starts its kernels."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from functools import cache
 from pathlib import Path
 
 from gsbench.errors import InputError
+from gsbench.raster.executors import find
 
 log = logging.getLogger(__name__)
 
 
 def missing_tools() -> list[str]:
-    """What is not here of a C compiler and Python's headers, each with the package that has it. Loads neither torch nor
-    Triton."""
+    """List what is missing of a C compiler and Python's headers, each with the package that has it. Loads neither torch
+    nor Triton.
+    """
     missing = []
     compiler = os.environ.get("CC")
     found = shutil.which(compiler.split()[0]) if compiler else shutil.which("gcc") or shutil.which("clang")
@@ -37,14 +39,16 @@ def missing_tools() -> list[str]:
 @cache
 def load_driver() -> None:
     """Let Triton find the GPU and load its launcher, compiling it if need be; InputError says what is missing."""
-    from triton import knobs
-    from triton.runtime import driver
-
-    if not Path(knobs.cache.dir).exists():
-        log.info("compiling the GPU kernels, once: they are kept in %s", knobs.cache.dir)
     try:
+        from triton import knobs
+        from triton.runtime import driver
+
+        if not Path(knobs.cache.dir).exists():
+            log.info("compiling the GPU kernels, once: they are kept in %s", knobs.cache.dir)
         driver.active.get_current_target()
     except (RuntimeError, OSError, AssertionError, ImportError) as error:
         missing = missing_tools()
         reason = "Triton needs " + " and ".join(missing) if missing else f"Triton cannot start: {error}"
+        if old := find("triton").too_old():
+            reason = f"raster=triton {old}"
         raise InputError(reason) from error

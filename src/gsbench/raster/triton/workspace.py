@@ -28,7 +28,7 @@ class Workspace:
         return self._buffers[name][:count]
 
     def capacity(self, name: str) -> int:
-        """How many numbers ``take`` gives without growing."""
+        """The number of values that ``take`` gives without growing."""
         buffer = self._buffers.get(name)
         return 0 if buffer is None else len(buffer)
 

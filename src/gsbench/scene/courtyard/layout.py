@@ -1,4 +1,4 @@
-"""What stands in the procedural courtyard: solid primitives with materials, in metres, z up, the lawn at z = 0."""
+"""Objects of the procedural courtyard: solid primitives with materials, in metres, z up, the lawn at z = 0."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def ring_camera(angle: float, width: int, height: int) -> Camera:
 
 
 def render_view(layout: Layout, camera: Camera, seed: int) -> NDArray[np.uint8]:
-    """One photograph, [H, W, 3] uint8 sRGB; surfaces are matt, so a point has one colour in all views."""
+    """Render one photograph, [H, W, 3] uint8 sRGB; surfaces are matt, so a point has one colour in all views."""
     image = np.empty((camera.height, camera.width, 3), dtype=np.uint8)
     render(
         layout.kind, layout.center, layout.rotation, layout.size, layout.material, layout.tint,

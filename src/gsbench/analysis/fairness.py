@@ -1,0 +1,207 @@
+"""The fairness sheet of a comparison: all in which two arms differ, what was tuned, and what is whose default.
+
+It is made from the trials' records and from the files of the arms, never written by hand, so nothing can be left out of
+it that was recorded.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from gsbench.analysis.attribution import (
+    attribute,
+    attribution_sentence,
+    differing_keys,
+    representatives,
+)
+from gsbench.analysis.differences import CODE, short_version
+from gsbench.analysis.origins import cloud_of, machine_of
+from gsbench.analysis.pairing import arm_name, pair_trials
+from gsbench.analysis.results import Arm, TrialResult, canonical
+from gsbench.analysis.shipped import REFERENCE, notes_of, resolved, shipped_arms, shipped_name
+from gsbench.analysis.tables import Column, Entry, Row, Table
+from gsbench.analysis.tuning import tuning_lines
+from gsbench.runs.layout import EVENTS
+from gsbench.runs.trial_record import TrialRecord
+from gsbench.words import counted, listed
+
+LONGEST = 60  # characters of a value that are shown
+UNKNOWN, NONE = "not recorded", "–"
+ALIKE, UNLIKE = "", "≠"
+NAMES = ("densify.name", "densify._target_")  # settings that say which arm it is
+DIFFERS = "differs"  # heading of the column that marks what does
+
+Reader = Callable[[TrialResult], float | None]
+
+
+def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Table:
+    """The sheet of two arms of ``trials`` (all of the experiment, each with its variant) as a table with notes.
+
+    What was measured is over the pairs of trials that are compared: a value, or the smallest and the largest of a
+    trial. Raises ValueError for an arm without trials.
+    """
+    pairs = pair_trials(trials, first, second)
+    one, other = pairs[0] if pairs else representatives(trials, first, second)
+    compared = [trial for pair in pairs for trial in pair] or trials
+    groups = [[trial for trial in compared if trial.arm == arm] for arm in (first, second)]
+    rows = [_row(what, *(read(group) for group in groups)) for what, read in MEASURED.items()]
+    settings = [_setting_row(key, one, other) for key in differing_keys(one.config, other.config)]
+    if settings:
+        settings[0] = Row(settings[0].labels, settings[0].entries, rule_above=True)
+    found = attribute(trials, first, second)
+    notes = [attribution_sentence(found, first, second) or _alone(found.ingredients, first, second)]
+    notes += [f"Compared: {counted(len(pairs), 'pair')} of trials of one scene and seed."]
+    notes += [f"Tuning. {line}" for line in tuning_lines(trials, (first, second))]
+    notes += [line for trial in (one, other) for line in default_lines(trial)]
+    return Table(
+        f"Fairness sheet: {arm_name(second)} against {arm_name(first)}",
+        ("what",),
+        (Column("", arm_name(first)), Column("", arm_name(second)), Column("", DIFFERS)),
+        (*rows, *settings),
+        tuple(notes),
+        (("", arm_name(first)), ("", arm_name(second)), ("", DIFFERS)),
+        wrapped=True,
+    )
+
+
+def default_lines(trial: TrialResult) -> list[str]:
+    """Settings of an arm by their origin, as its file states it: its authors' defaults, gsbench's, the trial's own."""
+    name, config = shipped_name(trial.config), trial.config
+    if not config:
+        return [f"Defaults. {arm_name(trial.arm)}: {UNKNOWN}."]
+    if trial.program:
+        version = trial.trainer_version or UNKNOWN
+        what = f"the program {trial.program} (version {version}) with its own defaults, but for what its command gives"
+        return [f"Defaults. {arm_name(trial.arm)}: {what}: {_shown(config.get('densify.command'))}."]
+    if name is None:
+        target = config.get("densify._target_", "a class that is not recorded")
+        digest = trial.code.get(f"{CODE}{target}")
+        of_file = f" (version {short_version(digest)})" if digest else ""
+        what = f"{target}{of_file} is no arm of gsbench; its defaults stand in its class"
+        return [f"Defaults. {arm_name(trial.arm)}: {what}."]
+    notes = notes_of(name)
+    own = resolved(shipped_arms()[name], config)
+    changed = [
+        f"{key.removeprefix('densify.')} {_shown(config[key])} ({_shown(value)} there)"
+        for key, value in own.items()
+        if key in config and config[key] != value and not _is_open(value) and key not in NAMES
+    ]
+    line = f"Defaults. {arm_name(trial.arm)}: densify={name}"
+    line += f" but for {listed(changed)}" if changed else " as it is shipped"
+    if notes.theirs:
+        line += f"; its authors have {listed([f'{key} {value}' for key, value in notes.theirs.items()])}"
+    if notes.preset and config.get("train.name") not in (notes.preset, None):
+        line += f"; its file names train={notes.preset}, this is train={config['train.name']}"
+    return [f"{line}. {_source(notes.text)}".rstrip()]
+
+
+def _is_open(value: object) -> bool:
+    """Whether a setting of a file refers to one that the trial has not recorded."""
+    return isinstance(value, str) and REFERENCE.fullmatch(value) is not None
+
+
+def _source(text: str) -> str:
+    return f"Its file says: “{text}”" if text else ""
+
+
+def _alone(found: Sequence[str], first: Arm, second: Arm) -> str:
+    if not found:
+        return f"{arm_name(second)} and {arm_name(first)} differ in no recorded setting."
+    return f"{arm_name(second)} differs from {arm_name(first)} by {found[0]} alone."
+
+
+def _row(what: str, first: str, second: str) -> Row:
+    return Row((what,), (Entry(first), Entry(second), Entry(ALIKE if first == second else UNLIKE)))
+
+
+def _setting_row(key: str, one: TrialResult, other: TrialResult) -> Row:
+    return _row(key, *(_shown(trial.config[key]) if key in trial.config else NONE for trial in (one, other)))
+
+
+def _shown(value: Any) -> str:
+    text = value if isinstance(value, str) else canonical(value)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…"
+
+
+def _span(read: Reader, decimals: int = 0) -> Callable[[Sequence[TrialResult]], str]:
+    """Shows a number of trials: one value, or the smallest and the largest with the mean."""
+
+    def show(trials: Sequence[TrialResult]) -> str:
+        values = [value for trial in trials if (value := read(trial)) is not None]
+        if not values:
+            return UNKNOWN
+        low, high = (f"{value:,.{decimals}f}" for value in (min(values), max(values)))
+        return low if low == high else f"{low} to {high}, mean {statistics.fmean(values):,.{decimals}f}"
+
+    return show
+
+
+def _each(read: Callable[[TrialResult], str | None]) -> Callable[[Sequence[TrialResult]], str]:
+    """Shows the different texts of trials."""
+
+    def show(trials: Sequence[TrialResult]) -> str:
+        return ", ".join(sorted({read(trial) or UNKNOWN for trial in trials}))
+
+    return show
+
+
+def _rounds(trial: TrialResult) -> float | None:
+    """How often the densifier refined; a log that is missing or empty says nothing."""
+    return float(len(trial.curve(EVENTS))) or None
+
+
+def _last_round(trial: TrialResult) -> float | None:
+    steps = [row["step"] for row in trial.curve(EVENTS)]
+    return float(max(steps)) if steps else None
+
+
+def _recorded(read: Callable[[TrialRecord], float | None]) -> Reader:
+    """Reads a number of ``results.json``."""
+    return lambda trial: read(trial.record)
+
+
+def _resolution(trial: TrialResult) -> str | None:
+    size = trial.record.resolution
+    return None if size is None else f"{size[0]}×{size[1]} px"
+
+
+def _budget(trial: TrialResult) -> str | None:
+    """``15,000 Gaussians (governor), 600 s``"""
+    budget = trial.record.budget
+    if budget is None:
+        return None
+    count, seconds = budget.max_gaussians, budget.seconds
+    parts = [f"{count:,} Gaussians ({budget.cap})" if count else "", f"{seconds:g} s" if seconds else ""]
+    return ", ".join(filter(None, parts)) or "none"
+
+
+def _code(trial: TrialResult) -> str | None:
+    parts = [f"{part.removeprefix(CODE)} {short_version(version)}" for part, version in sorted(trial.code.items())]
+    release = trial.record.versions.get("gsbench")
+    program = f"{trial.program} {trial.trainer_version}".strip()
+    return ", ".join(filter(None, [program, f"gsbench {release}" if release else "", *parts])) or None
+
+
+# Settings that are shown of both arms, whether they differ in them or not.
+MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
+    "trials": lambda trials: str(len(trials)),
+    "views for training": _span(_recorded(lambda record: record.train_views)),
+    "held-out views": _span(_recorded(lambda record: record.test_views)),
+    "pictures": _each(_resolution),
+    "photographs (hash)": _each(lambda trial: trial.record.hashes.get("data", "")[:12]),
+    "initial points": _span(_recorded(lambda record: record.num_init_points)),
+    "initial cloud (hash)": _each(lambda trial: (cloud_of(trial) or "")[:12]),
+    "iterations": _span(_recorded(lambda record: record.iterations)),
+    "rounds of the densifier": _span(_rounds),
+    "last round (iteration)": _span(_last_round),
+    "budget": _each(_budget),
+    "Gaussians in the end": _span(_recorded(lambda record: record.num_gaussians)),
+    "seconds of training": _span(_recorded(lambda record: record.seconds.get("train"))),
+    "memory (MB)": _span(_recorded(lambda record: record.peak_memory_mb)),
+    "rasterizer": _each(lambda trial: trial.record.raster),
+    "protocol": _each(lambda trial: trial.record.protocol),
+    "machine": _each(machine_of),
+    "code": _each(_code),
+}

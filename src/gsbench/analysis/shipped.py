@@ -1,0 +1,81 @@
+"""The arms that gsbench ships, as ``conf/densify`` states them: read as plain files, without composing.
+
+What an arm's authors wrote, and where gsbench departs from it, stands in the comments of its file: the lines above the
+settings, and ``theirs: VALUE`` beside a setting.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import yaml
+
+from gsbench.system.install import conf_dir
+
+GROUP = "densify"
+THEIRS = re.compile(r"^(?P<key>\w+):.*#.*?theirs:? (?P<value>[^;|]+?)\s*$", re.MULTILINE)  # the authors' own value
+PRESET = re.compile(r"\btrain=(\w+)")
+REFERENCE = re.compile(r"\$\{([\w.]+)\}")  # the value of another key
+
+
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+@cache
+def shipped_arms() -> dict[str, Mapping[str, Any]]:
+    """The settings of each densifier of gsbench by its name; programs of others are none."""
+    return {path.stem: _read(path.stem) for path in sorted((conf_dir() / GROUP).glob("*.yaml"))}
+
+
+def shipped_name(config: Mapping[str, Any]) -> str | None:
+    """The shipped arm that a trial's configuration is made from: of its name, else of its class; None of neither."""
+    target, name = config.get(f"{GROUP}._target_"), config.get(f"{GROUP}.name")
+    same = [arm for arm, settings in shipped_arms().items() if settings["_target_"] == target]
+    return str(name) if name in same else next(iter(sorted(same, key=len)), None)
+
+
+@dataclass(frozen=True)
+class FileNotes:
+    """Notes of a shipped arm's file on its authors: its first lines, their values where they are others, and the
+    preset of `train` that goes with it ("" for none).
+    """
+
+    text: str
+    theirs: Mapping[str, str]
+    preset: str
+
+
+@cache
+def notes_of(name: str) -> FileNotes:
+    """The comments of the file of the shipped arm ``name``."""
+    content = (conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8")
+    lines = itertools.takewhile(lambda line: line.startswith("#"), content.splitlines())
+    text = " ".join(line.removeprefix("#").strip() for line in lines)
+    preset = PRESET.search(text)
+    theirs = {found["key"]: found["value"].strip() for found in THEIRS.finditer(content)}
+    return FileNotes(text, theirs, preset[1] if preset else "")
+
+
+def resolved(settings: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
+    """``settings`` of a densifier with dotted keys, as they would be in a trial with the configuration ``config``.
+
+    What refers to a key that ``config`` lacks stays as it is written.
+    """
+    found = {}
+    for key, value in settings.items():
+        named = REFERENCE.fullmatch(value) if isinstance(value, str) else None
+        found[f"{GROUP}.{key}"] = value if named is None else config.get(named[1], value)
+    return found
+
+
+@cache
+def _read(name: str) -> dict[str, Any]:
+    """An arm's own settings above those of the arms that its list of defaults names."""
+    content = yaml.load((conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8"), Loader=_LOADER)
+    parents = [parent for parent in content.pop("defaults", []) if parent != "_self_"]
+    return {key: value for parent in parents for key, value in _read(parent).items()} | content

@@ -1,0 +1,67 @@
+"""Notes below a table about the experiment as a whole: who trained, what was declared, in what arms differ."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gsbench.analysis.attribution import attribute, attribution_sentence
+from gsbench.analysis.cells import with_variants
+from gsbench.analysis.declaration import standing
+from gsbench.analysis.pairing import ViewCache, choose_pairs, controls_of
+from gsbench.analysis.results import Arm, Experiment, TrialResult
+from gsbench.runs.layout import SEARCH
+from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
+
+_BY_PROGRAM = (
+    ("Trained here by another program, its model rendered by gsbench", FROM_MODEL),
+    ("Trained here by another program, its own renders measured as they are", FROM_RENDERS),
+)
+
+
+def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
+    """Lines that say which arms gsbench did not train, and what of them it saw."""
+    notes = []
+    for what, origin in _BY_PROGRAM:
+        own = [trial for trial in trials if trial.program and trial.record.evaluated_from == origin]
+        if own:
+            versions = {(f"{trial.init}-{trial.densify}", trial.trainer_version) for trial in own}
+            arms = ", ".join(f"{arm} (version {version})" for arm, version in sorted(versions))
+            notes.append(f"{what} (its time is that of the whole program, its budget its own): {arms}.")
+    for what, origin in (
+        ("A model that another program trained, rendered here", FROM_MODEL),
+        ("Renders of another program, measured as they are", FROM_RENDERS),
+    ):
+        own = [trial for trial in trials if trial.made_elsewhere and trial.record.evaluated_from == origin]
+        if own:
+            arms = ", ".join(sorted({f"{trial.init}-{trial.densify}" for trial in own}))
+            notes.append(f"{what} (its conditions are not known): {arms}.")
+    return notes
+
+
+def declared_notes(experiment: Experiment) -> list[str]:
+    """The verdict on the declared metric, of the whole experiment; nothing where none was declared.
+
+    Which trials a table shows has no say in it, so that nobody can choose a verdict by choosing trials.
+    """
+    declared = standing(experiment.folder, experiment.trials)
+    if declared is None or any(trial.translated_from for trial in experiment.trials):
+        return []
+    from gsbench.analysis.verdicts import declared_lines, judge  # here, for a quick start of what needs no test
+
+    trials, pairs = compared_pairs(experiment)
+    return declared_lines(declared, judge(trials, pairs, ViewCache(), declared))
+
+
+def attribution_notes(experiment: Experiment) -> list[str]:
+    """A line for each pair of arms that differ in more than one ingredient: in which, and what would isolate one."""
+    trials, pairs = compared_pairs(experiment)
+    return [sentence for pair in pairs if (sentence := attribution_sentence(attribute(trials, *pair), *pair))]
+
+
+def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
+    """The experiment's trials as arms, and the pairs of arms that are compared: none among the points of a search."""
+    trials = with_variants(experiment.trials)
+    if (experiment.folder / SEARCH).exists():
+        return trials, []
+    arms = sorted({trial.arm for trial in trials})
+    return trials, choose_pairs(arms, controls=controls_of(trials)) if arms else []

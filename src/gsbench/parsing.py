@@ -1,0 +1,212 @@
+"""Reading the small files that gsbench writes, whoever wrote or broke them since: bounded, and plain values alone.
+
+A file is read if it is a regular one of at most `MOST_BYTES`; nothing else is opened, so that a FIFO or a device holds
+nobody up. What it holds is JSON or YAML of at most `MOST_DEPTH` levels, whose numbers are finite.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic_core import from_json
+
+from gsbench.errors import InputError
+
+MOST_BYTES = 64 << 20  # the plan of 80,000 trials; a training that logs each of 300,000 iterations
+CHUNK = 1 << 20
+MOST_YAML_BYTES = 1 << 20  # a configuration has 2 to 10 kB, and its parser takes a second for this much
+MOST_DEPTH = 40  # levels of nesting: ours have up to six, and what a user's class is given adds a few
+MOST_WORD = 4000  # characters of plain YAML: what could be a number
+MOST_VALUES = 100_000  # of YAML, whose aliases let a few lines stand for billions
+LARGEST_INT = 2**64  # beyond the seeds of torch and times in ns
+KEYS = {str, int}
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class DamagedError(InputError):
+    """A file of ours cannot be read, or is not what it ought to be; ``reason`` says why without its name."""
+
+    def __init__(self, path: Path, reason: str) -> None:
+        self.path, self.reason = path, one_line(reason)
+        super().__init__(f"{path} {self.reason}")
+
+
+def one_line(text: str, most: int = 300) -> str:
+    """A text for people, whatever a file or a library put into it."""
+    line = " ".join(text.split())
+    return line if len(line) <= most else f"{line[:most]}…"
+
+
+def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+    """The content of a regular file; raises DamagedError for any other, and FileNotFoundError where there is none."""
+    with _opened(path) as descriptor:
+        content = _read_up_to(descriptor, most + 1)
+    if len(content) > most:
+        raise DamagedError(path, f"cannot be read: it has more than {most:,} bytes")
+    return content
+
+
+def read_tail(path: Path, count: int) -> bytes:
+    """The last ``count`` bytes of a regular file; raises as `read_bytes` does."""
+    with _opened(path) as descriptor:
+        os.lseek(descriptor, max(0, os.fstat(descriptor).st_size - count), os.SEEK_SET)
+        return os.read(descriptor, count)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[int]:
+    """A descriptor of a regular file, closed afterwards; what goes wrong meanwhile is said of the file."""
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise DamagedError(path, "cannot be read: it is no regular file")
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+        try:
+            yield descriptor
+        finally:
+            os.close(descriptor)
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise FileNotFoundError(*error.args) from None
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise DamagedError(path, f"cannot be read ({getattr(error, 'strerror', None) or error})") from None
+
+
+def _read_up_to(descriptor: int, most: int) -> bytes:
+    """At most ``most`` bytes, in as few pieces as the system gives them."""
+    first = os.read(descriptor, min(most, CHUNK))
+    if len(first) < CHUNK and not os.read(descriptor, 1):
+        return first
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    parts: list[bytes] = []
+    while most > 0 and (part := os.read(descriptor, min(most, CHUNK))):
+        parts.append(part)
+        most -= len(part)
+    return b"".join(parts)
+
+
+def read_json(path: Path) -> Any:
+    """The plain value in a JSON file; raises as `read_bytes` does, and DamagedError for what `fault_of` finds."""
+    content = read_bytes(path)
+    try:
+        value = from_json(content)
+    except ValueError as error:
+        raise DamagedError(path, f"is not JSON ({error})") from None
+    if fault := fault_of(value):
+        raise DamagedError(path, f"is damaged: {fault}")
+    return value
+
+
+def read_yaml(path: Path) -> Any:
+    """The plain value in a YAML file; raises as `read_json` does."""
+    return parse_yaml(read_bytes(path, MOST_YAML_BYTES), path)
+
+
+def parse_yaml(content: bytes, path: Path) -> Any:
+    """Parse YAML; raises DamagedError for what is none, or has values that `fault_of` names.
+
+    Numbers need not be finite: YAML is what users set, and a class may have an infinite default.
+    """
+    try:
+        text = content.decode("utf-8")
+        fault = _danger_in_yaml(text)
+        value = None if fault else yaml.load(text, Loader=LOADER)
+    except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError) as error:
+        reason = getattr(error, "problem", None) or error  # PyYAML's own text has several lines
+        raise DamagedError(path, f"is not YAML ({reason})") from None
+    if fault := fault or fault_of(value, MOST_VALUES, infinite=True):
+        raise DamagedError(path, f"is damaged: {fault}")
+    return value
+
+
+def _danger_in_yaml(text: str) -> str:
+    """What of YAML must not reach its loader: depth (it goes down by recursion in C), merges that multiply, numbers
+    whose digits take hours; "" where there is nothing."""
+    level = 0
+    for event in yaml.parse(text, Loader=LOADER):
+        if getattr(event, "tag", None) is not None:
+            return f"it has the tag {event.tag}"
+        if isinstance(event, yaml.CollectionStartEvent):
+            level += 1
+            if level > MOST_DEPTH:
+                return f"it has more than {MOST_DEPTH} levels"
+        elif isinstance(event, yaml.CollectionEndEvent):
+            level -= 1
+        elif isinstance(event, yaml.ScalarEvent) and event.implicit[0]:  # a plain word, which may become anything
+            if event.value == "<<":
+                return "it has a merge key"
+            if len(event.value) > MOST_WORD:
+                return f"it has a word of {len(event.value):,} characters without quotes"
+    return ""
+
+
+def fault_of(value: Any, most: int | None = None, infinite: bool = False) -> str:
+    """The reason why ``value`` is not plain, "" where it is: keys are texts or integers, levels at most `MOST_DEPTH`.
+
+    ``most`` is how many values it may have, an alias of YAML counted as often as it stands there. Numbers are finite
+    unless ``infinite``.
+    """
+    level, count = [value], 0
+    for _ in range(MOST_DEPTH):
+        below: list[Any] = []
+        for item in level:
+            kind = type(item)
+            if kind is dict:
+                if _fault_of_keys(item):
+                    return _named_fault(value)
+                below += item.values()
+            elif kind is list:
+                below += item
+            elif _fault_of_leaf(item) and not (infinite and type(item) is float):
+                return _named_fault(value)
+            if most is not None and count + len(below) > most:
+                return f"it has more than {most:,} values"
+        count += len(below)
+        if not below:
+            return ""
+        level = below
+    return f"it has more than {MOST_DEPTH} levels"
+
+
+def _named_fault(value: Any, place: str = "", depth: int = 0) -> str:
+    """The first key or number that is none, with its place; "" where there is none above `MOST_DEPTH`."""
+    if not isinstance(value, dict | list) or depth > MOST_DEPTH:
+        fault = _fault_of_leaf(value)
+        return f"{place or 'it'} is {fault}" if fault else ""
+    if isinstance(value, dict) and (fault := _fault_of_keys(value)):
+        return f"{place or 'it'} has {fault}"
+    entries = value.items() if isinstance(value, dict) else enumerate(value)
+    found = (_named_fault(item, f"{place}.{key}" if place else str(key), depth + 1) for key, item in entries)
+    return next((fault for fault in found if fault), "")
+
+
+def _fault_of_leaf(item: Any) -> str:
+    kind = type(item)
+    if kind is str:
+        return "" if item.isascii() or _is_unicode(item) else "a text with half a character"
+    if kind is float:
+        return "" if item - item == 0 else f"{item}, which is no finite number"
+    if kind is int:
+        return "" if -LARGEST_INT < item < LARGEST_INT else "an integer beyond all bounds"
+    return "" if kind is bool or item is None else f"of type {kind.__name__}"
+
+
+def _fault_of_keys(mapping: dict[Any, Any]) -> str:
+    kinds = set(map(type, mapping))
+    if len(kinds) > 1 or not kinds <= KEYS:  # sorted JSON needs them of one kind
+        return "keys that are not all texts, or all integers"
+    return next((f"a key that is {fault}" for key in mapping if (fault := _fault_of_leaf(key))), "")
+
+
+def _is_unicode(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True

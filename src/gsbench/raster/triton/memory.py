@@ -1,0 +1,35 @@
+"""The memory that the Triton rasterizer keeps, counted from its buffers' shapes. Loads neither torch nor Triton."""
+
+from __future__ import annotations
+
+# Bytes that stay from step to step, in the workspaces of `executor`.
+BYTES_OF_GAUSSIAN = 64 + 3 * 4 + 3 * 8  # record; depth and key, rows of blocks; their places, the order
+BYTES_OF_UNIT = 3 * 4 + 8  # a row of blocks of a Gaussian: owner, first block, width; end of its pairs
+BYTES_OF_PAIR = 64 + 8 + 2 * 4 + 2 * 2  # row of gradient sums; slot; Gaussian, twice; key, twice
+BYTES_OF_BLOCK = 128 * (4 + 4) + 3 * 4 + 8  # of 128 pixels transmittance and last entry; list
+BYTES_OF_RENDER = 64 + 4 + 4 + 3 * 8  # the record that cannot be seen, the end of the lists, flags, status
+UNITS_AT_FIRST = 2  # rows of blocks that a Gaussian has room for, before they are counted
+
+# While pairs are sorted: the numbers of the slots, and a second copy of these and of the keys.
+BYTES_OF_SORTING = 8 + 8 + 2
+
+
+def workspace_bytes(gaussians: int, units: int, pairs: int, blocks: int) -> int:
+    """The buffers of one render with its backward pass, those for rows of blocks having room for ``units``."""
+    return (
+        BYTES_OF_RENDER
+        + BYTES_OF_GAUSSIAN * gaussians
+        + BYTES_OF_UNIT * units
+        + BYTES_OF_PAIR * pairs
+        + BYTES_OF_BLOCK * blocks
+    )
+
+
+def render_bytes(gaussians: int, units: int, pairs: int, blocks: int) -> int:
+    """Bytes that renders hold at once, with their backward passes, beside their results and gradients.
+
+    ``pairs`` (Gaussian, block) stand in ``units`` rows of blocks. A buffer that has to grow becomes at least twice as
+    large as it was, so that after some growth it may be up to twice what is counted here.
+    """
+    room = UNITS_AT_FIRST * gaussians
+    return workspace_bytes(gaussians, room if units <= room else 2 * units, pairs, blocks) + BYTES_OF_SORTING * pairs

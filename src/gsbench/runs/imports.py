@@ -1,0 +1,102 @@
+"""Imports of a Python file, read from its text: nothing is run, and an import that waits in a function counts too."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+BY_NAME = frozenset({"import_module", "__import__"})  # called with the name of a module
+# Functions that make code run which no import statement names; `attach` is lazy_loader's.
+BY_OTHER_MEANS = frozenset(
+    """
+    exec run_path run_module spec_from_file_location spec_from_loader module_from_spec SourceFileLoader load_module
+    load_source iter_modules walk_packages find_spec attach attach_stub get_class get_object instantiate locate
+    """.split()  # noqa: SIM905 - words are easier to read than a list of 17 quoted ones
+)
+SEARCHED = frozenset({"path", "addsitedir"})  # of `sys` and `site`: where Python looks for modules
+MAX_PLACE = 200  # characters of a text that may name a folder
+
+
+@dataclass(frozen=True)
+class Imports:
+    """The imports of a file.
+
+    ``names`` has pairs of a module and what is taken of it: a name, ``*``, or None for the module itself.
+    ``computed`` says that modules are imported whose names the text does not give. ``places`` are the texts that may
+    be folders to look in, where the file changes ``sys.path``, else None.
+    """
+
+    names: tuple[tuple[str, str | None], ...] = ()
+    computed: bool = False
+    places: tuple[str, ...] | None = None
+
+
+def read_imports(tree: ast.Module, module: str, is_package: bool) -> Imports:
+    """The imports of the parsed file of ``module``; those for type checkers alone do not count."""
+    package = module if is_package else module.rpartition(".")[0]
+    names: dict[tuple[str, str | None], None] = {}
+    by_name, by_other_means, understood = set(BY_NAME), set(BY_OTHER_MEANS), set()
+    computed, searches = False, False
+    nodes = list(_nodes(tree))
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            names |= {(alias.name, None): None for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            source = _absolute("." * node.level + (node.module or ""), package)
+            names |= {(source, alias.name): None for alias in node.names}
+            by_name |= {alias.asname for alias in node.names if alias.asname and alias.name in BY_NAME}
+            by_other_means |= {alias.asname for alias in node.names if alias.asname and alias.name in BY_OTHER_MEANS}
+            searches |= node.module in ("sys", "site") and any(alias.name in SEARCHED for alias in node.names)
+    for node in nodes:
+        if isinstance(node, ast.Call) and _word(node.func) in by_name and (found := _named(node, package)):
+            understood.add(node.func)
+            names[(found, None)] = None
+    for node in nodes:
+        word = _word(node)
+        if isinstance(node, ast.Attribute) and word in SEARCHED:
+            searches |= _word(node.value) in ("sys", "site")
+        computed |= word in by_other_means or (word in by_name and node not in understood)
+    places = (node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str))
+    kept = tuple(dict.fromkeys(place for place in places if 0 < len(place) <= MAX_PLACE and place.isprintable()))
+    return Imports(tuple(names), computed, kept if searches else None)
+
+
+def _nodes(tree: ast.AST) -> Iterator[ast.AST]:
+    pending = [tree]
+    while pending:
+        node = pending.pop()
+        if isinstance(node, ast.If) and _word(node.test) == "TYPE_CHECKING":
+            pending += node.orelse
+            continue
+        yield node
+        pending += ast.iter_child_nodes(node)
+
+
+def _word(node: ast.AST) -> str | None:
+    """The last word of ``a.b.c``."""
+    if isinstance(node, ast.Attribute):
+        return node.attr
+    return node.id if isinstance(node, ast.Name) else None
+
+
+def _named(call: ast.Call, package: str) -> str | None:
+    """The module that a call imports by a name that the text gives; None where it does not."""
+    values = [*call.args, *(keyword.value for keyword in call.keywords)]
+    if not values or not isinstance(values[0], ast.Constant) or not isinstance(values[0].value, str):
+        return None
+    name = values[0].value
+    if not name.startswith("."):
+        return name
+    known = len(values) == 2 and _word(values[1]) in ("__package__", "__name__")
+    return _absolute(name, package) if known else None
+
+
+def _absolute(name: str, package: str) -> str:
+    """The full name of a relative one, which begins with a dot for each package up."""
+    rest = name.lstrip(".")
+    level = len(name) - len(rest)
+    if not level:
+        return name
+    parts = package.split(".")
+    return ".".join([*parts[: len(parts) - level + 1], *([rest] if rest else [])])

@@ -1,0 +1,42 @@
+"""``search.json``: what a search found so far, written after each point and shown by the report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from gsbench.records import Count, Number, Part, Text, read_typed
+from gsbench.runs.layout import SEARCH
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point(Part):
+    """A choice of values; ``value`` is the mean of the metric over its seeds, None while there is none."""
+
+    number: Count
+    state: Literal["done", "failed", "unfinished"]
+    settings: dict[str, bool | int | Number | str]
+    value: Number | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchRecord(Part):
+    """The metric and its direction, how many points with how many seeds, and which settings have a log scale."""
+
+    metric: Text
+    direction: Literal[-1, 1]
+    wanted: Count
+    seeds: Count
+    validation: bool = False  # whether validation views judged its points, so that none saw a test view
+    log: list[str]
+    points: list[Point]
+
+    def __post_init__(self) -> None:
+        if len({frozenset(point.settings) for point in self.points if point.value is not None}) > 1:
+            raise ValueError("the points have different settings")
+
+
+def read_search(home: Path) -> SearchRecord:
+    """The search of the experiment in ``home``; raises FileNotFoundError and DamagedError."""
+    return read_typed(home / SEARCH, SearchRecord)

@@ -1,0 +1,153 @@
+"""Content of a finished trial's ``results.json``: its writers fill this record, its readers are given it."""
+
+from __future__ import annotations
+
+import json
+import reprlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError
+
+from gsbench.parsing import DamagedError, fault_of
+from gsbench.records import MOST, Amount, Count, Number, Part, Text, adapter, misfit
+from gsbench.runs.origin import FROM_RENDERS
+
+COMPLETE = "complete"
+Iteration = Annotated[str, Field(pattern=r"^\d{1,18}$")]  # as the key of an object
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget(Part):
+    """Limits on the growth of a trial: a cap on Gaussians, the rule that keeps it, a limit of time in s."""
+
+    max_gaussians: Count | None = None
+    cap: str | None = None
+    seconds: Amount | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Code(Part):
+    """The versions of the code: sha256 of the files of a user's classes, versions of gsbench's stages.
+
+    ``files`` are those of gsbench that had a part, with their states (`gsbench.runs.code`); ``commit`` is that of the
+    checkout that trained, ``edited`` says whether files that git follows had changed.
+    """
+
+    sources: dict[str, str] = field(default_factory=dict)
+    stages: dict[str, int] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
+    commit: str | None = None
+    edited: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricRecord(Part):
+    """Facts of a user's own metric; see `gsbench.eval.facts`."""
+
+    label: str
+    direction: Literal[-1, 0, 1] = 0
+    decimals: Annotated[int, Field(ge=0, le=12)] = 3
+    unit: str = ""
+    worthwhile: Annotated[float, Field(gt=0, le=MOST)] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Earlier(Part):
+    """Metrics at an earlier iteration."""
+
+    metrics: dict[str, Number]
+    num_gaussians: Count | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Declared(Part):
+    """The metric that the verdict was declared to be about, and when (`gsbench.runs.declaration`)."""
+
+    metric: str
+    time: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trainer(Part):
+    """The program that trained in gsbench's place: as it is called, its version, what it says of it, the command."""
+
+    program: str
+    version: str
+    said: str | None = None
+    command: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialRecord(Part):
+    """A finished trial. What nobody can know of it is None, or absent from the file where that is the default.
+
+    ``metrics`` are means over the test views, ``unavailable`` says why others are missing and ``awaited`` names those
+    of them that may still come; ``seconds`` are by stage, ``resolution`` is (width, height) in px.
+    """
+
+    status: Literal["complete"]
+    experiment: Text
+    scene: Text
+    init: Text
+    densify: Text
+    seed: Count
+    raster: Text
+    protocol: Text
+    iterations: Count
+    metrics: dict[str, Number]
+    unavailable: dict[str, str]
+    seconds: dict[str, Amount]
+    num_init_points: Count | None
+    num_gaussians: Count | None
+    peak_memory_mb: Amount | None
+    hashes: dict[str, str]
+    versions: dict[str, str]
+    evaluated_from: Literal["model", "renders"] | None = None  # what gsbench did not train itself
+    trained_by: Trainer | None = None
+    measured: str | None = None  # when the evaluation came into the store
+    declared: Declared | None = None
+    awaited: list[str] = field(default_factory=list)
+    metric_facts: dict[str, MetricRecord] = field(default_factory=dict)
+    metrics_at: dict[Iteration, Earlier] = field(default_factory=dict)
+    causes: dict[str, Count] = field(default_factory=dict)  # of the Gaussians that live at the end
+    scene_extent: Amount | None = None  # world units
+    budget: Budget | None = None
+    train_views: Count | None = None
+    test_views: Count | None = None
+    split: str = ""  # the views that are held out, as short text (`gsbench.runs.splits`)
+    held_out: str = ""  # the same in a sentence
+    resolution: tuple[Count, Count] | None = None
+    events: dict[str, Count] = field(default_factory=dict)  # totals of the refinements, by cause
+    init_report: dict[str, Any] = field(default_factory=dict)
+    renders: dict[str, str] = field(default_factory=dict)  # where the renders of another program came from
+    code: Code = field(default_factory=Code)
+    machine: dict[str, str] | None = None
+
+    def __post_init__(self) -> None:
+        if self.num_gaussians is None and self.evaluated_from != FROM_RENDERS:
+            raise ValueError("num_gaussians is not there")
+        if fault := fault_of(self.init_report):
+            raise ValueError(f"in init_report {fault}")
+
+
+class UnfinishedError(DamagedError):
+    """A ``results.json`` that does not say that its trial is complete."""
+
+
+def record_from(content: bytes, path: Path) -> TrialRecord:
+    """The record that the JSON of the file ``path`` is; raises DamagedError, and UnfinishedError."""
+    try:
+        return adapter(TrialRecord).validate_json(content)
+    except ValidationError as error:
+        of_status = next((fault for fault in error.errors() if fault["loc"] == ("status",)), None)
+        if of_status is not None:
+            said = "missing" if of_status["type"] == "missing" else reprlib.repr(of_status["input"])
+            raise UnfinishedError(path, f"is unfinished, its status is {said}") from None
+        raise DamagedError(path, misfit(error)) from None
+
+
+def results_text(record: TrialRecord) -> str:
+    """The content of ``results.json``."""
+    return json.dumps(record.to_json(), indent=1, allow_nan=False) + "\n"

@@ -1,0 +1,211 @@
+"""What differs between two arms, said wherever they are compared, and which arm would isolate an ingredient."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from gsbench.analysis.attribution import ELSEWHERE, NO_RECORD, RULES, attribute, attribution_sentence, ingredients
+from gsbench.analysis.cells import with_variants
+from gsbench.analysis.pairing import choose_pairs, controls_of
+from gsbench.analysis.report.build import build_report
+from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.analysis.shipped import resolved, shipped_arms
+from gsbench.analysis.tables import build_table
+from gsbench.runs.hashing import config_hash
+from tests.analysis.synthetic import write_arms
+from tests.conftest import ROOT
+
+SCHEDULE = {"train.densify_start": 500, "train.densify_stop": 15_000, "train.mcmc_stop": 25_000}
+SCHEDULE |= {"train.densify_interval": 100, "train.opacity_reset_interval": 3000, "train.iterations": 30_000}
+
+
+def config(name: str, **changes: Any) -> dict[str, Any]:
+    """A shipped densifier as a trial records it."""
+    return SCHEDULE | resolved(shipped_arms()[name], SCHEDULE) | {f"densify.{key}": v for key, v in changes.items()}
+
+
+def densifier(name: str, **changes: Any) -> dict[str, Any]:
+    """The same as the settings of the group alone."""
+    prefix = "densify."
+    return {key.removeprefix(prefix): v for key, v in config(name, **changes).items() if key.startswith(prefix)}
+
+
+def trials_of(runs: Path, arms: dict[str, dict[str, Any]], **settings: Any) -> list[TrialResult]:
+    write_arms(runs, arms, **settings)
+    return with_variants(load_experiment(runs, "exp").trials)
+
+
+def sentence(trials: list[TrialResult], first: str, second: str) -> str:
+    pair = ("sfm", first), ("sfm", second)
+    return attribution_sentence(attribute(trials, *pair), *pair)
+
+
+# --- ingredients
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        ("adc", "longaxis", ("split", "gradient", "threshold")),
+        ("absgrad", "longaxis", ("split",)),
+        ("adc", "volumetric", ("volume rule",)),
+        ("volumetric", "volumetric_once", ("split_isotropic",)),
+        ("adc", "adc", ()),
+    ],
+)
+def test_arms_of_gsbench_differ_in_what_their_files_say(first: str, second: str, expected: tuple[str, ...]) -> None:
+    assert ingredients(config(first), config(second)) == expected
+
+
+def test_every_shipped_class_says_in_what_it_departs_from_adc() -> None:
+    assert {settings["_target_"] for settings in shipped_arms().values()} <= set(RULES)
+
+
+def test_settings_that_only_name_or_place_a_trial_are_no_ingredient() -> None:
+    other = config("adc") | {"densify.name": "adc-2", "eval.primary": "psnr", "eval.lpips": [], "train.log_every": 1}
+    assert ingredients(config("adc"), other | {"seed": 4, "threads": 2, "launch.name": "slurm"}) == ()
+
+
+def test_changes_outside_the_densifier_are_ingredients() -> None:
+    other = config("adc", stop=9000) | {"train.opacity": 0.05, "train.scale": 0.1, "scene.max_size": 160}
+    assert set(ingredients(config("adc"), other)) == {"schedule", "learning rates", "scene.max_size"}
+    sfm = config("adc") | {"init._target_": "gsbench.init.Sfm", "init.max_num_features": 1, "init.poses": "own"}
+    dim = config("adc") | {"init._target_": "gsbench.init.Dim", "init.extractor": "aliked", "init.poses": "shared"}
+    assert set(ingredients(sfm, dim)) == {"initial cloud", "cameras"}
+
+
+def test_a_class_of_ones_own_is_one_ingredient_and_its_settings_belong_to_it() -> None:
+    """And of two versions of one class with settings of its own, each setting is one."""
+    own = config("adc") | {"densify._target_": "mine.Patient", "densify.patience": 3}
+    assert ingredients(config("adc"), own) == ("rule mine.Patient",)
+    assert ingredients(config("adc"), own | {"densify.interval": 50}) == ("rule mine.Patient", "schedule")
+    assert ingredients(own, own | {"densify.patience": 4, "densify.options.depth": 1}) == ("patience", "options.depth")
+    assert ingredients(config("longaxis"), own)[0] == "rule mine.Patient"
+
+
+# --- isolating
+
+
+def test_a_mixed_comparison_names_the_arm_that_isolates(tmp_path: Path) -> None:
+    trials = trials_of(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")})
+    assert sentence(trials, "adc", "longaxis") == (
+        "sfm-longaxis differs from sfm-adc by split, gradient and threshold; isolate split with densify=absgrad."
+    )
+    page = build_report(load_experiment(tmp_path, "exp"))
+    assert "longaxis differs from sfm-adc by split, gradient and threshold" in page.split("</strong>")[0]
+    notes = build_table(load_experiment(tmp_path, "exp")).notes
+    assert sentence(trials, "adc", "longaxis") in notes
+
+
+def test_a_comparison_of_one_ingredient_is_not_commented(tmp_path: Path) -> None:
+    trials = trials_of(tmp_path, {"adc": densifier("adc"), "volumetric": densifier("volumetric")})
+    assert sentence(trials, "adc", "volumetric") == ""
+    assert not any("differs from" in note for note in build_table(load_experiment(tmp_path, "exp")).notes)
+
+
+def test_an_arm_that_was_run_comes_before_one_that_could_be(tmp_path: Path) -> None:
+    arms = {name: densifier(name) for name in ("adc", "absgrad", "longaxis")}
+    assert "isolate split with sfm-absgrad, which is here" in sentence(trials_of(tmp_path, arms), "adc", "longaxis")
+
+
+def test_what_a_command_changed_in_all_arms_is_no_difference(tmp_path: Path) -> None:
+    """A threshold, a budget and a schedule that both have hold for the isolating arm, too."""
+    changes = {"gradient_threshold": 0.0016, "max_gaussians": 9, "cap": "governor", "stop": 77}
+    arms = {name: densifier(name, **changes) for name in ("adc", "longaxis")}
+    assert sentence(trials_of(tmp_path, arms), "adc", "longaxis") == (
+        "sfm-longaxis differs from sfm-adc by split and gradient; isolate split with densify=absgrad."
+    )
+
+
+def test_where_nothing_isolates_that_is_said(tmp_path: Path) -> None:
+    own = densifier("adc", interval=50) | {"_target_": "mine.Patient", "patience": 3}
+    trials = trials_of(tmp_path, {"adc": densifier("adc"), "patient": own})
+    expected = "differs from sfm-adc by rule mine.Patient and schedule; no arm at hand isolates one of them."
+    assert sentence(trials, "adc", "patient").endswith(expected)
+
+
+def test_a_variant_of_a_setting_is_an_arm_that_can_isolate(tmp_path: Path) -> None:
+    own = {"_target_": "mine.Patient", "patience": 3}
+    write_arms(tmp_path, {"adc": densifier("adc"), "patient": densifier("adc", interval=50) | own})
+    write_arms(tmp_path, {"patient": densifier("adc") | own})
+    trials = with_variants(load_experiment(tmp_path, "exp").trials)
+    (mixed,) = {trial.arm[1] for trial in trials if trial.config["densify.interval"] == 50}
+    (baseline,) = {trial.arm[1] for trial in trials if trial.densify == "adc"}
+    assert "isolate schedule with sfm-patient interval=100, which is here" in sentence(trials, baseline, mixed)
+
+
+def test_trials_without_a_record_are_said_to_have_none(tmp_path: Path) -> None:
+    for path in write_arms(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")}):
+        if "longaxis" in path.parent.name:
+            (path / "config.yaml").unlink()
+    assert sentence(list(load_experiment(tmp_path, "exp").trials), "adc", "longaxis").endswith(f"by {NO_RECORD}.")
+
+
+def test_what_another_program_did_is_many_ingredients_at_once(tmp_path: Path) -> None:
+    program = {"_target_": "gsbench.densify.External", "command": "train"}
+    trials = trials_of(tmp_path, {"adc": densifier("adc"), "3dgs": program, "brush": program})
+    assert sentence(trials, "adc", "3dgs") == (
+        "sfm-3dgs differs from sfm-adc by all that the program 3dgs does otherwise."
+    )
+    assert "the program brush does otherwise and all that the program 3dgs" in sentence(trials, "3dgs", "brush")
+
+
+def test_what_was_trained_elsewhere_is_not_known(tmp_path: Path) -> None:
+    for path in write_arms(tmp_path, {"adc": densifier("adc"), "theirs": densifier("adc")}):
+        if path.parent.name == "sfm-theirs":
+            data = json.loads((path / "results.json").read_text())
+            (path / "results.json").write_text(json.dumps(data | {"evaluated_from": "model"}))
+    trials = list(load_experiment(tmp_path, "exp").trials)
+    assert trials[-1].made_elsewhere
+    assert sentence(trials, "adc", "theirs") == f"sfm-theirs differs from sfm-adc by {ELSEWHERE}."
+
+
+def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> None:
+    trials_of(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")})
+    (tmp_path / "exp" / "search.json").write_text("{}")
+    assert not any("differs from" in note for note in build_table(load_experiment(tmp_path, "exp")).notes)
+
+
+# --- controls
+
+
+def test_controls_are_held_against_their_arms(tmp_path: Path) -> None:
+    arms = {name: densifier(name) for name in ("adc", "absgrad", "longaxis")}
+    trials = trials_of(tmp_path, arms, eval__controls={"longaxis": "absgrad", "mcmc": "adc", "adc": "adc"})
+    pairs = choose_pairs(sorted({trial.arm for trial in trials}), controls=controls_of(trials))
+    against = [(first[1], second[1]) for first, second in pairs]
+    assert against == [("adc", "absgrad"), ("adc", "longaxis"), ("absgrad", "longaxis")]
+    assert "sfm-longaxis against sfm-absgrad" in build_report(load_experiment(tmp_path, "exp"))
+    varied = [("sfm", f"{name} cap={cap}") for name in ("absgrad", "adc", "longaxis") for cap in (1, 2)]
+    assert choose_pairs(varied, controls={"longaxis": "absgrad"})[-2:] == [
+        (varied[0], varied[4]),
+        (varied[1], varied[5]),
+    ]
+
+
+def test_naming_a_control_makes_no_other_trial() -> None:
+    with_control = {"eval": {"lpips": [], "controls": {"longaxis": "absgrad"}}, "densify": {"name": "adc"}}
+    assert config_hash(with_control) == config_hash({"eval": {"lpips": []}, "densify": {"name": "adc"}})
+
+
+def test_experiments_list_the_control_of_every_mixed_arm() -> None:
+    """Where an experiment holds an arm that isolates an ingredient of another, it says so."""
+    checked = 0
+    for file in sorted((ROOT / "conf" / "experiment").glob("*.yaml")):
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+        arms = str(content.get("hydra", {}).get("sweeper", {}).get("params", {}).get("densify", "")).split(",")
+        controls = content.get("eval", {}).get("controls", {})
+        assert set(controls) | set(controls.values()) <= set(arms)
+        for arm in (one for one in arms if one in shipped_arms() and "adc" in arms):
+            mixed = ingredients(config("adc"), config(arm))
+            alone = [one for one in arms if one != arm and len(found := ingredients(config(one), config(arm))) == 1
+                     and found[0] in mixed]  # fmt: skip
+            if len(mixed) > 1 and alone:
+                checked += 1
+                assert controls.get(arm) in alone, f"{file.name}: {alone} isolate what {arm} does"
+    assert checked >= 2

@@ -1,0 +1,191 @@
+"""The fairness sheet: generated from records and files, and nothing that was recorded is missing from it."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsbench.analysis.cells import with_variants
+from gsbench.analysis.fairness import UNLIKE, default_lines, fairness_table
+from gsbench.analysis.report.build import build_report
+from gsbench.analysis.results import load_experiment
+from gsbench.analysis.shipped import notes_of, shipped_arms
+from gsbench.analysis.table_formats import to_latex
+from gsbench.analysis.tables import Table
+from gsbench.analysis.tuning import NOTHING
+from gsbench.errors import InputError
+from gsbench.verbs import tables
+from tests.analysis.synthetic import write_arms
+from tests.analysis.test_attribution import densifier
+
+LEFT, RIGHT = ("sfm", "adc"), ("sfm", "longaxis")
+
+
+def sheet(runs: Path, second: str = "longaxis", first: str = "adc") -> Table:
+    return fairness_table(with_variants(load_experiment(runs, "exp").trials), ("sfm", first), ("sfm", second))
+
+
+def shown(table: Table) -> dict[str, tuple[str, str, str]]:
+    return {row.labels[0]: tuple(entry.text for entry in row.entries) for row in table.rows}  # type: ignore[misc]
+
+
+def change(paths: list[Path], arm: str, **values: Any) -> None:
+    for path in paths:
+        if path.parent.name == f"sfm-{arm}":
+            data = json.loads((path / "results.json").read_text())
+            (path / "results.json").write_text(json.dumps(data | values))
+
+
+@pytest.fixture
+def paths(tmp_path: Path) -> list[Path]:
+    return write_arms(tmp_path, {name: densifier(name) for name in ("adc", "longaxis")})
+
+
+def test_settings_schedules_and_what_was_measured_stand_side_by_side(tmp_path: Path, paths: list[Path]) -> None:
+    change(paths, "longaxis", train_views=40, num_init_points=9000, num_gaussians=31_000, seconds={"train": 80.0})
+    change(paths, "longaxis", versions={"gsbench": "0.2.0"}, hashes={"data": "data-courtyard", "cloud": "abcdef"})
+    for path in paths:
+        if path.parent.name == "sfm-longaxis":
+            (path / "events.jsonl").write_text("".join(json.dumps({"step": 100 * k}) + "\n" for k in range(1, 24)))
+    rows = shown(sheet(tmp_path))
+    assert rows["views for training"] == ("42", "40", UNLIKE)
+    assert rows["initial points"] == ("3,000", "9,000", UNLIKE)
+    assert rows["initial cloud (hash)"][1:] == ("abcdef", UNLIKE)
+    assert rows["Gaussians in the end"] == ("20,000 to 20,020, mean 20,010", "31,000", UNLIKE)
+    assert rows["rounds of the densifier"] == ("15", "23", UNLIKE)
+    assert rows["last round (iteration)"] == ("2,000", "2,300", UNLIKE)
+    assert rows["seconds of training"][1] == "80"
+    assert rows["code"] == ("gsbench 0.1.0", "gsbench 0.2.0", UNLIKE)
+    assert rows["budget"] == ("50,000 Gaussians (soft)", "50,000 Gaussians (soft)", "")
+    assert rows["densify.gradient_threshold"] == ("0.0002", "0.0008", UNLIKE)
+    assert rows["densify.split_distance"] == ("–", "0.45", UNLIKE)
+    assert "densify.split_size" not in rows  # alike
+
+
+def test_only_trials_that_are_compared_count(tmp_path: Path, paths: list[Path]) -> None:
+    """Seed 2 of the baseline has no partner, so its count is not part of the comparison."""
+    shutil.rmtree(next(path for path in paths if path.parent.name == "sfm-longaxis" and path.name.endswith("seed2")))
+    table = sheet(tmp_path)
+    assert shown(table)["Gaussians in the end"][0] == "20,000 to 20,010, mean 20,005"
+    assert "Compared: 2 pairs of trials of one scene and seed." in table.notes
+
+
+def test_the_notes_say_the_ingredients_the_tuning_and_the_defaults(tmp_path: Path, paths: list[Path]) -> None:
+    notes = sheet(tmp_path).notes
+    assert notes[0].startswith("sfm-longaxis differs from sfm-adc by split, gradient and threshold; isolate split")
+    assert f"Tuning. {NOTHING}" in notes
+    assert any(line.startswith("Defaults. sfm-adc: densify=adc as it is shipped. Its file says") for line in notes)
+    assert any("XiaoBin2001/Improved-GS, d008d11" in line for line in notes)
+
+
+def test_departures_from_a_file_and_from_its_authors_are_named(tmp_path: Path) -> None:
+    write_arms(tmp_path, {"edgeaware": densifier("edgeaware", gradient_threshold=0.5)}, train__name="quick")
+    (line,) = default_lines(load_experiment(tmp_path, "exp").trials[0])
+    assert "densify=edgeaware but for gradient_threshold 0.5 (0.0003 there)" in line
+    assert "its authors have max_gaussians 3,000,000" in line
+    assert "its file names train=improved_gs, this is train=quick" in line
+
+
+def test_every_shipped_arm_has_something_to_say() -> None:
+    for name in set(shipped_arms()) - {"none"}:
+        assert len(notes_of(name).text) > 30, name
+
+
+def test_an_arm_of_ones_own_has_its_class_and_version(tmp_path: Path) -> None:
+    own = {"_target_": "largest.SplitLargest", "start": 50, "share": 0.1}
+    found = write_arms(tmp_path, {"adc": densifier("adc"), "largest": own})
+    change(found, "largest", code={"sources": {"largest.SplitLargest": "3fa9c1d2aaaaaaaaaaaa"}, "stages": {}})
+    table = sheet(tmp_path, "largest")
+    assert shown(table)["densify.share"] == ("–", "0.1", UNLIKE)
+    assert "largest.SplitLargest 3fa9c1d2" in shown(table)["code"][1]
+    assert any("largest.SplitLargest (version 3fa9c1d2" in line for line in table.notes)
+    assert table.notes[0] == "sfm-largest differs from sfm-adc by rule largest.SplitLargest and schedule; " + (
+        "no arm at hand isolates one of them."
+    )
+
+
+def test_trials_without_any_record_still_have_a_sheet(tmp_path: Path, paths: list[Path]) -> None:
+    for path in paths:
+        for name in ("config.yaml", "events.jsonl"):
+            (path / name).unlink()
+    change(paths, "longaxis", seconds={}, hashes={}, versions={}, budget=None, resolution=[400, 300, 3])
+    table = sheet(tmp_path)
+    assert shown(table)["rounds of the densifier"] == ("not recorded", "not recorded", "")
+    assert shown(table)["budget"][1] == "not recorded"
+    assert "what is not recorded" in table.notes[0]
+
+
+# --- tuning
+
+
+def test_values_that_were_tried_here_are_said(tmp_path: Path) -> None:
+    arms = {f"volumetric-{v}": densifier("volumetric", volume_threshold=v) for v in (0.01, 0.03, 0.1)}
+    write_arms(tmp_path, {"adc": densifier("adc"), **arms, "absgrad": densifier("absgrad")})
+    notes = sheet(tmp_path, "volumetric-0.01").notes
+    (line,) = [note for note in notes if note.startswith("Tuning.")]  # absgrad is of adc's class, and no choice of it
+    assert "sfm-volumetric-0.01: 3 choices of its settings were run here" in line
+    assert "densify.volume_threshold (0.01, 0.03, 0.1)" in line
+    assert "held-out views that the verdict uses" in line
+
+
+def test_a_search_that_proposed_the_settings_is_named(tmp_path: Path) -> None:
+    write_arms(tmp_path, {"adc": densifier("adc"), "volumetric": densifier("volumetric", volume_threshold=0.06841)})
+    points = [{"number": k, "settings": {"densify.volume_threshold": v}} for k, v in enumerate((0.1, 0.06841))]
+    (tmp_path / "vth").mkdir()
+    (tmp_path / "vth" / "search.json").write_text(json.dumps({"metric": "psnr", "points": points}))
+    for name, content in (("other", '{"points": [3, {"settings": []}]}'), ("broken", "{")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "search.json").write_text(content)
+    (line,) = [note for note in sheet(tmp_path, "volumetric").notes if note.startswith("Tuning.")]
+    assert (
+        "densify.volume_threshold=0.06841 is one of 2 points of the search vth, by psnr of its held-out views" in line
+    )
+
+
+# --- where it stands
+
+
+def test_the_sheet_stands_before_the_verdicts_numbers_in_the_report(tmp_path: Path, paths: list[Path]) -> None:
+    page = build_report(load_experiment(tmp_path, "exp"))
+    assert (
+        page.index('<h2 id="h-verdict"') < page.index("Fairness sheet: sfm-longaxis") < page.index("seeds to resolve")
+    )
+    assert page.count("<caption>Fairness sheet") == 1
+
+
+def test_the_verb_writes_a_sheet_for_each_pair_in_every_format(
+    tmp_path: Path, paths: list[Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert tables.main(["exp", "--layout", "fairness"], tmp_path) == 0
+    assert "### Fairness sheet: sfm-longaxis against sfm-adc" in capsys.readouterr().out
+    for format_name, suffix in (("latex", "tex"), ("csv", "csv"), ("html", "html")):
+        out = tmp_path / "out"
+        assert tables.main(["exp", "--layout", "fairness", "--format", format_name, "--out", str(out)], tmp_path) == 0
+        assert (out / f"exp-fairness-sfm-longaxis-sfm-adc.{suffix}").stat().st_size > 500
+    one = tmp_path / "one"
+    write_arms(one, {"adc": densifier("adc")})
+    with pytest.raises(InputError, match="one arm"):
+        tables.main(["exp", "--layout", "fairness"], one)
+
+
+def test_the_latex_has_columns_that_wrap(tmp_path: Path, paths: list[Path]) -> None:
+    text = to_latex(sheet(tmp_path))
+    assert text.startswith("% needs \\usepackage{booktabs,array}\n")
+    (spec,) = re.findall(r"\\begin\{tabular\}\{(.*)\}", text)
+    assert spec.count("p{0.23\\linewidth}") == 3
+    body = text.split("\\midrule")[1].split("\\bottomrule")[0]
+    assert all(line.count(" & ") == 3 for line in body.strip().splitlines())
+    assert text.count("{") - text.count("\\{") == text.count("}") - text.count("\\}")
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex with booktabs is not installed")
+def test_the_latex_compiles(tmp_path: Path, paths: list[Path]) -> None:
+    document = f"\\documentclass{{article}}\\usepackage{{booktabs,array}}\\begin{{document}}{to_latex(sheet(tmp_path))}"
+    (tmp_path / "a.tex").write_text(document + "\\end{document}")
+    subprocess.run(["pdflatex", "-halt-on-error", "a.tex"], cwd=tmp_path, check=True, capture_output=True)

@@ -1,0 +1,56 @@
+"""What a comparison says of its arms, from real trials: gsbench's own, and one from a file outside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gsbench.cli import run
+from tests.end_to_end.conftest import SMALL
+
+pytestmark = pytest.mark.end_to_end
+
+PATIENT = """
+from dataclasses import dataclass
+from gsbench.densify import ADC
+
+@dataclass
+class Patient(ADC):
+    patience: int = 3
+"""
+TINY = [*SMALL, "train.iterations=2", "scene.views=9", "scene.width=48", "scene.height=36", "init.count=200"]
+TINY += ["raster=reference", "eval.lpips=[]", "eval.flip=false", "tracking=none", "seed=0,1", "name=arms"]
+OWN = ["densify=adc", "densify._target_=patient_arm.Patient", "densify.name=patient", "+densify.patience=4"]
+
+
+def test_arms_of_any_origin_are_told_apart_and_those_that_come_late_cost_the_declaration_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "patient_arm.py").write_text(PATIENT)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+
+    def tables(*words: str) -> str:
+        capsys.readouterr()
+        assert run(["tables", "arms", *words]) == 0
+        return capsys.readouterr().out
+
+    assert run(["-m", *TINY, "densify=adc,longaxis", "eval.primary=ssim"]) == 0
+    notes = tables()
+    assert "SSIM was declared beforehand" in notes
+    assert "before any of the 4 trials was measured" in notes
+    mixed = (
+        "random-longaxis differs from random-adc by split, gradient and threshold; isolate split with densify=absgrad"
+    )
+    assert mixed in notes
+
+    assert run(["-m", *TINY, *OWN, "densify.interval=40", "allow_targets=[patient_arm]"]) == 0
+    notes = tables()
+    assert "but 2 of the 6 trials were added when results were there (arm random-patient)" in notes
+    assert "random-patient differs from random-adc by rule patient_arm.Patient and schedule" in notes
+    sheet = tables("--layout", "fairness", "--format", "latex")
+    assert "densify.patience & -- & 4" in sheet
+    assert "patient\\_arm.Patient" in sheet
+    assert "is no arm of gsbench" in sheet
+    assert sheet.count("\\caption{Fairness sheet") == 2

@@ -1,0 +1,68 @@
+"""gsbench itself is edited: no command returns the numbers that it gave before."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsbench.runs.code import PACKAGE
+from gsbench.system.install import conf_dir
+from tests.end_to_end.conftest import SMALL, Run
+
+pytestmark = [pytest.mark.end_to_end, pytest.mark.slow]
+
+QUICK = [
+    *SMALL,
+    "train.iterations=20",
+    "eval.lpips=[]",
+    "eval.flip=false",
+    "tracking=none",
+    "raster=cpu",
+    "name=edited",
+]
+
+
+def test_an_edited_loss_is_trained_with(gsbench: Run, tmp_path: Path) -> None:
+    copy = tmp_path / "copy" / "src" / "gsbench"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(conf_dir(), tmp_path / "copy" / "conf")
+    changes = {"PYTHONPATH": str(copy.parent), "GSBENCH_RUNS": str(tmp_path / "runs")}
+
+    def train(*words: str) -> str:
+        done = gsbench(*QUICK, *words, timeout=900, **changes)  # where kernels have to be compiled first
+        assert done.returncode == 0, done.stderr
+        return done.stdout + done.stderr
+
+    def results() -> dict[str, Any]:
+        (path,) = (tmp_path / "runs" / "edited").glob("*/*/*/results.json")
+        found: dict[str, Any] = json.loads(path.read_text())
+        return found
+
+    train()
+    first = results()
+    assert first["code"]["files"]["eval/ssim.py"]
+    loss = copy / "train" / "trainer.py"
+    text = loss.read_text()
+    assert text.count("PhotometricLoss(options.ssim_weight,") == 1
+    loss.write_text(text + "# a comment\n")
+    assert "was done" in train()
+    loss.write_text(text.replace("(options.ssim_weight,", "(0.95,"))
+    assert "will be checked: the code of gsbench changed in: train/trainer.py" in train("--dry-run")
+    stale = gsbench("explain", "--stale", *QUICK, **changes)
+    assert "code.train/trainer.py: " in stale.stdout
+    assert stale.stdout.count("not in the store") == 2  # train, evaluate
+    assert "was done" not in train()
+    second = results()
+    assert second["metrics"]["psnr"] != first["metrics"]["psnr"]
+    assert second["hashes"]["init"] == first["hashes"]["init"]
+
+    with (copy / "densify" / "mcmc.py").open("a") as other:
+        other.write("MORE = 1\n")
+    assert "was done" in train()  # another arm
+    loss.write_text(text)
+    assert "iteration" not in train()  # the store has it
+    assert results()["metrics"] == first["metrics"]

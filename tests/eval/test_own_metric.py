@@ -1,0 +1,50 @@
+"""What a user's metric may return, and what becomes of one that does something else."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.errors import InputError
+from gsbench.eval.evaluator import Evaluator
+from gsbench.eval.protocol import get_protocol
+
+IMAGE = np.zeros((16, 16, 3), np.uint8)
+
+
+class Own:
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+    def measure(self, image: torch.Tensor, truth: torch.Tensor) -> Any:
+        if self.value is SystemExit:
+            sys.exit(0)
+        return self.value
+
+
+def measured(value: Any) -> dict[str, float]:
+    return Evaluator(get_protocol("paper"), lpips=(), flip=False, extra={"own": Own(value)}).evaluate_view(IMAGE, IMAGE)
+
+
+@pytest.mark.parametrize(
+    "value", [2, 2.0, np.float32(2), np.int64(2), np.array(2.0), np.array([2.0]), torch.tensor(2.0), torch.tensor([2])]
+)
+def test_any_number_will_do(value: Any) -> None:
+    assert measured(value)["own"] == 2.0
+
+
+@pytest.mark.parametrize(
+    "value", ["2.0", "good", b"2", True, None, 2j, [2.0], {}, np.zeros(2), torch.zeros(2), np.array("2")]
+)
+def test_what_is_no_number_is_named(value: Any) -> None:
+    with pytest.raises(InputError, match=r"eval\.extra\.own must return a number for each view, got "):
+        measured(value)
+
+
+def test_a_metric_that_ends_the_process_is_an_error() -> None:
+    with pytest.raises(InputError, match=r"eval\.extra\.own ended the process \(exit code 0\)"):
+        measured(SystemExit)

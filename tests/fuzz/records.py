@@ -1,0 +1,302 @@
+"""Damaged files of a runs folder, one after the other; run as a program, so that a crash or a hang is seen as one.
+
+    python -m tests.fuzz.records FOLDER FIRST COUNT [FILE]
+
+damages the files of a small experiment, or FILE alone, reads them as the verbs do, and prints how many cases were
+noticed and how many were read, and the case that ended in anything else.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from gsbench.analysis.explain import explain_cell
+from gsbench.analysis.frame import to_frame
+from gsbench.analysis.report.search_charts import search_part
+from gsbench.analysis.report.sections import event_charts, training_charts, volume_charts
+from gsbench.analysis.results import load_experiment, read_views
+from gsbench.analysis.table_formats import to_html
+from gsbench.analysis.tables import build_table
+from gsbench.errors import InputError
+from gsbench.launch import queue
+from gsbench.launch.plan import Estimator, read_plan
+from gsbench.launch.states import states_of_experiment
+from gsbench.runs.declaration import read_declarations, read_plans
+from gsbench.runs.finished import find_finished
+from gsbench.runs.inputs import write_finished
+from gsbench.runs.trial_files import TrialPaths, read_config, stage_and_step
+from gsbench.tracking.record import TrackedFiles
+from gsbench.tracking.state import read_state
+from gsbench.verbs.status import lines_of
+from tests.finished import record_of
+from tests.fuzz.corrupt import corrupt
+
+SLOW_SECONDS = 20.0
+DONE, FAILED, EXPERIMENT = "sfm-adc", "sfm-volumetric", "exp"
+NAMES = (
+    "results.json", "inputs.json", "config.yaml", "plan.json", "declared.jsonl", "metrics.jsonl", "events.jsonl",
+    "volume_histograms.jsonl", "per_view.csv", "failed.json", "building.json", ".submitted.json", "search.json",
+    "mlflow.json", ".lock.holder",
+)  # fmt: skip
+STRANGE: tuple[str, ...] = (
+    "null", "{}", "[]", '""', "true", "0", "-1", "NaN", "-Infinity", "1e400", "1e308", "9" * 400, "9" * 5000, '"x"',
+    '"27"', "[" * 5000, "[" * 150 + "]" * 150, '{"a":' * 60 + "1" + "}" * 60, '"\\ud800"', '"../../x"', '"\\u0000"',
+    '"a\\nb"', "[null]", '{"name": 3}', "1.5", "18446744073709551616", '{"": {}}', '["_target_"]',
+)  # fmt: skip
+
+
+def values_of(runs: Path, densify: str, seed: int, threshold: float) -> dict[str, Any]:
+    """A configuration as a trial writes it, as far as anyone reads it."""
+    return {
+        "name": EXPERIMENT,
+        "seed": seed,
+        "runs": str(runs),
+        "scene": {"name": "courtyard", "test_every": 8},
+        "init": {"name": "sfm", "poses": "shared"},
+        "densify": {"name": densify, "volume_threshold": threshold},
+        "train": {"iterations": 100, "max_seconds": None},
+        "eval": {"primary": None},
+        "tracking": {"enabled": True, "uri": None, "flush_seconds": 1.0, "patience_seconds": 1.0, "images": 1},
+        "launch": {"name": "serial"},
+    }
+
+
+def write_trial(runs: Path, densify: str, seed: int, threshold: float = 0.03) -> Path:
+    """A trial with every file that its readers look for."""
+    values = values_of(runs, densify, seed, threshold)
+    folder = TrialPaths.of(values).folder
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text(json.dumps(values))
+    steps = range(10, 101, 10)
+    rows = [{"step": k, "psnr": 20 + k / 50, "num_gaussians": 10 * k, "seconds": k / 10, "loss": 1 / k} for k in steps]
+    events = [{"step": k, "cloned": 2, "split_volume": 1, "opacity_reset": False, "strictness": 1.0} for k in steps]
+    edges = [-18 + k for k in range(22)]
+    histograms = [{"step": 50, "log10_edges": edges, "counts": [k % 5 for k in range(21)]}]
+    for name, lines in (("metrics", rows), ("events", events), ("volume_histograms", histograms)):
+        (folder / f"{name}.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    psnr = 26.5 + seed
+    (folder / "per_view.csv").write_text(f"view,psnr\na,{psnr - 1}\nb,{psnr + 1}\n")
+    record = record_of(
+        values,
+        metrics={"psnr": psnr},
+        seconds={"init": 1.0, "train": 60.0, "evaluate": 2.0},
+        hashes={"config": folder.name, "data": "d", "init": "i"},
+        events={"cloned": 20, "split_volume": 10},
+        causes={"initial": 3, "clone": 7},
+        resolution=(40, 30),
+        test_views=2,
+        init_report={"num_points": 5, "gauge": {"scene_extent": 4.5}},
+        versions={"gsbench": "0"},
+        machine={"cpu": "c", "kernels": "k", "torch": "t", "device": "cpu"},
+    )
+    write_finished(folder, values, record)
+    return folder
+
+
+def write_original(runs: Path) -> dict[str, Path]:
+    """A small experiment; its files by name, those that are damaged in turn."""
+    home = runs / EXPERIMENT
+    done = [write_trial(runs, name, seed) for name in ("adc", "volumetric") for seed in (0, 1)][0]
+    variant = write_trial(runs, "volumetric", 0, 0.5)
+    failed = write_trial(runs, "volumetric", 1, 0.5)
+    (failed / "results.json").unlink()
+    (failed / "failed.json").write_text(json.dumps({"error": "E", "message": "m", "time": 1.0, "seed": 1}))
+    (failed / "building.json").write_text(json.dumps({"stage": "train", "folder": str(done)}))
+    (failed / ".submitted.json").write_text(json.dumps({"job": "5", "log": "l", "user": "u"}))
+    (variant / "mlflow.json").write_text(
+        json.dumps(
+            {"uri": "u", "token": "t", "started": 1, "run_id": "r", "logged": {"metrics.jsonl": 5}, "complete": "c"}
+        )
+    )
+    (done / ".lock.holder").write_text(json.dumps({"host": "h", "pid": 1, "since": 1.0, "slurm": None, "what": "w"}))
+    entry = {"overrides": ["seed=0"], "cwd": str(runs), "time": 1.0, "sweep": {"id": "s", "count": 2}}
+    places = {path.relative_to(home).as_posix(): entry for path in (done, failed)}
+    (home / "plan.json").write_text(json.dumps({"version": 1, "trials": places}))
+    declared = [
+        {"metric": "psnr", "time": "2026-11-21T20:05:00Z"},
+        {"plan": {"a": 1}, "hash": "h", "time": "2026-11-21T20:05:00Z"},
+    ]
+    (home / "declared.jsonl").write_text("".join(json.dumps(line) + "\n" for line in declared))
+    point = {"number": 0, "state": "done", "settings": {"a": 0.5, "b": "x"}, "value": 20.0}
+    search = {"metric": "psnr", "direction": 1, "wanted": 3, "seeds": 1, "log": ["a"], "points": [point]}
+    (home / "search.json").write_text(json.dumps(search))
+    places_of = {name: done / name for name in NAMES}
+    places_of |= {name: home / name for name in ("plan.json", "declared.jsonl", "search.json")}
+    places_of |= {name: failed / name for name in ("failed.json", "building.json", ".submitted.json")}
+    places_of |= {"mlflow.json": variant / "mlflow.json", "config.yaml": variant / "config.yaml"}
+    assert all(path.is_file() for path in places_of.values())
+    return places_of
+
+
+def damage(path: Path, sound: bytes, rng: Random) -> str:
+    """Damage the file; what was done in one word."""
+    kind = rng.choice(("shape",) * 6 + ("bytes",) * 3 + ("place",))
+    if kind == "bytes":
+        path.write_bytes(corrupt(sound, rng))
+    elif kind == "shape":
+        path.write_bytes(_misshapen(sound, rng))
+    else:
+        path.unlink()
+        kind = rng.choice(("fifo", "folder", "loop", "device", "absent", "empty", "huge"))
+        if kind == "fifo":
+            os.mkfifo(path)
+        elif kind == "folder":
+            path.mkdir()
+        elif kind in ("loop", "device"):
+            path.symlink_to(path if kind == "loop" else "/dev/zero")
+        elif kind == "empty":
+            path.touch()
+        elif kind == "huge":
+            with path.open("wb") as stream:
+                stream.truncate(1 << 40)
+    return kind
+
+
+def _misshapen(sound: bytes, rng: Random) -> bytes:
+    """The JSON with one or two values, keys or whole lines replaced by strange ones."""
+    lines = sound.decode().splitlines() if sound.count(b"\n{") else [sound.decode()]
+    at = rng.randrange(len(lines))
+    try:
+        tree = json.loads(lines[at])
+    except ValueError:  # the table of views
+        return rng.choice(STRANGE).encode().join(sound.split(b",", rng.randint(1, 3)))
+    marks: dict[str, str] = {}
+    for _ in range(rng.choice((1, 1, 2))):
+        tree = _replaced(tree, rng, marks)
+    text = json.dumps(tree)
+    for mark, strange in marks.items():
+        text = text.replace(f'"{mark}"', strange)
+    lines[at] = text
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _replaced(tree: Any, rng: Random, marks: dict[str, str]) -> Any:
+    if isinstance(tree, dict) and tree and rng.random() < 0.85:
+        key = rng.choice(list(tree))
+        how = rng.random()
+        if how < 0.1:
+            return {name: value for name, value in tree.items() if name != key}
+        if how < 0.15:
+            return tree | {rng.choice(("", "x", "\ud800", "a.b", "seed")): tree[key]}
+        return tree | {key: _replaced(tree[key], rng, marks)}
+    if isinstance(tree, list) and tree and rng.random() < 0.85:
+        at = rng.randrange(len(tree))
+        return [*tree[:at], _replaced(tree[at], rng, marks), *tree[at + rng.randint(0, 1) :]]
+    mark = f"mark{len(marks)}{rng.randrange(10**9)}"
+    marks[mark] = rng.choice(STRANGE)
+    return mark
+
+
+def look(runs: Path, places: dict[str, Path]) -> int:
+    """Read everything as the verbs do; how much was refused or left out. Raises what is no InputError."""
+    home = runs / EXPERIMENT
+    refused = 0
+
+    def attempt(read: Callable[[], object]) -> None:
+        nonlocal refused
+        try:
+            read()
+        except InputError as error:
+            assert len(str(error).splitlines()) == 1
+            refused += 1
+
+    def tables() -> None:
+        experiment = load_experiment(runs, EXPERIMENT)
+        assert all(len(line.splitlines()) == 1 for line in experiment.warnings)
+        nonlocal refused
+        refused += len(experiment.warnings) - 1  # one trial has failed
+        arms = sorted({trial.arm for trial in experiment.trials})
+        attempt(lambda: to_html(build_table(experiment)).encode())
+        attempt(lambda: to_frame(experiment).to_csv())
+        attempt(lambda: training_charts(experiment.trials, arms))
+        attempt(lambda: event_charts(experiment.trials, arms))
+        attempt(lambda: volume_charts(experiment.trials, arms))
+        for trial in experiment.trials:
+            attempt(lambda trial=trial: read_views(trial))  # type: ignore[misc]
+
+    attempt(tables)
+    attempt(lambda: explain_cell(f"{EXPERIMENT}:courtyard:psnr:adc", runs))
+    attempt(lambda: "\n".join(lines_of(states_of_experiment(home), everything=True)).encode())
+    attempt(lambda: read_plan(home))
+    attempt(lambda: Estimator(runs).estimate(values_of(runs, "adc", 0, 0.03)))
+    attempt(lambda: (read_declarations(home), read_plans(home)))
+    attempt(lambda: search_part(home))
+    for folder in {path.parent for path in places.values()} - {home}:
+        attempt(lambda folder=folder: read_config(folder))  # type: ignore[misc]
+        attempt(lambda folder=folder: stage_and_step(folder))  # type: ignore[misc]
+        attempt(lambda folder=folder: read_state(folder / "mlflow.json"))  # type: ignore[misc]
+        attempt(lambda folder=folder: _mirror(runs, folder))  # type: ignore[misc]
+    attempt(lambda: find_finished(values_of(runs, "adc", 0, 0.03)))
+    return refused
+
+
+def _mirror(runs: Path, folder: Path) -> None:
+    record = TrackedFiles(runs, folder, read_config(folder))
+    assert record.params()
+    assert record.tags()
+    record.sweep()
+    list(record.curves({}))
+    results = record.results()
+    if results is not None:
+        record.summary(results, 2, False)
+
+
+class Noticed(logging.Handler):
+    """Counts warnings, which are lines."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.count = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        assert len(record.getMessage().splitlines()) == 1
+        self.count += 1
+
+
+def main(folder: Path, first: int, count: int, only: str | None) -> None:
+    """Try the cases; the number of the present one stands in ``FOLDER/current``."""
+    runs = folder / "runs"
+    shutil.rmtree(runs, ignore_errors=True)
+    places = write_original(runs)
+    queue.read_queue = lambda users: {}  # Slurm has no part in this, and may take its time
+    warnings = Noticed()
+    logging.getLogger("gsbench").addHandler(warnings)
+    logging.getLogger("gsbench").propagate = False
+    assert look(runs, places) == 0
+    assert warnings.count == 0
+    found: Counter[str] = Counter()
+    kinds: Counter[str] = Counter()
+    for case in range(first, first + count):
+        rng = Random(case)
+        name = only or NAMES[case % len(NAMES)]
+        path = places[name]
+        sound, stamp = path.read_bytes(), path.stat()
+        kinds[damage(path, sound, rng)] += 1
+        (folder / "current").write_text(f"{case} {name}")
+        started, warnings.count = time.perf_counter(), 0
+        noticed = look(runs, places) + warnings.count
+        taken = time.perf_counter() - started
+        assert taken < SLOW_SECONDS, f"took {taken:.0f} s"
+        found["noticed" if noticed else "read"] += 1
+        if path.is_dir() and not path.is_symlink():
+            path.rmdir()
+        else:
+            path.unlink(missing_ok=True)
+        path.write_bytes(sound)
+        os.utime(path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    of = ", ".join(f"{number} {kind}" for kind, number in sorted(kinds.items()))
+    print(f"{count} cases: {found['noticed']} noticed, {found['read']} read as sound ({of})")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4] if len(sys.argv) > 4 else None)

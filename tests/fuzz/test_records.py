@@ -1,0 +1,97 @@
+"""Damaged files of a runs folder cost themselves, never the rest: no crash, no hang, one line that names the file."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import gsbench
+from gsbench import cli
+from tests.fuzz.records import EXPERIMENT, NAMES, write_original
+
+ROOT = Path(__file__).resolve().parents[2]
+CASES = 15 * 20  # in CI; `python -m tests.fuzz.records FOLDER 0 10000` tries more
+DEEP = b"[" * 100_000
+DAMAGES = {
+    "deep": DEEP,
+    "long integer": b'{"status": ' + b"9" * 5000 + b"}",
+    "infinite": b'{"status": "complete", "seed": 1e400}',
+    "null": b"null",
+    "empty object": b"{}",
+    "list": b"[]",
+    "number": b"17",
+    "binary": bytes(range(256)),
+    "empty": b"",
+}
+
+
+def test_damaged_files_are_left_out_or_read_right(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tests.fuzz.records", str(tmp_path), "0", str(CASES)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
+    case = (tmp_path / "current").read_text()
+    assert done.returncode == 0, f"case {case}: {done.stderr[-2000:]}"
+    assert done.stdout.startswith(f"{CASES} cases: ")
+
+
+@pytest.fixture
+def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
+    monkeypatch.setattr("gsbench.launch.queue.read_queue", lambda users: {})
+    return write_original(tmp_path)
+
+
+@pytest.mark.parametrize("damage", [*DAMAGES, "fifo", "folder"])
+@pytest.mark.parametrize("name", ["results.json", "inputs.json", "plan.json", "config.yaml", "metrics.jsonl"])
+def test_the_verbs_say_one_line_for_a_damaged_file(
+    name: str, damage: str, places: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = places[name]
+    if damage in DAMAGES:
+        path.write_bytes(DAMAGES[damage])
+    else:
+        path.unlink()
+        (os.mkfifo if damage == "fifo" else os.mkdir)(path)
+    for argv in (["tables", EXPERIMENT], ["status", EXPERIMENT], ["status"], ["tables", EXPERIMENT, "--format=trials"]):
+        assert cli.run(argv) in (0, 1)
+        captured = capsys.readouterr()
+        assert "Traceback" not in captured.err + captured.out
+        assert sum(line.startswith("left out") for line in captured.err.splitlines()) <= 2
+        if argv[0] == "tables":
+            assert "psnr" in captured.out.lower()
+            if name in ("results.json", "inputs.json"):
+                assert name in captured.err
+    assert cli.run(["explain", f"{EXPERIMENT}:courtyard:psnr:adc"]) == 0
+
+
+def test_every_kind_of_file_is_among_the_damaged(places: dict[str, Path]) -> None:
+    assert set(places) == set(NAMES)
+
+
+# What is ours to read goes through the typed readers; what these files read is somebody else's or their own process's.
+READS_ITSELF = {
+    "analysis/paper.py", "analysis/published/__init__.py", "datasets/catalog.py", "datasets/plan.py",  # of the package
+    "claims/file.py",  # what a user writes by hand
+    "claims/here.py", "launch/batch.py", "system/isolate.py", "init/base.py",  # text of this very process
+    "datasets/records.py",  # beside data sets, not in the runs folder
+    "scene/load.py",  # in the store's views, made anew where it is damaged
+    "parsing.py",
+}  # fmt: skip
+LOADERS = {("json", "loads"), ("json", "load"), ("yaml", "load"), ("yaml", "safe_load"), ("yaml", "full_load")}
+
+
+def test_no_file_of_ours_is_parsed_beside_its_reader() -> None:
+    package = Path(gsbench.__file__).parent
+    found = set()
+    for path in package.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                if (node.value.id, node.attr) in LOADERS:
+                    found.add(path.relative_to(package).as_posix())
+            if isinstance(node, ast.ImportFrom) and node.module in ("json", "yaml"):
+                assert not {alias.name for alias in node.names} & {name for _, name in LOADERS}, path
+    assert found == READS_ITSELF

@@ -1,0 +1,210 @@
+"""Points that owe nothing to test photographs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.init import MODEL_FOLDER, Dataset, Initializer, Sfm, SiftKornia, read_cloud
+from gsbench.init.base import REPORT_FILE, PointsFrom
+from gsbench.init.colmap.training_points import track_matches
+from gsbench.pipeline.components import options_of
+from gsbench.scene.colmap import read_model
+from gsbench.scene.types import Capture
+
+
+def quick_sfm(**options: Any) -> Sfm:
+    """SIFT on the pictures as they are, with few features: this is not about good points."""
+    return Sfm(**({"threads": 1, "first_octave": 0, "max_num_features": 1500} | options))
+
+
+@pytest.fixture(scope="module")
+def with_points(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """The courtyard with a model whose points all views made, its images numbered against their names."""
+    folder = tmp_path_factory.mktemp("points")
+    quick_sfm().run(courtyard, folder)
+    model, turned = read_model(folder / MODEL_FOLDER), pycolmap.Reconstruction()
+    camera = next(iter(model.cameras.values()))
+    turned.add_camera_with_trivial_rig(camera)
+    ids = {image_id: 100 - image_id for image_id in model.images}
+    for image_id, image in model.images.items():
+        points = np.array([point.xy for point in image.points2D])
+        copy = pycolmap.Image(name=image.name, keypoints=points, camera_id=camera.camera_id, image_id=ids[image_id])
+        turned.add_image_with_trivial_frame(copy, image.cam_from_world())
+    for point in model.points3D.values():
+        elements = [pycolmap.TrackElement(ids[e.image_id], e.point2D_idx) for e in point.track.elements]
+        turned.add_point3D(point.xyz, pycolmap.Track(elements), point.color)
+    (folder / "turned").mkdir()
+    turned.write_binary(folder / "turned")
+    return replace(courtyard, model=folder / "turned")
+
+
+def seen_by(model: pycolmap.Reconstruction) -> list[set[str]]:
+    return [
+        {model.images[element.image_id].name for element in point.track.elements} for point in model.points3D.values()
+    ]
+
+
+def poses(folder: Path) -> dict[str, bytes]:
+    model = read_model(folder / MODEL_FOLDER)
+    return {image.name: image.cam_from_world().matrix().tobytes() for image in model.images.values()}
+
+
+def test_dataset_keeps_what_two_training_views_see(with_points: Capture, tmp_path: Path) -> None:
+    before = read_model(with_points.model)  # type: ignore[arg-type]
+    train, test = set(with_points.train_names), set(with_points.test_names)
+    wanted = sorted(  # two features at one place, of unlike orientation, may be two points there
+        point.xyz.tobytes()
+        for point, names in zip(before.points3D.values(), seen_by(before), strict=True)
+        if len(names & train) >= 2
+    )
+    assert len(wanted) < before.num_points3D(), "else nothing is tested"
+    report = Dataset(points_from="train").run(with_points, tmp_path)
+    after = read_model(tmp_path / MODEL_FOLDER)
+    assert sorted(point.xyz.tobytes() for point in after.points3D.values()) == wanted
+    assert not any(names & test for names in seen_by(after))
+    assert all(len(names) >= 2 for names in seen_by(after))
+    assert len(after.images) == len(before.images), "test views keep their cameras"
+    points = report.training_points
+    assert points is not None
+    assert (points.choice, points.kept, points.of) == ("train", len(wanted), before.num_points3D())
+    assert points.taken == pytest.approx(1 - len(wanted) / before.num_points3D())
+    said = json.loads((tmp_path / REPORT_FILE).read_text())["training_points"]
+    assert said["taken"] == points.taken
+    assert not (tmp_path / "work").exists()
+
+
+def test_colours_come_from_training_photographs(with_points: Capture, tmp_path: Path) -> None:
+    """Each is the mean of the photographs at its observations, here interpolated anew."""
+    Dataset(points_from="train").run(with_points, tmp_path)
+    model = read_model(tmp_path / MODEL_FOLDER)
+    pictures = {
+        name: np.asarray(Image.open(with_points.images / name)).astype(float) for name in with_points.image_names
+    }
+    for point in list(model.points3D.values())[::50]:
+        samples = []
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            x, y = image.points2D[element.point2D_idx].xy - 0.5
+            column, row = int(np.floor(x)), int(np.floor(y))
+            picture, dx, dy = pictures[image.name], x - np.floor(x), y - np.floor(y)
+            samples.append(
+                (1 - dy) * ((1 - dx) * picture[row, column] + dx * picture[row, column + 1])
+                + dy * ((1 - dx) * picture[row + 1, column] + dx * picture[row + 1, column + 1])
+            )
+        np.testing.assert_allclose(point.color, np.mean(samples, axis=0), atol=1.0)
+
+
+def test_retriangulated_points_are_near_the_first_ones_and_have_training_observations_alone(
+    with_points: Capture, tmp_path: Path
+) -> None:
+    report = Dataset(points_from="retriangulated").run(with_points, tmp_path)
+    model, test = read_model(tmp_path / MODEL_FOLDER), set(with_points.test_names)
+    assert report.training_points is not None
+    assert 0 < report.training_points.taken < 0.6  # type: ignore[operator]
+    assert not any(names & test for names in seen_by(model))
+    assert poses(tmp_path).keys() == set(with_points.image_names)
+    first = read_cloud_of(with_points)
+    cloud = read_cloud(tmp_path / MODEL_FOLDER).points
+    nearest = [float(np.linalg.norm(first - point, axis=1).min()) for point in cloud[::20]]
+    assert np.median(nearest) < 0.02  # m, in a yard of 10 m
+    assert model.compute_mean_reprojection_error() < 1.0
+
+
+def read_cloud_of(capture: Capture) -> np.ndarray:
+    return np.array([point.xyz for point in read_model(capture.model).points3D.values()])  # type: ignore[arg-type]
+
+
+def test_matches_of_tracks_are_all_pairs_of_a_tracks_training_views(with_points: Capture) -> None:
+    model = read_model(with_points.model)  # type: ignore[arg-type]
+    train = set(with_points.train_names)
+    expected: dict[tuple[int, int], set[tuple[int, int]]] = {}
+    for point in model.points3D.values():
+        elements = sorted((e.image_id, e.point2D_idx) for e in point.track.elements)
+        elements = [(i, k) for i, k in elements if model.images[i].name in train]
+        for place, (one, k) in enumerate(elements):
+            for other, m in elements[place + 1 :]:
+                expected.setdefault((one, other), set()).add((k, m))
+    found = track_matches(model, train)
+    assert {pair: {(int(k), int(m)) for k, m in rows} for pair, rows in found.items()} == expected
+    assert track_matches(model, []) == {}
+
+
+def with_noise(capture: Capture, folder: Path) -> Capture:
+    """The capture with its test photographs replaced by noise."""
+    shutil.copytree(capture.images, folder)
+    rng = np.random.default_rng(0)
+    for name in capture.test_names:
+        width, height = Image.open(folder / name).size
+        Image.fromarray(rng.integers(0, 256, (height, width, 3), dtype=np.uint8)).save(folder / name)
+    return replace(capture, images=folder)
+
+
+MAKERS: dict[str, Callable[[PointsFrom], Initializer]] = {
+    "sfm": lambda choice: quick_sfm(points_from=choice),
+    "sift_kornia": lambda choice: SiftKornia(points_from=choice, max_keypoints=1024, threads=1),
+    "dataset": lambda choice: Dataset(points_from=choice),
+}
+
+
+@pytest.mark.parametrize("choice", ["train", "retriangulated"])
+@pytest.mark.parametrize(
+    "name",
+    ["sfm", "dataset", pytest.param("sift_kornia", marks=pytest.mark.slow)],  # the path of dim, without weights
+)
+def test_not_one_bit_of_a_test_photograph_is_in_the_cloud(
+    with_points: Capture, tmp_path: Path, name: str, choice: PointsFrom
+) -> None:
+    clouds = []
+    for capture, place in ((with_points, "a"), (with_noise(with_points, tmp_path / "noise"), "b")):
+        MAKERS[name](choice).run(capture, tmp_path / place)
+        cloud = read_cloud(tmp_path / place / MODEL_FOLDER)
+        assert len(cloud) > 100
+        clouds.append((cloud.points.tobytes(), cloud.colors.tobytes(), poses(tmp_path / place)))
+    assert clouds[0] == clouds[1]
+
+
+def test_noise_would_be_seen_in_points_from_all(with_points: Capture, tmp_path: Path) -> None:
+    clouds = []
+    for capture, place in ((with_points, "a"), (with_noise(with_points, tmp_path / "noise"), "b")):
+        MAKERS["sfm"]("all").run(capture, tmp_path / place)
+        clouds.append(read_cloud(tmp_path / place / MODEL_FOLDER).points.tobytes())
+    assert clouds[0] != clouds[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("choice", ["train", "retriangulated"])
+def test_estimated_cameras_keep_all_views_and_points_of_training_views(
+    bare_photos: Capture, tmp_path: Path, choice: PointsFrom
+) -> None:
+    capture = replace(bare_photos, test_names=bare_photos.image_names[3:5])
+    report = Sfm(points_from=choice, threads=1).run(capture, tmp_path)
+    model, test = read_model(tmp_path / MODEL_FOLDER), set(capture.test_names)
+    assert report.num_registered == len(capture.image_names)
+    assert not any(names & test for names in seen_by(model))
+    points = report.training_points
+    assert points is not None
+    assert points.of is not None
+    assert points.kept == model.num_points3D() < points.of
+
+
+def test_without_two_training_views_nothing_is_left(with_points: Capture, tmp_path: Path) -> None:
+    lonely = replace(with_points, test_names=with_points.image_names[1:])
+    with pytest.raises(InputError, match=r"init\.points_from=train: no point is left"):
+        Dataset(points_from="train").run(lonely, tmp_path)
+
+
+def test_the_choice_of_before_has_no_part_in_a_key() -> None:
+    for made in (Sfm, SiftKornia, Dataset):
+        assert "points_from" not in options_of("init", made())
+        assert options_of("init", made(points_from="train"))["points_from"] == "train"

@@ -1,0 +1,41 @@
+"""Where entered renders may stand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gsbench.errors import InputError
+from gsbench.renders.import_renders import Place, find_place
+from gsbench.renders.reference_images import Truth
+
+COURTYARD = Truth({}, "the test views of a trial", "0" * 64, (96, 72), {}, "courtyard", "sfm")
+FOLDER = Truth({}, "the pictures in a folder", "0" * 64, (96, 72), {})
+
+
+@pytest.mark.parametrize(
+    ("word", "scene", "seed", "truth", "said"),
+    [
+        ("table1:mine", "garden", 0, COURTYARD, r"--scene garden: the photographs are .* of the scene courtyard"),
+        ("table1:mine", None, -1, COURTYARD, "--seed -1: must be 0 or more"),
+        ("table1:mine", "../x", 0, FOLDER, r"--scene \.\./x: must be a plain folder name"),
+        ("table1:mine", None, 0, FOLDER, "give it with --scene"),
+        ("store:arm", None, 0, COURTYARD, "store is gsbench's own folder"),
+        ("Store:arm", None, 0, COURTYARD, "Store is gsbench's own folder"),
+        ("mlartifacts:arm", None, 0, COURTYARD, "mlartifacts is gsbench's own folder"),
+        (".jobs:arm", None, 0, COURTYARD, "is not EXPERIMENT:ARM"),
+    ],
+)
+def test_places_that_would_mix_or_damage_results_are_refused(
+    word: str, scene: str | None, seed: int, truth: Truth, said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=said):
+        find_place(word, scene, seed, truth, tmp_path)
+
+
+def test_the_scene_may_be_named_again(tmp_path: Path) -> None:
+    wanted = Place("table1", "courtyard", "sfm", "mine", 3)
+    assert find_place("table1:mine", "courtyard", 3, COURTYARD, tmp_path) == wanted
+    assert find_place("table1:mine", None, 3, COURTYARD, tmp_path) == wanted
+    assert find_place("table1:mine", "garden", 3, FOLDER, tmp_path).scene == "garden"

@@ -1,0 +1,195 @@
+"""The same renders under the conventions of others, and what of the difference each convention makes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from gsbench.analysis.results import load_experiment
+from gsbench.analysis.table_formats import to_markdown
+from gsbench.analysis.tables import build_table
+from gsbench.analysis.translations import by_protocol
+from gsbench.cli import run
+from gsbench.errors import InputError
+from gsbench.eval.evaluator import Evaluator, quantize
+from gsbench.eval.protocol import OTHERS, PAPER, STANDARD, Protocol
+from gsbench.renders.translate import Material, Pictures, in_words, translate
+from gsbench.runs.layout import PROTOCOLS
+
+SIZE = (60, 80)
+
+
+def pictures(seed: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """(renders before rounding, photographs by one filter, by another): three views each."""
+    rng = np.random.default_rng(seed)
+    exact, one, other = {}, {}, {}
+    for view in ("a.png", "b.png", "c.png"):
+        large = rng.integers(0, 256, (SIZE[0] * 3, SIZE[1] * 3, 3), dtype=np.uint8)
+        image = Image.fromarray(large)
+        size = (SIZE[1], SIZE[0])
+        one[view] = np.asarray(image.resize(size, Image.Resampling.LANCZOS))
+        other[view] = np.asarray(image.resize(size, Image.Resampling.BICUBIC))
+        noise = rng.normal(0, 0.05, (*SIZE, 3))
+        exact[view] = np.clip(one[view] / 255 + noise, 0, 1).astype(np.float32)
+    return exact, one, other
+
+
+def material(exact: dict[str, np.ndarray], one: Pictures, other: Pictures) -> Material:
+    renders = {view: quantize(torch.from_numpy(image)).numpy() for view, image in exact.items()}
+    return Material(renders, one, lambda: exact, lambda protocol: other if protocol.shrinking == "bicubic" else one)
+
+
+def plain(protocol: Protocol) -> Evaluator:
+    return Evaluator(protocol, lpips=(), flip=False)
+
+
+def test_each_protocol_measures_as_its_program_does() -> None:
+    """scikit-image's PSNR and SSIM of the pictures that each program would compare."""
+    exact, one, other = pictures(0)
+    source = material(exact, one, other)
+    rounded = {view: np.floor(image.astype(np.float64) * 255 + 0.5) / 255 for view, image in exact.items()}
+    expected = {  # renders, photographs, SSIM over the inside alone
+        "3dgs": (rounded, other, False), "gsplat": (exact, other, True), "nerfbaselines": (rounded, other, True),
+        "nerfstudio": (exact, other, True), "mipnerf360": (rounded, one, True),
+    }  # fmt: skip
+    assert expected.keys() == OTHERS.keys()
+    for name, (renders, photographs, inside) in expected.items():
+        found = translate(source, PAPER, OTHERS[name], plain)
+        truths = {view: photograph / 255 for view, photograph in photographs.items()}
+        psnr = [peak_signal_noise_ratio(truths[v], np.float64(renders[v]), data_range=1) for v in renders]
+        assert found.metrics["psnr"] == pytest.approx(np.mean(psnr), abs=1e-4), name
+        ssim = [
+            structural_similarity(
+                truths[v], np.float64(renders[v]), channel_axis=2, data_range=1, gaussian_weights=True, sigma=1.5,
+                use_sample_covariance=False,
+            )
+            for v in renders
+        ]  # fmt: skip
+        if inside:
+            assert found.metrics["ssim"] == pytest.approx(np.mean(ssim), abs=1e-5), name
+        else:
+            assert abs(found.metrics["ssim"] - np.mean(ssim)) > 1e-4
+
+
+@pytest.mark.parametrize("base", [PAPER, STANDARD])
+@pytest.mark.parametrize("name", OTHERS)
+def test_shares_add_up_to_the_difference(name: str, base: Protocol) -> None:
+    source = material(*pictures(1))
+    found = translate(source, base, OTHERS[name], plain)
+    evaluator = plain(base)
+    own = [evaluator.evaluate_view(source.renders[v], source.photographs[v]) for v in source.renders]
+    for metric in ("psnr", "ssim"):
+        before = float(np.mean([row[metric] for row in own]))
+        assert sum(found.shares[metric].values()) == pytest.approx(found.metrics[metric] - before, abs=1e-9)
+    assert set(found.shares["psnr"]) <= {"resampling", "rounding"}
+    assert ("SSIM padding" in found.shares["ssim"]) == (OTHERS[name].ssim_padding != base.ssim_padding)
+
+
+def test_what_cannot_be_followed_is_said_and_nothing_is_put_in_its_place() -> None:
+    exact, one, other = pictures(2)
+
+    def refuse(*_: object) -> Pictures:
+        raise InputError("it is not there")
+
+    source = material(exact, one, other)
+    found = translate(Material(source.renders, one, refuse, refuse), PAPER, OTHERS["gsplat"], plain)  # type: ignore[arg-type]
+    assert found.unknown == {"resampling": "it is not there", "rounding": "it is not there"}
+    assert found.shares["psnr"] == {}
+    assert set(found.shares["ssim"]) == {"SSIM padding"}
+    whole = translate(source, PAPER, OTHERS["gsplat"], plain)
+    assert whole.unknown == {}
+    assert found.metrics["psnr"] != whole.metrics["psnr"]
+    assert "resampling as it was, since it is not there" in in_words(found)
+
+
+def test_a_crop_leaves_out_the_border() -> None:
+    exact, one, _ = pictures(3)
+    view = next(iter(exact))
+    cropped = Protocol("mine", 1, True, "valid", None, crop=4)
+    found = plain(cropped).evaluate_view(exact[view], one[view])
+    inside = plain(STANDARD).evaluate_view(
+        np.ascontiguousarray(exact[view][4:-4, 4:-4]), np.ascontiguousarray(one[view][4:-4, 4:-4])
+    )
+    assert found == pytest.approx(inside)
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A trial of the courtyard whose photographs were shrunk."""
+    home = tmp_path_factory.mktemp("home")
+    words = [
+        "scene=courtyard", "scene.views=12", "scene.width=160", "scene.height=120", "scene.max_size=80", "init=random",
+        "init.count=2000", "init.size=1.2", "densify=none", "train.iterations=150", "eval.lpips=[]", "eval.flip=false",
+        "tracking=none", "device=cpu", "name=small", f"runs={home / 'runs'}",
+    ]  # fmt: skip
+    assert run(words) == 0
+    return home
+
+
+def test_trials_are_measured_by_all_and_shown_by_one(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
+    assert run(["tables", "small", "--protocol", "gsplat"]) == 2
+    assert "gsbench evaluate small --protocol gsplat" in capsys.readouterr().err
+    assert run(["evaluate", "small", "--protocol", "all"]) == 0
+    said = capsys.readouterr().out
+    assert all(f"{name}-1: PSNR" in said for name in OTHERS)
+    assert run(["tables", "small", "--protocol", "gsplat", "--metrics", "psnr"]) == 0
+    table = capsys.readouterr().out
+    assert "Protocol gsplat-1." in table
+    assert "nerfstudio-project/gsplat 90d7b4b" in table
+    assert "resampling" in table
+    trial = load_experiment(home / "runs", "small").trials[0]
+    record = json.loads((trial.path / PROTOCOLS).read_text())["protocols"]
+    assert set(record) == {protocol.id for protocol in OTHERS.values()}
+    shares = record["gsplat-1"]["shares"]["psnr"]
+    assert record["gsplat-1"]["unknown"] == {}
+    assert abs(shares["resampling"]) > abs(shares["rounding"]) > 0
+    assert sum(shares.values()) == pytest.approx(
+        record["gsplat-1"]["metrics"]["psnr"] - trial.metrics["psnr"], abs=1e-6
+    )
+    assert record["mipnerf360-1"]["metrics"]["psnr"] == pytest.approx(trial.metrics["psnr"], abs=1e-6)
+
+
+def test_protocols_never_share_a_cell(home: Path) -> None:
+    experiment = load_experiment(home / "runs", "small")
+    run(["evaluate", "small", "--protocol", "gsplat", "--json"])
+    translated = by_protocol(experiment, "gsplat")
+    both = [*experiment.trials, *translated.trials]
+    with pytest.raises(InputError, match="protocol"):
+        build_table(experiment, both, rows=["scene"])
+    assert "gsplat-1" in to_markdown(build_table(translated))
+
+
+def test_what_was_measured_of_other_renders_is_not_shown(home: Path) -> None:
+    experiment = load_experiment(home / "runs", "small")
+    path = experiment.trials[0].path / PROTOCOLS
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps(record | {"made_of": "others"}))
+    with pytest.raises(InputError, match="was not measured by gsplat-1"):
+        by_protocol(experiment, "gsplat")
+    path.write_text(json.dumps(record))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["renders"], "--truth is not given"),
+        (["small", "--protocol", "all", "--truth", "small:courtyard:none"], "take no --truth"),
+        (["small", "--protocol", "all", "eval.flip=true"], "as they were made"),
+        (["renders", "--protocol", "gsplat", "--truth", "small:courtyard:none"], "with --as EXPERIMENT:ARM, then"),
+    ],
+)
+def test_wrong_words_are_refused(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
+    assert run(["evaluate", *words]) == 2
+    assert message in capsys.readouterr().err

@@ -1,0 +1,143 @@
+"""Which views are held out, by each way of `scene.split`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsbench.config.compose import compose_one
+from gsbench.errors import InputError
+from gsbench.runs.hashing import LATER, config_hash
+from gsbench.scene.camera import Camera
+from gsbench.scene.hold_out import hold_out
+from gsbench.scene.options import SceneConfig
+from gsbench.scene.readers import read_colmap, read_photos
+from gsbench.scene.split import SplitRule
+from tests.scene.test_sectors import ring
+
+NAMES = [f"{k:02d}.png" for k in range(24)]
+
+
+def cameras(names: Sequence[str]) -> list[Camera]:
+    return ring([15.0 * int(name[:2]) for name in names])
+
+
+def test_every_nth_is_what_it_was() -> None:
+    found = hold_out(NAMES, SplitRule())
+    assert found.test == ("00.png", "08.png", "16.png")
+    assert (found.words, found.put_away) == ("every 8th image", ())
+
+
+def test_a_sector_is_contiguous_and_walks_around() -> None:
+    rule = SplitRule(split="sector", sectors=4)
+    parts = [hold_out(NAMES, replace(rule, sector=part), cameras=cameras).test for part in range(4)]
+    assert parts[0] == tuple(NAMES[:6])
+    assert [name for part in parts for name in part] == NAMES
+    assert "part 0 of 4 by azimuth" in hold_out(NAMES, rule, cameras=cameras).words
+
+
+@given(st.integers(9, 24), st.integers(2, 8), st.integers(0, 1))
+def test_matched_splits_leave_equally_many_views(count: int, sectors: int, sector: int) -> None:
+    rule = SplitRule(match_views=True, sectors=sectors, sector=sector)
+    spread = hold_out(NAMES[:count], rule, cameras=cameras)
+    part = hold_out(NAMES[:count], replace(rule, split="sector"), cameras=cameras)
+    assert len(spread.train) == len(part.train) == count - count // sectors
+    for found in (spread, part):
+        assert sorted([*found.train, *found.test]) == NAMES[:count]
+    steps = np.diff([NAMES.index(name) for name in spread.test])
+    assert len(steps) == 0 or steps.max() - steps.min() <= 1, "spread evenly"
+
+
+@pytest.mark.parametrize("split", ["every_nth", "sector"])
+def test_validation_puts_the_test_views_away_and_asks_the_same_of_the_rest(split: str) -> None:
+    rule = SplitRule(split=split, sectors=4, test_every=4)  # type: ignore[arg-type]
+    test = hold_out(NAMES, rule, cameras=cameras).test
+    found = hold_out(NAMES, replace(rule, validation=True), cameras=cameras)
+    assert found.put_away == test
+    assert not set(test) & {*found.train, *found.test}
+    assert sorted([*found.train, *found.test, *test]) == NAMES
+    if split == "sector":  # the part beside the one put away
+        assert found.test == tuple(NAMES[6:10])
+
+
+def test_validation_of_lists_takes_every_nth_of_the_training_list() -> None:
+    rule = SplitRule(split="list", validation=True, test_every=5)
+    found = hold_out(NAMES, rule, lists=(NAMES[4:], NAMES[:4]))
+    assert found.put_away == tuple(NAMES[:4])
+    assert found.test == tuple(NAMES[4::5])
+
+
+def test_a_put_away_view_is_no_part_of_the_capture(make_scene: Callable[..., Path]) -> None:
+    root = make_scene(names=NAMES[:9])
+    plain, judged = (read_colmap("toy", root, split=SplitRule(test_every=3, validation=v)) for v in (False, True))
+    assert plain.test_names == ("00.png", "03.png", "06.png")
+    assert judged.image_names == tuple(name for name in NAMES[:9] if name not in plain.test_names)
+    assert judged.test_names == ("01.png", "05.png")
+    fingerprint = judged.fingerprint
+    (root / "images" / "00.png").write_bytes((root / "images" / "01.png").read_bytes())
+    assert read_colmap("toy", root, split=SplitRule(test_every=3, validation=True)).fingerprint == fingerprint
+    assert read_colmap("toy", root, split=SplitRule(test_every=3)).fingerprint != plain.fingerprint
+
+
+def test_sectors_of_a_folder_use_its_cameras_under_other_file_names(make_scene: Callable[..., Path]) -> None:
+    root = make_scene(names=NAMES[:8])
+    for name in NAMES[:8]:
+        (root / "images" / name).rename(root / "images" / f"{name[:2]}.jpg")
+    capture = read_colmap("toy", root, split=SplitRule(split="sector", sectors=4, sector=3))
+    assert capture.test_names == ("06.jpg", "07.jpg")
+    assert "one direction" in capture.held_out
+
+
+def test_lists_of_nerfbaselines_are_found_by_their_names(make_scene: Callable[..., Path]) -> None:
+    root = make_scene(names=NAMES[:8])
+    with pytest.raises(InputError, match=r"neither train_list\.txt nor test_list\.txt"):
+        read_colmap("toy", root, split=SplitRule(split="list"))
+    (root / "train_list.txt").write_text("\n".join(NAMES[2:7]) + "\n")
+    (root / "test_list.txt").write_text("\n".join(NAMES[:2]))
+    for read in (read_colmap, read_photos):
+        capture = read("toy", root, split=SplitRule(split="list"))
+        assert capture.test_names == tuple(NAMES[:2])
+        assert capture.train_names == tuple(NAMES[2:7])
+    assert read_colmap("toy", root).test_names == ("00.png",), "lists that nobody named hold out nothing"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"split": "matched"}, r"sweep it, as in -m scene\.split=every_nth,sector scene\.match_views=true"),
+        ({"sector": 8}, "the last is 7"),
+        ({"split": "sector", "test_list": "a.txt"}, "both say"),
+        ({"split": "list", "match_views": True}, "cannot be matched"),
+        ({"train_list": "a.txt", "match_views": True}, "cannot be matched"),
+        ({"split": "sector", "kind": "photos"}, "needs the cameras"),
+        ({"split": "random"}, "scene.split"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused(settings: dict[str, str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        SceneConfig(**({"name": "a", "kind": "colmap", "path": "/a"} | settings))  # type: ignore[arg-type]
+
+
+def test_too_many_sectors_and_photographs_without_cameras_are_refused() -> None:
+    with pytest.raises(InputError, match=r"scene\.sectors=8 are more than the 5 images"):
+        hold_out(NAMES[:5], SplitRule(split="sector"), cameras=cameras)
+    with pytest.raises(InputError, match="needs the cameras"):
+        hold_out(NAMES, SplitRule(split="sector"))
+
+
+def test_later_settings_have_no_part_in_a_hash_at_the_value_of_before() -> None:
+    values = compose_one(["scene=garden", "scene.path=photos", "init=sfm"]).values
+    before = values | {
+        group: {key: value for key, value in values[group].items() if key not in LATER[group]} for group in LATER
+    }
+    assert {key: values["scene"][key] for key in LATER["scene"]} == LATER["scene"]
+    assert config_hash(values) == config_hash(before)
+    for key, value in {"split": "sector", "sector": 1, "sectors": 4, "match_views": True, "validation": True}.items():
+        changed = values | {"scene": values["scene"] | {key: value}}
+        assert config_hash(changed) != config_hash(values)

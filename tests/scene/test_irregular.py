@@ -1,0 +1,203 @@
+"""Captures that hold what is no photograph: pipes, devices, links in circles, other formats, names of any length."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from gsbench.errors import InputError
+from gsbench.gaussians.ply import check_ply, read_ply
+from gsbench.init.colmap.pairs import gps_positions
+from gsbench.init.point_files import read_points, read_similarity
+from gsbench.scene.colmap import read_model
+from gsbench.scene.images import IMAGE_SUFFIXES, exif_orientation, image_size, read_image
+from gsbench.scene.names import check_picture_names
+from gsbench.scene.readers import fingerprint, list_images, read_photos
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and links of a POSIX system")
+SECONDS = 20
+
+
+@pytest.fixture(autouse=True)
+def limit() -> Iterator[None]:
+    """A hang is an error."""
+
+    def stop(signum: int, frame: object) -> None:
+        raise AssertionError("it hangs")
+
+    earlier = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(SECONDS)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, earlier)
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for name in ("a.png", "b.png", "c.png"):
+        Image.fromarray(np.full((6, 8, 3), ord(name[0]), np.uint8)).save(folder / name)
+    return folder
+
+
+def odd_files(folder: Path, suffix: str) -> list[Path]:
+    """A pipe, a device that never ends, and a link to each."""
+    os.mkfifo(folder / f"pipe{suffix}")
+    (folder / f"zero{suffix}").symlink_to("/dev/zero")
+    (folder / f"link{suffix}").symlink_to(folder / f"pipe{suffix}")
+    return [folder / f"{name}{suffix}" for name in ("pipe", "zero", "link")]
+
+
+READERS: list[tuple[str, Callable[[Path], object]]] = [
+    (".png", read_image),
+    (".jpg", image_size),
+    (".tif", exif_orientation),
+    (".png", lambda path: fingerprint(path.parent, [path.name])),
+    (".ply", read_ply),
+    (".ply", check_ply),
+    (".ply", read_points),
+    (".npy", read_points),
+    (".txt", read_points),
+    (".txt", read_similarity),
+    (".txt", lambda path: read_photos("x", path.parent, images="images", test_list=str(path))),
+]
+
+
+@pytest.mark.parametrize(("suffix", "read"), READERS)
+def test_pipes_and_devices_are_refused(
+    suffix: str, read: Callable[[Path], object], tmp_path: Path, photos: Path
+) -> None:
+    for path in odd_files(tmp_path, suffix):
+        with pytest.raises(InputError, match="is no regular file"):
+            read(path)
+
+
+def test_a_pipe_among_photographs_is_named(photos: Path, tmp_path: Path) -> None:
+    os.mkfifo(photos / "d.png")
+    with pytest.raises(InputError, match=r"d\.png is no regular file"):
+        read_photos("x", tmp_path)
+
+
+def test_a_pipe_is_no_file_of_a_model(tmp_path: Path) -> None:
+    for stem in ("cameras", "images", "points3D"):
+        os.mkfifo(tmp_path / f"{stem}.bin")
+    with pytest.raises(InputError, match="no COLMAP model here"):
+        read_model(tmp_path)
+
+
+def test_links_in_a_circle_are_followed_once(photos: Path) -> None:
+    for name in ("a", "b"):
+        (photos / name).symlink_to(".")
+    (photos / "inner").mkdir()
+    (photos / "inner" / "up").symlink_to("../..")
+    assert list_images(photos) == ["a.png", "b.png", "c.png"]
+
+
+def test_a_folder_goes_by_its_own_name_and_a_linked_one_by_the_link(photos: Path, tmp_path: Path) -> None:
+    (photos / "z").mkdir()
+    (photos / "a.png").rename(photos / "z" / "a.png")
+    (photos / "alias").symlink_to("z")
+    (tmp_path / "outside").mkdir()
+    (photos / "b.png").rename(tmp_path / "outside" / "b.png")
+    (photos / "far").symlink_to(tmp_path / "outside")
+    (photos / ".hidden").mkdir()
+    (photos / ".hidden" / "d.png").touch()
+    assert list_images(photos) == ["c.png", "far/b.png", "z/a.png"]
+
+
+def test_a_dangling_link_is_named(photos: Path, tmp_path: Path) -> None:
+    (photos / "d.png").symlink_to("nowhere.png")
+    with pytest.raises(InputError, match=r"d\.png"):
+        read_photos("x", tmp_path)
+
+
+@pytest.mark.parametrize("form", ["DDS", "JPEG2000", "GIF", "ICNS", "PPM", "TGA", "PCX", "SGI", "PDF", "EPS"])
+def test_other_formats_are_refused_whatever_their_name(form: str, tmp_path: Path) -> None:
+    Image.new("RGB", (16, 16)).save(tmp_path / "a.bin", format=form)
+    for suffix in IMAGE_SUFFIXES:
+        path = tmp_path / f"a{suffix}"
+        path.write_bytes((tmp_path / "a.bin").read_bytes())
+        with pytest.raises(InputError, match="not a readable image"):
+            read_image(path)
+
+
+@pytest.mark.parametrize("form", ["JPEG", "PNG", "WEBP", "TIFF", "BMP", "MPO"])
+def test_the_formats_of_photographs_are_read_whatever_their_name(form: str, tmp_path: Path) -> None:
+    Image.new("RGB", (16, 12)).save(tmp_path / "a.jpg", format=form)
+    assert read_image(tmp_path / "a.jpg").shape == (12, 16, 3)
+
+
+@pytest.mark.parametrize(
+    "exif", [b"Exif\0\0" + bytes(range(200)), b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + bytes(20), b"Exif"]
+)
+def test_a_damaged_exif_is_as_none(exif: bytes, tmp_path: Path) -> None:
+    Image.new("RGB", (16, 12)).save(tmp_path / "a.jpg", exif=exif)
+    assert exif_orientation(tmp_path / "a.jpg") == 1
+    assert gps_positions([tmp_path / "a.jpg"]) is None
+    assert read_image(tmp_path / "a.jpg").shape == (12, 16, 3)
+
+
+def test_positions_that_are_no_numbers_are_as_none(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8825).update({1: "N", 2: (1.0, 2.0, 3.0), 3: "E", 4: (1.0, 2.0, 3.0), 6: IFDRational(0, 0)})
+    Image.new("RGB", (16, 12)).save(tmp_path / "a.jpg", exif=exif)
+    assert gps_positions([tmp_path / "a.jpg"]) is None
+
+
+def test_names_that_make_no_file_name_are_refused_before_any_work(photos: Path, tmp_path: Path) -> None:
+    long = "ä" * 120 + ".png"  # 244 bytes
+    (photos / "a.png").rename(photos / long)
+    with pytest.raises(InputError, match="a name of more than 220 bytes"):
+        read_photos("x", tmp_path, test_every=1 + 1)
+    with pytest.raises(InputError, match=r"the pictures of a/b\.png and a__b\.jpg would both be a__b\.png"):
+        check_picture_names(["a/b.png", "a__b.jpg"], photos)
+    check_picture_names(["a/b.png", "a/c.png"], photos)
+
+
+@pytest.mark.parametrize("kind", ["binary", "text"])
+@pytest.mark.parametrize("file", ["frames", "rigs", "images"])
+@pytest.mark.parametrize("length", [1.001, 2.0, 0.01])
+def test_quaternions_of_any_length_are_rotations(kind: str, file: str, length: float, tmp_path: Path) -> None:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_frames_per_rig, options.num_points3D, options.num_cameras_per_rig = 3, 12, 2
+    options.sensor_from_rig_rotation_stddev = 5.0
+    model = pycolmap.synthesize_dataset(options)
+    model.write_text(tmp_path)
+    lines = (tmp_path / f"{file}.txt").read_text().split("\n")
+    first = next(number for number, line in enumerate(lines) if line and not line.startswith("#"))
+    words, at = lines[first].split(), {"frames": 2, "rigs": 7, "images": 1}[file]
+    words[at : at + 4] = [repr(float(word) * length) for word in words[at : at + 4]]
+    lines[first] = " ".join(words)
+    (tmp_path / f"{file}.txt").write_text("\n".join(lines))
+    if kind == "binary":
+        scaled = pycolmap.Reconstruction(tmp_path)
+        for path in tmp_path.iterdir():
+            path.unlink()
+        scaled.write_binary(tmp_path)
+    read = read_model(tmp_path)
+    for image_id, image in model.images.items():
+        found = read.images[image_id].cam_from_world().matrix()
+        np.testing.assert_allclose(found, image.cam_from_world().matrix(), atol=1e-9)
+
+
+def test_a_rig_whose_sensor_has_no_rotation_is_refused(tmp_path: Path) -> None:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_frames_per_rig, options.num_points3D, options.num_cameras_per_rig = 3, 12, 2
+    pycolmap.synthesize_dataset(options).write_text(tmp_path)
+    rigs = (tmp_path / "rigs.txt").read_text().split("\n")
+    first = next(number for number, line in enumerate(rigs) if line and not line.startswith("#"))
+    words = rigs[first].split()
+    words[7:11] = ["0"] * 4
+    rigs[first] = " ".join(words)
+    (tmp_path / "rigs.txt").write_text("\n".join(rigs))
+    with pytest.raises(InputError, match=r"rigs\.txt: a sensor of rig 1 has no pose that can be used"):
+        read_model(tmp_path)

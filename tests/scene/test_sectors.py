@@ -1,0 +1,120 @@
+"""Contiguous parts of cameras, and how far a view is from the training views."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsbench.scene.camera import Camera
+from gsbench.scene.columns import ANGLE, DISTANCE
+from gsbench.scene.courtyard.render import ring_camera
+from gsbench.scene.nearness import nearness
+from gsbench.scene.sectors import arrange, sector_of
+
+
+def looking(center: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Camera:
+    """A camera at ``center`` that looks at ``target``."""
+    forward = (target - center) / np.linalg.norm(target - center)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Camera(40, 30, 50.0, 50.0, 20.0, 15.0, rotation, -rotation @ center)
+
+
+def ring(degrees: list[float], radius: float = 3.0) -> list[Camera]:
+    angles = np.radians(degrees)
+    return [looking(np.array([radius * np.cos(a), radius * np.sin(a), 1.5]), np.zeros(3)) for a in angles]
+
+
+def turned(camera: Camera, rotation: np.ndarray, shift: np.ndarray, scale: float) -> Camera:
+    """The camera after the world was scaled, turned and shifted."""
+    world = camera.rotation @ rotation.T
+    center = scale * rotation @ camera.center + shift
+    return Camera(40, 30, 50.0, 50.0, 20.0, 15.0, world, -world @ center)
+
+
+def some_rotation(seed: int) -> np.ndarray:
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q = q @ np.diag(np.sign(np.diag(r)))
+    return q * np.sign(np.linalg.det(q))
+
+
+def is_cyclic_run(found: set[int], order: list[int]) -> bool:
+    """Whether the places of ``found`` in the cyclic ``order`` are neighbours."""
+    inside = [index in found for index in order]
+    return sum(a != b for a, b in zip(inside, inside[1:] + inside[:1], strict=True)) <= 2
+
+
+@given(st.integers(0, 99), st.integers(2, 6), st.booleans())
+def test_a_ring_is_cut_by_azimuth_whatever_its_names_and_gauge(seed: int, sectors: int, far: bool) -> None:
+    rng = np.random.default_rng(seed)
+    degrees = list(rng.permutation(np.arange(24) * 15.0))
+    rotation, shift = some_rotation(seed), np.array([5.0, -3.0, 2.0]) * (100 if far else 1)
+    cameras = [turned(camera, rotation, shift, 0.3) for camera in ring(degrees)]
+    found = arrange(cameras)
+    assert "surround" in found.words
+    assert found.order[0] == 0, "a closed ring begins at the first camera"
+    around = [int(index) for index in np.argsort(degrees)]
+    parts = [{found.order[place] for place in sector_of(24, part, sectors)} for part in range(sectors)]
+    assert sorted(index for part in parts for index in part) == list(range(24))
+    assert all(is_cyclic_run(part, around) for part in parts)
+
+
+def test_an_open_ring_begins_after_its_gap() -> None:
+    cameras = ring([100.0, 60.0, 20.0, 140.0, 180.0, 220.0, 260.0])  # nothing from 260 to 380
+    assert [round(np.degrees(np.arctan2(*cameras[k].center[1::-1])) % 360) for k in arrange(cameras).order] == [
+        20, 60, 100, 140, 180, 220, 260,
+    ]  # fmt: skip
+
+
+def test_cameras_on_one_side_are_cut_by_planes_in_order() -> None:
+    arc = ring([0.0, 20.0, 40.0, 60.0, 80.0, 100.0])
+    found = arrange(arc)
+    assert "one side" in found.words
+    assert found.order == (0, 1, 2, 3, 4, 5)
+
+
+def test_parallel_and_outward_looking_cameras_are_cut_by_planes() -> None:
+    places = [np.array([x, 0.0, 0.0]) for x in (0.0, 3.0, 1.0, 2.0)]
+    row = [looking(place, place + np.array([0.0, 5.0, 0.0])) for place in places]
+    assert "one direction" in arrange(row).words
+    assert arrange(row).order == (0, 2, 3, 1)
+    outward = [
+        looking(camera.center, 2 * camera.center - [0, 0, 1.5]) for camera in ring([0.0, 90.0, 180.0, 270.0, 45.0])
+    ]
+    assert "do not look at one place" in arrange(outward).words
+
+
+def test_an_exact_ring_is_cut_alike_whatever_the_last_digits_are() -> None:
+    cameras = [ring_camera(k * 2 * np.pi / 48, 40, 30) for k in range(48)]
+    noise = np.random.default_rng(0).normal(scale=1e-12, size=(48, 3))
+    shaken = [
+        Camera(40, 30, 50, 50, 20, 15, c.rotation, c.translation + d) for c, d in zip(cameras, noise, strict=True)
+    ]
+    assert arrange(cameras).order == arrange(shaken).order == tuple(range(48))
+
+
+@given(st.integers(3, 60), st.integers(2, 9))
+def test_parts_differ_by_one_at_most_and_matched_ones_by_none(count: int, sectors: int) -> None:
+    sizes = [len(sector_of(count, part, sectors)) for part in range(sectors)]
+    assert sum(sizes) == count
+    assert max(sizes) - min(sizes) <= 1
+    exactly = count // sectors
+    matched = [sector_of(count, part, sectors, exactly) for part in range(sectors)]
+    assert {len(part) for part in matched} == {exactly}
+    assert all(set(part) <= set(range(count)) for part in matched)
+
+
+def test_nearness_is_the_least_angle_and_the_least_distance() -> None:
+    training, test = ring([0.0, 40.0, 90.0]), ring([10.0, 75.0])
+    found = nearness(test, training, 2.0)
+    for camera, entry in zip(test, found, strict=True):
+        cosines = [float(camera.rotation[2] @ other.rotation[2]) for other in training]
+        assert entry[ANGLE] == pytest.approx(np.degrees(np.arccos(max(cosines))), abs=1e-9)
+        places = [float(np.linalg.norm(camera.center - other.center)) for other in training]
+        assert entry[DISTANCE] == pytest.approx(min(places) / 2.0)
+    assert nearness(training, training, 2.0) == [{ANGLE: 0.0, DISTANCE: 0.0}] * 3
+    assert nearness(test, training[:1], 0.0)[0].keys() == {ANGLE}
+    assert nearness([], training, 1.0) == []
