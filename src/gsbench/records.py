@@ -94,6 +94,13 @@ def iterate_rows(content: bytes, kind: type[T], path: Path) -> Iterator[tuple[st
     What follows a damaged line is left out, with a warning unless it is the torn last one of a killed writer.
     """
     lines = content.splitlines(keepends=True)
+    try:
+        rows = typed(b"[" + b",".join(lines) + b"]", list[kind], path)  # type: ignore[valid-type] # at once, mostly
+    except DamagedError:
+        rows = []
+    if len(rows) == len(lines):  # else a line holds several
+        yield from ((line.decode("utf-8").rstrip("\r\n"), row) for line, row in zip(lines, rows, strict=True))
+        return
     for number, line in enumerate(lines, 1):
         try:
             row = typed(line, kind, path)

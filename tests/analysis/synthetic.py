@@ -124,6 +124,7 @@ def write_trial(
         writer.writerow(["view", *views])
         writer.writerows([name, *(repr(float(values[k])) for values in views.values())] for k, name in enumerate(names))
     config = {"name": data["experiment"], "seed": data["seed"], "scene": {"name": data["scene"]}}
+    config["init"] = {"name": data["init"]}
     config |= {
         "densify": {"name": data["densify"], "volume_threshold": 0.03},
         "train": {"iterations": data["iterations"]},

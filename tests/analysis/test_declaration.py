@@ -275,12 +275,9 @@ def test_records_without_trials_and_damaged_ones_are_read(tmp_path: Path) -> Non
     found = standing(experiment.folder, experiment.trials)
     assert found is not None
     assert found.beforehand
-    for trials in ({"a": [0]}, {"a/b/c/d": [0]}, {"a/b/c": 3, "a/b/d": ["x"]}):
+    for trials in ({"a": [0]}, {"a/b/c/d": [0]}, {"a/b/c": 3}, {"a/b/d": ["x"]}):
         declare_trials(tmp_path, (EARLY, trials), metric="psnr")  # type: ignore[arg-type]
-        found = standing(experiment.folder, experiment.trials)
-        assert found is not None
-        assert len(found.added) == 12
-        assert found.sentences("PSNR")
+        assert standing(experiment.folder, experiment.trials) is None  # a line that is damaged declares nothing
 
 
 # --- simulated sweeps without any difference

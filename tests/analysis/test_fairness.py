@@ -114,10 +114,11 @@ def test_trials_without_any_record_still_have_a_sheet(tmp_path: Path, paths: lis
     for path in paths:
         for name in ("config.yaml", "events.jsonl"):
             (path / name).unlink()
-    change(paths, "longaxis", seconds={}, hashes={}, versions={}, budget=None, resolution=[400, 300, 3])
+    change(paths, "longaxis", seconds={}, hashes={"data": "data-courtyard"}, versions={})
     table = sheet(tmp_path)
     assert shown(table)["rounds of the densifier"] == ("not recorded", "not recorded", "")
-    assert shown(table)["budget"][1] == "not recorded"
+    assert shown(table)["seconds of training"][1] == "not recorded"
+    assert shown(table)["code"] == ("gsbench 0.1.0", "not recorded", UNLIKE)
     assert "what is not recorded" in table.notes[0]
 
 
@@ -136,9 +137,13 @@ def test_values_that_were_tried_here_are_said(tmp_path: Path) -> None:
 
 def test_a_search_that_proposed_the_settings_is_named(tmp_path: Path) -> None:
     write_arms(tmp_path, {"adc": densifier("adc"), "volumetric": densifier("volumetric", volume_threshold=0.06841)})
-    points = [{"number": k, "settings": {"densify.volume_threshold": v}} for k, v in enumerate((0.1, 0.06841))]
+    points = [
+        {"number": k, "state": "done", "value": 27.5, "settings": {"densify.volume_threshold": v}}
+        for k, v in enumerate((0.1, 0.06841))
+    ]
+    record = {"metric": "psnr", "direction": 1, "wanted": 2, "seeds": 1, "log": [], "points": points}
     (tmp_path / "vth").mkdir()
-    (tmp_path / "vth" / "search.json").write_text(json.dumps({"metric": "psnr", "points": points}))
+    (tmp_path / "vth" / "search.json").write_text(json.dumps(record))
     for name, content in (("other", '{"points": [3, {"settings": []}]}'), ("broken", "{")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "search.json").write_text(content)
@@ -146,6 +151,10 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path: Path) -> None:
     assert (
         "densify.volume_threshold=0.06841 is one of 2 points of the search vth, by psnr of its held-out views" in line
     )
+
+    (tmp_path / "vth" / "search.json").write_text(json.dumps(record | {"validation": True}))
+    (line,) = [note for note in sheet(tmp_path, "volumetric").notes if note.startswith("Tuning.")]
+    assert "by psnr of validation views, none of which is held out." in line
 
 
 # --- where it stands

@@ -223,7 +223,7 @@ def test_unknown_names_are_refused(make_experiment: Make) -> None:
     experiment = make_experiment()
     with pytest.raises(InputError, match="unknown metric 'pnsr'"):
         build_table(experiment, metrics=["pnsr"])
-    with pytest.raises(InputError, match=r"no setting 'densify\.grad_tresh'"):
+    with pytest.raises(InputError, match=r"no trial has a setting 'densify\.grad_tresh'"):
         build_table(experiment, rows=["scene", "densify.grad_tresh"])
 
 

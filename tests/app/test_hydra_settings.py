@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -24,8 +25,8 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def no_trials(monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(trial: Any, wait: bool) -> dict[str, Any]:
-        return {"scene": "s", "init": "i", "densify": "d", "seed": 0, "metrics": {"psnr": 1.0}}
+    def run(trial: Any, wait: bool) -> SimpleNamespace:
+        return SimpleNamespace(metrics={"psnr": 1.0})
 
     monkeypatch.setattr(serial, "_run", run)
 

@@ -19,6 +19,7 @@ from gsbench.launch.plan import add_to_plan
 from gsbench.launch.trial import Trial
 from gsbench.runs.declaration import read_plans
 from gsbench.runs.layout import CONFIG, RESULTS
+from gsbench.runs.trial_record import record_from
 from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.launch.test_declare import TINY
 
@@ -49,12 +50,13 @@ class Fake:
                 continue
             if seed == self.stops_at:
                 raise KeyboardInterrupt
-            if not (trial.folder / RESULTS).exists():
+            results = trial.folder / RESULTS
+            if not results.exists():
                 views = {"psnr": self.psnr(arm, seed) + np.arange(3.0)}
                 data = trial_data(Plan(experiment="stop"), "courtyard", "random", arm, seed, views)
                 write_trial(trial.paths.runs, data, views, trial.folder.name.partition("-")[0])
                 (trial.folder / CONFIG).write_text(trial.yaml)
-            outcomes.append(Outcome(trial.folder, "done", metrics={}))
+            outcomes.append(outcome_of_results(trial.folder, record_from(results.read_bytes(), results)))
         return outcomes
 
 

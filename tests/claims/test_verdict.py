@@ -150,11 +150,7 @@ def test_error_in_textured_parts_sees_the_blurred_grass(make_pairs: MakePairs) -
 def test_arms_that_are_one_and_the_same_refute_nothing(make_pairs: MakePairs) -> None:
     """A training that ends before a rule first acts says nothing about the rule."""
     pairs = make_pairs(seeds=range(4))
-    twins, capped = {}, {}
-    for key, (one, other) in pairs.items():
-        equal = replace(other.record, num_gaussians=one.record.num_gaussians)
-        capped[key] = (one, replace(other, record=equal))  # counts alone are equal
-        twins[key] = (one, replace(other, record=replace(equal, metrics=dict(one.metrics))))
+    twins = {key: (one, replace(other, record=one.record)) for key, (one, other) in pairs.items()}
     for changes in ({}, {"direction": "same"}, {"metric": "train_time", "least": "10%"}):
         found = judge_claim(*claim_with(**changes), twins, SCENES)
         assert found.word == "not testable here"
@@ -162,4 +158,8 @@ def test_arms_that_are_one_and_the_same_refute_nothing(make_pairs: MakePairs) ->
         assert found.decision is None
     one_differs = {**twins, ("garden", 0): pairs["garden", 0]}
     assert judge_claim(*claim_with(), one_differs, SCENES).word != "not testable here"
+    capped = {  # counts alone are equal
+        key: (one, replace(other, record=replace(other.record, num_gaussians=one.record.num_gaussians)))
+        for key, (one, other) in pairs.items()
+    }
     assert judge_claim(*claim_with(metric="gaussians", least="10%"), capped, SCENES).word == "refuted"

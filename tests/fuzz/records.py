@@ -106,8 +106,9 @@ def write_trial(runs: Path, densify: str, seed: int, threshold: float = 0.03) ->
 def write_original(runs: Path) -> dict[str, Path]:
     """A small experiment; its files by name, those that are damaged in turn."""
     home = runs / EXPERIMENT
-    done = [write_trial(runs, name, seed) for name in ("adc", "volumetric") for seed in (0, 1)][0]
+    done, *_ = [write_trial(runs, name, seed) for name in ("adc", "volumetric") for seed in (0, 1)]
     variant = write_trial(runs, "volumetric", 0, 0.5)
+    (variant / "inputs.json").unlink()  # so that its settings are read from the YAML
     failed = write_trial(runs, "volumetric", 1, 0.5)
     (failed / "results.json").unlink()
     (failed / "failed.json").write_text(json.dumps({"error": "E", "message": "m", "time": 1.0, "seed": 1}))
@@ -207,7 +208,8 @@ def look(runs: Path, places: dict[str, Path]) -> int:
         try:
             read()
         except InputError as error:
-            assert len(str(error).splitlines()) == 1
+            if len(str(error).splitlines()) != 1:
+                raise RuntimeError("more than a line") from error
             refused += 1
 
     def tables() -> None:

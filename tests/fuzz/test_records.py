@@ -48,7 +48,11 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
 @pytest.mark.parametrize("damage", [*DAMAGES, "fifo", "folder"])
 @pytest.mark.parametrize("name", ["results.json", "inputs.json", "plan.json", "config.yaml", "metrics.jsonl"])
 def test_the_verbs_say_one_line_for_a_damaged_file(
-    name: str, damage: str, places: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str,
+    damage: str,
+    places: dict[str, Path],
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     path = places[name]
     if damage in DAMAGES:
@@ -59,12 +63,15 @@ def test_the_verbs_say_one_line_for_a_damaged_file(
     for argv in (["tables", EXPERIMENT], ["status", EXPERIMENT], ["status"], ["tables", EXPERIMENT, "--format=trials"]):
         assert cli.run(argv) in (0, 1)
         captured = capsys.readouterr()
-        assert "Traceback" not in captured.err + captured.out
-        assert sum(line.startswith("left out") for line in captured.err.splitlines()) <= 2
+        said = [line for line in (*captured.err.splitlines(), *caplog.messages) if line.startswith("left out")]
+        caplog.clear()
+        assert len(said) <= 2  # one trial of these has failed, and tables say so
         if argv[0] == "tables":
             assert "psnr" in captured.out.lower()
-            if name in ("results.json", "inputs.json"):
-                assert name in captured.err
+            assert name == "metrics.jsonl" or name == "plan.json" or any(name in line for line in said)
+        if argv == ["status", EXPERIMENT]:
+            assert name != "plan.json" or any(name in line for line in said)
+            assert ("damaged" in captured.out) == (name in ("results.json", "inputs.json"))
     assert cli.run(["explain", f"{EXPERIMENT}:courtyard:psnr:adc"]) == 0
 
 
@@ -76,9 +83,9 @@ def test_every_kind_of_file_is_among_the_damaged(places: dict[str, Path]) -> Non
 READS_ITSELF = {
     "analysis/paper.py", "analysis/published/__init__.py", "datasets/catalog.py", "datasets/plan.py",  # of the package
     "claims/file.py",  # what a user writes by hand
-    "claims/here.py", "launch/batch.py", "system/isolate.py", "init/base.py",  # text of this very process
+    "claims/here.py", "launch/batch.py", "init/base.py",  # text of this very process
     "datasets/records.py",  # beside data sets, not in the runs folder
-    "scene/load.py",  # in the store's views, made anew where it is damaged
+    "scene/load.py",  # prepared views, beside the store
     "parsing.py",
 }  # fmt: skip
 LOADERS = {("json", "loads"), ("json", "load"), ("yaml", "load"), ("yaml", "safe_load"), ("yaml", "full_load")}
@@ -89,9 +96,9 @@ def test_no_file_of_ours_is_parsed_beside_its_reader() -> None:
     found = set()
     for path in package.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-                if (node.value.id, node.attr) in LOADERS:
-                    found.add(path.relative_to(package).as_posix())
+            named = isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
+            if named and (node.value.id, node.attr) in LOADERS:
+                found.add(path.relative_to(package).as_posix())
             if isinstance(node, ast.ImportFrom) and node.module in ("json", "yaml"):
                 assert not {alias.name for alias in node.names} & {name for _, name in LOADERS}, path
     assert found == READS_ITSELF

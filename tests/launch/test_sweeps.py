@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 import re
@@ -14,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from gsbench import cli
 from gsbench.app.command import launch, run_trials
 from gsbench.app.hydra_app import compose_trials
 from gsbench.config.command_words import GROUPS, options, parse
@@ -22,6 +25,7 @@ from gsbench.config.trust import check_target
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError, explain_storage
 from gsbench.launch import serial
+from gsbench.launch.batch import run_batch
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.plan import (
     Estimator,
@@ -500,8 +504,75 @@ def test_storage_errors_are_recognised(tmp_path: Path) -> None:
         assert isinstance(explain_storage(RuntimeError(text), tmp_path), DiskFullError)
     assert isinstance(explain_storage(OSError(28, "x"), tmp_path), DiskFullError)
     assert isinstance(explain_storage(PermissionError(13, "x", "/some/file"), tmp_path), InputError)
+    for number, words in ((errno.EFBIG, "may not grow any more"), (errno.ENOLCK, "has no locks")):
+        found = explain_storage(OSError(number, "x", str(tmp_path / "file")), tmp_path)
+        assert isinstance(found, InputError)
+        assert words in str(found)
     assert explain_storage(RuntimeError("shape mismatch"), tmp_path) is None
     assert explain_storage(FileNotFoundError(2, "x"), tmp_path) is None
+
+
+@pytest.mark.parametrize("number", [errno.EFBIG, errno.ENOLCK, errno.EROFS])
+def test_verbs_that_write_say_storage_errors_in_one_line(
+    number: int, runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*arguments: object) -> None:
+        raise OSError(number, os.strerror(number), str(runs / "x" / "plan.json"))
+
+    add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
+    monkeypatch.setattr("gsbench.runs.plan_file.write_json", refuse)
+    assert cli.run(["status", "x", "--forget"]) == 2
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert "plan.json" in said
+
+
+@pytest.mark.skipif(not hasattr(fcntl, "flock"), reason="needs flock")
+def test_a_file_system_without_locks_is_named(
+    runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(descriptor: int, operation: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    assert cli.run(["status", "x", "--forget"]) == 2
+    assert "has no locks" in capsys.readouterr().err
+
+
+def test_what_is_done_is_found_in_a_folder_that_may_not_be_written_to(
+    runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = trial_values()
+    results = finish(values)
+    trials = [Trial.of(replace(_composed(), values=values))]
+    before = sorted(path for path in runs.rglob("*"))
+
+    def refuse(*arguments: object, **named: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(runs))
+
+    for name in ("gsbench.files.TemporaryDirectory", "gsbench.files.atomic", "gsbench.launch.plan.hold"):
+        monkeypatch.setattr(name, refuse)
+    (outcome,) = run_batch(trials)
+    assert outcome.status == "done"
+    assert outcome.metrics == results.metrics
+    assert sorted(path for path in runs.rglob("*")) == before
+    with pytest.raises(InputError, match="may not be written to"):
+        run_batch([Trial.of(replace(_composed(), values=trial_values("seed=1")))])
+
+
+@pytest.mark.parametrize("folder", ["/proc/x", "/dev/null/x", "notes.txt/x"])
+@pytest.mark.parametrize("words", [["hydra.run.dir={}"], ["-m", "hydra.sweep.dir={}", "seed=0,1"]])
+def test_a_folder_of_hydra_that_cannot_be_made_is_refused_before_any_work(
+    folder: str, words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "notes.txt").touch()
+    assert cli.run([*(word.format(folder) for word in words), "name=x", "tracking=none"]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert "dir=" in said[0]
+    assert "cannot be made" in said[0]
+    assert not (tmp_path / "runs").exists()
 
 
 def test_lock_is_seen_and_freed(tmp_path: Path) -> None:

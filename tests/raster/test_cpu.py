@@ -14,7 +14,7 @@ import torch
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.raster.cpu import CpuRasterizer, executor, simd
+from gsbench.raster.cpu import CpuRasterizer, binning, executor, shuffle, simd
 from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
 from gsbench.raster.reference import ReferenceRasterizer
 from tests.raster.strategies import Case, render_with_gradients
@@ -55,6 +55,18 @@ def test_equal_depths_are_blended_in_the_order_of_the_index() -> None:
     assert reference.max() > 0.5
 
 
+def test_depths_are_sorted_as_numpy_sorts_them() -> None:
+    generator = np.random.default_rng(0)
+    depths = np.exp(generator.uniform(-1.6, 20, 500)).astype(np.float32)
+    depths[generator.integers(0, 500, 60)] = depths[7]
+    keys = (depths.view(np.uint32).astype(np.uint64) << np.uint64(32)) | np.arange(500, dtype=np.uint64)
+    begins, visible = np.array([0, 200, 320]), np.array([150, 0, 180])
+    order, spare = np.empty((2, 330), np.uint64)
+    digits = np.empty((binning.PASSES, binning.BUCKETS), np.int64)
+    binning.sort_by_depth(begins, visible, keys, order, spare, digits)
+    np.testing.assert_array_equal(order, np.sort(np.concatenate([keys[:150], keys[320:]])))
+
+
 def test_needles_keep_their_gradients() -> None:
     """Long thin Gaussians: the determinant of their 2D covariance loses its digits in float32 as ac - b^2."""
     gaussians = Case(90, 70, 40, sh_degree=0).gaussians()
@@ -67,6 +79,21 @@ def test_needles_keep_their_gradients() -> None:
         errors.append(leaves.log_scales.grad.double())
     assert errors[1].abs().max() > 0
     assert (errors[0] - errors[1]).abs().max() < 2e-5 * errors[1].abs().max()
+
+
+def test_turning_a_ball_has_no_gradient() -> None:
+    """Not even a rounding error: Adam would turn 1e-13 into a full step. What is nearly a ball has a true one."""
+    for stretch in (0.0, 0.01):
+        gaussians = MANY.gaussians()
+        gaussians.log_scales[:] = gaussians.log_scales[:, :1]
+        gaussians.log_scales[:, 1] += stretch
+        found = []
+        for rasterizer, dtype in ((CpuRasterizer(threads=1), torch.float32), (ReferenceRasterizer(), torch.float64)):
+            leaves = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
+            rasterizer.render(leaves, MANY.camera(), 3, BLACK.to(dtype)).image.square().sum().backward()
+            found.append(leaves.quaternions.grad.double())
+        assert bool(found[0].any()) == (stretch > 0)
+        assert (found[0] - found[1]).abs().max() < 1e-3 * found[1].abs().max() + 1e-12
 
 
 def test_renders_may_be_differentiated_late_and_twice() -> None:
@@ -209,34 +236,69 @@ def test_vector_functions() -> None:
 
 
 @numba.njit
-def _wide_functions(x, out):  # type: ignore[no-untyped-def]
-    for i in range(0, len(x), simd.WIDE_LANES):
+def _logarithms(x, out):  # type: ignore[no-untyped-def]
+    for i in range(0, len(x), simd.LANES):
         value = simd.load(x, i)
-        power = simd.exp2(value)
-        simd.store(out[0], i, power)
-        simd.store(out[1], i, simd.log2(power))
-        simd.store(out[2], i, simd.square_root(power) + simd.floor(value) - simd.ceil(value))
+        simd.store(out[0], i, simd.log2(value))
+        simd.store(out[1], i, simd.square_root(value) + simd.floor(value) - simd.ceil(value))
 
 
-def test_float64_functions_over_their_range() -> None:
-    x = np.linspace(-1000, 1000, 8 * 4096)
-    out = np.empty((3, len(x)))
-    _wide_functions(x, out)
-    np.testing.assert_allclose(out[0], np.exp2(x), rtol=1e-13)
-    np.testing.assert_allclose(out[1], x, rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(out[2], np.sqrt(np.exp2(x)) + np.floor(x) - np.ceil(x), rtol=1e-12)
+def test_logarithms_and_roots_over_their_range() -> None:
+    x = np.exp2(np.linspace(-126, 100, 16 * 4096)).astype(np.float32)
+    out = np.empty((2, len(x)), np.float32)
+    _logarithms(x, out)
+    exact = np.log2(x.astype(np.float64))
+    assert (np.abs(out[0] - exact) / np.maximum(np.abs(exact), 1)).max() < 2e-7
+    np.testing.assert_allclose(out[1], np.sqrt(x) + np.floor(x) - np.ceil(x), rtol=1e-6)
 
 
 @numba.njit
-def _gather(array, indices, out):  # type: ignore[no-untyped-def]
-    simd.store(out, 0, simd.gather(array, indices, 3, 1))
+def _gather_and_scatter(array, indices, out):  # type: ignore[no-untyped-def]
+    value = simd.gather(array, indices, 3, 1)
+    simd.store(out, 0, value)
+    simd.scatter(array, indices, 3, 2, value)
 
 
-def test_gather() -> None:
+def test_gather_and_scatter() -> None:
     array = np.arange(60, dtype=np.float32).reshape(20, 3)
-    indices, out = np.array([5, 0, 19, 7, 7, 2, 1, 3]), np.empty(8)
-    _gather(array, indices, out)
-    np.testing.assert_array_equal(out, array[indices, 1])
+    before = array.copy()
+    indices, out = np.array([5, 0, 19, 7, 2, 1, 3, 4, 6, 8, 9, 10, 11, 12, 7, 7]), np.empty(16, np.float32)
+    _gather_and_scatter(array, indices, out)
+    np.testing.assert_array_equal(out, before[indices, 1])
+    before[indices, 2] = before[indices, 1]
+    np.testing.assert_array_equal(array, before)
+
+
+@numba.njit
+def _shuffles(matrix, rest, basis, out, moved):  # type: ignore[no-untyped-def]
+    shuffle.transpose(matrix, 0)
+    loaded = shuffle.load_rest(rest, 45)
+    shuffle.store_rest(moved, 45, loaded)
+    red, green, blue = shuffle.by_channel(loaded)
+    simd.store(out, 0, red)
+    simd.store(out, 16, green)
+    simd.store(out, 32, blue)
+    shuffle.store_rest(out, 48, shuffle.outer_rest(simd.load(basis, 0), 2.0, 3.0, 5.0))
+    simd.store(out, 96, shuffle.as_span(simd.splat(7), simd.splat(1024)))
+    simd.store(out, 112, shuffle.index_bits(40))
+    simd.store(out, 128, shuffle.as_integers(simd.load(basis, 0)))
+
+
+def test_shuffles() -> None:
+    matrix = np.arange(256, dtype=np.float32)
+    rest, moved = np.arange(135, dtype=np.float32), np.zeros(135, np.float32)
+    basis, out = np.arange(16, dtype=np.float32), np.zeros(144, np.float32)
+    _shuffles(matrix, rest, basis, out, moved)
+    np.testing.assert_array_equal(matrix.reshape(16, 16), np.arange(256).reshape(16, 16).T)
+    own = rest[45:90]
+    np.testing.assert_array_equal(moved, np.concatenate([np.zeros(45), own, np.zeros(45)]))
+    for channel in range(3):
+        np.testing.assert_array_equal(out[16 * channel :][:15], own.reshape(15, 3)[:, channel])
+    np.testing.assert_array_equal(out[48:93].reshape(15, 3), np.outer(basis[:15], [2, 3, 5]))
+    integers = out.view(np.int32)
+    assert (integers[96:112] == 7 + (1024 << 16)).all()
+    np.testing.assert_array_equal(integers[112:128], np.arange(40, 56))
+    np.testing.assert_array_equal(integers[128:144], np.arange(16))
 
 
 def test_exp2_over_its_range() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import os
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,7 +12,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from gsbench import cli
 from gsbench.raster.cpu import jit
+from gsbench.runs.stages import TRAIN
+from gsbench.runs.step import Step
+from gsbench.runs.store import Store
 from gsbench.verbs import doctor
 from gsbench.verbs.doctor import Finding
 from tests.conftest import ROOT
@@ -122,3 +127,28 @@ def test_the_whole_of_it_on_this_machine(tmp_path: Path, capsys: pytest.CaptureF
     topics = {line.split()[1] for line in lines}
     assert {"gsbench", "python", "torch", "gpu", "rasterizer", "kernels", "data", "runs", "weights"} <= topics
     assert all(line.split()[0] in ("ok", "note", "bad") for line in lines)
+
+
+def test_a_sample_of_the_store_is_read_whole(tmp_path: Path) -> None:
+    store = Store(tmp_path / "store")
+    folders = [
+        store.get(Step(TRAIN, {"x": x}, lambda folder: (folder / "model").write_text("m"))).path  # type: ignore[arg-type,return-value]
+        for x in range(10)
+    ]
+    assert said(doctor.check_store(tmp_path)) == [("ok", "10 results are as they were written")]
+    assert said(doctor.check_store(tmp_path, 25)) == [("ok", "3 results are as they were written, of 10 in all")]
+    for folder in folders:  # a flipped byte with its time kept
+        state = (folder / "model").stat()
+        (folder / "model").write_text("n")
+        os.utime(folder / "model", ns=(state.st_atime_ns, state.st_mtime_ns))
+    found = said(doctor.check_store(tmp_path, 25))
+    assert [verdict for verdict, _ in found] == ["note", "note", "note", "ok"]
+    assert "model differs from what was written" in found[0][1]
+
+
+@pytest.mark.parametrize("text", ["0", "-5%", "101", "x", "nan", "%"])
+def test_a_sample_is_a_share(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["doctor", "--store", f"--sample={text}"]) == 2
+    assert "such as 5%" in capsys.readouterr().err
+    assert cli.run(["doctor", "--sample=5%"]) == 2
+    assert "--store" in capsys.readouterr().err

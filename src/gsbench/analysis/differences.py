@@ -7,8 +7,8 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from gsbench.analysis.results import TrialResult, canonical
+from gsbench.runs.hashing import BEFORE
 from gsbench.runs.source import SHOWN
-from gsbench.runs.splits import setting
 from gsbench.words import counted
 
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
@@ -38,12 +38,16 @@ def differing_conditions(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
 
 
 def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
-    """The settings in which trials with different configuration hashes differ, those that may differ left out."""
+    """The settings in which trials with different configuration hashes differ, those that may differ left out.
+
+    A key that a configuration lacks counts as unset: a metric that was added later is null in earlier trials.
+    """
     if len({trial.config_hash for trial in trials}) == 1:
         return {}
-    keys = {key for trial in trials for key in trial.config if not key.startswith(IGNORED_SETTINGS)}
-    values = {key: sorted({canonical(setting(trial.config, key)) for trial in trials}) for key in sorted(keys)}
-    return {key: found for key, found in values.items() if len(found) > 1}
+    kinds = {trial.kind: trial.config_texts for trial in trials}.values()
+    keys = {key for texts in kinds for key in texts if not key.startswith(IGNORED_SETTINGS)}
+    values = {key: {texts.get(key, canonical(BEFORE.get(key))) for texts in kinds} for key in keys}
+    return {key: sorted(found) for key, found in sorted(values.items()) if len(found) > 1}
 
 
 def differing_code(trials: Iterable[TrialResult]) -> dict[str, Versions]:

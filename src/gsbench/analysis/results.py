@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import logging
 import math
 import os
 import re
@@ -32,8 +33,13 @@ from gsbench.runs.translation_record import Translation
 from gsbench.runs.trial_files import failure_of
 from gsbench.runs.trial_record import TrialRecord, UnfinishedError
 
+log = logging.getLogger(__name__)
+
 TRIAL_FOLDER = re.compile(r"(?P<hash>[0-9a-f]{8})-seed(?P<seed>\d+)")
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
+
+ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
+GROUPS = ("scene", "init", "densify")  # of a configuration: what every trial has
 
 Arm = tuple[str, str]  # initialiser, densifier
 
@@ -46,6 +52,13 @@ class Configurations:
 
     def __init__(self) -> None:
         self._known: dict[Kind, Mapping[str, Any]] = {}
+        self._texts: dict[Kind, Mapping[str, str]] = {}
+
+    def texts(self, kind: Kind, folder: Path) -> Mapping[str, str]:
+        """The same as `shared`, each as comparable text."""
+        if kind not in self._texts:
+            self._texts[kind] = {key: canonical(value) for key, value in self.shared(kind, folder).items()}
+        return self._texts[kind]
 
     def shared(self, kind: Kind, folder: Path) -> Mapping[str, Any]:
         """The settings of the trial in ``folder``, as those of any other of its ``kind``; {} where unreadable."""
@@ -79,8 +92,8 @@ def load_flat_config(folder: Path) -> dict[str, Any]:
     values = read_settings(folder)
     if values is None:
         values = read_yaml(folder / CONFIG)
-    if not isinstance(values, dict):
-        raise DamagedError(folder / CONFIG, "is damaged: it is no configuration")
+    if not isinstance(values, dict) or not all(isinstance(values.get(group), dict) for group in GROUPS):
+        raise DamagedError(folder / CONFIG, f"is damaged: it lacks one of the groups {', '.join(GROUPS)}")
     return flatten(values)
 
 
@@ -150,6 +163,11 @@ class TrialResult:
         return self.settings.shared(self.kind, self.path)
 
     @property
+    def config_texts(self) -> Mapping[str, str]:
+        """The settings of `config` as comparable text."""
+        return self.settings.texts(self.kind, self.path)
+
+    @cached_property
     def kind(self) -> Kind:
         """The identity that trials share which differ in their seeds alone."""
         return self.scene, self.init, self.densify, self.config_hash
@@ -315,7 +333,7 @@ def list_experiments(runs_dir: Path) -> list[str]:
     """The names of the experiments in a runs folder, sorted."""
     if not runs_dir.is_dir():
         return []
-    found = (entry for entry in os.scandir(runs_dir) if entry.is_dir() and not entry.name.startswith("."))
+    found = (entry for entry in os.scandir(runs_dir) if is_folder(entry) and not entry.name.startswith("."))
     return sorted(entry.name for entry in found if entry.name not in IN_RUNS)
 
 
@@ -393,7 +411,9 @@ def _number(text: str) -> float:
 
 def canonical(value: object) -> str:
     """JSON text that is equal for equal values."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+    if type(value) is int or (type(value) is float and math.isfinite(value)):
+        return repr(value)  # as JSON writes it; most settings are such
+    return ENCODER.encode(value)
 
 
 def _trial_folders(folder: Path) -> Iterator[str]:
@@ -404,8 +424,20 @@ def _trial_folders(folder: Path) -> Iterator[str]:
 
 
 def _folders(place: str | Path) -> list[str]:
-    with os.scandir(place) as entries:
-        return [entry.path for entry in entries if entry.is_dir() and not entry.name.startswith(".")]
+    try:
+        with os.scandir(place) as entries:
+            return [entry.path for entry in entries if is_folder(entry) and not entry.name.startswith(".")]
+    except OSError as error:
+        log.warning("left out: %s cannot be read (%s)", place, error.strerror)
+        return []
+
+
+def is_folder(entry: os.DirEntry[str]) -> bool:
+    """Whether an entry is a folder, or a link to one; a link to itself is none."""
+    try:
+        return entry.is_dir()
+    except OSError:
+        return False
 
 
 def _why_unfinished(path: Path) -> str:

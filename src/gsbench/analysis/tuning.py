@@ -66,10 +66,11 @@ def _search_line(file: Path, own: TrialResult) -> str:
     for point in search.points:
         settings = point.settings
         if settings and all(own.config.get(key) == settings[key] for key in settings):
+            views = "validation views, none of which is held out" if search.validation else "its held-out views"
             chosen = listed([f"{key}={settings[key]}" for key in sorted(settings)])
             return (
                 f"{'-'.join(own.arm)}: {chosen} is one of {counted(len(search.points), 'point')} of the search "
-                f"{file.parent.name}, by {search.metric} of its held-out views."
+                f"{file.parent.name}, by {search.metric} of {views}."
             )
     return ""
 

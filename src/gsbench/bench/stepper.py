@@ -69,10 +69,10 @@ class Stepper:
     def step(self) -> dict[str, float]:
         """One step as its parts, waiting for the device after each; ms."""
         trainer = self.trainer
-        camera, target = trainer.scene.train[0].camera, trainer.targets.get(0)
+        target = trainer.targets.get(0)
         cpu = time.process_time()
         marks = [self._now()]
-        image = trainer.rasterizer.render(trainer.gaussians.values, camera, SH_DEGREE, trainer.background).image
+        image = trainer.render(0).image
         marks.append(self._now())
         # A peer that gives no image has numbers to stand in, so that something flows back.
         is_image = self.peer is None or self.peer.gives_image

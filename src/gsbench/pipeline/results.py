@@ -45,7 +45,7 @@ def results_of(
     """
     init, trained, evaluated = entries[INIT.name], entries[TRAIN.name], entries[EVALUATE.name]
     training, evaluation = read_training(trained.path), read_evaluation(evaluated.path)
-    manifest, checkout = read_manifest(evaluated.path), read_manifest(trained.path).checkout
+    manifest = read_manifest(evaluated.path)
     events = read_curve(trained.path / EVENTS)
     sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]}, reverse=True)
     results = TrialRecord(
@@ -95,8 +95,7 @@ def results_of(
             sources=sources_of(values),
             stages={stage.name: stage.version for stage in STAGES},
             files=dict(sorted(code.items())),
-            commit=checkout.get("commit"),
-            edited=checkout.get("edited", False),
+            **training.checkout,
         ),
         machine=training.machine,
         versions=versions(),

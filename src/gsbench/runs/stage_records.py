@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from gsbench.records import Amount, Count, Number, Part, read_typed
 from gsbench.runs.layout import METRICS, TRAINING
@@ -23,6 +23,7 @@ class Training(Part):
     seconds: Amount
     peak_memory_mb: Amount | None
     machine: dict[str, str]
+    checkout: dict[str, Any] = field(default_factory=dict)  # the commit of gsbench's own, and whether it was edited
     evaluated_from: Literal["model", "renders"] | None = None
     trained_by: Trainer | None = None
 

@@ -7,8 +7,8 @@ from gsbench.runs.step import Stage
 
 CAPTURE = Stage("scene", 1)
 INIT = Stage("init", 1, resumable=True)
-TRAIN = Stage("train", 1, resumable=True, scratch=("checkpoint-*.pt",))
+TRAIN = Stage("train", 2, resumable=True, scratch=("checkpoint-*.pt",))
 GROUND_TRUTH = Stage("ground_truth", 1)
-EVALUATE = Stage("evaluate", 1)
+EVALUATE = Stage("evaluate", 2)
 
 STAGES = (CAPTURE, INIT, TRAIN, GROUND_TRUTH, EVALUATE)

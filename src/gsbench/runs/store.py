@@ -14,8 +14,7 @@ import stat
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field
-from functools import cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ from gsbench.records import Amount, Count, Part, read_typed
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import MANIFEST, VIEWS
 from gsbench.runs.step import Stage, Step
-from gsbench.system.checkout import checkout_of
 from gsbench.system.locks import BusyError, hold
 
 log = logging.getLogger(__name__)
@@ -55,7 +53,6 @@ class Manifest(Part):
     seconds: Amount
     gsbench: str
     created: str
-    checkout: dict[str, Any] = field(default_factory=dict)  # of gsbench: its commit, and whether it was edited
 
     def __post_init__(self) -> None:
         if fault := fault_of(self.inputs):
@@ -177,17 +174,9 @@ def write_manifest(folder: Path, step: Step, seconds: float) -> None:
         "outputs": outputs,
         "seconds": seconds,
         "gsbench": __version__,
-        "checkout": _checkout(),
         "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
     write_json(folder / MANIFEST, manifest)
-
-
-@cache
-def _checkout() -> dict[str, Any]:
-    """The commit of gsbench's checkout, and whether files that git follows had changed; empty without one."""
-    found = checkout_of(Path(__file__).parent, Path(__file__).name)
-    return {} if found is None else {"commit": found.commit, "edited": found.edited}
 
 
 def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) -> Manifest:

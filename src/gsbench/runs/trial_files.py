@@ -65,8 +65,9 @@ class Failure(Part):
 
     @property
     def reason(self) -> str:
-        """The failure in one line."""
-        return one_line(self.message or self.error) or "no reason was given"
+        """The first line of the text."""
+        lines = (self.message or self.error).strip().splitlines()
+        return one_line(lines[0]) if lines else "no reason was given"
 
 
 @dataclass(frozen=True, kw_only=True)

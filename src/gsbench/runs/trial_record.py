@@ -39,7 +39,7 @@ class Code(Part):
     stages: dict[str, int] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
     commit: str | None = None
-    edited: bool = False
+    edited: bool | None = None  # None: without a checkout, or not to be told
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,9 @@ import os
 import re
 import subprocess
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 SECONDS_FOR_GIT = 10
 STARTS_NOTHING = ("core.fsmonitor=false", f"core.hooksPath={os.devnull}", "protocol.allow=never")
@@ -31,6 +33,13 @@ def checkout_of(folder: Path, holds: str | None = None) -> Checkout | None:
     if not _has_filters(folder):
         changes = _git(folder, "status", "--porcelain", "--untracked-files=no", "--ignore-submodules=all")
     return Checkout(commit, None if changes is None else bool(changes))
+
+
+@cache
+def own_checkout() -> dict[str, Any]:
+    """The commit of gsbench's own checkout, and whether files that git follows had changed; empty without one."""
+    found = checkout_of(Path(__file__).parent, Path(__file__).name)
+    return {} if found is None else {"commit": found.commit, "edited": found.edited}
 
 
 def _has_filters(folder: Path) -> bool:

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
 from gsbench.raster.cpu.jit import inlined, kernel
-from gsbench.raster.cpu.simd import LANES, absolute, fma, lane_sums, load, select, splat, store
+from gsbench.raster.cpu.simd import LANES, absolute, fma, lane_sums, load, load_numbers, select, splat, store
 from gsbench.raster.cpu.workspace import ArenaPool, ShardRunner, TensorPool
 from gsbench.system.resources import available_cores
 
@@ -25,6 +25,7 @@ CHANNELS = 3
 PAD = LANES  # zeros on both sides of a row: at least CHANNELS * WINDOW_RADIUS
 TAPS = 2 * WINDOW_RADIUS + 1
 WEIGHTS = window().numpy().astype(np.float32)[WINDOW_RADIUS:].copy()  # from the centre outwards
+MAPS = 4  # image, target, sum of their squares, product
 LANE = np.arange(LANES, dtype=np.float32)
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 F_C1, F_C2 = np.float32(C1), np.float32(C2)
@@ -63,18 +64,29 @@ def _sum(vector: Any, scratch: Any) -> float:
 
 
 @inlined
-def _read_row(image: Any, row: int, numbers: int, out: Any) -> None:
-    """A row of an image (float32, or uint8 in 255ths) behind PAD zeros that ``out`` has already."""
+def _read_row(image: Any, row: int, numbers: int, divisor: Any, out: Any) -> None:
+    """A row of an image, float32 or uint8, in units of ``divisor``, behind PAD zeros that ``out`` has already."""
     start = row * numbers
-    for i in range(numbers):
-        out[PAD + i] = image[start + i]
+    if numbers < LANES:
+        for i in range(numbers):
+            out[PAD + i] = image[start + i] / divisor
+    else:
+        for i in range(0, numbers, LANES):
+            place = min(i, numbers - LANES)  # the last vector repeats some numbers, so as to end with the row
+            store(out, PAD + place, load_numbers(image, start + place) / divisor)
 
 
 @inlined
-def _scale_row(out: Any, numbers: int, divisor: Any) -> None:
-    if divisor != ONE:
+def _write_row(line: Any, row: int, numbers: int, image: Any) -> None:
+    """The inverse of ``_read_row``, from ``line`` without padding."""
+    start = row * numbers
+    if numbers < LANES:
         for i in range(numbers):
-            out[PAD + i] /= divisor
+            image[start + i] = line[i]
+    else:
+        for i in range(0, numbers, LANES):
+            place = min(i, numbers - LANES)
+            store(image, start + place, load(line, place))
 
 
 @kernel
@@ -99,35 +111,32 @@ def similarity_rows(
     length = (numbers + LANES - 1) // LANES * LANES
     padded = length + 2 * PAD
     part = TAPS * length
-    x, y, xx = memory[:padded], memory[padded:], memory[2 * padded :]
-    yy, xy, ring = memory[3 * padded :], memory[4 * padded :], memory[5 * padded :]
-    scratch = ring[5 * part :]
-    for i in range(0, 5 * padded, LANES):
+    x, y, squares = memory[:padded], memory[padded:], memory[2 * padded :]
+    products, ring = memory[3 * padded :], memory[4 * padded :]
+    scratch = ring[MAPS * part :]
+    for i in range(0, 4 * padded, LANES):
         store(memory, i, splat(ZERO))
     total_similarity, total_l1 = 0.0, 0.0
     lane = load(LANE, 0)
     for row in range(begin - WINDOW_RADIUS, end + WINDOW_RADIUS):
         slot = (row + TAPS) % TAPS * length
         if 0 <= row < height:
-            _read_row(image, row, numbers, x)
-            _read_row(target, row, numbers, y)
-            _scale_row(y, numbers, divisor)
+            _read_row(image, row, numbers, ONE, x)
+            _read_row(target, row, numbers, divisor, y)
             l1 = splat(ZERO)
             for i in range(PAD, PAD + length, LANES):
                 a, b = load(x, i), load(y, i)
-                store(xx, i, a * a)
-                store(yy, i, b * b)
-                store(xy, i, a * b)
+                store(squares, i, fma(a, a, b * b))  # SSIM asks for the sum of both variances alone
+                store(products, i, a * b)
                 l1 += absolute(a - b)
             if begin <= row < end:
                 total_l1 += _sum(l1, scratch)
             _blur_row(x, 0, ring, slot, numbers)
             _blur_row(y, 0, ring, part + slot, numbers)
-            _blur_row(xx, 0, ring, 2 * part + slot, numbers)
-            _blur_row(yy, 0, ring, 3 * part + slot, numbers)
-            _blur_row(xy, 0, ring, 4 * part + slot, numbers)
+            _blur_row(squares, 0, ring, 2 * part + slot, numbers)
+            _blur_row(products, 0, ring, 3 * part + slot, numbers)
         else:
-            for m in range(5):
+            for m in range(MAPS):
                 for i in range(0, length, LANES):
                     store(ring, m * part + slot + i, splat(ZERO))
         center = row - WINDOW_RADIUS
@@ -136,14 +145,13 @@ def similarity_rows(
         similarity = splat(ZERO)
         for i in range(0, numbers, LANES):
             mean_x, mean_y = _blur_column(ring, 0, i, center, length), _blur_column(ring, part, i, center, length)
-            square_x = _blur_column(ring, 2 * part, i, center, length)
-            square_y = _blur_column(ring, 3 * part, i, center, length)
-            product = _blur_column(ring, 4 * part, i, center, length)
+            square = _blur_column(ring, 2 * part, i, center, length)
+            product = _blur_column(ring, 3 * part, i, center, length)
             a1 = fma(mean_x * mean_y, TWO, F_C1)
             a2 = fma(product - mean_x * mean_y, TWO, F_C2)
             means = mean_x * mean_x + mean_y * mean_y
             b1 = means + F_C1
-            b2 = (square_x + square_y) - means + F_C2
+            b2 = square - means + F_C2
             inside = lane < np.float32(numbers - i)
             inverse = ONE / (b1 * b2)
             value = select(inside, a1 * a2 * inverse, ZERO)
@@ -198,9 +206,8 @@ def gradient_rows(
         center = row - WINDOW_RADIUS
         if center < begin:
             continue
-        _read_row(image, center, numbers, x)
-        _read_row(target, center, numbers, y)
-        _scale_row(y, numbers, divisor)
+        _read_row(image, center, numbers, ONE, x)
+        _read_row(target, center, numbers, divisor, y)
         for i in range(0, numbers, LANES):
             a, b = load(x, PAD + i), load(y, PAD + i)
             d_mean = _blur_column(ring, 0, i, center, length)
@@ -209,9 +216,7 @@ def gradient_rows(
             similarity = fma(d_square * TWO, a, fma(d_product, b, d_mean))
             sign = select(a > b, splat(l1_factor), select(a < b, splat(-l1_factor), ZERO))
             store(line, i, fma(similarity, -ssim_factor, sign))
-        start = center * numbers
-        for i in range(numbers):
-            gradient[start + i] = line[i]
+        _write_row(line, center, numbers, gradient)
 
 
 class CompiledLoss:
@@ -241,7 +246,7 @@ class CompiledLoss:
         arena = self._arenas.lease(holder)
         padded = -(-width * CHANNELS // LANES) * LANES + 2 * PAD
         derivatives = arena.take("derivatives", (3 * height * padded if differentiate else 0,), np.float32)
-        memory = arena.take("memory", (SHARDS, 5 * (TAPS + 1) * padded + LANES), np.float32)
+        memory = arena.take("memory", (SHARDS, MAPS * (TAPS + 1) * padded + LANES), np.float32)
         common = (height, width, pixels, wanted, divisor, derivatives)
 
         def similarity(shard: int) -> None:

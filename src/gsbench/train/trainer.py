@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster import Rasterizer
+from gsbench.raster.base import DeferringRasterizer, RenderOutput
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.runs.rows import whole_lines
 from gsbench.scene.types import Scene
@@ -113,6 +114,7 @@ class Trainer:
         )
         self.context = DensifyContext(scene.extent, bool((self.background == 1).all()), self.device, views)
         densifier.begin(initial, self.context)
+        self._defer()
 
     def run(self, folder: Path, on_status: Callable[[Status], None] = lambda status: None) -> Gaussians:
         """Train to the last iteration, or to the end of the time budget; returns the Gaussians, detached."""
@@ -181,13 +183,7 @@ class Trainer:
         if self.order.following is not None:
             self.targets.prefetch(self.order.following)
         try:
-            render = self.rasterizer.render(
-                self.gaussians.values,
-                self.scene.train[index].camera,
-                self.sh_degree,
-                self.background,
-                self.densifier.needs_absolute_gradient,
-            )
+            render = self.render(index)
         except ValueError as error:  # the optimiser has driven a parameter out of range
             raise TrainingError(f"iteration {step}: {error}; {_last_state(folder)}") from error
         loss, l1, ssim = self.loss(render.image, target)
@@ -198,7 +194,7 @@ class Trainer:
         if step == options.iterations:  # 3DGS saves before it would refine or step
             return None
         if step in self.snapshot_at:
-            write_ply(self.gaussians.values, folder / snapshot_file(step))
+            write_ply(self.gaussians.snapshot(), folder / snapshot_file(step))
         self.densifier.observe(step, render)
         if options.step_after_refine:
             self._optimize(render.visible)
@@ -209,6 +205,19 @@ class Trainer:
         if len(self.gaussians) == 0:
             raise TrainingError(f"no Gaussian was left after iteration {step}; the pruning thresholds are too high")
         return event
+
+    def render(self, index: int) -> RenderOutput:
+        """The training view ``index`` as the present iteration draws it, with a graph."""
+        deferred, camera = self.gaussians.deferred, self.scene.train[index].camera
+        rest = camera, self.sh_degree, self.background, self.densifier.needs_absolute_gradient
+        if deferred is None:
+            return self.rasterizer.render(self.gaussians.values, *rest)
+        rasterizer = cast("DeferringRasterizer", self.rasterizer)  # or else nothing would be deferred
+        return rasterizer.render_deferred(self.gaussians.leaves, deferred, *rest)
+
+    def _defer(self) -> None:
+        """Put off steps of harmonics where the rasterizer can, and the optimiser is the plain one of 3DGS."""
+        self.gaussians.defer_harmonics(hasattr(self.rasterizer, "render_deferred") and not self.options.visible_adam)
 
     @contextmanager
     def _explained(self, folder: Path) -> Iterator[None]:
@@ -252,6 +261,7 @@ class Trainer:
             self.gaussians = TrainableGaussians.load(
                 state["gaussians"], self.gaussians.rates, self.gaussians.spatial_scale, self.device
             )
+            self._defer()
             self.densifier.load_state_dict(state["densifier"], self.context)
             for name, rng in self.rngs.items():
                 rng.set_state(state["rngs"][name])

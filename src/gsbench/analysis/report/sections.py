@@ -118,14 +118,12 @@ def compare_arms(
 
 def training_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str]:
     """Curves by arm, averaged over scenes and seeds at the steps that all trials have."""
-    charts = []
-    for key, title, y_label in CURVES:
-        series = []
-        for arm in arms:
-            own = [trial for trial in trials if trial.arm == arm]
-            points = mean_by_step([_rows(trial, layout.CURVES, key) for trial in own])
-            series.append(Series(arm_name(arm), points))
-        charts.append(line_chart(title, series, "iteration", y_label))
+    keys = [key for key, _, _ in CURVES]
+    means = {arm: _mean_curves(own, layout.CURVES, keys) for arm, own in _by_arm(trials, arms).items()}
+    charts = [
+        line_chart(title, [Series(arm_name(arm), found[key]) for arm, found in means.items()], "iteration", y_label)
+        for key, title, y_label in CURVES
+    ]
     return [chart for chart in charts if chart]
 
 
@@ -143,26 +141,30 @@ def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str
     labels = [cause.replace("_", " ") for cause in causes]
     bars = [(name, [counts[cause] for cause in causes]) for name, counts in totals]
     charts = [bar_chart("Refinement by cause, mean of a trial", labels, bars, "Gaussians"), _origin_chart(trials, arms)]
-    for arm in arms:
-        own = [trial for trial in trials if trial.arm == arm]
-        series = [
-            Series(label, mean_by_step([_rows(trial, layout.EVENTS, cause) for trial in own]))
-            for cause, label in zip(causes, labels, strict=True)
-        ]
+    strictness = []  # how a governor moved the thresholds; no chart where none did
+    for arm, own in _by_arm(trials, arms).items():
+        means = _mean_curves(own, layout.EVENTS, [*causes, "strictness"])
+        series = [Series(label, means[cause]) for cause, label in zip(causes, labels, strict=True)]
         charts.append(line_chart(f"Refinement over time: {arm_name(arm)}", series, "iteration", "Gaussians"))
-    charts.append(_strictness_chart(trials, arms))
+        strictness.append(Series(arm_name(arm), means["strictness"]))
+    title = "Thresholds of growth under the governor, as multiples of their settings"
+    charts.append(line_chart(title, strictness, "iteration", "factor", log_y=True))
     return [chart for chart in charts if chart]
 
 
-def _strictness_chart(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> str:
-    """How a governor moved the thresholds; empty where none did."""
-    series = []
-    for arm in arms:
-        own = [trial for trial in trials if trial.arm == arm]
-        points = mean_by_step([_rows(trial, layout.EVENTS, "strictness") for trial in own])
-        series.append(Series(arm_name(arm), points))
-    title = "Thresholds of growth under the governor, as multiples of their settings"
-    return line_chart(title, series, "iteration", "factor", log_y=True)
+def _by_arm(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> dict[Arm, list[TrialResult]]:
+    groups = by_key(trials, lambda trial: trial.arm)
+    return {arm: groups.get(arm, []) for arm in arms}
+
+
+def _mean_curves(trials: Sequence[TrialResult], name: str, keys: Sequence[str]) -> dict[str, list[tuple[float, float]]]:
+    """The mean over trials of each key of a file of curves, which is read once."""
+    found: dict[str, list[list[tuple[float, float]]]] = {key: [] for key in keys}
+    for trial in trials:
+        rows = trial.curve(name)
+        for key, curves in found.items():
+            curves.append([(float(row["step"]), float(row[key])) for row in rows if key in row])
+    return {key: mean_by_step(curves) for key, curves in found.items()}
 
 
 def _origin_chart(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> str:
@@ -287,10 +289,6 @@ def _region_chart(errors: RegionErrors, first: Arm, second: Arm) -> str:
     series = [(arm_name(first), errors.first), (arm_name(second), errors.second)]
     what = MAP_PROPERTIES.get(errors.property, "texture energy of the ground truth")
     return bar_chart(f"Error by {what}", labels, series, "error (8-bit levels)")
-
-
-def _rows(trial: TrialResult, name: str, key: str) -> list[tuple[float, float]]:
-    return [(float(row["step"]), float(row[key])) for row in trial.curve(name) if key in row]
 
 
 def _is_number(value: object) -> bool:

@@ -33,6 +33,7 @@ from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_L
 from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
+from gsbench.system.checkout import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.own_modules import SAFE_PATH
 from gsbench.words import readable_time
@@ -94,6 +95,7 @@ def external_step(
             # of a GPU's memory only the program itself could tell what it needed
             "peak_memory_mb": ended.peak_memory_mb if device.type == "cpu" else None,
             "machine": describe_machine(device),
+            "checkout": own_checkout(),
             "trained_by": {
                 "program": trainer.program,
                 "version": trainer.version,
@@ -103,7 +105,8 @@ def external_step(
         }
         write_json(folder / TRAINING, summary)
 
-    return step_of_code(replace(TRAIN, resumable=False), inputs, build, __name__)  # it starts from the beginning
+    stage = replace(TRAIN, version=1, resumable=False)  # it starts from the beginning, and is no training of ours
+    return step_of_code(stage, inputs, build, __name__)
 
 
 def take_result(trainer: External, pattern: str, views: Views, output: Path, folder: Path) -> dict[str, Any]:

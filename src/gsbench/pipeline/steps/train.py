@@ -25,6 +25,7 @@ from gsbench.raster import Rasterizer
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
+from gsbench.system.checkout import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.memory import peak_memory_mb, reset_peak_memory
 from gsbench.train.options import WITHOUT_EFFECT_ON_MODEL, TrainConfig
@@ -78,6 +79,7 @@ def train_step(
             "seconds": trainer.seconds,
             "peak_memory_mb": peak_memory_mb(device),
             "machine": describe_machine(device),
+            "checkout": own_checkout(),
         }
         write_json(folder / TRAINING, summary)
 

@@ -104,7 +104,7 @@ def composite_tiles(
     tiles_x = (width + at.TILE - 1) // at.TILE
     lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
     column, row = lane_x * np.float32(at.BLOCK), lane_y * np.float32(at.BLOCK)
-    floats, _, live = memory
+    floats, live = memory
     red, green, blue = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :], floats[2 * at.TILE_PIXELS :]
     for tile in range(first, past):
         left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
@@ -217,7 +217,7 @@ def decomposite_tiles(
     cancels. ``g_alpha`` may be empty for zero. ``want_absolute`` is True or None: a value that numba compiles out.
     """
     tiles_x = (width + at.TILE - 1) // at.TILE
-    floats, _, _ = memory
+    floats, _ = memory
     red, green, blue = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :], floats[2 * at.TILE_PIXELS :]
     behind, through = floats[3 * at.TILE_PIXELS :], floats[4 * at.TILE_PIXELS :]  # S, and T behind the current record
     for tile in range(first, past):

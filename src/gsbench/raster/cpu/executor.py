@@ -12,16 +12,28 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.deferred import DeferredHarmonics
+from gsbench.gaussians.model import NUM_SH_REST, Gaussians
 from gsbench.raster.base import CONSTANTS, RenderOutput
 from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.backprojection import backproject_shard
-from gsbench.raster.cpu.binning import balance_tiles, count_shard, fill_shard, start_tiles
+from gsbench.raster.cpu.binning import (
+    BUCKETS,
+    PASSES,
+    balance_tiles,
+    fill_shard,
+    pair_shard,
+    sort_by_depth,
+    start_tiles,
+)
 from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_tiles, decomposite_tiles
+from gsbench.raster.cpu.deferred import CHUNK, Factors, pending_of
 from gsbench.raster.cpu.footprint import cover_tiles
 from gsbench.raster.cpu.jit import announce_compilation
 from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, project_shard
-from gsbench.raster.cpu.workspace import Arena, ArenaPool, ShardRunner, TensorPool
+from gsbench.raster.cpu.shuffle import REST
+from gsbench.raster.cpu.simd import LANES
+from gsbench.raster.cpu.workspace import HEADROOM, Arena, ArenaPool, ShardRunner, TensorPool
 from gsbench.raster.footprint import Footprint, view_depths
 from gsbench.raster.validate import check_settings, raise_for_values
 from gsbench.scene.camera import Camera
@@ -51,6 +63,7 @@ class CpuRasterizer:
         self._frames = ArenaPool()
         self._scratch = ArenaPool()
         self._tensors = TensorPool()
+        self._pairs_of_shard = 0  # of tile and record: the room that sufficed so far
         announce_compilation()
 
     def render(
@@ -62,6 +75,29 @@ class CpuRasterizer:
         absolute_gradient: bool = False,
     ) -> RenderOutput:
         """Render as ``raster.base.Rasterizer`` says. Raises ValueError naming the parameter that cannot be used."""
+        return self._render(gaussians, None, camera, sh_degree, background, absolute_gradient)
+
+    def render_deferred(
+        self,
+        gaussians: Gaussians,
+        harmonics: DeferredHarmonics,
+        camera: Camera,
+        sh_degree: int,
+        background: Tensor,
+        absolute_gradient: bool = False,
+    ) -> RenderOutput:
+        """Render as ``raster.base.DeferringRasterizer`` says."""
+        return self._render(gaussians, harmonics, camera, sh_degree, background, absolute_gradient)
+
+    def _render(
+        self,
+        gaussians: Gaussians,
+        harmonics: DeferredHarmonics | None,
+        camera: Camera,
+        sh_degree: int,
+        background: Tensor,
+        absolute_gradient: bool,
+    ) -> RenderOutput:
         check_settings(gaussians, camera, sh_degree, background)
         if gaussians.means.dtype != torch.float32 or gaussians.means.device.type != "cpu":
             raise ValueError(
@@ -70,8 +106,11 @@ class CpuRasterizer:
         screen_points = torch.zeros(len(gaussians), 2, requires_grad=True)
         absolute = torch.zeros(len(gaussians), 2) if absolute_gradient else None
         kept = _Kept()
+        tensors = gaussians.tensors()
+        if harmonics is not None:  # autograd does not see what is changed behind its back, and gets no gradient for
+            tensors["sh_rest"] = tensors["sh_rest"].detach()
         image, alpha, radii = _Render.apply(
-            self, kept, camera, sh_degree, absolute, background, screen_points, *gaussians.tensors().values()
+            self, kept, harmonics, camera, sh_degree, absolute, background, screen_points, *tensors.values()
         )
         footprint = partial(_footprint, self, kept, gaussians.map(torch.Tensor.detach), camera)
         return RenderOutput(image, alpha, radii, screen_points, absolute, footprint)
@@ -104,6 +143,7 @@ def _forward(
     rasterizer: CpuRasterizer,
     arena: Arena,
     gaussians: Gaussians,
+    harmonics: DeferredHarmonics | None,
     camera: Camera,
     degree: int,
     background: NDArray[np.float32],
@@ -116,7 +156,7 @@ def _forward(
     count = len(gaussians)
     view = at.make_view(camera, CONSTANTS)
     tiles = view.tiles_x * view.tiles_y
-    arrays = _arrays(gaussians)
+    arrays, pending = _arrays(gaussians), pending_of(harmonics)
     records = arena.take("records", (count * at.RECORD,), np.float32)
     record_ints = records.view(np.int32)
     keys = arena.take("keys", (count,), np.uint64)
@@ -127,7 +167,18 @@ def _forward(
     def project(shard: int) -> None:
         begin, end = edges[shard], edges[shard + 1]
         project_shard(
-            at.kernel_memory(), begin, end, *arrays, degree, view, records, record_ints, keys, radii_array, flags[shard]
+            at.kernel_memory(),
+            begin,
+            end,
+            *arrays,
+            pending,
+            degree,
+            view,
+            records,
+            record_ints,
+            keys,
+            radii_array,
+            flags[shard],
         )
 
     run(GAUSSIAN_SHARDS, project)
@@ -135,18 +186,39 @@ def _forward(
         raise_for_values(gaussians)
 
     order = arena.take("order", (int(flags[:, VISIBLE].sum()),), np.uint64)
-    np.concatenate([keys[begin : begin + n] for begin, n in zip(edges, flags[:, VISIBLE], strict=False)], out=order)
-    order.sort()
+    digits = np.empty((PASSES, BUCKETS), np.int64)
+    spare = arena.take("spare", order.shape, np.uint64)
+    sort_by_depth(np.array(edges[:-1]), flags[:, VISIBLE].copy(), keys, order, spare, digits)
 
     counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
     starts = arena.take("starts", (tiles + 1,), np.int64)
     cuts = _edges(len(order), GAUSSIAN_SHARDS)
-    binning = (order, records, record_ints, view.tiles_x, LOG2_ALPHA_MIN)
-    run(GAUSSIAN_SHARDS, lambda shard: count_shard(cuts[shard], cuts[shard + 1], *binning, counts[shard]))
+    made = np.zeros(GAUSSIAN_SHARDS, np.int64)  # pairs of tile and record
+
+    def pair(shard: int) -> None:
+        made[shard] = pair_shard(
+            cuts[shard],
+            cuts[shard + 1],
+            order,
+            records,
+            record_ints,
+            view.tiles_x,
+            LOG2_ALPHA_MIN,
+            counts[shard],
+            pairs[shard],
+        )
+
+    room = rasterizer._pairs_of_shard
+    pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
+    run(GAUSSIAN_SHARDS, pair)
+    if made.max() > room:  # once in a while, as the scene grows
+        room = rasterizer._pairs_of_shard = int(made.max() * HEADROOM)
+        pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
+        run(GAUSSIAN_SHARDS, pair)
     start_tiles(counts, starts)
-    pairs = int(starts[tiles])
-    entries = arena.take("entries", (pairs,), np.int32)
-    run(GAUSSIAN_SHARDS, lambda shard: fill_shard(cuts[shard], cuts[shard + 1], *binning, counts[shard], entries))
+    total = int(starts[tiles])
+    entries = arena.take("entries", (total,), np.int32)
+    run(GAUSSIAN_SHARDS, lambda shard: fill_shard(made[shard], pairs[shard], counts[shard], entries))
 
     frame = _Frame(
         view,
@@ -155,7 +227,7 @@ def _forward(
         records,
         starts,
         entries,
-        arena.take("masks", (pairs,), np.uint16),
+        arena.take("masks", (total,), np.uint16),
         arena.take("processed", (tiles,), np.int64),
         arena.take("transmittance", (tiles * at.TILE_PIXELS,), np.float32),
         arena.take("last", (tiles * at.TILE_PIXELS,), np.float32),
@@ -199,11 +271,15 @@ def _backward(
     arena: Arena,
     frame: _Frame,
     gaussians: Gaussians,
+    harmonics: DeferredHarmonics | None,
     g_image: NDArray[np.float32],
     g_alpha: NDArray[np.float32],
     absolute: Tensor | None,
-) -> tuple[list[Tensor], Tensor]:
-    """The gradients of the six tensors and of ``screen_points``; fills ``absolute`` [N, 2] if it is given."""
+) -> tuple[list[Tensor | None], Tensor]:
+    """The gradients of the six tensors and of ``screen_points``; fills ``absolute`` [N, 2] if it is given.
+
+    With ``harmonics`` the gradient of ``sh_rest`` is None, and its factors go there.
+    """
     count = len(gaussians)
     rows = arena.take("rows", (TILE_SHARDS, count * at.ROW), np.float32, zero=True)
     want_absolute = None if absolute is None else True
@@ -214,47 +290,56 @@ def _backward(
     rasterizer._runner.run(TILE_SHARDS, decomposite)
 
     means, log_scales, quaternions, logits, _, sh_rest = _arrays(gaussians)
-    gradients = [rasterizer._tensors.empty(tuple(tensor.shape)) for tensor in gaussians.tensors().values()]
-    g_screen = rasterizer._tensors.empty((count, 2))
-    g_means, g_log_scales, g_quaternions, g_logits, g_sh_dc, g_sh_rest = (tensor.numpy() for tensor in gradients)
+    take = rasterizer._tensors.empty
+    gradients = {name: take(tuple(tensor.shape)) for name, tensor in gaussians.tensors().items() if name != "sh_rest"}
+    g_screen = take((count, 2))
     g_absolute = np.empty((0, 2), np.float32) if absolute is None else absolute.numpy()
     edges = _edges(count, GAUSSIAN_SHARDS)
+    # A shard's chunks of factors: as many as its Gaussians could fill.
+    chunks = [edge // LANES + shard for shard, edge in enumerate(edges)]
+    g_sh_rest = take((count if harmonics is None else 0, NUM_SH_REST, 3))
+    factors = take((0 if harmonics is None else chunks[-1] * CHUNK,))
+    common = (
+        means,
+        log_scales,
+        quaternions,
+        logits,
+        sh_rest,
+        pending_of(harmonics),
+        frame.degree,
+        frame.view,
+        frame.records.view(np.int32),
+        frame.tile_shard,
+        rows.reshape(-1),
+        gradients["means"].numpy(),
+        gradients["log_scales"].numpy(),
+        gradients["quaternions"].numpy(),
+        gradients["opacity_logits"].numpy().reshape(count, 1),
+        gradients["sh_dc"].numpy(),
+        g_sh_rest.numpy().reshape(-1, REST),
+        factors.numpy(),
+        factors.numpy().view(np.int32),
+        g_screen.numpy(),
+        g_absolute,
+    )
 
     def backproject(shard: int) -> None:
-        backproject_shard(
-            at.kernel_memory(),
-            edges[shard],
-            edges[shard + 1],
-            int(frame.visible[shard]),
-            means,
-            log_scales,
-            quaternions,
-            logits,
-            sh_rest,
-            frame.degree,
-            frame.view,
-            frame.records.view(np.int32),
-            frame.tile_shard,
-            rows.reshape(-1),
-            g_means,
-            g_log_scales,
-            g_quaternions,
-            g_logits.reshape(count, 1),
-            g_sh_dc,
-            g_sh_rest.reshape(count, 45),
-            g_screen.numpy(),
-            g_absolute,
-            absolute is not None,
-        )
+        begin, end, visible = edges[shard], edges[shard + 1], int(frame.visible[shard])
+        backproject_shard(at.kernel_memory(), begin, end, visible, chunks[shard], *common)
 
     rasterizer._runner.run(GAUSSIAN_SHARDS, backproject)
-    return gradients, g_screen
+    if harmonics is None:
+        return [*gradients.values(), g_sh_rest], g_screen
+    if frame.degree > 0:
+        visible = [int(number) for number in frame.visible]
+        harmonics.receive(Factors(rasterizer._runner, factors, chunks[:-1], visible, frame.degree, count))
+    return [*gradients.values(), None], g_screen
 
 
 def _arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:
-    """The six tensors as arrays that share their memory; ``sh_rest`` as [N, 45]."""
+    """The six tensors as arrays that share their memory; ``sh_rest`` as [N * 45]."""
     means, log_scales, quaternions, logits, sh_dc, sh_rest = (t.detach().numpy() for t in gaussians.tensors().values())
-    return means, log_scales, quaternions, logits, sh_dc, sh_rest.reshape(len(means), 45)
+    return means, log_scales, quaternions, logits, sh_dc, sh_rest.reshape(-1)
 
 
 def _footprint(
@@ -301,6 +386,7 @@ class _Render(torch.autograd.Function):
         ctx: Any,
         rasterizer: CpuRasterizer,
         kept: _Kept,
+        harmonics: DeferredHarmonics | None,
         camera: Camera,
         degree: int,
         absolute: Tensor | None,
@@ -315,9 +401,11 @@ class _Render(torch.autograd.Function):
         alpha = rasterizer._tensors.empty((camera.height, camera.width))
         radii = torch.empty(len(gaussians), dtype=torch.int32)
         background_array = background.detach().contiguous().numpy()
-        kept.frame = _forward(rasterizer, arena, gaussians, camera, degree, background_array, image, alpha, radii)
-        ctx.rasterizer, ctx.kept, ctx.absolute = rasterizer, kept, absolute
-        ctx.save_for_backward(alpha if ctx.needs_input_grad[5] else None, *gaussians.tensors().values())
+        kept.frame = _forward(
+            rasterizer, arena, gaussians, harmonics, camera, degree, background_array, image, alpha, radii
+        )
+        ctx.rasterizer, ctx.kept, ctx.harmonics, ctx.absolute = rasterizer, kept, harmonics, absolute
+        ctx.save_for_backward(alpha if ctx.needs_input_grad[6] else None, *gaussians.tensors().values())
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
         return image, alpha, radii
@@ -335,10 +423,17 @@ class _Render(torch.autograd.Function):
         arena = ctx.rasterizer._scratch.lease(holder)
         try:
             gradients, g_screen = _backward(
-                ctx.rasterizer, arena, frame, Gaussians(*tensors), g_image_array, g_alpha_array, ctx.absolute
+                ctx.rasterizer,
+                arena,
+                frame,
+                Gaussians(*tensors),
+                ctx.harmonics,
+                g_image_array,
+                g_alpha_array,
+                ctx.absolute,
             )
         except BaseException:
             arena.drop("rows")  # it must be all zero, and an interrupt may have left sums in it
             raise
         g_background = None if alpha is None else (g_image * (1 - alpha).unsqueeze(-1)).sum((0, 1))
-        return None, None, None, None, None, g_background, g_screen, *gradients
+        return None, None, None, None, None, None, g_background, g_screen, *gradients

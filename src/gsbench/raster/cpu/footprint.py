@@ -40,7 +40,7 @@ def cover_tiles(
     here too which pixels are blended.
     """
     tiles_x = (width + at.TILE - 1) // at.TILE
-    floats, _, _ = memory
+    floats, _ = memory
     one = splat(ONE)
     own, row = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :]
     for tile in range(first, past):

@@ -1,6 +1,6 @@
-"""The geometry of projection for 8 Gaussians at a time, in float64, shared by the forward and the backward kernel.
+"""The geometry of projection for 16 Gaussians at a time, in float32, shared by the forward and the backward kernel.
 
-In float32 the 2D covariance of a needle would lose too many digits. Matrices are tuples of rows, vectors tuples.
+Matrices are tuples of rows, vectors tuples. Nothing here subtracts large numbers: see ``spread``.
 """
 
 from __future__ import annotations
@@ -12,9 +12,7 @@ from gsbench.raster.cpu.jit import inlined
 from gsbench.raster.cpu.simd import exp2, gather, maximum, minimum, square_root
 
 LOG2_E = 1.0 / math.log(2.0)
-MAX_LOG2 = (
-    1000.0  # beyond, exp2 is undefined; a scale of 2^1000 overflows in the determinant, and its Gaussian is culled
-)
+MAX_LOG2 = 126.0  # beyond, exp2 is undefined; a scale of 2^126 has a variance that is not finite, and is culled
 
 
 @inlined
@@ -33,10 +31,19 @@ def rotation_matrix(w: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @inlined
-def to_view(mean: Any, v: Any) -> Any:
-    x = mean[0] * v.r00 + mean[1] * v.r01 + mean[2] * v.r02 + v.tx
-    y = mean[0] * v.r10 + mean[1] * v.r11 + mean[2] * v.r12 + v.ty
-    z = mean[0] * v.r20 + mean[1] * v.r21 + mean[2] * v.r22 + v.tz
+def from_camera(mean: Any, v: Any) -> Any:
+    """The vector from the camera centre to the mean, in world axes.
+
+    Everything goes through this difference: rotating it loses no digits however far the scene is from its origin.
+    """
+    return mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
+
+
+@inlined
+def to_view(offset: Any, v: Any) -> Any:
+    x = offset[0] * v.r00 + offset[1] * v.r01 + offset[2] * v.r02
+    y = offset[0] * v.r10 + offset[1] * v.r11 + offset[2] * v.r12
+    z = offset[0] * v.r20 + offset[1] * v.r21 + offset[2] * v.r22
     return x, y, z
 
 
@@ -87,19 +94,22 @@ def gather_quaternions(quaternions: Any, indices: Any) -> Any:
 
 
 @inlined
-def covariance(m0: Any, m1: Any, blur: Any) -> Any:
-    """xx, xy, yy and the determinant of M M^T + blur I, for the rows of M.
+def spread(m0: Any, m1: Any, blur: Any) -> Any:
+    """Spread of the rows of M: xx, xy, yy of the covariance C = M M^T + blur I, and a = yy / det C.
 
-    The determinant has no cancellation: det(M M^T) is the squared cross product of the rows.
+    1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows; dividing a row by the square
+    root of yy first gives 1/a without cancellation and without overflow.
     """
-    xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1)
-    cross = (m0[1] * m1[2] - m0[2] * m1[1], m0[2] * m1[0] - m0[0] * m1[2], m0[0] * m1[1] - m0[1] * m1[0])
-    return xx + blur, xy, yy + blur, dot(cross, cross) + blur * (xx + yy + blur)
+    xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + blur
+    inverse = 1 / square_root(yy)
+    n1 = (m1[0] * inverse, m1[1] * inverse, m1[2] * inverse)
+    cross = (m0[1] * n1[2] - m0[2] * n1[1], m0[2] * n1[0] - m0[0] * n1[2], m0[0] * n1[1] - m0[1] * n1[0])
+    given = dot(cross, cross) + blur * (xx + yy) / yy
+    return xx + blur, xy, yy, 1 / given
 
 
 @inlined
-def direction_from_camera(mean: Any, v: Any) -> Any:
-    """The direction from the camera centre to the mean, of length 1, and the inverse distance."""
-    dx, dy, dz = mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
-    inverse = 1 / square_root(dx * dx + dy * dy + dz * dz)
-    return dx * inverse, dy * inverse, dz * inverse, inverse
+def normalized(offset: Any) -> Any:
+    """Scale ``offset`` to length 1; with the inverse of its length."""
+    inverse = 1 / square_root(dot(offset, offset))
+    return scaled(offset, (inverse, inverse, inverse)), inverse

@@ -1,4 +1,8 @@
-"""Spherical harmonics for the projection kernels: the basis and its pull-back to the direction, in float32."""
+"""Spherical harmonics for the projection kernels, beyond the constant one, in float32.
+
+The basis of 16 Gaussians is a 16x16 matrix: first a row for each function, which the kernels transpose into a row for
+each Gaussian, to be multiplied with its coefficients.
+"""
 
 from __future__ import annotations
 
@@ -6,122 +10,96 @@ from typing import Any
 
 import numpy as np
 
-from gsbench.gaussians.model import NUM_SH_REST
 from gsbench.gaussians.spherical_harmonics import C0, C1, C2, C3
 from gsbench.raster.cpu.jit import inlined
+from gsbench.raster.cpu.shuffle import transpose
+from gsbench.raster.cpu.simd import LANES, load, splat, store
 
 F0, F1 = np.float32(C0), np.float32(C1)
 D0, D1, D2, D3, D4 = (np.float32(value) for value in C2)
 T0, T1, T2, T3, T4, T5, T6 = (np.float32(value) for value in C3)
-HALF, TWO, THREE, FOUR, SIX, EIGHT = (np.float32(value) for value in (0.5, 2, 3, 4, 6, 8))
+TWO, THREE, FOUR, SIX, EIGHT = (np.float32(value) for value in (2, 3, 4, 6, 8))
 ZERO = np.float32(0)
-SH_TERMS = NUM_SH_REST + 1
+MATRIX = LANES * LANES
 
 
 @inlined
-def fill_basis(degree: int, x: Any, y: Any, z: Any, basis: Any) -> None:
-    """Write the (degree + 1)^2 basis functions at the unit direction (x, y, z)."""
-    basis[0] = F0
+def fill_basis(degree: int, x: Any, y: Any, z: Any, matrix: Any) -> None:
+    """Write function k + 1 at the unit directions (x, y, z) to column k of ``matrix`` [16 * 16], a row a Gaussian.
+
+    The columns of functions above ``degree``, and the last one, are zero.
+    """
+    for k in range((degree + 1) * (degree + 1) - 1, LANES):
+        store(matrix, k * LANES, splat(ZERO))
     if degree >= 1:
-        basis[1] = -F1 * y
-        basis[2] = F1 * z
-        basis[3] = -F1 * x
+        store(matrix, 0, -F1 * y)
+        store(matrix, LANES, F1 * z)
+        store(matrix, 2 * LANES, -F1 * x)
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        basis[4] = D0 * x * y
-        basis[5] = D1 * y * z
-        basis[6] = D2 * (TWO * zz - xx - yy)
-        basis[7] = D3 * x * z
-        basis[8] = D4 * (xx - yy)
+        store(matrix, 3 * LANES, D0 * x * y)
+        store(matrix, 4 * LANES, D1 * y * z)
+        store(matrix, 5 * LANES, D2 * (TWO * zz - xx - yy))
+        store(matrix, 6 * LANES, D3 * x * z)
+        store(matrix, 7 * LANES, D4 * (xx - yy))
         if degree >= 3:
-            basis[9] = T0 * y * (THREE * xx - yy)
-            basis[10] = T1 * x * y * z
-            basis[11] = T2 * y * (FOUR * zz - xx - yy)
-            basis[12] = T3 * z * (TWO * zz - THREE * xx - THREE * yy)
-            basis[13] = T4 * x * (FOUR * zz - xx - yy)
-            basis[14] = T5 * z * (xx - yy)
-            basis[15] = T6 * x * (xx - THREE * yy)
+            store(matrix, 8 * LANES, T0 * y * (THREE * xx - yy))
+            store(matrix, 9 * LANES, T1 * x * y * z)
+            store(matrix, 10 * LANES, T2 * y * (FOUR * zz - xx - yy))
+            store(matrix, 11 * LANES, T3 * z * (TWO * zz - THREE * xx - THREE * yy))
+            store(matrix, 12 * LANES, T4 * x * (FOUR * zz - xx - yy))
+            store(matrix, 13 * LANES, T5 * z * (xx - yy))
+            store(matrix, 14 * LANES, T6 * x * (xx - THREE * yy))
+    transpose(matrix, 0)
 
 
 @inlined
-def direction_gradient(degree: int, x: Any, y: Any, z: Any, g: Any) -> Any:
-    """The gradient (not yet tangential) at (x, y, z) of ``sum_k g[k] basis[k]``."""
-    gx, gy, gz = ZERO, ZERO, ZERO
+def direction_gradient(degree: int, x: Any, y: Any, z: Any, matrix: Any) -> Any:
+    """The gradient (not yet tangential) at (x, y, z) of ``sum_k g[k] basis[k + 1]``.
+
+    ``matrix`` [16 * 16] has g as a row for each Gaussian; it is transposed.
+    """
+    gx, gy, gz = splat(ZERO), splat(ZERO), splat(ZERO)
     if degree >= 1:
-        gx, gy, gz = -F1 * g[3], -F1 * g[1], F1 * g[2]
+        transpose(matrix, 0)
+        gx = -F1 * load(matrix, 2 * LANES)
+        gy = -F1 * load(matrix, 0)
+        gz = F1 * load(matrix, LANES)
     if degree >= 2:
-        gx += D0 * y * g[4] - TWO * D2 * x * g[6] + D3 * z * g[7] + TWO * D4 * x * g[8]
-        gy += D0 * x * g[4] + D1 * z * g[5] - TWO * D2 * y * g[6] - TWO * D4 * y * g[8]
-        gz += D1 * y * g[5] + FOUR * D2 * z * g[6] + D3 * x * g[7]
+        g_xy, g_yz, g_zz = load(matrix, 3 * LANES), load(matrix, 4 * LANES), load(matrix, 5 * LANES)
+        g_xz, g_xx_yy = load(matrix, 6 * LANES), load(matrix, 7 * LANES)
+        gx += D0 * y * g_xy - TWO * D2 * x * g_zz + D3 * z * g_xz + TWO * D4 * x * g_xx_yy
+        gy += D0 * x * g_xy + D1 * z * g_yz - TWO * D2 * y * g_zz - TWO * D4 * y * g_xx_yy
+        gz += D1 * y * g_yz + FOUR * D2 * z * g_zz + D3 * x * g_xz
     if degree >= 3:
         xx, yy, zz = x * x, y * y, z * z
         xy, xz, yz = x * y, x * z, y * z
+        g9, g10, g11 = load(matrix, 8 * LANES), load(matrix, 9 * LANES), load(matrix, 10 * LANES)
+        g12, g13, g14 = load(matrix, 11 * LANES), load(matrix, 12 * LANES), load(matrix, 13 * LANES)
+        g15 = load(matrix, 14 * LANES)
         gx += (
-            SIX * T0 * xy * g[9]
-            + T1 * yz * g[10]
-            - TWO * T2 * xy * g[11]
-            - SIX * T3 * xz * g[12]
-            + T4 * (FOUR * zz - THREE * xx - yy) * g[13]
-            + TWO * T5 * xz * g[14]
-            + THREE * T6 * (xx - yy) * g[15]
+            SIX * T0 * xy * g9
+            + T1 * yz * g10
+            - TWO * T2 * xy * g11
+            - SIX * T3 * xz * g12
+            + T4 * (FOUR * zz - THREE * xx - yy) * g13
+            + TWO * T5 * xz * g14
+            + THREE * T6 * (xx - yy) * g15
         )
         gy += (
-            THREE * T0 * (xx - yy) * g[9]
-            + T1 * xz * g[10]
-            + T2 * (FOUR * zz - xx - THREE * yy) * g[11]
-            - SIX * T3 * yz * g[12]
-            - TWO * T4 * xy * g[13]
-            - TWO * T5 * yz * g[14]
-            - SIX * T6 * xy * g[15]
+            THREE * T0 * (xx - yy) * g9
+            + T1 * xz * g10
+            + T2 * (FOUR * zz - xx - THREE * yy) * g11
+            - SIX * T3 * yz * g12
+            - TWO * T4 * xy * g13
+            - TWO * T5 * yz * g14
+            - SIX * T6 * xy * g15
         )
         gz += (
-            T1 * xy * g[10]
-            + EIGHT * T2 * yz * g[11]
-            + T3 * (SIX * zz - THREE * xx - THREE * yy) * g[12]
-            + EIGHT * T4 * xz * g[13]
-            + T5 * (xx - yy) * g[14]
+            T1 * xy * g10
+            + EIGHT * T2 * yz * g11
+            + T3 * (SIX * zz - THREE * xx - THREE * yy) * g12
+            + EIGHT * T4 * xz * g13
+            + T5 * (xx - yy) * g14
         )
     return gx, gy, gz
-
-
-@inlined
-def add_colors(degree: int, direction: Any, sh_dc: Any, sh_rest: Any, i: int, basis: Any, rgb: Any) -> int:
-    """Write the colour of Gaussian i to ``rgb`` [3]; returns a bit for each channel that was below 0 and is clamped."""
-    fill_basis(degree, direction[0], direction[1], direction[2], basis)
-    red, green, blue = basis[0] * sh_dc[i, 0], basis[0] * sh_dc[i, 1], basis[0] * sh_dc[i, 2]
-    for k in range((degree + 1) * (degree + 1) - 1):
-        red += basis[k + 1] * sh_rest[i, 3 * k]
-        green += basis[k + 1] * sh_rest[i, 3 * k + 1]
-        blue += basis[k + 1] * sh_rest[i, 3 * k + 2]
-    red, green, blue = red + HALF, green + HALF, blue + HALF
-    rgb[0] = ZERO if red < ZERO else red  # NaN stays
-    rgb[1] = ZERO if green < ZERO else green
-    rgb[2] = ZERO if blue < ZERO else blue
-    return (1 if red < ZERO else 0) + (2 if green < ZERO else 0) + (4 if blue < ZERO else 0)
-
-
-@inlined
-def pull_back_colors(
-    degree: int,
-    direction: Any,
-    g_rgb: Any,
-    sh_rest: Any,
-    i: int,
-    basis: Any,
-    g_basis: Any,
-    g_sh_dc: Any,
-    g_sh_rest: Any,
-) -> Any:
-    """Write the gradients of Gaussian i's coefficients; returns the gradient (not yet tangential) at its direction."""
-    red, green, blue = g_rgb
-    fill_basis(degree, direction[0], direction[1], direction[2], basis)
-    g_sh_dc[i, 0], g_sh_dc[i, 1], g_sh_dc[i, 2] = basis[0] * red, basis[0] * green, basis[0] * blue
-    used = (degree + 1) * (degree + 1) - 1
-    for k in range(used):
-        g_basis[k + 1] = red * sh_rest[i, 3 * k] + green * sh_rest[i, 3 * k + 1] + blue * sh_rest[i, 3 * k + 2]
-        g_sh_rest[i, 3 * k] = basis[k + 1] * red
-        g_sh_rest[i, 3 * k + 1] = basis[k + 1] * green
-        g_sh_rest[i, 3 * k + 2] = basis[k + 1] * blue
-    for k in range(3 * used, g_sh_rest.shape[1]):
-        g_sh_rest[i, k] = ZERO
-    return direction_gradient(degree, direction[0], direction[1], direction[2], g_basis)

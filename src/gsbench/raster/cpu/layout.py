@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.raster.base import RasterConstants
-from gsbench.raster.cpu.simd import LANES, SUM_LANES, WIDE_LANES
+from gsbench.raster.cpu.simd import LANES, SUM_LANES
 from gsbench.scene.camera import Camera
 
 BLOCK = 4  # px; one vector holds the 4x4 pixels of a block, row by row
@@ -40,13 +40,9 @@ SUM_RED, SUM_GREEN, SUM_BLUE = SUM_LANES[6:9]
 SUM_ABS_T, SUM_ABS_Y = SUM_LANES[9:11]  # |h t|, |h (d power / d dy)|
 
 
-def kernel_memory() -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]]:
+def kernel_memory() -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Scratch memory for one call of a kernel; kernels allocate nothing themselves."""
-    return (
-        np.empty(5 * TILE_PIXELS, np.float32),
-        np.empty(2 * RECORD * WIDE_LANES, np.float64),
-        np.empty(LANES, np.int64),
-    )
+    return np.empty(5 * TILE_PIXELS, np.float32), np.empty(LANES, np.int64)
 
 
 class View(NamedTuple):

@@ -1,4 +1,4 @@
-"""Explicit SIMD values inside numba kernels: 16 float32 or 8 float64 in one LLVM vector.
+"""Explicit SIMD values inside numba kernels: 16 float32 in one LLVM vector.
 
 Auto-vectorisation of numba loops is fragile: an unlucky index type makes an inner loop scalar. Here a vector is a value
 like any other: ``load`` and ``store`` move it, ``+ - * /``, ``-x`` and comparisons work lane by lane (a Python or numpy
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from llvmlite import ir
@@ -25,19 +25,18 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 intrinsic: Any = numba_extending.intrinsic  # its functions take one argument less than they are written with
 
 LANES = 16  # of float32
-WIDE_LANES = 8  # of float64
 
 
 class _Vector(types.Type):
-    """The numba type of ``lanes`` numbers of a type."""
+    """The numba type of 16 float32."""
 
-    def __init__(self, element: Any, lanes: int) -> None:
-        self.element, self.lanes = element, lanes
-        self.scalar_ir = ir.FloatType() if element == types.float32 else ir.DoubleType()
-        self.ir = ir.VectorType(self.scalar_ir, lanes)
-        self.bits_ir = ir.VectorType(ir.IntType(element.bitwidth), lanes)
-        self.suffix = f"v{lanes}f{element.bitwidth}"  # of LLVM's intrinsic functions
-        super().__init__(name=f"{element}x{lanes}")
+    def __init__(self) -> None:
+        self.element, self.lanes = types.float32, LANES
+        self.scalar_ir = ir.FloatType()
+        self.ir = ir.VectorType(self.scalar_ir, LANES)
+        self.bits_ir = ir.VectorType(ir.IntType(32), LANES)
+        self.suffix = f"v{LANES}f32"  # of LLVM's intrinsic functions
+        super().__init__(name=f"float32x{LANES}")
 
     def constant(self, value: float) -> ir.Constant:
         return ir.Constant(self.ir, [ir.Constant(self.scalar_ir, value)] * self.lanes)
@@ -47,17 +46,15 @@ class _Vector(types.Type):
 
 
 class _Mask(types.Type):
-    """The numba type of ``lanes`` truth values."""
+    """The numba type of 16 truth values."""
 
-    def __init__(self, lanes: int) -> None:
-        self.lanes = lanes
-        self.ir = ir.VectorType(ir.IntType(1), lanes)
-        super().__init__(name=f"maskx{lanes}")
+    def __init__(self) -> None:
+        self.ir = ir.VectorType(ir.IntType(1), LANES)
+        super().__init__(name=f"maskx{LANES}")
 
 
-_NARROW = _Vector(types.float32, LANES)
-_WIDE = _Vector(types.float64, WIDE_LANES)
-_OF_ARRAY = {types.float32: _NARROW, types.float64: _WIDE}
+VECTOR = _Vector()
+_MASK = _Mask()
 
 
 @register_model(_Vector)
@@ -71,7 +68,7 @@ class _Model(models.PrimitiveModel):
 # ----------------------------------------------------------------------------------------------------------
 
 
-def _lane_indices(lanes: Sequence[int]) -> ir.Constant:
+def lane_indices(lanes: Sequence[int]) -> ir.Constant:
     return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), [ir.Constant(ir.IntType(32), lane) for lane in lanes])
 
 
@@ -81,7 +78,7 @@ def _as_vector(context: Any, builder: Any, value: Any, kind: Any, vector: _Vecto
     scalar = context.cast(builder, value, kind, vector.element)
     undefined = ir.Constant(vector.ir, ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(first, undefined, _lane_indices([0] * vector.lanes))
+    return builder.shuffle_vector(first, undefined, lane_indices([0] * vector.lanes))
 
 
 def _common_vector(kinds: Sequence[Any]) -> _Vector | None:
@@ -97,7 +94,7 @@ def _register_operator(functions: Sequence[Any], arity: int, emit: Callable[...,
     class _Template(AbstractTemplate):
         def generic(self, args: Sequence[Any], kws: Any) -> Any:
             vector = _common_vector(args) if len(args) == arity else None
-            return signature(_Mask(vector.lanes) if compares else vector, *args) if vector else None
+            return signature(_MASK if compares else vector, *args) if vector else None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         vector: Any = _common_vector(sig.args)
@@ -141,37 +138,51 @@ _register_mask_operator([operator.invert], 1, lambda builder, a: builder.not_(a)
 # -------------------------------------------------------------------------------------------------------------
 
 
-def _address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+def address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Of element ``args[1]`` of the array ``args[0]``."""
     data = context.make_array(sig.args[0])(context, builder, args[0]).data
     return builder.gep(data, [context.cast(builder, args[1], sig.args[1], types.intp)])
 
 
 def _vector_of(array: Any) -> _Vector:
-    if not (isinstance(array, types.Array) and array.layout == "C" and array.dtype in _OF_ARRAY):
-        raise TypeError(f"a contiguous float32 or float64 array is needed, got {array}")
-    return _OF_ARRAY[array.dtype]
+    if not (isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.float32):
+        raise TypeError(f"a contiguous float32 array is needed, got {array}")
+    return VECTOR
 
 
 @intrinsic
 def load(typing_context: Any, array: Any, index: Any) -> Any:
-    """The vector ``array.flat[index : index + lanes]``, 16 float32 or 8 float64."""
+    """The vector ``array.flat[index : index + 16]``."""
     vector = _vector_of(array)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = builder.bitcast(_address(context, builder, sig, args), vector.ir.as_pointer())
+        pointer = builder.bitcast(address(context, builder, sig, args), vector.ir.as_pointer())
         return builder.load(pointer, align=vector.element.bitwidth // 8)
 
     return vector(array, index), codegen
 
 
 @intrinsic
+def load_numbers(typing_context: Any, array: Any, index: Any) -> Any:
+    """``load`` of an array that may be uint8 instead."""
+    is_bytes = isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.uint8
+    vector = VECTOR if is_bytes else _vector_of(array)
+    kind = ir.VectorType(ir.IntType(8), LANES) if is_bytes else vector.ir
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        value = builder.load(builder.bitcast(address(context, builder, sig, args), kind.as_pointer()), align=1)
+        return builder.uitofp(value, vector.ir) if is_bytes else value
+
+    return vector(array, index), codegen
+
+
+@intrinsic
 def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write the vector ``value`` to ``array.flat[index : index + lanes]``."""
+    """Write the vector ``value`` to ``array.flat[index : index + 16]``."""
     vector = _vector_of(array)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = builder.bitcast(_address(context, builder, sig, args), vector.ir.as_pointer())
+        pointer = builder.bitcast(address(context, builder, sig, args), vector.ir.as_pointer())
         operand = _as_vector(context, builder, args[2], sig.args[2], vector)
         builder.store(operand, pointer, align=vector.element.bitwidth // 8)
         return context.get_dummy_value()
@@ -179,23 +190,40 @@ def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
     return types.void(array, index, value), codegen
 
 
+def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
+    """The addresses of ``array.flat[indices[k] * stride + offset]``, lane by lane, of the first four of ``args``."""
+    data = context.make_array(sig.args[0])(context, builder, args[0]).data
+    indices = context.make_array(sig.args[1])(context, builder, args[1]).data
+    stride, offset = (context.cast(builder, args[k], sig.args[k], types.intp) for k in (2, 3))
+    for lane in range(LANES):
+        index = builder.load(builder.gep(indices, [ir.Constant(ir.IntType(64), lane)]))
+        yield builder.gep(data, [builder.add(builder.mul(index, stride), offset)])
+
+
 @intrinsic
 def gather(typing_context: Any, array: Any, indices: Any, stride: Any, offset: Any) -> Any:
-    """8 float64: ``array.flat[indices[k] * stride + offset]`` of a float32 array; ``indices`` is an int64 array [8]."""
+    """``array.flat[indices[k] * stride + offset]`` in lane k; ``indices`` is an int64 array [16]."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        places = context.make_array(sig.args[1])(context, builder, args[1]).data
-        factor = context.cast(builder, args[2], sig.args[2], types.intp)
-        shift = context.cast(builder, args[3], sig.args[3], types.intp)
-        narrow = ir.Constant(ir.VectorType(ir.FloatType(), WIDE_LANES), ir.Undefined)
-        for lane in range(WIDE_LANES):
-            place = builder.load(builder.gep(places, [ir.Constant(ir.IntType(64), lane)]))
-            element = builder.load(builder.gep(data, [builder.add(builder.mul(place, factor), shift)]))
-            narrow = builder.insert_element(narrow, element, ir.Constant(ir.IntType(32), lane))
-        return builder.fpext(narrow, _WIDE.ir)
+        vector = ir.Constant(VECTOR.ir, ir.Undefined)
+        for lane, place in enumerate(_places(context, builder, sig, args)):
+            vector = builder.insert_element(vector, builder.load(place), ir.Constant(ir.IntType(32), lane))
+        return vector
 
-    return _WIDE(array, indices, stride, offset), codegen
+    return _vector_of(array)(array, indices, stride, offset), codegen
+
+
+@intrinsic
+def scatter(typing_context: Any, array: Any, indices: Any, stride: Any, offset: Any, value: Any) -> Any:
+    """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``; of equal indices the last one wins."""
+    _vector_of(array)
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        for lane, place in enumerate(_places(context, builder, sig, args)):
+            builder.store(builder.extract_element(args[4], ir.Constant(ir.IntType(32), lane)), place)
+        return context.get_dummy_value()
+
+    return types.void(array, indices, stride, offset, value), codegen
 
 
 @intrinsic
@@ -207,7 +235,7 @@ def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
         kind = ir.FunctionType(ir.VoidType(), [byte_pointer, word, word, word])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
         read, keep_in_all_caches, data = (ir.Constant(word, value) for value in (0, 3, 1))
-        pointer = builder.bitcast(_address(context, builder, sig, args), byte_pointer)
+        pointer = builder.bitcast(address(context, builder, sig, args), byte_pointer)
         builder.call(function, [pointer, read, keep_in_all_caches, data])
         return context.get_dummy_value()
 
@@ -236,23 +264,14 @@ def _function(emit: Callable[..., Any], *kinds: Any) -> Any:
     return vector(*kinds), codegen
 
 
-def _splat(scalar: Any, vector: _Vector) -> Any:
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _as_vector(context, builder, args[0], sig.args[0], vector)
-
-    return vector(scalar), codegen
-
-
 @intrinsic
 def splat(typing_context: Any, scalar: Any) -> Any:
     """``scalar`` in all of 16 float32."""
-    return _splat(scalar, _NARROW)
 
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _as_vector(context, builder, args[0], sig.args[0], VECTOR)
 
-@intrinsic
-def wide(typing_context: Any, scalar: Any) -> Any:
-    """``scalar`` in all of 8 float64."""
-    return _splat(scalar, _WIDE)
+    return VECTOR(scalar), codegen
 
 
 @intrinsic
@@ -298,7 +317,7 @@ def ceil(typing_context: Any, a: Any) -> Any:
 def select(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
     """``a`` where ``mask``, else ``b``; one of the two may be a number."""
     vector = _common_vector((a, b))
-    if vector is None or mask != _Mask(vector.lanes):
+    if vector is None or mask != _MASK:
         return None
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -313,7 +332,7 @@ def mask_bits(typing_context: Any, mask: Any) -> Any:
     """The mask as an integer: lane k is bit k."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.zext(builder.bitcast(args[0], ir.IntType(mask.lanes)), ir.IntType(64))
+        return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(64))
 
     return types.uint64(mask), codegen
 
@@ -321,13 +340,12 @@ def mask_bits(typing_context: Any, mask: Any) -> Any:
 @intrinsic
 def mask_from_bits(typing_context: Any, bits: Any) -> Any:
     """The mask of 16 lanes whose lane k is bit k of an integer."""
-    mask = _Mask(LANES)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         wide_bits = context.cast(builder, args[0], sig.args[0], types.uint64)
-        return builder.bitcast(builder.trunc(wide_bits, ir.IntType(LANES)), mask.ir)
+        return builder.bitcast(builder.trunc(wide_bits, ir.IntType(LANES)), _MASK.ir)
 
-    return mask(bits), codegen
+    return _MASK(bits), codegen
 
 
 @intrinsic
@@ -349,45 +367,41 @@ def _polynomial(builder: Any, vector: _Vector, x: Any, coefficients: Sequence[fl
     return value
 
 
-def _emit_exp2(builder: Any, vector: _Vector, x: Any, coefficients: Sequence[float]) -> Any:
-    """2^x = 2^n 2^f: adding 1.5 * 2^mantissa_bits leaves the nearest integer n in the low mantissa bits."""
-    mantissa_bits = 23 if vector is _NARROW else 52
-    magic = vector.constant(1.5 * 2.0**mantissa_bits)
-    shifted = builder.fadd(x, magic)
-    fraction = builder.fsub(x, builder.fsub(shifted, magic))
-    value = builder.bitcast(_polynomial(builder, vector, fraction, coefficients), vector.bits_ir)
-    exponent = builder.shl(builder.bitcast(shifted, vector.bits_ir), vector.bits(mantissa_bits))
-    return builder.bitcast(builder.add(value, exponent), vector.ir)
-
-
+MANTISSA_BITS = 23
 # 2^f on [-1/2, 1/2]: relative least-squares fit at 200 Chebyshev nodes, exact at 0, error 1.0e-7.
-_EXP2_NARROW = (1.0, 0.69314688444, 0.24022237957, 0.05550893024, 0.00967169832, 0.00132186722)
-_EXP2_WIDE = tuple(math.log(2.0) ** k / math.factorial(k) for k in range(12))  # Taylor series, error 1e-14
-# log2(m) = 2 / ln 2 artanh(s), s = (m - 1) / (m + 1), as a series in s^2; for m in [sqrt(1/2), sqrt(2)] error 1e-14
-_LOG2_SERIES = tuple(2.0 / math.log(2.0) / (2 * k + 1) for k in range(9))
+_EXP2 = (1.0, 0.69314688444, 0.24022237957, 0.05550893024, 0.00967169832, 0.00132186722)
+# log2(m) = 2 / ln 2 artanh(s), s = (m - 1) / (m + 1), as a series in s^2; for m in [sqrt(1/2), sqrt(2)] error 2e-8
+_LOG2_SERIES = tuple(2.0 / math.log(2.0) / (2 * k + 1) for k in range(5))
+_BITS_OF_ROOT_HALF = 0x3F3504F3
 
 
 @intrinsic
 def exp2(typing_context: Any, a: Any) -> Any:
-    """``2^a``: float32 within 2.5e-7 for -126 <= a < 127.5, float64 within 1e-13 for |a| < 1022; beyond, any value."""
+    """``2^a`` within 2.5e-7 for -126 <= a < 127.5; beyond, any value.
+
+    2^a = 2^n 2^f: adding 1.5 * 2^23 leaves the nearest integer n in the low bits of the mantissa.
+    """
 
     def emit(builder: Any, vector: _Vector, x: Any) -> Any:
-        return _emit_exp2(builder, vector, x, _EXP2_NARROW if vector is _NARROW else _EXP2_WIDE)
+        magic = vector.constant(1.5 * 2.0**MANTISSA_BITS)
+        shifted = builder.fadd(x, magic)
+        fraction = builder.fsub(x, builder.fsub(shifted, magic))
+        value = builder.bitcast(_polynomial(builder, vector, fraction, _EXP2), vector.bits_ir)
+        exponent = builder.shl(builder.bitcast(shifted, vector.bits_ir), vector.bits(MANTISSA_BITS))
+        return builder.bitcast(builder.add(value, exponent), vector.ir)
 
     return _function(emit, a)
 
 
 @intrinsic
 def log2(typing_context: Any, a: Any) -> Any:
-    """``log2(a)`` of 8 positive, normal float64, within 1e-13; any value elsewhere."""
-    if a is not _WIDE:
-        return None
+    """``log2(a)`` of positive, normal numbers, within 2e-7 of the larger of it and 1; any value elsewhere."""
 
     def emit(builder: Any, vector: _Vector, x: Any) -> Any:
         # The bits above those of sqrt(1/2), shifted down, are the exponent n of x = 2^n m.
-        bits, low = builder.bitcast(x, vector.bits_ir), vector.bits(0x3FE6A09E00000000)
-        exponent = builder.ashr(builder.sub(bits, low), vector.bits(52))
-        mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, vector.bits(52))), vector.ir)
+        bits = builder.bitcast(x, vector.bits_ir)
+        exponent = builder.ashr(builder.sub(bits, vector.bits(_BITS_OF_ROOT_HALF)), vector.bits(MANTISSA_BITS))
+        mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, vector.bits(MANTISSA_BITS))), vector.ir)
         s = builder.fdiv(builder.fsub(mantissa, vector.constant(1.0)), builder.fadd(mantissa, vector.constant(1.0)))
         series = _polynomial(builder, vector, builder.fmul(s, s), _LOG2_SERIES)
         return _call(builder, "fmuladd", vector, s, series, builder.sitofp(exponent, vector.ir))
@@ -406,7 +420,7 @@ def lane_sums(typing_context: Any, vectors: Any) -> Any:
     A tree of shuffles and additions: each level joins two vectors into one, so that the sums of eleven vectors cost
     about as much as three single sums.
     """
-    if not (isinstance(vectors, types.UniTuple) and vectors.dtype is _NARROW):
+    if not (isinstance(vectors, types.UniTuple) and vectors.dtype is VECTOR):
         return None
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -414,10 +428,10 @@ def lane_sums(typing_context: Any, vectors: Any) -> Any:
         half = LANES // 2
         while half:
             if len(level) % 2:
-                level.append(_NARROW.constant(0.0))
+                level.append(VECTOR.constant(0.0))
             # Of each group of 2 * half lanes the first half comes from a, the second from b.
             low = [lane // (2 * half) * 2 * half + lane % half + lane // half % 2 * LANES for lane in range(LANES)]
-            first, second = _lane_indices(low), _lane_indices([lane + half for lane in low])
+            first, second = lane_indices(low), lane_indices([lane + half for lane in low])
             level = [
                 builder.fadd(builder.shuffle_vector(a, b, first), builder.shuffle_vector(a, b, second))
                 for a, b in zip(level[::2], level[1::2], strict=True)
@@ -425,4 +439,4 @@ def lane_sums(typing_context: Any, vectors: Any) -> Any:
             half //= 2
         return level[0]
 
-    return _NARROW(vectors), codegen
+    return VECTOR(vectors), codegen

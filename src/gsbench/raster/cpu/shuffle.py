@@ -1,0 +1,156 @@
+"""Vectors turned into other vectors: 16x16 transposition, integers in the bits of lanes, and harmonics by channel.
+
+The kernels hold a quantity of 16 Gaussians in a vector; records, gradient rows and the coefficients of one Gaussian lie
+side by side in memory. Here one becomes the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from llvmlite import ir
+from numba.core import types
+
+from gsbench.gaussians.model import NUM_SH_REST
+from gsbench.raster.cpu.simd import LANES, VECTOR, address, intrinsic, lane_indices
+
+CHANNELS = 3
+REST = CHANNELS * NUM_SH_REST  # numbers of one Gaussian in ``sh_rest``: coefficient by coefficient, r g b
+REST_STARTS = (0, LANES, REST - LANES)  # of the three vectors that hold them; the last two share three numbers
+
+
+def _load(builder: Any, pointer: Any, place: int) -> Any:
+    at = builder.gep(pointer, [ir.Constant(ir.IntType(64), place)])
+    return builder.load(builder.bitcast(at, VECTOR.ir.as_pointer()), align=4)
+
+
+def _store(builder: Any, value: Any, pointer: Any, place: int) -> None:
+    at = builder.gep(pointer, [ir.Constant(ir.IntType(64), place)])
+    builder.store(value, builder.bitcast(at, VECTOR.ir.as_pointer()), align=4)
+
+
+@intrinsic
+def transpose(typing_context: Any, array: Any, index: Any) -> Any:
+    """Transpose the 16x16 numbers at ``array.flat[index : index + 256]`` in place."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        pointer = address(context, builder, sig, args)
+        rows = [_load(builder, pointer, LANES * k) for k in range(LANES)]
+        half = LANES // 2
+        while half:  # swap the off-diagonal squares of size ``half``
+            own = [lane - half + LANES if lane & half else lane for lane in range(LANES)]
+            other = [lane + LANES if lane & half else lane + half for lane in range(LANES)]
+            for k in range(LANES):
+                if not k & half:
+                    a, b = rows[k], rows[k + half]
+                    rows[k] = builder.shuffle_vector(a, b, lane_indices(own))
+                    rows[k + half] = builder.shuffle_vector(a, b, lane_indices(other))
+            half //= 2
+        for k, row in enumerate(rows):
+            _store(builder, row, pointer, LANES * k)
+        return context.get_dummy_value()
+
+    return types.void(array, index), codegen
+
+
+@intrinsic
+def as_integers(typing_context: Any, value: Any) -> Any:
+    """Whole numbers as int32, whose bits the lanes then hold: only to be stored, or read as int32."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.bitcast(builder.fptosi(args[0], VECTOR.bits_ir), VECTOR.ir)
+
+    return VECTOR(value), codegen
+
+
+@intrinsic
+def as_span(typing_context: Any, first: Any, past: Any) -> Any:
+    """``first + past * 65536`` as int32, in the bits of the lanes."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        low, high = (builder.fptosi(value, VECTOR.bits_ir) for value in args)
+        return builder.bitcast(builder.or_(low, builder.shl(high, VECTOR.bits(16))), VECTOR.ir)
+
+    return VECTOR(first, past), codegen
+
+
+@intrinsic
+def index_bits(typing_context: Any, start: Any) -> Any:
+    """``start`` + lane as int32, in the bits of the lanes."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        first = context.cast(builder, args[0], sig.args[0], types.int32)
+        undefined = ir.Constant(VECTOR.bits_ir, ir.Undefined)
+        placed = builder.insert_element(undefined, first, ir.Constant(ir.IntType(32), 0))
+        everywhere = builder.shuffle_vector(placed, undefined, lane_indices([0] * LANES))
+        return builder.bitcast(builder.add(everywhere, lane_indices(range(LANES))), VECTOR.ir)
+
+    return VECTOR(start), codegen
+
+
+@intrinsic
+def load_rest(typing_context: Any, array: Any, index: Any) -> Any:
+    """The 45 numbers ``array.flat[index : index + 45]`` as three vectors that start at ``REST_STARTS``."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        pointer = address(context, builder, sig, args)
+        return context.make_tuple(builder, sig.return_type, [_load(builder, pointer, start) for start in REST_STARTS])
+
+    return types.UniTuple(VECTOR, CHANNELS)(array, index), codegen
+
+
+@intrinsic
+def store_rest(typing_context: Any, array: Any, index: Any, values: Any) -> Any:
+    """The inverse of ``load_rest``."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        pointer = address(context, builder, sig, args)
+        for k, start in enumerate(REST_STARTS):
+            _store(builder, builder.extract_value(args[2], k), pointer, start)
+        return context.get_dummy_value()
+
+    return types.void(array, index, values), codegen
+
+
+@intrinsic
+def by_channel(typing_context: Any, rest: Any) -> Any:
+    """Red, green and blue of ``load_rest``: coefficient k in lane k; lane 15 repeats lane 14."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        first, second, third = (builder.extract_value(args[0], k) for k in range(CHANNELS))
+        channels = []
+        for channel in range(CHANNELS):
+            places = [CHANNELS * min(k, NUM_SH_REST - 1) + channel for k in range(LANES)]
+            front = [place if place < 2 * LANES else 0 for place in places]
+            whole = [k if p < 2 * LANES else p - REST_STARTS[2] + LANES for k, p in enumerate(places)]
+            joined = builder.shuffle_vector(first, second, lane_indices(front))
+            channels.append(builder.shuffle_vector(joined, third, lane_indices(whole)))
+        return context.make_tuple(builder, sig.return_type, channels)
+
+    return types.UniTuple(VECTOR, CHANNELS)(rest), codegen
+
+
+@intrinsic
+def outer_rest(typing_context: Any, basis: Any, red: Any, green: Any, blue: Any) -> Any:
+    """basis[k] times a colour, in the order of ``load_rest``; ``basis`` has coefficient k in lane k."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        row, *colors = args
+        undefined = ir.Constant(VECTOR.ir, ir.Undefined)
+        color = undefined
+        for channel, value in enumerate(colors):
+            scalar = context.cast(builder, value, sig.args[channel + 1], types.float32)
+            color = builder.insert_element(color, scalar, ir.Constant(ir.IntType(32), channel))
+
+        def spread(vector: Any, lanes: Sequence[int]) -> Any:
+            return builder.shuffle_vector(vector, undefined, lane_indices(lanes))
+
+        products = []
+        for start in REST_STARTS:
+            numbers = range(start, start + LANES)
+            factor = spread(row, [number // CHANNELS for number in numbers])
+            products.append(builder.fmul(factor, spread(color, [number % CHANNELS for number in numbers])))
+        return context.make_tuple(builder, sig.return_type, products)
+
+    return types.UniTuple(VECTOR, CHANNELS)(basis, red, green, blue), codegen

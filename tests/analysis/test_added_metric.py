@@ -1,0 +1,56 @@
+"""A metric of one's own that is added to an experiment with trials: what these lack counts as unset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gsbench.analysis.cells import select_trials
+from gsbench.analysis.report.build import build_report
+from gsbench.analysis.results import load_experiment
+from gsbench.analysis.tables import build_table
+from gsbench.errors import InputError
+from tests.analysis.test_tables import one_trial
+
+KEY = "eval.extra.mae._target_"
+OWN = {"eval__extra": {"mae": {"_target_": "mine.Mae"}}}
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    for seed in (0, 1):
+        for densify in ("adc", "volumetric"):
+            one_trial(tmp_path, seed, "aaaaaaaa", _densify=densify, psnr=27.0 + seed)
+            one_trial(tmp_path, seed, "bbbbbbbb", OWN, _densify=densify, psnr=27.0 + seed, mae=3.0)
+    return tmp_path
+
+
+def test_tables_show_both_and_choose_either(runs: Path) -> None:
+    experiment = load_experiment(runs, "exp")
+    table = build_table(experiment)
+    assert table.row_headings == ("scene", "init", "densify", KEY)
+    shown = {(row.labels[2], row.labels[3]) for row in table.rows if row.labels[0] == "garden"}
+    assert shown == {(arm, value) for arm in ("adc", "volumetric") for value in ("None", "mine.Mae")}
+    assert len(select_trials(experiment.trials, {KEY: "mine.Mae"})) == 4
+    assert len(select_trials(experiment.trials, {KEY: "None"})) == 4
+
+
+def test_the_report_is_written(runs: Path) -> None:
+    assert "mine.Mae" in build_report(load_experiment(runs, "exp"))
+
+
+def test_a_null_and_no_key_are_one_setting(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
+    one_trial(tmp_path, 1, "bbbbbbbb", {"eval__extra": None}, psnr=28.0)
+    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
+    assert [row.entries[0].text for row in table.rows] == ["27.50 ± 0.71"]
+
+
+@pytest.mark.parametrize("name", ["eval.extra.mea._target_", "densify.volume_treshold", "nothing"])
+def test_a_key_that_no_trial_has_is_refused(runs: Path, name: str) -> None:
+    experiment = load_experiment(runs, "exp")
+    with pytest.raises(InputError, match=f"no trial has a setting '{name}'"):
+        build_table(experiment, rows=["scene", name])
+    with pytest.raises(InputError, match=f"no trial has a setting '{name}'"):
+        select_trials(experiment.trials, {name: "None"})

@@ -1,0 +1,104 @@
+"""An experiment of thousands of finished trials, made by copying, and how long verbs take to read it.
+
+    python -m tests.benchmarks.scale FOLDER [SCENES ARMS SEEDS]
+
+prints a line for each verb: its name, CPU seconds and wall seconds of the whole command.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from gsbench.runs.hashing import config_hash, sha256_of
+from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_record import results_text
+from tests.finished import record_of
+
+NAME = "scale"
+VERBS = (["tables", NAME], ["status", NAME], ["report", NAME])
+
+
+def values_of(runs: Path, scene: int, arm: int, seed: int) -> dict[str, Any]:
+    """Settings as many as a trial's; every second arm is a variant of the one before."""
+    groups = {group: {f"setting_{k}": k / 7 for k in range(20)} for group in ("scene", "init", "train", "eval")}
+    densify = {f"setting_{k}": k / 7 for k in range(20)} | {
+        "name": "adc" if arm < 2 else f"arm{arm // 2}",
+        "volume_threshold": 0.03 if arm % 2 else 0.3,
+    }
+    names: dict[str, Any] = {"name": NAME, "seed": seed, "runs": str(runs), "tracking": {"name": "none"}, "launch": {}}
+    return names | groups | {
+        "scene": groups["scene"] | {"name": f"scene{scene:02d}"},
+        "init": groups["init"] | {"name": "sfm"},
+        "densify": densify,
+    }  # fmt: skip
+
+
+def write_trial(values: dict[str, Any], psnr: float) -> None:
+    """The files of a finished trial, as `write_finished` of `gsbench.runs.inputs` leaves them."""
+    folder = TrialPaths.of(values).folder
+    folder.mkdir(parents=True)
+    views = [psnr + k / 10 for k in range(-3, 4)]
+    per_view = "view,psnr\n" + "".join(f"v{k},{value!r}\n" for k, value in enumerate(views))
+    steps = range(100, 2001, 100)
+    curve = "".join(json.dumps({"step": k, "loss": 1 / k, "num_gaussians": k, "seconds": k / 10}) + "\n" for k in steps)
+    record = record_of(
+        values,
+        metrics={"psnr": sum(views) / len(views)},
+        hashes={"config": config_hash(values), "data": values["scene"]["name"], "init": "i", "cloud": "c"},
+        resolution=(400, 300),
+        init_report={f"number_{k}": k / 3 for k in range(40)},
+        machine={"cpu": "c", "architecture": "a", "kernels": "k", "torch": "t", "device": "cpu"},
+    )
+    text = results_text(record)
+    published = {f"renders/{k:04d}.png": (18000 + k, 1795342870763741765 + k) for k in range(30)}
+    digests = {"results.json": text, "per_view.csv": per_view, "metrics.jsonl": curve}
+    inputs = {
+        "version": 1,
+        "config": config_hash(values),
+        "results": sha256_of(record.to_json()),
+        "digests": {name: hashlib.sha256(content.encode()).hexdigest() for name, content in digests.items()},
+        "stages": {}, "pycolmap": None, "sources": {}, "folders": {}, "entries": {},
+        "published": published,
+        "settings": values,
+    }  # fmt: skip
+    for name, content in (digests | {"inputs.json": json.dumps(inputs, indent=1)}).items():
+        (folder / name).write_text(content)
+
+
+def write_all(runs: Path, scenes: int, arms: int, seeds: int) -> int:
+    """The trials of every scene, arm and seed; how many they are."""
+    for scene in range(scenes):
+        for arm in range(arms):
+            for seed in range(seeds):
+                write_trial(values_of(runs, scene, arm, seed), 25 + scene / 10 + arm / 20 + (seed * 7 % 5) / 30)
+    return scenes * arms * seeds
+
+
+def timed(runs: Path, argv: list[str]) -> tuple[float, float]:
+    """CPU and wall seconds of a command of gsbench."""
+    started, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    environment = os.environ | {"GSBENCH_RUNS": str(runs)}
+    command = [sys.executable, "-m", "gsbench.cli", *argv]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return cpu, time.perf_counter() - started
+
+
+if __name__ == "__main__":
+    place = Path(sys.argv[1]).resolve()
+    shape = tuple(map(int, sys.argv[2:5])) or (50, 20, 10)
+    if not (place / NAME).exists():
+        write_all(place, *shape)
+    for argv in VERBS:
+        cpu, wall = timed(place, argv)
+        print(f"{argv[0]:<8} {cpu:6.1f} s CPU {wall:6.1f} s", flush=True)

@@ -1,0 +1,22 @@
+"""Verbs over an experiment of many trials: what they say is right; how long they take is printed, and fails nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gsbench.analysis.results import load_experiment
+from gsbench.analysis.tables import build_table
+from tests.benchmarks.scale import NAME, timed, write_all
+
+
+def test_many_trials_are_read_and_averaged(tmp_path: Path) -> None:
+    """Ten thousand: `python -m tests.benchmarks.scale FOLDER 50 20 10`."""
+    assert write_all(tmp_path, scenes=3, arms=4, seeds=5) == 60
+    experiment = load_experiment(tmp_path, NAME)
+    assert len(experiment.trials) == 60
+    assert experiment.warnings == ()
+    table = build_table(experiment, metrics=["psnr"])
+    assert table.row_headings == ("scene", "init", "densify", "densify.volume_threshold")
+    assert len(table.rows) == 3 * 4 + 4
+    cpu, wall = timed(tmp_path, ["tables", NAME])
+    print(f"tables of 60 trials: {cpu:.1f} s CPU, {wall:.1f} s")
