@@ -14,7 +14,7 @@ from gsbench.analysis.declaration import standing
 from gsbench.analysis.results import read_experiment
 from gsbench.claims.stopping import standing_verdicts
 from gsbench.launch.declare import declare, declared_metrics, planned_trials
-from gsbench.launch.outcome import Outcome
+from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
 from gsbench.launch.trial import Trial
 from gsbench.runs.declaration import read_plans
@@ -182,7 +182,7 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(
     assert "launch.stop_when_decided" in text
     capsys.readouterr()
     assert cli.run(["tables", "stop"]) == 0
-    assert "as fixed are too sure" in capsys.readouterr().out
+    assert "too sure of this metric" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
