@@ -56,6 +56,9 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     require_values(values, group)
     options = {key: value for key, value in values.items() if key not in RESERVED}
     own = target.startswith(OWN)
+    if not own:  # a class may be older than a setting of the group's YAML, which means what was before it
+        known = inspect.signature(cls).parameters.keys() | as_before(group, options).keys()
+        options = {key: value for key, value in options.items() if key in known}
     if dataclasses.is_dataclass(cls) and not own:
         options = checked(cls, options, group)
     else:
