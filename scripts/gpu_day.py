@@ -36,7 +36,7 @@ def machine() -> dict[str, str]:
 
 
 def bits(device: str, width: int, height: int, count: int) -> list[str]:
-    """What differs among three runs of render, loss and gradients: on new memory, on used memory, with new pools."""
+    """Differences among three runs of render, loss and gradients: on new memory, on used memory, with new pools."""
     import torch
 
     from gsbench.bench.scenes import make_scene

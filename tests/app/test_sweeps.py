@@ -182,7 +182,7 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(
     assert "launch.stop_when_decided" in text
     capsys.readouterr()
     assert cli.run(["tables", "stop"]) == 0
-    assert "too sure of this metric" in capsys.readouterr().out
+    assert "as fixed are too sure" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,7 +20,7 @@ from gsbench.bench.scenes import (
     skewed_gaussians,
     trained_like_gaussians,
 )
-from gsbench.bench.stages import REST, short_name, timed_kernels
+from gsbench.bench.stages import REST, short_name, stages_of_a_step, timed_kernels
 from gsbench.bench.stepper import Setting, Stepper
 from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
@@ -157,6 +159,27 @@ def test_kernels_are_put_back_when_a_step_fails() -> None:
     with pytest.raises(RuntimeError, match="step"), timed_kernels("cpu"):
         step()
     assert cpu_executor.composite_tiles is kernel
+
+
+def test_what_a_gpu_ran_is_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On events as torch's profiler has them: real ones of this CPU, and the same as if of a GPU."""
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+        torch.ones(3).sum()
+    on_cpu = profile.events()[0]
+    assert not on_cpu.is_user_annotation
+
+    def on_gpu(name: str, us: float, is_range: bool = False) -> SimpleNamespace:
+        device, time_range = SimpleNamespace(name="CUDA"), SimpleNamespace(elapsed_us=lambda: us)
+        return SimpleNamespace(name=name, device_type=device, time_range=time_range, is_user_annotation=is_range)
+
+    kernel = "void at::native::multi_tensor_apply_kernel<int>(int)"
+    events = [on_cpu, on_gpu(kernel, 1500), on_gpu(kernel, 500), on_gpu("Optimizer.step", 2000, True), on_gpu("f", 250)]
+    recording = nullcontext(SimpleNamespace(events=lambda: events))
+    monkeypatch.setattr(torch.profiler, "profile", lambda **_: recording)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
+    sample = {"step_ms": 1.5, "cpu_ms": 9.0}
+    stages = stages_of_a_step(lambda: sample, "cuda", repeats=2)
+    assert stages == {"multi_tensor_apply_kernel": 1.0, "f": 0.125, REST: 0.375}
 
 
 @pytest.mark.parametrize(

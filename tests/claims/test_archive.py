@@ -46,7 +46,7 @@ def test_results_settings_and_views_come_back(tmp_path: Path) -> None:
     back = unpack_archive(file, tmp_path / "other")
     assert [one.label for one in back.trials] == [one.label for one in there.trials]
     for one, other in zip(there.trials, back.trials, strict=True):
-        assert other.data == one.data
+        assert other.record == one.record
         assert other.config == one.config
         assert read_views(other) == read_views(one)
     assert (back.folder / "declared.jsonl").read_text() == (there.folder / "declared.jsonl").read_text()
@@ -193,7 +193,10 @@ def test_a_file_too_large_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     runs = tmp_path / "runs"
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
@@ -201,10 +204,9 @@ def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
     (first / "per_view.csv").write_text("view,psnr\nview000,1.0\n")
     (second / "results.json").write_text("{")
     assert run(["export", "--results", "exp", "--out", str(tmp_path / "out" / "a.zip")]) == 0
-    captured = capsys.readouterr()
-    assert captured.out == f"{tmp_path / 'out' / 'a.zip'}\n"
-    assert "does not average" in captured.err
-    assert "not JSON" in captured.err
+    assert capsys.readouterr().out == f"{tmp_path / 'out' / 'a.zip'}\n"
+    assert "does not average" in caplog.text
+    assert "not JSON" in caplog.text
     assert len(unpack_archive(tmp_path / "out" / "a.zip", tmp_path / "b").trials) == 10
     for path in runs.glob("exp/*/*/*/per_view.csv"):
         path.write_text("")

@@ -84,6 +84,9 @@ READS_ITSELF = {
     "analysis/paper.py", "analysis/published/__init__.py", "datasets/catalog.py", "datasets/plan.py",  # of the package
     "claims/file.py",  # what a user writes by hand
     "claims/here.py", "launch/batch.py", "init/base.py",  # text of this very process
+    "analysis/shipped.py",  # arms of the package
+    "claims/stopping.py", "verbs/ablate.py",  # text of this process; words of a command line
+    "claims/archive.py", "claims/studies.py",  # archives and nerfbaselines' files, which anybody may have made
     "datasets/records.py",  # beside data sets, not in the runs folder
     "scene/load.py",  # prepared views, beside the store
     "parsing.py",

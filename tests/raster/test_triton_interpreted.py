@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from triton.runtime.interpreter import interpreter_builder
 
 from gsbench.densify import ADC
 from gsbench.gaussians.initial import gaussians_from_cloud
@@ -21,6 +22,7 @@ from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.raster.triton import executor
 from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.raster.triton.memory import workspace_bytes
+from gsbench.raster.triton.workspace import Workspace
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import Scene, View
 from gsbench.train.loss import torch_photometric_loss
@@ -48,6 +50,40 @@ def test_the_same_bits_on_every_run() -> None:
     expected = bits(*render_with_gradients(rasterizer, SMALL, torch.float32))
     assert bits(*render_with_gradients(rasterizer, SMALL, torch.float32)) == expected  # memory that was used before
     assert bits(*render_with_gradients(TritonRasterizer(), SMALL, torch.float32)) == expected
+
+
+def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Programs in any order, memory full of NaN and of places far outside: nothing is read before it is written.
+
+    Of the long lists of opaque Gaussians many entries are such that no pixel comes to them.
+    """
+    case = Case(20, 17, 80, sh_degree=1, log_scale=-0.5, logit=4.0)
+    values = torch.rand(case.height, case.width, generator=torch.Generator().manual_seed(1))
+
+    def run() -> list[bytes]:
+        output, gradients = render_with_gradients(TritonRasterizer(), case, torch.float32)
+        footprint = output.footprint(values)
+        frame = output.footprint.args[1].frame
+        skipped.append(int((frame.starts[1:] - frame.past).sum()))
+        return bits(output, gradients) + [tensor.numpy().tobytes() for tensor in vars(footprint).values()]
+
+    skipped: list[int] = []
+    expected = run()
+    original, place, builder = Workspace.take, interpreter_builder.set_grid_idx, interpreter_builder
+
+    def poisoned(self: Workspace, name: str, count: int, dtype: torch.dtype) -> Tensor:
+        view = original(self, name, count, dtype)
+        return view.fill_(torch.nan if dtype.is_floating_point else torch.iinfo(dtype).max // 2)
+
+    def shuffled(x: int, y: int, z: int) -> None:
+        count = builder.grid_dim[0]
+        order = torch.randperm(count, generator=torch.Generator().manual_seed(count))
+        place(int(order[x]), y, z)
+
+    monkeypatch.setattr(Workspace, "take", poisoned)
+    monkeypatch.setattr(builder, "set_grid_idx", shuffled)
+    assert run() == expected
+    assert skipped[0] == skipped[1] > 50
 
 
 def test_equal_depths_are_blended_in_the_order_of_the_index() -> None:

@@ -21,6 +21,7 @@ from gsbench.scene.colmap import read_model
 from gsbench.scene.images import IMAGE_SUFFIXES, exif_orientation, image_size, read_image
 from gsbench.scene.names import check_picture_names
 from gsbench.scene.readers import fingerprint, list_images, read_photos
+from gsbench.scene.split import SplitRule
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and links of a POSIX system")
 SECONDS = 20
@@ -68,7 +69,7 @@ READERS: list[tuple[str, Callable[[Path], object]]] = [
     (".npy", read_points),
     (".txt", read_points),
     (".txt", read_similarity),
-    (".txt", lambda path: read_photos("x", path.parent, images="images", test_list=str(path))),
+    (".txt", lambda path: read_photos("x", path.parent, images="images", split=SplitRule(test_list=str(path)))),
 ]
 
 
@@ -157,7 +158,7 @@ def test_names_that_make_no_file_name_are_refused_before_any_work(photos: Path, 
     long = "ä" * 120 + ".png"  # 244 bytes
     (photos / "a.png").rename(photos / long)
     with pytest.raises(InputError, match="a name of more than 220 bytes"):
-        read_photos("x", tmp_path, test_every=1 + 1)
+        read_photos("x", tmp_path, split=SplitRule(test_every=2))
     with pytest.raises(InputError, match=r"the pictures of a/b\.png and a__b\.jpg would both be a__b\.png"):
         check_picture_names(["a/b.png", "a__b.jpg"], photos)
     check_picture_names(["a/b.png", "a/c.png"], photos)

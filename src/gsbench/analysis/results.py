@@ -48,10 +48,13 @@ Kind = tuple[str, str, str, str]  # scene, initialiser, densifier, hash of the c
 
 
 class Configurations:
-    """The settings that determine the results of an experiment's trials, read once for all of one kind."""
+    """The settings that determine the results of an experiment's trials, read once for all of one kind.
 
-    def __init__(self) -> None:
-        self._known: dict[Kind, Mapping[str, Any]] = {}
+    Those that are ``known`` are not read: of trials that have not run.
+    """
+
+    def __init__(self, known: Mapping[Kind, Mapping[str, Any]] | None = None) -> None:
+        self._known: dict[Kind, Mapping[str, Any]] = dict(known or {})
         self._texts: dict[Kind, Mapping[str, str]] = {}
 
     def texts(self, kind: Kind, folder: Path) -> Mapping[str, str]:
@@ -433,7 +436,7 @@ def _folders(place: str | Path) -> list[str]:
 
 
 def is_folder(entry: os.DirEntry[str]) -> bool:
-    """Whether an entry is a folder, or a link to one; a link to itself is none."""
+    """Return whether an entry is a folder, or a link to one; a link to itself is none."""
     try:
         return entry.is_dir()
     except OSError:

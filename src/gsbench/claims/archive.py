@@ -31,6 +31,7 @@ from gsbench.analysis.results import Experiment, TrialResult, read_experiment, r
 from gsbench.claims.crate import crate_metadata
 from gsbench.errors import InputError
 from gsbench.files import atomic
+from gsbench.parsing import read_yaml
 from gsbench.runs.layout import CONFIG, DECLARED, PER_VIEW, RESULTS
 from gsbench.settings import is_folder_name
 
@@ -49,12 +50,15 @@ def write_archive(experiment: Experiment, out: Path) -> list[str]:
     Raises InputError where none is left.
     """
     kept, rows, left_out = [], [], list(experiment.warnings)
+    configurations: dict[str, list[tuple[str, int]]] = {}  # each once, with its trials
     for trial in experiment.trials:
         try:
-            rows += [(_folder(trial), view, metrics) for view, metrics in sorted(read_views(trial).items())]
+            views, configuration = read_views(trial), _configuration(trial)
         except InputError as error:
             left_out.append(f"{trial.label}: {error}")
             continue
+        rows += [(_folder(trial), view, metrics) for view, metrics in sorted(views.items())]
+        configurations.setdefault(configuration, []).append((_folder(trial), trial.seed))
         kept.append(trial)
     if not kept:
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
@@ -63,7 +67,9 @@ def write_archive(experiment: Experiment, out: Path) -> list[str]:
         TRIALS: _json_lines(
             {"folder": _folder(trial), "results": _without_paths(trial.record.to_json())} for trial in kept
         ),
-        CONFIGURATIONS: _configurations(kept),
+        CONFIGURATIONS: _json_lines(
+            {"configuration": json.loads(text), "trials": trials} for text, trials in configurations.items()
+        ),
         PER_VIEW: _table(rows),
     } | ({DECLARED: declared.read_bytes()} if declared.is_file() else {})
     manifest = {
@@ -188,14 +194,15 @@ def _place(folder: object) -> str:
     return str(folder)
 
 
-def _configurations(trials: Sequence[TrialResult]) -> bytes:
-    """Each configuration once."""
-    found: dict[str, list[tuple[str, int]]] = {}
-    for trial in trials:
-        values = yaml.safe_load((trial.path / CONFIG).read_text(encoding="utf-8"))
-        kept = {key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}
-        found.setdefault(json.dumps(_without_paths(kept)), []).append((_folder(trial), trial.seed))
-    return _json_lines({"configuration": json.loads(text), "trials": trials} for text, trials in found.items())
+def _configuration(trial: TrialResult) -> str:
+    """The trial's configuration as JSON, without what says where files lie; raises InputError where it is damaged."""
+    try:
+        values = read_yaml(trial.path / CONFIG)
+    except FileNotFoundError:
+        raise InputError(f"it has no {CONFIG}") from None
+    if not isinstance(values, dict):
+        raise InputError(f"its {CONFIG} is no mapping")
+    return json.dumps(_without_paths({key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}))
 
 
 def _without_paths(value: Any) -> Any:

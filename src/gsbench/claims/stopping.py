@@ -7,7 +7,7 @@ is read from it and from the trials' files. So the same command goes on after a 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic
@@ -16,7 +16,7 @@ import yaml
 
 from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.pairing import arm_name, choose_pairs
-from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.analysis.results import Configurations, TrialResult, read_experiment
 from gsbench.analysis.statistics import ALPHA
 from gsbench.claims.file import Claim
 from gsbench.claims.sequential import FIRST_LOOK, Design, plan_looks
@@ -183,7 +183,7 @@ def plan_sweep(trials: Sequence[T]) -> Stopping[T]:
         raise InputError(
             f"launch.stop_when_decided: what of {metric} matters is not known: give launch.least_difference"
         )
-    expected = with_variants([_Expected.of(trial) for trial in trials])
+    expected = with_variants([_expected(trial) for trial in trials])
     seeds = _seeds(expected)
     chosen = choose_pairs(sorted({trial.arm for trial in expected}))
     if not chosen:
@@ -226,40 +226,30 @@ def headline(verdict: Verdict) -> str:
     )
 
 
-@dataclass(frozen=True)
-class _Expected(TrialResult):
-    """A trial that need not have run: it has a configuration and no results."""
-
-    values: Mapping[str, Any] = field(default_factory=dict, repr=False)
-
-    @classmethod
-    def of(cls, trial: Composed) -> _Expected:
-        values, folder = trial.values, TrialPaths.of(trial.values).folder
-        record = TrialRecord(
-            status="complete",  # as the type has it: no file says so
-            experiment=values["name"],
-            scene=values["scene"]["name"],
-            init=values["init"]["name"],
-            densify=values["densify"]["name"],
-            seed=values["seed"],
-            raster="",
-            protocol="",
-            iterations=0,
-            metrics={},
-            unavailable={},
-            seconds={},
-            num_init_points=None,
-            num_gaussians=0,
-            peak_memory_mb=None,
-            hashes={},
-            versions={},
-        )
-        settings = flatten(yaml.safe_load(trial.yaml))
-        return cls(folder, folder.name.partition(SEED)[0], record, values=settings)
-
-    @property
-    def config(self) -> Mapping[str, Any]:
-        return self.values
+def _expected(trial: Composed) -> TrialResult:
+    """The trial as if it had run: it has a configuration and no results."""
+    values, folder = trial.values, TrialPaths.of(trial.values).folder
+    record = TrialRecord(
+        status="complete",  # as the type has it: no file says so
+        experiment=values["name"],
+        scene=values["scene"]["name"],
+        init=values["init"]["name"],
+        densify=values["densify"]["name"],
+        seed=values["seed"],
+        raster="",
+        protocol="",
+        iterations=0,
+        metrics={},
+        unavailable={},
+        seconds={},
+        num_init_points=None,
+        num_gaussians=0,
+        peak_memory_mb=None,
+        hashes={},
+        versions={},
+    )
+    found = TrialResult(folder, folder.name.partition(SEED)[0], record)
+    return replace(found, settings=Configurations({found.kind: flatten(yaml.safe_load(trial.yaml))}))
 
 
 def _facts(metric: str, values: Mapping[str, Any]) -> MetricFacts:

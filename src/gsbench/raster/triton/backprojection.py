@@ -40,17 +40,24 @@ from gsbench.raster.triton.layout import (
 
 
 @triton.jit(do_not_specialize=["units"])
-def sum_units(pair_ends, unit_widths, units, rows, GROUP: tl.constexpr):
-    """Add the ``rows`` [pairs, 16] of each unit into the first of them. Its slots are neighbours."""
+def sum_units(pair_ends, unit_widths, unit_blocks, last_slots, units, rows, GROUP: tl.constexpr):
+    """Add the ``rows`` [pairs, 16] of each unit into the first of them. Its slots are neighbours.
+
+    Only those that compositing came to have been written. They are the ones up to ``last_slots`` [blocks], since the
+    list of a block has its slots in rising order.
+    """
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = unit < units
     width = tl.load(unit_widths + unit, mask=inside, other=0)
     first = tl.load(pair_ends + unit, mask=inside, other=0) - width
+    block = tl.load(unit_blocks + unit, mask=inside, other=0)
     place = rows + first[:, None] * ROW + tl.arange(0, ROW)[None, :]  # [GROUP, ROW]
     total = tl.zeros([GROUP, ROW], tl.float32)
     for k in range(0, tl.max(width, 0)):
-        total += tl.load(place + k * ROW, mask=(k < width)[:, None], other=0.0)
-    tl.store(place, total, mask=(width > 1)[:, None])
+        written = first + k <= tl.load(last_slots + block + k, mask=k < width, other=-1)
+        total += tl.load(place + k * ROW, mask=(written & (k < width))[:, None], other=0.0)
+    written = first <= tl.load(last_slots + block, mask=width == 1, other=-1)
+    tl.store(place, total, mask=((width > 1) | ((width == 1) & ~written))[:, None])
 
 
 @triton.jit

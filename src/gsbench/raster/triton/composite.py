@@ -107,13 +107,15 @@ def composite(
     transmittance,
     last,
     past,
+    slots,
+    last_slots,
 ):
     """Blend the block that ``order`` [blocks] has at the place of this program.
 
     In: ``starts`` [blocks + 1], ``entries`` [pairs] the Gaussians of the lists, ``records`` [N + 1, 16] with one that
     cannot be seen at ``closing``. Out: ``image`` [H, W, 3], ``alpha`` [H, W]; for the backward pass, by block, lane and
     step, the final ``transmittance`` and ``last``, past the last entry that was looked at before the pixel stopped;
-    ``past`` [blocks], their maximum.
+    ``past`` [blocks], their maximum; ``last_slots`` [blocks], the entry before it in ``slots`` [pairs], -1 for none.
     """
     block = tl.load(order + tl.program_id(0)).to(tl.int32)
     inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
@@ -151,7 +153,9 @@ def composite(
     state = block * BLOCK_PIXELS + block_places()
     tl.store(transmittance + state, light)
     tl.store(last + state, seen)
-    tl.store(past + block, tl.minimum(tl.max(tl.max(seen, 0), 0), end))
+    stop = tl.minimum(tl.max(tl.max(seen, 0), 0), end)
+    tl.store(past + block, stop)
+    tl.store(last_slots + block, tl.load(slots + stop - 1, mask=begin < stop, other=-1))
     tl.store(alpha + pixel, 1.0 - light, mask=inside)
     tl.store(image + 3 * pixel, tl.fma(light, tl.load(background), red), mask=inside)
     tl.store(image + 3 * pixel + 1, tl.fma(light, tl.load(background + 1), green), mask=inside)
@@ -240,20 +244,14 @@ def decomposite(
 
     Behind a Gaussian lies light S = sum of later (c . g) alpha T plus what the background gets; the loss changes with
     its alpha by T (c . g) - S / (1 - alpha). Going back to front S grows from the background's part, so that nothing
-    cancels. ``slots`` [pairs] has the row of each entry. ``g_alpha`` is read if ``HAS_ALPHA``.
+    cancels. ``slots`` [pairs] has the row of each entry. Rows of entries that no pixel came to stay as they are.
+    ``g_alpha`` is read if ``HAS_ALPHA``.
     """
     block = tl.load(order + tl.program_id(0)).to(tl.int32)
     inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
-    begin, end, stop = tl.load(starts + block), tl.load(starts + block + 1), tl.load(past + block)
+    begin, stop = tl.load(starts + block), tl.load(past + block)
     lane = tl.arange(0, LANES)
     number, stores = _number_of_sum(lane, ABSOLUTE)
-
-    # Entries that no pixel came to.
-    stop = tl.maximum(stop, begin)
-    for first in range(stop, end, LANES):
-        skipped = first + lane
-        place = rows_out + tl.load(slots + skipped, mask=skipped < end, other=0)[:, None] * ROW
-        tl.store(place + tl.arange(0, ROW)[None, :], tl.zeros([LANES, ROW], tl.float32), mask=(skipped < end)[:, None])
 
     g = (
         tl.load(g_image + 3 * pixel, mask=inside, other=0.0),

@@ -82,6 +82,7 @@ class _Frame:
     row_counts: Tensor  # [N] int32 units of each Gaussian
     first_units: Tensor  # [N] int64
     unit_widths: Tensor  # [units] int32 pairs of each unit
+    unit_blocks: Tensor  # [units] int32 the first block of each
     pair_ends: Tensor  # [units] int64 running sum of them
     order: Tensor  # [blocks] int64 the longest lists first
     starts: Tensor  # [blocks + 1] int32
@@ -90,6 +91,7 @@ class _Frame:
     transmittance: Tensor  # [blocks * BLOCK_PIXELS]
     last: Tensor  # [blocks * BLOCK_PIXELS] int32
     past: Tensor  # [blocks] int32
+    last_slots: Tensor  # [blocks] int64
 
 
 def _forward(
@@ -125,7 +127,7 @@ def _forward(
     capacity = max(frame_memory.capacity("unit_widths"), UNITS_AT_FIRST * count, 1)
     while True:
         owners = scratch.take("unit_owners", capacity, torch.int32)
-        first_blocks = scratch.take("unit_blocks", capacity, torch.int32)
+        first_blocks = frame_memory.take("unit_blocks", capacity, torch.int32)
         widths = frame_memory.take("unit_widths", capacity, torch.int32).zero_()
         pair_ends = frame_memory.take("pair_ends", capacity, torch.int64)
         launch(find_units, count, 128)(
@@ -180,6 +182,7 @@ def _forward(
         row_counts,
         first_units,
         widths,
+        first_blocks,
         pair_ends,
         order,
         starts,
@@ -188,6 +191,7 @@ def _forward(
         frame_memory.take("transmittance", blocks * BLOCK_PIXELS.value, torch.float32),
         frame_memory.take("last", blocks * BLOCK_PIXELS.value, torch.int32),
         frame_memory.take("past", blocks, torch.int32),
+        frame_memory.take("last_slots", blocks, torch.int64),
     )
     launch_grid(composite, blocks)(
         order,
@@ -204,9 +208,17 @@ def _forward(
         frame.transmittance,
         frame.last,
         frame.past,
+        slots,
+        frame.last_slots,
         num_warps=1,
     )
     return frame
+
+
+def _sum_units(frame: _Frame, rows: Tensor) -> None:
+    launch(sum_units, frame.units, 32)(
+        frame.pair_ends, frame.unit_widths, frame.unit_blocks, frame.last_slots, frame.units, rows
+    )
 
 
 def _backward(
@@ -242,7 +254,7 @@ def _backward(
         ABSOLUTE=absolute is not None,
         num_warps=1,
     )
-    launch(sum_units, frame.units, 32)(frame.pair_ends, frame.unit_widths, frame.units, rows)
+    _sum_units(frame, rows)
     means, log_scales, quaternions, logits, _, sh_rest = gaussians.tensors().values()
     gradients = [torch.zeros_like(tensor) for tensor in gaussians.tensors().values()]
     g_screen = torch.zeros_like(means[:, :2])
@@ -280,7 +292,7 @@ def _footprint(
     holder = _Holder()
     with torch.cuda.device_of(covered):
         scratch = rasterizer._scratch.lease(holder, device)
-        rows = scratch.take("rows", frame.pairs * ROW.value, torch.float32).zero_()  # ``cover`` fills three of 16
+        rows = scratch.take("rows", frame.pairs * ROW.value, torch.float32)  # ``cover`` fills three of 16
         launch_grid(cover, frame.grid.blocks)(
             frame.starts,
             frame.entries,
@@ -290,12 +302,13 @@ def _footprint(
             frame.grid.height,
             frame.grid.blocks_x,
             frame.last,
+            frame.past,
             asked,
             rows,
             HAS_VALUES=values is not None,
             num_warps=1,
         )
-        launch(sum_units, frame.units, 32)(frame.pair_ends, frame.unit_widths, frame.units, rows)
+        _sum_units(frame, rows)
         launch(sum_cover, count, 128)(
             count,
             frame.row_counts,

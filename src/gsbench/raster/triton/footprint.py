@@ -24,18 +24,20 @@ def cover(
     height,
     blocks_x,
     last,
+    past,
     values,
     rows_out,
     HAS_VALUES: tl.constexpr,
 ):
-    """Write to the rows of ``rows_out`` [pairs, 16] of one block how many pixels each Gaussian was blended into, and
-    the sums over them of ``values`` [H, W], read if ``HAS_VALUES``, and of the distances to its mean, px."""
+    """Write to the rows of ``rows_out`` [pairs, 16] of one block, for its entries up to ``past`` [blocks]: how many
+    pixels each Gaussian was blended into, and the sums over them of ``values`` [H, W], read if ``HAS_VALUES``, and of
+    the distances to its mean, px."""
     block = tl.program_id(0)
     inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
     seen = tl.load(last + block * BLOCK_PIXELS + block_places())
     asked = tl.load(values + pixel, mask=inside & HAS_VALUES, other=0.0)
     columns = x[None, :] + (tl.arange(0, STEPS) * LANE_COLUMNS).to(tl.float32)[:, None]
-    for position in range(tl.load(starts + block), tl.load(starts + block + 1)):
+    for position in range(tl.load(starts + block), tl.load(past + block)):
         record = load_record(records, tl.load(entries + position))
         power, _, dy = log2_alpha(record, x, y)
         blended = (power >= LOG2_ALPHA_MIN) & (position < seen)
