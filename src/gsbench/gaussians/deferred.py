@@ -27,7 +27,7 @@ FIRST_CAPACITY = 1024  # steps
 
 
 class Coasting:
-    """How far a Gaussian has coasted that was last stepped at step t, for every t up to the present ``step``."""
+    """Distance that a Gaussian has coasted that was last stepped at step t, for every t up to the present ``step``."""
 
     def __init__(self, step: int = 0, drift: Tensor | None = None) -> None:
         self.step = step

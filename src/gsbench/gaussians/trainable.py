@@ -93,7 +93,7 @@ class TrainableGaussians:
         self.optimizer.zero_grad(set_to_none=True)
 
     def defer_harmonics(self, deferred: bool = True) -> None:
-        """From now on step harmonics where a rasterizer sees them (or, with ``False``, all of them again)."""
+        """Step harmonics from now on where a rasterizer sees them (or, with ``False``, all of them again)."""
         if not deferred:
             self.settle()
             self.deferred = None

@@ -116,7 +116,7 @@ class Rasterizer(Protocol):
 
 
 class DeferringRasterizer(Rasterizer, Protocol):
-    """What a rasterizer may offer beyond the contract: renders that keep the harmonics' optimiser steps for later.
+    """Offer of a rasterizer beyond the contract: renders that keep the harmonics' optimiser steps for later.
 
     Whether one does shows in its having the method. A trainer uses it where nobody but its own optimiser needs the
     gradient of ``sh_rest`` as a tensor; everything else (metrics, scores, a user's own loop) goes through ``render``.

@@ -45,7 +45,7 @@ class Pending(NamedTuple):
 
 
 def pending_of(harmonics: DeferredHarmonics | None) -> Pending:
-    """What the kernels need of ``harmonics``, sharing its memory."""
+    """The arrays of ``harmonics`` that kernels need, sharing its memory."""
     if harmonics is None:
         empty = np.empty(0, np.float32)
         return Pending(empty, empty, np.empty(0, np.int32), 0, empty, empty, empty)

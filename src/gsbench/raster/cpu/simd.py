@@ -139,7 +139,7 @@ _register_mask_operator([operator.invert], 1, lambda builder, a: builder.not_(a)
 
 
 def address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Of element ``args[1]`` of the array ``args[0]``."""
+    """Address of element ``args[1]`` of the array ``args[0]``."""
     data = context.make_array(sig.args[0])(context, builder, args[0]).data
     return builder.gep(data, [context.cast(builder, args[1], sig.args[1], types.intp)])
 
