@@ -19,7 +19,7 @@ from pydantic_core import from_json
 from gsbench.errors import InputError
 
 MOST_BYTES = 64 << 20  # the plan of 80,000 trials; a training that logs each of 300,000 iterations
-CHUNK = 1 << 20
+SPARE = 1 << 16  # bytes that are read at once beyond a file's size
 MOST_YAML_BYTES = 1 << 20  # a configuration has 2 to 10 kB, and its parser takes a second for this much
 MOST_DEPTH = 40  # levels of nesting: ours have up to six, and what a user's class is given adds a few
 MOST_WORD = 4000  # characters of plain YAML: what could be a number
@@ -79,15 +79,11 @@ def _opened(path: Path) -> Iterator[int]:
 
 
 def _read_up_to(descriptor: int, most: int) -> bytes:
-    """At most ``most`` bytes, in as few pieces as the system gives them."""
-    first = os.read(descriptor, min(most, CHUNK))
-    if len(first) < CHUNK and not os.read(descriptor, 1):
-        return first
-    os.lseek(descriptor, 0, os.SEEK_SET)
-    parts: list[bytes] = []
-    while most > 0 and (part := os.read(descriptor, min(most, CHUNK))):
+    """At most ``most`` bytes: by one call where the file is as long as it says, which those of ``/proc`` are not."""
+    content = os.read(descriptor, min(most, os.fstat(descriptor).st_size + 1))
+    parts = [content]
+    while (left := most - sum(map(len, parts))) > 0 and (part := os.read(descriptor, min(left, SPARE))):
         parts.append(part)
-        most -= len(part)
     return b"".join(parts)
 
 
@@ -201,6 +197,8 @@ def _fault_of_keys(mapping: dict[Any, Any]) -> str:
     kinds = set(map(type, mapping))
     if len(kinds) > 1 or not kinds <= KEYS:  # sorted JSON needs them of one kind
         return "keys that are not all texts, or all integers"
+    if kinds == {str} and all(map(str.isascii, mapping)):
+        return ""
     return next((f"a key that is {fault}" for key in mapping if (fault := _fault_of_leaf(key))), "")
 
 

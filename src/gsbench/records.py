@@ -29,6 +29,7 @@ MOST = 1e30  # of a measured number: no mean or variance of such overflows, and 
 Number = Annotated[float, Field(ge=-MOST, le=MOST)]
 Amount = Annotated[float, Field(ge=0, le=MOST)]
 Count = Annotated[int, Field(ge=0, lt=2**63)]
+Whole = Annotated[int, Field(gt=-(2**63), lt=2**63)]
 Text = Annotated[str, MinLen(1)]
 STRICT = ConfigDict(strict=True, allow_inf_nan=False, extra="ignore")
 

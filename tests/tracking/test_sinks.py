@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ from PIL import Image
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.preflight import check_trackers
+from gsbench.runs.plan_file import Entry, Sweep, write_entries
 from gsbench.tracking import connect, ensure_experiment, mirror_trial, prepare
 from gsbench.tracking.mlflow_sink import STATE, TRIES, MlflowSink
-from gsbench.tracking.record import TrialRecord
+from gsbench.tracking.record import TrackedFiles
 from tests.tracking.helpers import RECORDS, begin_trial, found_runs, history, options, trial_values, write_trial
 
 AT = {"50": {"metrics": {"psnr": 15.0}, "num_gaussians": 7}}
@@ -86,10 +88,10 @@ def test_experiments_open_as_machine_learning(runs: Path) -> None:
 def test_the_trials_of_a_sweep_have_one_parent(runs: Path) -> None:
     trials = [finished_trial(runs, seed) for seed in (10, 11, 12)]
     home = trials[0][0].parents[2]
-    sweep = {"sweep": {"id": "0123abcd", "count": 2}}
-    entries = {folder.relative_to(home).as_posix(): sweep for folder, _ in trials[:2]}
-    alone = {trials[2][0].relative_to(home).as_posix(): {"overrides": []}}
-    (home / "plan.json").write_text(json.dumps({"trials": entries | alone}))
+    alone = Entry(overrides=(), cwd=str(runs), time=1.0)
+    swept = replace(alone, sweep=Sweep(id="0123abcd", count=2))
+    places = [folder.relative_to(home).as_posix() for folder, _ in trials]
+    write_entries(home, dict(zip(places, (swept, swept, alone), strict=True)))
     for folder, values in trials:
         mirror_trial(options(), runs, folder, values)
     client = connect(None, runs)
@@ -123,7 +125,7 @@ def test_a_race_for_a_data_set_is_run_again(text: str, tmp_path: Path, monkeypat
     folder = begin_trial(values)
     write_trial(folder, values)
     sink = object.__new__(MlflowSink)
-    sink._record, sink.run_id = TrialRecord(tmp_path, folder, values), "x"
+    sink._record, sink.run_id = TrackedFiles(tmp_path, folder, values), "x"
     sink.client = rivals = Rivals(TRIES - 1, text)
     sink._log_datasets(sink._record.results())
     assert rivals.entered == 2

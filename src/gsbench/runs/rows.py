@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from gsbench.parsing import DamagedError, read_bytes
-from gsbench.records import Amount, Count, Number, Part, iterate_rows
+from gsbench.records import Amount, Count, Number, Part, Whole, iterate_rows
 from gsbench.runs.inputs import read_unchanged
 
 log = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ def _with_step(row: dict[str, bool | int | float]) -> dict[str, bool | int | flo
     return row
 
 
-Value = bool | Annotated[int, Field(gt=-(2**63), lt=2**63)] | Number
+Value = bool | Whole | Number
 Row = Annotated[dict[str, Value], AfterValidator(_with_step)]  # of ``metrics.jsonl`` and ``events.jsonl``
 
 

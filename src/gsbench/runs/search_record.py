@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from gsbench.records import Count, Number, Part, Text, read_typed
+from gsbench.records import Count, Number, Part, Text, Whole, read_typed
 from gsbench.runs.layout import SEARCH
 
 
@@ -16,7 +16,7 @@ class Point(Part):
 
     number: Count
     state: Literal["done", "failed", "unfinished"]
-    settings: dict[str, bool | int | Number | str]
+    settings: dict[str, bool | Whole | Number | str]
     value: Number | None
 
 
@@ -35,6 +35,9 @@ class SearchRecord(Part):
     def __post_init__(self) -> None:
         if len({frozenset(point.settings) for point in self.points if point.value is not None}) > 1:
             raise ValueError("the points have different settings")
+        on_scale = (point.settings.get(key) for point in self.points for key in self.log)
+        if any(isinstance(value, int | float) and value <= 0 for value in on_scale):
+            raise ValueError("a setting of a log scale is not above 0")
 
 
 def read_search(home: Path) -> SearchRecord:
