@@ -18,7 +18,7 @@ NEXT_HYDRA := 'hydra-core>=1.4.0rc1,<1.5' 'omegaconf>=2.4.1rc1,<2.5'
 NEXT_HYDRA_TESTS := tests/app tests/config tests/end_to_end/test_hydra.py
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow test-generic test-next-hydra lint docs lock
+.PHONY: help install demo test test-slow test-generic next-hydra test-next-hydra lint docs lock
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -39,8 +39,10 @@ test-slow: $(VENV)/.stamp-dev ## run the tests that take long and rarely tell an
 test-generic: $(VENV)/.stamp-dev ## run core tests as on the plainest processor of this architecture
 	$(GENERIC) $(PYTEST) $(CORE_TESTS)
 
-test-next-hydra: $(VENV)/.stamp-dev ## run the tests of configurations and sweeps on the next version of Hydra
+next-hydra: $(VENV)/.stamp-dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --pre --no-deps --upgrade --target $(VENV)/next-hydra $(NEXT_HYDRA)
+
+test-next-hydra: next-hydra ## run the tests of configurations and sweeps on the next version of Hydra
 	PYTHONPATH=$(abspath $(VENV)/next-hydra) $(PYTEST) $(NEXT_HYDRA_TESTS)
 
 lint: $(VENV)/.stamp-dev ## check style and types
