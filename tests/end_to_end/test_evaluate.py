@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 
 from gsbench.cli import run
+from gsbench.scene.columns import ANGLE, DISTANCE
 from tests.end_to_end.conftest import SMALL, Run
 
 pytestmark = pytest.mark.end_to_end
@@ -72,7 +73,8 @@ def test_a_trials_own_renders_have_its_metrics_to_the_last_digit(gsbench: Run, r
         assert found["metrics"] == results(own)["metrics"]
         assert found["protocol"] == "paper-1"
         for view, row in views(own).items():
-            assert {key: repr(value) for key, value in found["views"][view].items()} == row
+            metrics = {key: value for key, value in row.items() if key not in (ANGLE, DISTANCE)}
+            assert {key: repr(value) for key, value in found["views"][view].items()} == metrics
     shown = gsbench("evaluate", str(own / "renders"), "--truth", str(own / "ground_truth"), "--protocol", "standard",
                     GSBENCH_RUNS=str(runs))  # fmt: skip
     assert "protocol standard-1" in shown.stdout
@@ -113,7 +115,9 @@ def test_renders_stand_in_the_table_with_a_verdict(
     report = gsbench("report", "small", GSBENCH_RUNS=str(runs))
     assert report.returncode == 0, report.stderr
     text = (runs / "small" / "report.html").read_text()
-    assert "random-theirs against random-adc, on this scene: better in PSNR" in text
+    # Two seeds decide nothing among three metrics, however much better these renders are.
+    assert "random-theirs against random-adc, on this scene: no evidence of a difference in PSNR" in text
+    assert "by what a training elsewhere did, of which nothing is recorded" in text
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     for words in (["status", "small"], ["explain", "small:courtyard:psnr:theirs"], ["sync", "small"]):
         assert run(words) == 0

@@ -37,7 +37,8 @@ def interpreted(request: pytest.FixtureRequest) -> Iterator[dict[str, subprocess
     if fault := interpreter_fault(triton.__version__, np.__version__):
         pytest.skip(fault)
     here = [item for item in request.session.items if item.path == request.path]
-    chosen = [item.callspec.params["part"] for item in here if hasattr(item, "callspec")]
+    calls = [item.callspec.params for item in here if hasattr(item, "callspec")]
+    chosen = [params["part"] for params in calls if "part" in params]
     environment = os.environ | {
         "TRITON_INTERPRET": "1",
         "OMP_NUM_THREADS": "1",

@@ -67,10 +67,15 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setattr(sys, "path", list(sys.path))
     names = ["mine", "pack", "helper", "spaced", "between"]
     allow_modules(names)
+    _forget(names)  # other tests have modules of these names
     yield tmp_path
+    _forget(names)
+    allowed_modules().clear()
+
+
+def _forget(names: list[str]) -> None:
     for name in [name for name in sys.modules if name.partition(".")[0] in names]:
         del sys.modules[name]
-    allowed_modules().clear()
 
 
 def write(home: Path, file: str, helper: str, text: str) -> str:
