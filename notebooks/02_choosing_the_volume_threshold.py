@@ -123,7 +123,8 @@ for name, densifier in modes.items():
     print(f"{name:<24} V_th = {thresholds[name]:.3g}, above it {(volumes > thresholds[name]).mean():.2%}")
 
 # %%
-cloud = read_cloud(next((runs / "store" / "init").iterdir()) / "sparse" / "0")
+key = json.loads((baseline / "results.json").read_text())["hashes"]["init"]
+cloud = read_cloud(runs / "store" / "init" / key / "sparse" / "0")
 first = np.log10(np.exp(log_volume(gaussians_from_cloud(cloud.points, cloud.colors).log_scales).numpy()))
 plt.figure(figsize=(9, 4))
 bins = np.arange(-12, 2, 0.25)

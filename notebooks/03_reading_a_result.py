@@ -166,7 +166,7 @@ figure.tight_layout()
 
 # %%
 for arm in (adc, volumetric):
-    counts = [trial.data["num_gaussians"] for trial in experiment.trials if trial.arm == arm]
+    counts = [trial.record.num_gaussians for trial in experiment.trials if trial.arm == arm]
     print(f"{arm[1]:>10}: {', '.join(f'{count:,}' for count in counts)} Gaussians")
 
 # %% [markdown]
