@@ -190,6 +190,7 @@ def test_bad_requests_are_one_line(
     assert error.count("gsbench: ") == 1
 
 
+@pytest.mark.slow
 def test_somebodys_model(gsbench: Run, runs: Path, tmp_path: Path) -> None:
     """train=none init=ply: a PLY from anywhere, rendered here; our own gives our own numbers back."""
     model = tmp_path / "theirs.ply"

@@ -34,6 +34,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
         yield running
 
 
+@pytest.mark.slow
 def test_fetch_then_table1_misses_nothing(gsbench: Run, server: Server, tmp_path: Path) -> None:
     one = gsbench("scene=garden")
     assert one.returncode == 2

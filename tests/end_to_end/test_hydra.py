@@ -112,7 +112,8 @@ def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, launc
     assert [path.stat().st_mtime_ns for path in results] == written  # nothing is done twice
 
 
-@pytest.mark.parametrize("launcher", ["joblib", pytest.param("submitit_local", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_a_callback_of_yours_is_found_in_the_processes_of_another_launcher(
     gsbench: Run, tmp_path: Path, launcher: str
 ) -> None:

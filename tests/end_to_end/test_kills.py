@@ -177,6 +177,7 @@ def test_read_only_runs_folder_is_bad_input(gsbench: Run, small_disk: Path) -> N
     assert os.listdir(small_disk) == []
 
 
+@pytest.mark.slow
 def test_a_failed_trial_does_not_stop_the_others_and_retry_mends_it(gsbench: Run, tmp_path: Path) -> None:
     """One densifier is the user's own and fails while a file is absent."""
     (tmp_path / "mine.py").write_text(

@@ -98,6 +98,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
         assert word in lines[-1]
 
 
+@pytest.mark.slow
 def test_truncated_photo_is_named(gsbench: Run, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()

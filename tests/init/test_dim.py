@@ -68,6 +68,7 @@ class TestUntrained:
         assert "transformers" in report.versions
         assert np.median(surface_distance(read_cloud(output / "out" / MODEL_FOLDER).points)) < 0.15
 
+    @pytest.mark.slow
     def test_lightglue_on_the_same_path(self, few: Capture, untrained_weights: Path, tmp_path: Path, caplog):
         init = superpoint(untrained_weights, max_keypoints=256, filter_threshold=0.0, pairs="sequential", overlap=1)
         report = init.run(few, tmp_path)

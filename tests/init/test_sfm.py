@@ -171,6 +171,7 @@ def test_names_with_spaces_and_photos_of_two_sizes(courtyard: Capture, tmp_path:
     assert len(model.cameras) == 2
 
 
+@pytest.mark.slow
 def test_webp_photos_give_what_png_ones_give(courtyard: Capture, tmp_path: Path):
     """COLMAP cannot read WebP; lossless copies must lead to the same points."""
     images = tmp_path / "images"

@@ -128,6 +128,7 @@ def test_every_yaml_composes(group: str) -> None:
             assert trial.values[group]["name"] == expected
 
 
+@pytest.mark.slow
 def test_paper_experiments_have_the_papers_trials_and_share_them() -> None:
     table1, table2 = experiment("table1"), experiment("table2")
     assert (len(table1), len(table2)) == (78, 144)

@@ -11,7 +11,6 @@ import pytest
 from tests.conftest import ROOT
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
-QUICK = "04_writing_your_own_densifier"  # the shortest
 TIMEOUT = 300  # s for a cell; on a fresh machine the first one also compiles the kernels
 
 
@@ -35,11 +34,9 @@ def test_pair_is_equal_and_has_no_outputs(path: Path) -> None:
         assert cell.get("execution_count") is None
 
 
+@pytest.mark.slow
 @pytest.mark.end_to_end
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(path, id=path.stem, marks=[] if path.stem == QUICK else [pytest.mark.slow]) for path in NOTEBOOKS],
-)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nbclient = pytest.importorskip("nbclient", reason="needs nbclient and ipykernel (extra dev)")
     nbformat = pytest.importorskip("nbformat", reason="needs nbformat (extra dev)")

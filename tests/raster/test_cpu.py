@@ -172,6 +172,7 @@ def test_float64_is_refused() -> None:
         CpuRasterizer(threads=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cpu", ["generic"])
 def test_hosts_without_wide_vectors(cpu: str, tmp_path: Path) -> None:
     """Compiled for the plainest CPU of this architecture (SSE2 on x86), in a process of its own."""

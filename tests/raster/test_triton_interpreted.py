@@ -52,6 +52,7 @@ def test_the_same_bits_on_every_run() -> None:
     assert bits(*render_with_gradients(TritonRasterizer(), SMALL, torch.float32)) == expected
 
 
+@pytest.mark.slow
 def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Programs in any order, memory full of NaN and of places far outside: nothing is read before it is written.
 

@@ -82,9 +82,11 @@ def check_complete(runs: Path, name: str, code: int, errors: str) -> None:
 @pytest.mark.parametrize(
     "kind",
     [
-        "never answers",
         "refuses",
-        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("answers after a minute", "hangs up", "postgresql")),
+        *(
+            pytest.param(kind, marks=pytest.mark.slow)
+            for kind in ("never answers", "answers after a minute", "hangs up", "postgresql")
+        ),
     ],
 )
 def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
@@ -170,7 +172,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.1)
 
 
-@pytest.fixture(params=["http", "postgresql"])
+@pytest.fixture(params=[pytest.param("http", marks=pytest.mark.slow), "postgresql"])
 def tracker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Gate, str]]:
     """A tracker that works, behind a gate, and its address there."""
     with ExitStack() as stack:

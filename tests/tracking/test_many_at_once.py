@@ -70,6 +70,7 @@ def test_eight_jobs_at_once_on_a_new_postgresql_database(tmp_path: Path, postgre
 
 
 @pytest.mark.end_to_end
+@pytest.mark.slow
 def test_machines_that_share_no_folder_create_one_experiment(tmp_path: Path, postgresql: str) -> None:
     """No file lock is shared: the database itself has to keep them apart."""
     code = (
