@@ -2,7 +2,8 @@
 
     python -m tests.benchmarks.scale FOLDER [SCENES ARMS SEEDS]
 
-prints a line for each verb: its name, CPU seconds and wall seconds of the whole command.
+prints a line for each verb, and one for the dry run of a sweep of as many further trials: its name, CPU seconds and
+wall seconds of the whole command.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from tests.finished import record_of
 
 NAME = "scale"
 VERBS = (["tables", NAME], ["status", NAME], ["report", NAME])
+DENSIFIERS = "adc absgrad absgs edgeaware longaxis mcmc pixelgs revised taming volumetric".split()  # noqa: SIM905
 
 
 def values_of(runs: Path, scene: int, arm: int, seed: int) -> dict[str, Any]:
@@ -82,6 +84,22 @@ def write_all(runs: Path, scenes: int, arms: int, seeds: int) -> int:
     return scenes * arms * seeds
 
 
+def dry_run(runs: Path, scenes: int, arms: int, seeds: int) -> list[str]:
+    """The words of a sweep that is only listed; its captures are empty folders."""
+    captures = [runs / ".captures" / f"scene{k:02d}" for k in range(scenes)]
+    for capture in captures:
+        (capture / "images").mkdir(parents=True, exist_ok=True)
+    limits = [100_000 * (k + 1) for k in range(-(-arms // len(DENSIFIERS)))]
+    lists = {
+        "scene.path": captures,
+        "densify": DENSIFIERS[: -(-arms // len(limits))],
+        "densify.max_gaussians": limits,
+        "seed": range(seeds),
+    }
+    words = [f"{key}={','.join(map(str, values))}" for key, values in lists.items()]
+    return ["-m", "name=further", "scene=colmap", *words, "--dry-run"]
+
+
 def timed(runs: Path, argv: list[str]) -> tuple[float, float]:
     """CPU and wall seconds of a command of gsbench."""
     started, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -99,6 +117,6 @@ if __name__ == "__main__":
     shape = tuple(map(int, sys.argv[2:5])) or (50, 20, 10)
     if not (place / NAME).exists():
         write_all(place, *shape)
-    for argv in VERBS:
+    for name, argv in [*((words[0], words) for words in VERBS), ("dry run", dry_run(place, *shape))]:
         cpu, wall = timed(place, argv)
-        print(f"{argv[0]:<8} {cpu:6.1f} s CPU {wall:6.1f} s", flush=True)
+        print(f"{name:<8} {cpu:6.1f} s CPU {wall:6.1f} s", flush=True)

@@ -21,7 +21,7 @@ from gsbench.raster.contract import (
     footprint_errors,
     render_with_gradients,
 )
-from gsbench.raster.executors import Executor, find
+from gsbench.raster.executors import Executor, find, offers
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.camera import Camera
 from tests.raster.strategies import extreme_gaussians
@@ -67,6 +67,8 @@ def test_values_and_gradients_match_the_reference(rasterizer: Rasterizer, device
         if not (name == "sh_rest" and case.sh_degree == 0):
             assert reference.abs().max() > 0, name
     assert find(rasterizer.name).has_footprint
+    assert offers(rasterizer.name, "has_splitting_matrix")  # so it was compared
+    assert "splitting_probe" in gradients
     assert max(footprint_errors(output, expected).values()) < FOOTPRINT_TOLERANCE  # asked after the backward pass
 
 
@@ -115,7 +117,8 @@ def test_nothing_to_see_is_the_background(rasterizer: Rasterizer, device: str) -
 @given(gaussians=extreme_gaussians())
 def test_extreme_gaussians_give_finite_results(rasterizer: Rasterizer, device: str, gaussians: Gaussians) -> None:
     leaves = gaussians.map(lambda tensor: tensor.to(device).requires_grad_())
-    output = rasterizer.render(leaves, _camera(37, 21), 3, torch.zeros(3, device=device), absolute_gradient=True)
+    background = torch.zeros(3, device=device)
+    output = rasterizer.render(leaves, _camera(37, 21), 3, background, absolute_gradient=True, splitting_matrix=True)  # type: ignore[call-arg]
     assert output.image.isfinite().all()
     assert ((output.alpha >= 0) & (output.alpha <= 1)).all()
     assert (output.radii >= 0).all()
@@ -124,6 +127,7 @@ def test_extreme_gaussians_give_finite_results(rasterizer: Rasterizer, device: s
         assert tensor.grad is None or tensor.grad.isfinite().all(), name
     assert output.screen_points.grad is None or output.screen_points.grad.isfinite().all()
     assert output.screen_gradient_abs.isfinite().all()
+    assert output.splitting_probe.grad is None or output.splitting_probe.grad.isfinite().all()
 
 
 @pytest.mark.parametrize("name", ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
-import logging
 import re
 import subprocess
 import sys
@@ -56,7 +55,6 @@ def test_the_table_loads_no_torch() -> None:
 
 
 def test_auto(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr(logging.getLogger("gsbench"), "propagate", True)
     assert resolve_name("auto", CPU) == "cpu"
     installed(monkeypatch, "gsplat")
     assert resolve("auto", "cuda").name == "gsplat"

@@ -14,7 +14,7 @@ import torch
 
 from gsbench.densify import ADC, PixelGS
 from gsbench.errors import InputError
-from gsbench.pipeline.components import build_rasterizer, check_footprint, rasterizer_inputs
+from gsbench.pipeline.components import build_rasterizer, check_offers, rasterizer_inputs
 from gsbench.raster import create_rasterizer
 from gsbench.runs.hashing import config_hash
 from tests.config.test_schema import composed
@@ -92,11 +92,11 @@ def test_options_are_checked_and_the_key_has_them(folder: Path) -> None:
 def test_without_a_footprint_it_is_refused_where_one_is_asked_for(folder: Path) -> None:
     values = composed(*OWN)
     rasterizer = build_rasterizer(values["raster"], values["allow_targets"], CPU)
-    check_footprint(ADC(), "adc", rasterizer.name, rasterizer)
+    check_offers(ADC(), "adc", rasterizer.name, rasterizer)
     with pytest.raises(InputError, match=r"densify=pixelgs asks .* raster=untiled does not say; take raster=reference"):
-        check_footprint(PixelGS(), "pixelgs", rasterizer.name, rasterizer)
+        check_offers(PixelGS(), "pixelgs", rasterizer.name, rasterizer)
     rasterizer.has_footprint = True  # type: ignore[attr-defined]
-    check_footprint(PixelGS(), "pixelgs", rasterizer.name, rasterizer)
+    check_offers(PixelGS(), "pixelgs", rasterizer.name, rasterizer)
 
 
 def test_only_rasterizers_with_a_name_of_their_own(folder: Path) -> None:

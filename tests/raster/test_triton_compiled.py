@@ -14,12 +14,13 @@ from torch.utils._pytree import tree_leaves
 
 pytest.importorskip("triton")
 
+from gsbench.gaussians.deferred import DeferredHarmonics
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.contract import Case
 from gsbench.raster.triton import composite, executor
 from gsbench.raster.triton.executor import TritonRasterizer
-from gsbench.train.loss_triton import TritonLoss
+from gsbench.train.loss_triton import MULTIPROCESSORS, STRIP, TritonLoss, rows_of_program
 from tests.raster.ahead_of_time import TARGETS, Launch, compile_for, recorded, specialization
 
 CASE = Case(33, 49, 50, sh_degree=3)
@@ -51,6 +52,24 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
         yield record
 
 
+def deferred_step(case: Case, harmonics: DeferredHarmonics, rasterizer: TritonRasterizer) -> None:
+    """One training step's render, backward and step of harmonics that are put off."""
+    device = harmonics.values.device
+    gaussians = case.gaussians().map(lambda tensor: tensor.float().to(device).requires_grad_())
+    output = rasterizer.render_deferred(
+        gaussians, harmonics, case.camera(), case.sh_degree, torch.zeros(3, device=device)
+    )
+    output.image.sum().backward()
+    assert harmonics.gradient is not None
+    harmonics.gradient.step(harmonics, 1e-3, 1e-15)
+    harmonics.coasting.advance(1e-3)
+
+
+def harmonics_of(case: Case, device: str = "cpu") -> DeferredHarmonics:
+    values, first, second = (torch.zeros(case.count, 15, 3, device=device) for _ in range(3))
+    return DeferredHarmonics(values, first, second, torch.zeros(case.count, dtype=torch.int32, device=device))
+
+
 def step(
     case: Case, device: str = "cpu", absolute: bool = False, footprint: bool = False
 ) -> tuple[Gaussians, RenderOutput]:
@@ -74,10 +93,13 @@ def step(
 def test_kernels_compile_without_spills(launches: list[Launch], target: int, monkeypatch: pytest.MonkeyPatch) -> None:
     step(CASE)
     step(CASE, absolute=True, footprint=True)
+    deferred_step(CASE, harmonics_of(CASE), TritonRasterizer())
     if target == 90:  # the other variants: the lower degrees, and blocks that are numbered in 32 bits
         monkeypatch.setattr(executor, "MAX_INT16", 0)
         for degree in (0, 1, 2):
             step(replace(CASE, sh_degree=degree))
+            if degree > 0:
+                deferred_step(replace(CASE, sh_degree=degree), harmonics_of(CASE), TritonRasterizer())
     compiled = {}
     for launch in launches:
         variant = launch.name, str(specialization(launch, target))
@@ -91,8 +113,8 @@ def test_kernels_compile_without_spills(launches: list[Launch], target: int, mon
             assert made.inner_loop / composite.UNROLL.value < FORWARD_ENTRY
         if launch.name == "decomposite":
             assert made.inner_loop / composite.UNROLL_BACK.value < BACKWARD_ENTRY
-    assert len({name for name, _ in compiled}) == 13
-    assert len(compiled) == (23 if target == 90 else 16)
+    assert len({name for name, _ in compiled}) == 14
+    assert len(compiled) == (32 if target == 90 else 19)
 
 
 def test_growing_compiles_nothing_anew(launches: list[Launch]) -> None:
@@ -100,12 +122,29 @@ def test_growing_compiles_nothing_anew(launches: list[Launch]) -> None:
     cases = (Case(33, 49, 50, 3), Case(32, 48, 64, 3), Case(1, 16, 1, 3))
     for case in cases:
         step(case)
+        deferred_step(case, harmonics_of(case), TritonRasterizer())
     names = [launch.name for launch in launches]
     each = len(names) // len(cases)
     assert names == names[:each] * len(cases)
     kinds = [specialization(launch) for launch in launches]
     for k, name in enumerate(names[:each]):
         assert kinds[k] == kinds[k + each] == kinds[k + 2 * each], name
+
+
+@pytest.mark.parametrize("size", [(1600, 1060), (500, 375), (800, 530), (256, 192), (140, 105), (4000, 3000)], ids=str)
+def test_a_loss_has_work_for_all_multiprocessors(size: tuple[int, int]) -> None:
+    """The fullest filters fewer rows than with programs of 32 rows, and few are idle that a smaller one would fill."""
+    strips = -(-3 * size[0] // STRIP)
+
+    def counted(rows: int) -> tuple[int, int]:
+        programs = strips * -(-size[1] // rows)
+        return programs, -(-programs // MULTIPROCESSORS) * (rows + 10)
+
+    rows = rows_of_program(size[1], 3 * size[0])
+    (programs, filtered), (_, before) = counted(rows), counted(32)
+    print(f"{size}: {rows} rows, {programs} programs; the fullest multiprocessor filters {filtered}, was {before}")
+    assert filtered < before
+    assert programs >= MULTIPROCESSORS or rows == 8
 
 
 class Watch(TorchDispatchMode):
@@ -145,3 +184,17 @@ def test_a_step_waits_once(launches: list[Launch]) -> None:
     with Watch() as watch:
         torch.zeros(3).to("meta")
     assert len(watch.waits) == 1
+
+
+def test_a_step_of_harmonics_that_are_put_off_waits_once(launches: list[Launch]) -> None:
+    """For how much there is to composite. What changes of the table of drifts goes to the device as one copy, on CUDA
+    from pinned memory, so that nobody waits for it."""
+    harmonics, rasterizer = harmonics_of(CASE, "meta"), TritonRasterizer()
+    deferred_step(CASE, harmonics, rasterizer)
+    asked = Answer.asked
+    with Watch() as watch:
+        deferred_step(CASE, harmonics, rasterizer)
+    made_by_the_test = 6  # tensors of Gaussians that go there
+    assert sorted(watch.waits) == ["aten._to_copy.default"] * made_by_the_test + ["aten.copy_.default"]
+    assert Answer.asked == asked + 1
+    assert [launch.name for launch in launches].count("step_harmonics") == 2

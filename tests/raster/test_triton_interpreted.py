@@ -11,17 +11,23 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from triton import language as tl
 from triton.runtime.interpreter import interpreter_builder
 
 from gsbench.densify import ADC
+from gsbench.gaussians import spherical_harmonics
+from gsbench.gaussians.deferred import DeferredHarmonics
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import Rasterizer, RenderOutput
 from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.raster.triton import executor
+from gsbench.raster.triton import composite, executor, layout
+from gsbench.raster.triton.deferred import Factors, Tables
 from gsbench.raster.triton.executor import TritonRasterizer
-from gsbench.raster.triton.memory import workspace_bytes
+from gsbench.raster.triton.memory import BYTES_OF_BORDER, PAIRS_OF_BORDER, workspace_bytes
 from gsbench.raster.triton.workspace import Workspace
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import Scene, View
@@ -45,6 +51,12 @@ def leaves(case: Case) -> Gaussians:
     return case.gaussians().map(lambda tensor: tensor.float().requires_grad_())
 
 
+def shorten_segments(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lists of the tests' scenes have many segments then."""
+    for module in (layout, composite):
+        monkeypatch.setattr(module, "SEGMENT", tl.constexpr(8))
+
+
 def test_the_same_bits_on_every_run() -> None:
     rasterizer = TritonRasterizer()
     expected = bits(*render_with_gradients(rasterizer, SMALL, torch.float32))
@@ -58,6 +70,7 @@ def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(monkeypatch:
 
     Of the long lists of opaque Gaussians many entries are such that no pixel comes to them.
     """
+    shorten_segments(monkeypatch)
     case = Case(20, 17, 80, sh_degree=1, log_scale=-0.5, logit=4.0)
     values = torch.rand(case.height, case.width, generator=torch.Generator().manual_seed(1))
 
@@ -85,6 +98,135 @@ def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(monkeypatch:
     monkeypatch.setattr(builder, "set_grid_idx", shuffled)
     assert run() == expected
     assert skipped[0] == skipped[1] > 50
+
+
+def misses(case: Case, gaussians: Gaussians) -> tuple[dict[str, float], RenderOutput]:
+    """The largest errors against the reference, each as a share of the largest value."""
+    results = []
+    for rasterizer, dtype in ((TritonRasterizer(), torch.float32), (ReferenceRasterizer(), torch.float64)):
+        copy = gaussians.map(lambda tensor, dtype=dtype: tensor.detach().clone().to(dtype).requires_grad_())
+        background = torch.tensor([0.2, 0.5, 0.9], dtype=dtype)
+        output = rasterizer.render(copy, case.camera(), case.sh_degree, background, absolute_gradient=True)
+        loss = output.image.square().sum() + 0.3 * output.alpha.square().sum()
+        loss.backward()
+        found = {name: tensor.grad for name, tensor in copy.tensors().items()}
+        found |= {"image": output.image, "screen": output.screen_points.grad, "absolute": output.screen_gradient_abs}
+        results.append((output, {name: tensor.detach().double() for name, tensor in found.items()}))
+    (output, found), (_, expected) = results
+    errors = {name: (found[name] - wanted).abs().max() / wanted.abs().max() for name, wanted in expected.items()}
+    return {name: float(error) for name, error in errors.items()}, output
+
+
+def test_a_long_list_is_walked_backward_in_segments() -> None:
+    """Some 600 faint Gaussians before one block, three segments; opaque ones between stop some of the pixels."""
+    case = Case(16, 8, 620, sh_degree=1)
+    gaussians = case.gaussians()
+    gaussians.means[:, :2] *= 0.3
+    gaussians.log_scales[:] = torch.tensor([0.2, 0.0, -0.2])
+    gaussians.opacity_logits[:] = -4.5
+    gaussians.log_scales[::40] = torch.tensor([-1.6, -2.0, -2.4])
+    gaussians.opacity_logits[::40] = 6.0
+    errors, output = misses(case, gaussians)
+    frame = output.footprint.args[1].frame
+    assert int(frame.past[0]) > 2 * PAIRS_OF_BORDER > int(frame.last.min()) > 0
+    assert len(frame.borders) == 2 * layout.BORDER.value
+    assert max(errors.values()) < 1e-5
+
+
+@pytest.mark.parametrize("logit", [0.0, 4.0])
+def test_segments_change_nothing_but_the_last_digits(monkeypatch: pytest.MonkeyPatch, logit: float) -> None:
+    """Six blocks of some 60 entries, eight a segment, some of them behind where all pixels of a block have stopped."""
+    case = Case(20, 17, 80, sh_degree=1, log_scale=-0.5, logit=logit)
+    shorten_segments(monkeypatch)
+    errors, output = misses(case, case.gaussians())
+    frame = output.footprint.args[1].frame
+    crossed = (frame.past - frame.starts[:-1] - 1) // 8
+    assert int(crossed.sum()) > 15
+    assert bool(((frame.starts[1:] - frame.starts[:-1] - 1) // 8 > crossed).any())
+    assert max(errors.values()) < 1e-5
+
+
+def random_factors(harmonics: DeferredHarmonics, degree: int, seed: int) -> tuple[Factors, Tensor]:
+    """A gradient of a random half of the Gaussians, in rows that are full of NaN elsewhere, and as a tensor."""
+    count, generator = len(harmonics.last), torch.Generator().manual_seed(seed)
+    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    color = torch.randn(count, 3, generator=generator)
+    seen = torch.rand(count, generator=generator) < 0.3 + 0.4 * (torch.arange(count) % 2)
+    rows = torch.full((count, 8), torch.nan)
+    rows[seen, :6] = torch.cat([direction, color], 1)[seen]
+    rows.view(torch.int32)[:, 6] = torch.where(seen, harmonics.last, -1)
+    functions = spherical_harmonics.basis(direction.double(), degree)[:, 1:]  # [N, K]
+    gradient = torch.zeros(count, 15, 3)
+    gradient[:, : functions.shape[1]] = torch.einsum("nk,nc->nkc", functions * seen[:, None], color.double()).float()
+    return Factors(Tables(rows.device), rows, degree), gradient
+
+
+def test_harmonics_that_are_put_off_come_to_the_same_as_dense_steps() -> None:
+    """Against torch's Adam, 300 steps of growing degree: with a densification, an opacity reset, a resume, a look."""
+    initial = random_gaussians(40, seed=5).map(Tensor.float)
+    dense, lazy = (TrainableGaussians(initial, LearningRates(), 1.0) for _ in range(2))
+    lazy.defer_harmonics()
+    tables, behind = Tables(torch.device("cpu")), 0
+    for step in range(300):
+        degree = min(3, step // 30)
+        if degree > 0:
+            factors, gradient = random_factors(lazy.deferred, degree, seed=step)
+            factors._tables = tables  # one for all steps, as a rasterizer has
+            lazy.deferred.receive(factors)
+            dense.values.sh_rest.grad = gradient
+        for each in (dense, lazy):
+            each.leaves.means.grad = torch.zeros_like(each.leaves.means)
+            if step == 250:
+                torch.testing.assert_close(each.values.sh_rest.grad, gradient, rtol=1e-5, atol=1e-6)
+            each.optimizer_step(degree)
+        behind = max(behind, int((lazy.deferred.coasting.step - lazy.deferred.last).max()))
+        if step == 100:
+            for each in (dense, lazy):
+                each.edit(torch.arange(40) % 7 != 3, append=initial.select(torch.arange(0, 30, 2)))
+        if step == 150:
+            for each in (dense, lazy):
+                each.overwrite("opacity_logits", each.leaves.opacity_logits.detach().clamp_max(0.5))
+        if step == 200:
+            state = lazy.state_dict()
+            assert state["deferred"]["last"].min() < lazy.deferred.coasting.step
+            lazy, tables = TrainableGaussians.load(state, LearningRates(), 1.0), Tables(torch.device("cpu"))
+    assert behind > 5
+    assert (dense.leaves.sh_rest[:30] - initial.sh_rest[:30]).abs().max() > 0.01
+    expected = dense.optimizer.state[dense.leaves.sh_rest]
+    found = lazy.deferred.settled()
+    for value, wanted in zip(found, (dense.leaves.sh_rest, expected["exp_avg"], expected["exp_avg_sq"]), strict=True):
+        assert (value - wanted).abs().max() < 2e-6 * wanted.abs().max()
+
+
+def test_a_render_sees_what_harmonics_have_missed() -> None:
+    """The picture and all gradients are those of settled Gaussians, and nothing is settled for it."""
+    trainable = TrainableGaussians(TINY.gaussians().map(Tensor.float), LearningRates(sh_rest=0.05), 1.0)
+    trainable.defer_harmonics()
+    for seed in range(4):
+        trainable.deferred.receive(random_factors(trainable.deferred, 3, seed)[0])
+        trainable.optimizer_step()
+    harmonics, rasterizer = trainable.deferred, TritonRasterizer()
+    assert 0 < (harmonics.last < 4).sum() < 20
+    before, last = trainable.leaves.sh_rest.detach().clone(), harmonics.last.clone()
+    background = torch.tensor([0.2, 0.5, 0.9])
+    settled = trainable.snapshot().map(lambda tensor: tensor.clone().requires_grad_())
+    assert (settled.sh_rest - before).abs().max() > 0.01
+    expected = rasterizer.render(settled, TINY.camera(), 3, background)
+    expected.image.square().sum().backward()
+    output = rasterizer.render_deferred(trainable.leaves, harmonics, TINY.camera(), 3, background)
+    assert torch.equal(output.radii, expected.radii)
+    assert (output.image - expected.image).abs().max() < 1e-6
+    output.image.square().sum().backward()
+    assert trainable.leaves.sh_rest.grad is None
+    assert torch.equal(trainable.leaves.sh_rest, before)
+    assert torch.equal(harmonics.last, last)
+    trainable.settle()  # leaves the gradient, too
+    assert torch.equal(trainable.leaves.sh_rest, settled.sh_rest)
+    for name, tensor in trainable.leaves.tensors().items():
+        wanted = getattr(settled, name).grad
+        assert (tensor.grad - wanted).abs().max() < 1e-5 * wanted.abs().max(), name
+    rasterizer.render_deferred(trainable.leaves, harmonics, TINY.camera(), 0, background).image.sum().backward()
+    assert harmonics.gradient is None
 
 
 def test_equal_depths_are_blended_in_the_order_of_the_index() -> None:
@@ -115,6 +257,21 @@ def test_needles_keep_their_gradients() -> None:
         results.append(copy.log_scales.grad.double())
     assert results[1].abs().max() > 0
     assert (results[0] - results[1]).abs().max() < 1e-4 * results[1].abs().max()
+
+
+@pytest.mark.parametrize("stretch", [0.0, 0.01])
+def test_turning_a_ball_has_no_gradient(stretch: float) -> None:
+    """Not even a rounding error: Adam would turn 1e-13 into a full step. What is nearly a ball has a true one."""
+    gaussians = SMALL.gaussians()
+    gaussians.log_scales[:] = gaussians.log_scales[:, :1]
+    gaussians.log_scales[:, 1] += stretch
+    found = []
+    for rasterizer, dtype in ((TritonRasterizer(), torch.float32), (ReferenceRasterizer(), torch.float64)):
+        copy = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
+        rasterizer.render(copy, SMALL.camera(), 3, BLACK.to(dtype)).image.square().sum().backward()
+        found.append(copy.quaternions.grad.double())
+    assert bool(found[0].any()) == (stretch > 0)
+    assert (found[0] - found[1]).abs().max() < 1e-3 * found[1].abs().max() + 1e-12
 
 
 def test_far_from_the_origin_nothing_is_lost() -> None:
@@ -239,7 +396,7 @@ def test_many_blocks_are_numbered_in_more_bits(monkeypatch: pytest.MonkeyPatch) 
     assert bits(*render_with_gradients(TritonRasterizer(), TINY, torch.float32)) == expected
 
 
-@pytest.mark.parametrize("case", [TINY, SMALL], ids=str)
+@pytest.mark.parametrize("case", [TINY, SMALL, Case(20, 17, 80, sh_degree=1, log_scale=-0.5)], ids=str)
 def test_the_memory_that_is_kept_is_counted_from_its_shapes(case: Case) -> None:
     rasterizer = TritonRasterizer()
     output = rasterizer.render(leaves(case), case.camera(), case.sh_degree, BLACK)
@@ -254,6 +411,8 @@ def test_the_memory_that_is_kept_is_counted_from_its_shapes(case: Case) -> None:
     )
     assert room >= 2 * count
     assert pairs > count / 2
+    assert layout.SEGMENT.value == PAIRS_OF_BORDER
+    assert layout.BORDER.value * 4 == BYTES_OF_BORDER
     assert sum(tensor.nbytes for tensor in buffers) == workspace_bytes(count, room, pairs, blocks)
 
 

@@ -88,7 +88,6 @@ class RasterizationPeer:
         return RenderOutput(images[0], alphas[0, ..., 0], radii, torch.zeros_like(gaussians.means[:, :2]))
 
 
-Peer = TorchPeer | RasterizationPeer
 PEERS: dict[str, type[TorchPeer] | type[RasterizationPeer]] = {
     kind.name: kind for kind in (TorchPeer, RasterizationPeer)
 }

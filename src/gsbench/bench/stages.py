@@ -70,7 +70,7 @@ def _wrapped(times: Counter[str]) -> Iterator[None]:
 
 
 def _stand_in_of(value: Any) -> Callable[[Any, Counter[str]], Any] | None:
-    """How to time ``value``; None if it is no kernel."""
+    """Say how to time ``value``; None if it is no kernel."""
     origin = type(value).__module__
     if origin.startswith("numba.") and hasattr(value, "py_func"):
         return _timed_call

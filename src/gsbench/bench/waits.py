@@ -74,7 +74,7 @@ def _is_mask(index: Any) -> bool:
 
 
 def _crosses(args: Any, result: Any) -> bool:
-    """Whether a copy goes from one type of device to another."""
+    """Return whether a copy goes from one type of device to another."""
     types = {tensor.device.type for tensor in (*args, result) if isinstance(tensor, torch.Tensor)}
     return len(types) > 1
 

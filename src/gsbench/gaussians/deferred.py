@@ -108,17 +108,17 @@ class DeferredHarmonics:
 
     def settled(self) -> tuple[Tensor, Tensor, Tensor]:
         """Copies of the values and both moments with all missed steps made."""
-        last = self.last.numpy()
+        last = self.last.long()
         missed = self.coasting.step - last  # [N]
 
-        def column(table: NDArray[np.float32]) -> Tensor:
-            return torch.from_numpy(table).reshape(-1, 1, 1)
+        def column(table: NDArray[np.float32], place: Tensor) -> Tensor:
+            return torch.from_numpy(table).to(place.device)[place].reshape(-1, 1, 1)
 
         direction = torch.where(self.second > 0, self.first / self.second.sqrt(), 0.0)
         return (
-            self.values.detach() - direction * column(self.coasting.drift[last]),
-            self.first * column(self.coasting.first_decay[missed]),
-            self.second * column(self.coasting.second_decay[missed]),
+            self.values.detach() - direction * column(self.coasting.drift, last),
+            self.first * column(self.coasting.first_decay, missed),
+            self.second * column(self.coasting.second_decay, missed),
         )
 
     @torch.no_grad()

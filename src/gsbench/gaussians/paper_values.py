@@ -21,7 +21,7 @@ class LearningRates:
     scale: float = 5e-3
     rotation: float = 1e-3
 
-    def position(self, step: int) -> float:
+    def position(self, step: float) -> float:
         """The log-linear schedule, without the factor of the scene extent."""
         t = min(max(step / self.position_steps, 0.0), 1.0)
         return math.exp((1 - t) * math.log(self.position_initial) + t * math.log(self.position_final))

@@ -64,7 +64,7 @@ class TrainableGaussians:
         """The present learning rate of the means, world units."""
         return self._rate("means")
 
-    def set_step(self, step: int) -> None:
+    def set_step(self, step: float) -> None:
         """Set the learning rate of the means for iteration ``step`` (1, 2, …)."""
         self._group("means")["lr"] = self.rates.position(step) * self.spatial_scale
 
@@ -101,7 +101,7 @@ class TrainableGaussians:
             parameter = self.leaves.sh_rest
             state = self._state(parameter)
             step = int(state["step"])
-            last = torch.full((len(self),), step, dtype=torch.int32)
+            last = torch.full((len(self),), step, dtype=torch.int32, device=parameter.device)
             self.deferred = DeferredHarmonics(parameter, state["exp_avg"], state["exp_avg_sq"], last, Coasting(step))
 
     def settle(self) -> None:
@@ -234,7 +234,7 @@ class TrainableGaussians:
         if "deferred" in state:
             trainable.defer_harmonics()
             assert trainable.deferred is not None
-            trainable.deferred.last = state["deferred"]["last"].clone()
+            trainable.deferred.last = state["deferred"]["last"].to(trainable.device, copy=True)
             trainable.deferred.coasting = Coasting(trainable.deferred.coasting.step, state["deferred"]["drift"])
         return trainable
 

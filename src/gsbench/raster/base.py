@@ -51,6 +51,12 @@ class RenderOutput:
     ``footprint()`` says which pixels each Gaussian was blended into; ``footprint(values)`` sums ``values`` [H, W] over
     them too. It takes its time when it is called, which may be after ``backward``. None where the rasterizer cannot
     say.
+
+    ``splitting_probe`` is [N, 3, 3], all zero, and a leaf, or None if it was not asked for: after ``backward`` its
+    ``.grad`` is each Gaussian's splitting matrix in this view, per world unit squared (SteepGS, arXiv 2505.05587): the
+    sum over pixels of (d loss / d s) times the second derivative of s by the position of the mean, for s the opacity
+    times the density at the pixel, before the clamp to ``alpha_max``. The projection is taken as linear there and the
+    covariance on the image as fixed.
     """
 
     image: Tensor
@@ -59,6 +65,7 @@ class RenderOutput:
     screen_points: Tensor
     screen_gradient_abs: Tensor | None = None
     footprint: FootprintOf | None = None
+    splitting_probe: Tensor | None = None
 
     @property
     def visible(self) -> Tensor:
@@ -71,12 +78,22 @@ class RenderOutput:
             raise RuntimeError("this densifier needs RenderOutput.footprint, which the rasterizer does not give")
         return self.footprint(values)
 
+    def require_splitting_matrix(self) -> Tensor:
+        """The splitting matrices [N, 3, 3] of this view. Raises RuntimeError where they were not asked for, or before
+        ``backward``."""
+        if self.splitting_probe is None or self.splitting_probe.grad is None:
+            raise RuntimeError(
+                "this densifier needs splitting matrices: render with splitting_matrix=True, then backward"
+            )
+        return self.splitting_probe.grad
+
 
 class Rasterizer(Protocol):
     """An executor of the contract; every one passes ``tests/raster/test_contract.py``.
 
     One of a user's that gives ``RenderOutput.footprint``, which is optional, has a class attribute ``has_footprint =
-    True``.
+    True``; one that gives splitting matrices has ``has_splitting_matrix = True``, and its ``render`` has one argument
+    more, ``splitting_matrix: bool = False``.
 
     Examples:
         The reference without colours; `departures` says what is not as the contract wants it.
@@ -130,6 +147,7 @@ class DeferringRasterizer(Rasterizer, Protocol):
         sh_degree: int,
         background: Tensor,
         absolute_gradient: bool = False,
+        splitting_matrix: bool = False,
     ) -> RenderOutput:
         """The same picture as ``render`` of the settled Gaussians: with what harmonics have missed.
 

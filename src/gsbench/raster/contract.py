@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import Rasterizer, RenderOutput
+from gsbench.raster.executors import offers
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.camera import Camera
 
@@ -88,15 +89,21 @@ CASES = (
 def render_with_gradients(
     rasterizer: Rasterizer, case: Case, dtype: torch.dtype, device: str = "cpu"
 ) -> tuple[RenderOutput, dict[str, Tensor]]:
-    """A render of ``case`` and the gradients of a fixed random weighting of the image and its alpha, in float64."""
+    """A render of ``case`` and the gradients of a fixed random weighting of the image and its alpha, in float64.
+
+    With the splitting matrices, where the rasterizer offers them.
+    """
     gaussians = case.gaussians().map(lambda tensor: tensor.to(device, dtype).requires_grad_())
     background = torch.tensor([0.2, 0.5, 0.9], dtype=dtype, device=device)
-    output = rasterizer.render(gaussians, case.camera(), case.sh_degree, background, absolute_gradient=True)
+    beyond = {"splitting_matrix": True} if offers(rasterizer.name, "has_splitting_matrix", rasterizer) else {}
+    output = rasterizer.render(gaussians, case.camera(), case.sh_degree, background, absolute_gradient=True, **beyond)
     generator = torch.Generator().manual_seed(7)
     weights = torch.randn(case.height, case.width, 4, generator=generator, dtype=torch.float64).to(device, dtype)
     ((output.image * weights[..., :3]).sum() + (output.alpha * weights[..., 3]).sum()).backward()
     gradients = {name: tensor.grad for name, tensor in gaussians.tensors().items()}
     gradients |= {"screen_points": output.screen_points.grad, "screen_gradient_abs": output.screen_gradient_abs}
+    if beyond:
+        gradients["splitting_probe"] = output.require_splitting_matrix()
     return output, {
         name: torch.zeros(()) if gradient is None else gradient.detach().cpu().double()
         for name, gradient in gradients.items()
@@ -106,8 +113,8 @@ def render_with_gradients(
 def departures(rasterizer: Rasterizer, device: str = "cpu", cases: tuple[Case, ...] = CASES) -> list[str]:
     """List the departures of ``rasterizer``, in float32 on ``device``, from the contract, one line each; [] if none.
 
-    Compares image, alpha, radii, all gradients and, where there is one, the footprint of ``cases`` with the reference,
-    and looks at a scene without Gaussians. Takes seconds.
+    Compares image, alpha, radii, all gradients and, where they are offered, the footprint and the splitting matrices of
+    ``cases`` with the reference, and looks at a scene without Gaussians. Takes seconds.
     """
     return [line for case in cases for line in _compare(rasterizer, case, device)] + _without_gaussians(
         rasterizer, device
@@ -133,6 +140,8 @@ def _compare(rasterizer: Rasterizer, case: Case, device: str) -> list[str]:
         different = int((output.radii.cpu() != expected.radii).sum())
         found.append(f"{case}: radii differ for {different} of {case.count} Gaussians")
     for name, reference in references.items():
+        if name == "splitting_probe" and name not in gradients:
+            continue  # it is an offer
         if gradients[name].shape != reference.shape:
             found.append(f"{case}: there is no gradient of {name}")
             continue

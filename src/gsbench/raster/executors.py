@@ -34,6 +34,7 @@ class Executor:
     upgrade: str = ""  # how to get that version
     takes_threads: bool = False  # its class has an argument ``threads``
     has_footprint: bool = True  # its renders say which pixels each Gaussian covers
+    has_splitting_matrix: bool = True  # its backward pass gives splitting matrices
 
     @property
     def is_installed(self) -> bool:
@@ -100,6 +101,7 @@ EXECUTORS = (
         package="gsplat",
         install=install_command("gsplat"),
         has_footprint=False,
+        has_splitting_matrix=False,
     ),
 )
 # Executors that ``auto`` takes: the first that is installed. Other types of devices have the reference alone.
@@ -119,6 +121,15 @@ def find(name: str) -> Executor:
     raise InputError(
         f"raster={name} is not known; choose {', '.join(names())}, or set raster._target_ to a class of your own"
     )
+
+
+def offers(name: str, fact: str, own: object = None) -> bool:
+    """Return whether the rasterizer called ``name`` has an offer beyond the contract, such as ``has_footprint``.
+
+    ``own`` is the rasterizer if it is a user's, whose attribute of that name says it.
+    """
+    given = {executor.name: bool(getattr(executor, fact)) for executor in EXECUTORS}
+    return given.get(name, bool(getattr(own, fact, False)))
 
 
 def resolve(name: str, device_type: str) -> Executor:

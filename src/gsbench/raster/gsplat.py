@@ -152,7 +152,7 @@ class _DeviceCamera:
 
 @dataclass(frozen=True)
 class _Frame:
-    """What compositing needs besides tensors with a gradient."""
+    """Values that compositing needs besides tensors with a gradient."""
 
     width: int
     height: int

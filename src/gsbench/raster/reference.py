@@ -49,6 +49,7 @@ class ReferenceRasterizer:
         sh_degree: int,
         background: Tensor,
         absolute_gradient: bool = False,
+        splitting_matrix: bool = False,
     ) -> RenderOutput:
         check_inputs(gaussians, camera, sh_degree, background)
         half_size = gaussians.means.new_tensor([camera.width / 2, camera.height / 2])  # NDC to pixels
@@ -62,6 +63,11 @@ class ReferenceRasterizer:
         radii[projected.index[reached]] = projected.radii[reached].to(torch.int32)
 
         means = projected.means + screen_points[projected.index] * half_size  # [M, 2]
+        probe, bends = None, None
+        if splitting_matrix:
+            probe = gaussians.means.new_zeros(len(gaussians), 3, 3, requires_grad=True)
+            linear = mean_jacobians(gaussians.means.detach()[projected.index], camera)  # [M, 2, 3]
+            bends = linear @ probe[projected.index] @ linear.mT  # [M, 2, 2] all zero
         rgb = self._colors(gaussians, projected.index, camera, sh_degree)  # [M, 3]
         opacities = gaussians.opacities[projected.index]  # [M]
 
@@ -84,13 +90,14 @@ class ReferenceRasterizer:
                 rgb[members],
                 background,
                 self.constants,
+                None if bends is None else bends[members],
                 use_reentrant=False,
                 preserve_rng_state=False,
             )
             image[y0:y1, x0:x1] = tile_image.reshape(y1 - y0, x1 - x0, 3)
             alpha[y0:y1, x0:x1] = tile_alpha.reshape(y1 - y0, x1 - x0)
         footprint = partial(self._footprint, gaussians.map(torch.Tensor.detach), camera)
-        return RenderOutput(image, alpha, radii, screen_points, gradient_abs, footprint)
+        return RenderOutput(image, alpha, radii, screen_points, gradient_abs, footprint, probe)
 
     @torch.no_grad()
     def _footprint(self, gaussians: Gaussians, camera: Camera, values: Tensor | None = None) -> Footprint:
@@ -179,6 +186,15 @@ def _to_image(
     return means, blurred, z
 
 
+def mean_jacobians(means: Tensor, camera: Camera) -> Tensor:
+    """The derivatives [M, 2, 3] of projected means, px, by ``means`` [M, 3], without the limits on the slopes."""
+    rotation = means.new_tensor(camera.rotation)  # [3, 3]
+    x, y, z = (means @ rotation.T + means.new_tensor(camera.translation)).unsqueeze(-1).unbind(1)  # each [M, 1]
+    row_x = camera.fx / z * (rotation[0] - x / z * rotation[2])  # [M, 3]
+    row_y = camera.fy / z * (rotation[1] - y / z * rotation[2])
+    return torch.stack([row_x, row_y], 1)
+
+
 def tile_rectangles(projected: Projection, camera: Camera, tile: int) -> tuple[Tensor, Tensor]:
     """The tiles that each Gaussian's square of two radii touches: first and past-the-last, int64 [M, 2] (x, y)."""
     means, radii = projected.means.detach(), projected.radii.unsqueeze(-1)
@@ -213,24 +229,41 @@ def composite(
     rgb: Tensor,
     background: Tensor,
     constants: RasterConstants = CONSTANTS,
+    bends: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Blend K Gaussians, front to back, at P pixels.
 
     ``pixels`` [P, 2], ``means`` [P, K, 2], ``conics`` [K, 3], ``opacities`` [K], ``rgb`` [K, 3]; returns [P, 3] and the
     opacity [P]. A pixel stops before the Gaussian that would bring its transmittance below ``transmittance_min``.
+    ``bends`` as in ``blending_weights``.
     """
-    weight = blending_weights(pixels, means, conics, opacities, constants)  # [P, K]
+    weight = blending_weights(pixels, means, conics, opacities, constants, bends)  # [P, K]
     opacity = weight.sum(1)  # [P]
     return weight @ rgb + (1 - opacity).unsqueeze(-1) * background, opacity
 
 
 def blending_weights(
-    pixels: Tensor, means: Tensor, conics: Tensor, opacities: Tensor, constants: RasterConstants = CONSTANTS
+    pixels: Tensor,
+    means: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    constants: RasterConstants = CONSTANTS,
+    bends: Tensor | None = None,
 ) -> Tensor:
-    """Alpha times transmittance, [P, K], for the arguments of ``composite``; 0 where a Gaussian is not blended."""
+    """Alpha times transmittance, [P, K], for the arguments of ``composite``; 0 where a Gaussian is not blended.
+
+    ``bends`` [K, 2, 2] is zero: its gradient is the sum over pixels of the gradient of each opacity times density times
+    that one's second derivative by the projected mean.
+    """
     dx, dy = (means - pixels.unsqueeze(1)).unbind(-1)  # [P, K]
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
     raw = opacities * power.clamp_max(0).exp()  # [P, K]
+    if bends is not None:
+        offset = (means - pixels.unsqueeze(1)).detach()  # [P, K, 2]
+        inverse = conics.detach()[:, [0, 1, 1, 2]].reshape(-1, 2, 2)  # [K, 2, 2]
+        slope = (inverse @ offset.unsqueeze(-1)).squeeze(-1)  # [P, K, 2]
+        second = slope.unsqueeze(-1) * slope.unsqueeze(-2) - inverse  # [P, K, 2, 2]
+        raw = raw + raw.detach() * (second * bends).sum((-2, -1))
     saturated = raw + (raw.clamp_max(constants.alpha_max) - raw).detach()  # the gradient passes the clamp
     alpha = torch.where((power <= 0) & (raw >= constants.alpha_min), saturated, 0.0)
     after = torch.cumprod(1 - alpha, dim=1)  # [P, K] transmittance behind each Gaussian

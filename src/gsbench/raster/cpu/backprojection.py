@@ -15,6 +15,7 @@ from gsbench.raster.cpu.geometry import (
     gather_quaternions,
     gather_vectors,
     image_axes,
+    image_rows,
     normalized,
     rotation_matrix,
     scaled,
@@ -25,7 +26,8 @@ from gsbench.raster.cpu.geometry import (
 from gsbench.raster.cpu.harmonics import F0, MATRIX, direction_gradient, fill_basis
 from gsbench.raster.cpu.jit import inlined, kernel
 from gsbench.raster.cpu.shuffle import REST, by_channel, outer_rest, store_rest, transpose
-from gsbench.raster.cpu.simd import LANES, gather, load, prefetch, scatter, select, splat, store
+from gsbench.raster.cpu.simd import gather, load, prefetch, scatter, select, splat, store
+from gsbench.raster.cpu.vector import LANES
 
 AHEAD = 16  # records that the prefetch runs ahead
 ZERO, ONE = np.float32(0), np.float32(1)
@@ -93,10 +95,12 @@ def backproject_shard(
     factor_ints: Any,
     g_screen: Any,
     g_absolute: Any,
+    g_splitting: Any,
 ) -> None:
     """Write every gradient of the Gaussians ``begin`` to ``end``; reads and clears their ``rows`` [shards * N * 16].
 
-    Where ``g_sh_rest`` is empty, the harmonics' goes to ``factors`` from ``chunk`` on, for the Gaussians that are seen.
+    ``g_absolute`` and ``g_splitting`` [N, 9] may be empty. Where ``g_sh_rest`` is empty, the harmonics' goes to
+    ``factors`` from ``chunk`` on, for the Gaussians that are seen.
     """
     unseen = begin  # the first Gaussian whose gradients are not written yet
     for record in range(begin, begin + visible + 1):
@@ -112,6 +116,8 @@ def backproject_shard(
             _clear(g_screen, unseen, past)
             if len(g_absolute) > 0:
                 _clear(g_absolute, unseen, past)
+            if len(g_splitting) > 0:
+                _clear(g_splitting, unseen, past)
         unseen = past + 1
     floats, indices = memory
     sums, basis, pulled = floats[:MATRIX], floats[MATRIX : 2 * MATRIX], floats[2 * MATRIX :]
@@ -177,6 +183,10 @@ def backproject_shard(
         q00 = a * a * load(sums, at.SUM_H_TT * LANES)
         q01 = a * e * load(sums, at.SUM_H_TY * LANES)
         q11 = e * e * load(sums, at.SUM_H_YY * LANES)
+        if len(g_splitting) > 0:
+            of_h = load(sums, at.SUM_H * LANES)
+            free = image_rows(x * inverse_z, y * inverse_z, inverse_z, v)
+            _scatter_splitting(g_splitting, indices, q00 - a * of_h, q01, q11 - e * of_h, shear, free)
         u0 = (n0[0] + shear * n1[0], n0[1] + shear * n1[1], n0[2] + shear * n1[2])
         g0 = (q00 * u0[0] + q01 * n1[0], q00 * u0[1] + q01 * n1[1], q00 * u0[2] + q01 * n1[2])
         g1 = (q01 * u0[0] + q11 * n1[0], q01 * u0[1] + q11 * n1[1], q01 * u0[2] + q11 * n1[2])
@@ -226,6 +236,29 @@ def backproject_shard(
         # d log(alpha) / d logit = 1 - opacity
         g_logit = load(sums, at.SUM_H * LANES) / (exponential(gather(logits, indices, 1, 0)) + ONE)
         scatter(g_logits, indices, 1, 0, g_logit)
+
+
+@inlined
+def _scatter_splitting(g_splitting: Any, indices: Any, d00: Any, d01: Any, d11: Any, shear: Any, rows: Any) -> None:
+    """Write F^T U^T (D G D - h D) U F for the derivative F = ``rows`` of the mean on the image, ``d`` what is between.
+
+    The second derivative of alpha by the mean on the image is alpha (u u^T - C), with u = C (dx, dy) and the conic
+    C = U^T D U; summed with weights h / alpha that is U^T (D G D - h D) U.
+    """
+    r0 = (rows[0][0] + shear * rows[1][0], rows[0][1] + shear * rows[1][1], rows[0][2] + shear * rows[1][2])
+    r1 = rows[1]
+    s0 = (d00 * r0[0] + d01 * r1[0], d00 * r0[1] + d01 * r1[1], d00 * r0[2] + d01 * r1[2])
+    s1 = (d01 * r0[0] + d11 * r1[0], d01 * r0[1] + d11 * r1[1], d01 * r0[2] + d11 * r1[2])
+    xy, xz, yz = r0[0] * s0[1] + r1[0] * s1[1], r0[0] * s0[2] + r1[0] * s1[2], r0[1] * s0[2] + r1[1] * s1[2]
+    scatter(g_splitting, indices, 9, 0, r0[0] * s0[0] + r1[0] * s1[0])
+    scatter(g_splitting, indices, 9, 1, xy)
+    scatter(g_splitting, indices, 9, 2, xz)
+    scatter(g_splitting, indices, 9, 3, xy)
+    scatter(g_splitting, indices, 9, 4, r0[1] * s0[1] + r1[1] * s1[1])
+    scatter(g_splitting, indices, 9, 5, yz)
+    scatter(g_splitting, indices, 9, 6, xz)
+    scatter(g_splitting, indices, 9, 7, yz)
+    scatter(g_splitting, indices, 9, 8, r0[2] * s0[2] + r1[2] * s1[2])
 
 
 @inlined

@@ -15,7 +15,6 @@ from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.jit import inlined, kernel
 from gsbench.raster.cpu.simd import (
-    LANES,
     absolute,
     exp2,
     fma,
@@ -31,6 +30,7 @@ from gsbench.raster.cpu.simd import (
     splat,
     store,
 )
+from gsbench.raster.cpu.vector import LANES
 
 LOG2_ALPHA_MIN = np.float32(math.log2(CONSTANTS.alpha_min))
 ALPHA_MAX = np.float32(CONSTANTS.alpha_max)
@@ -42,7 +42,6 @@ ZERO = np.float32(0)
 BLOCK_SPAN = np.float32(at.BLOCK - 1)
 TO_PRECISION = np.float32(2 * math.log(2.0))  # -curve to entry of the inverse covariance, up to sign
 AHEAD = 6  # list entries that the prefetch runs ahead
-ALL_BLOCKS = np.uint64(0xFFFF)
 
 LANE_X = (np.arange(LANES) % at.BLOCK).astype(np.float32)  # px within a block
 LANE_Y = (np.arange(LANES) // at.BLOCK).astype(np.float32)

@@ -20,7 +20,8 @@ from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.harmonics import fill_basis
 from gsbench.raster.cpu.jit import inlined, kernel
 from gsbench.raster.cpu.shuffle import REST, load_rest, outer_rest, store_rest
-from gsbench.raster.cpu.simd import LANES, fma, load, prefetch, select, square_root
+from gsbench.raster.cpu.simd import fma, load, prefetch, select, square_root
+from gsbench.raster.cpu.vector import LANES
 from gsbench.raster.cpu.workspace import ShardRunner
 
 # A chunk of factors: 16 Gaussians, a row of 16 float32 for each of these.

@@ -40,7 +40,7 @@ def _imported(source: Path, package: Path) -> tuple[Path, ...]:
 
 
 def _file(module: str, package: Path) -> Path | None:
-    """Where the module ``module`` of ``package`` lies; None for modules of other packages."""
+    """File of the module ``module`` of ``package``; None for modules of other packages."""
     first, *rest = module.split(".")
     if first != package.name:
         return None

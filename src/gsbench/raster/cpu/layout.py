@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.raster.base import RasterConstants
-from gsbench.raster.cpu.simd import LANES, SUM_LANES
+from gsbench.raster.cpu.simd import SUM_LANES
+from gsbench.raster.cpu.vector import LANES
 from gsbench.scene.camera import Camera
 
 BLOCK = 4  # px; one vector holds the 4x4 pixels of a block, row by row

@@ -31,7 +31,6 @@ from gsbench.raster.cpu.harmonics import F0, MATRIX, fill_basis
 from gsbench.raster.cpu.jit import inlined, kernel
 from gsbench.raster.cpu.shuffle import as_integers, as_span, by_channel, index_bits, transpose
 from gsbench.raster.cpu.simd import (
-    LANES,
     absolute,
     ceil,
     floor,
@@ -47,6 +46,7 @@ from gsbench.raster.cpu.simd import (
     square_root,
     store,
 )
+from gsbench.raster.cpu.vector import LANES
 from gsbench.raster.validate import MIN_QUATERNION_NORM
 
 MAX_RADIUS = 2.0**24  # px; keeps the radius of an absurdly large Gaussian inside int32

@@ -13,7 +13,8 @@ from llvmlite import ir
 from numba.core import types
 
 from gsbench.gaussians.model import NUM_SH_REST
-from gsbench.raster.cpu.simd import LANES, VECTOR, address, intrinsic, lane_indices
+from gsbench.raster.cpu.simd import address, intrinsic
+from gsbench.raster.cpu.vector import LANES, VECTOR, lane_indices
 
 CHANNELS = 3
 REST = CHANNELS * NUM_SH_REST  # numbers of one Gaussian in ``sh_rest``: coefficient by coefficient, r g b

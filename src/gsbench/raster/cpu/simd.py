@@ -1,10 +1,9 @@
 """Explicit SIMD values inside numba kernels: 16 float32 in one LLVM vector.
 
 Auto-vectorisation of numba loops is fragile: an unlucky index type makes an inner loop scalar. Here a vector is a value
-like any other: ``load`` and ``store`` move it, ``+ - * /``, ``-x`` and comparisons work lane by lane (a Python or numpy
-number is broadcast), comparisons give a mask for ``select``, ``&``, ``|`` and ``~``. LLVM maps the vector to what the
-host has: one AVX-512 register, two of AVX2, four of SSE or NEON; the lanes' results do not depend on it, apart from
-``fma``, which is fused only where the host can.
+like any other (`gsbench.raster.cpu.vector`): ``load`` and ``store`` move it, operators work lane by lane, ``select``
+takes the mask of a comparison. LLVM maps the vector to what the host has: one AVX-512 register, two of AVX2, four of
+SSE or NEON; the lanes' results do not depend on it, apart from ``fma``, which is fused only where the host can.
 
 Indices count array elements, are not checked and must not be negative. Arrays are contiguous.
 """
@@ -12,126 +11,16 @@ Indices count array elements, are not checked and must not be negative. Arrays a
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core import extending as numba_extending
-from numba.core.extending import lower_builtin, models, register_model
-from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+
+from gsbench.raster.cpu.vector import LANES, MASK, VECTOR, Vector, as_vector, common_vector, lane_indices
 
 intrinsic: Any = numba_extending.intrinsic  # its functions take one argument less than they are written with
-
-LANES = 16  # of float32
-
-
-class _Vector(types.Type):
-    """The numba type of 16 float32."""
-
-    def __init__(self) -> None:
-        self.element, self.lanes = types.float32, LANES
-        self.scalar_ir = ir.FloatType()
-        self.ir = ir.VectorType(self.scalar_ir, LANES)
-        self.bits_ir = ir.VectorType(ir.IntType(32), LANES)
-        self.suffix = f"v{LANES}f32"  # of LLVM's intrinsic functions
-        super().__init__(name=f"float32x{LANES}")
-
-    def constant(self, value: float) -> ir.Constant:
-        return ir.Constant(self.ir, [ir.Constant(self.scalar_ir, value)] * self.lanes)
-
-    def bits(self, value: int) -> ir.Constant:
-        return ir.Constant(self.bits_ir, [ir.Constant(self.bits_ir.element, value)] * self.lanes)
-
-
-class _Mask(types.Type):
-    """The numba type of 16 truth values."""
-
-    def __init__(self) -> None:
-        self.ir = ir.VectorType(ir.IntType(1), LANES)
-        super().__init__(name=f"maskx{LANES}")
-
-
-VECTOR = _Vector()
-_MASK = _Mask()
-
-
-@register_model(_Vector)
-@register_model(_Mask)
-class _Model(models.PrimitiveModel):
-    def __init__(self, manager: Any, frontend_type: Any) -> None:
-        super().__init__(manager, frontend_type, frontend_type.ir)
-
-
-# --- operators
-# ----------------------------------------------------------------------------------------------------------
-
-
-def lane_indices(lanes: Sequence[int]) -> ir.Constant:
-    return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), [ir.Constant(ir.IntType(32), lane) for lane in lanes])
-
-
-def _as_vector(context: Any, builder: Any, value: Any, kind: Any, vector: _Vector) -> Any:
-    if isinstance(kind, _Vector):
-        return value
-    scalar = context.cast(builder, value, kind, vector.element)
-    undefined = ir.Constant(vector.ir, ir.Undefined)
-    first = builder.insert_element(undefined, scalar, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(first, undefined, lane_indices([0] * vector.lanes))
-
-
-def _common_vector(kinds: Sequence[Any]) -> _Vector | None:
-    """The vector type of arguments of which each is that vector or a number; None if they are anything else."""
-    vectors = {kind for kind in kinds if isinstance(kind, _Vector)}
-    fits = len(vectors) == 1 and all(isinstance(kind, _Vector | types.Number) for kind in kinds)
-    return vectors.pop() if fits else None
-
-
-def _register_operator(functions: Sequence[Any], arity: int, emit: Callable[..., Any], compares: bool = False) -> None:
-    """Let ``functions`` of vectors (or vectors and numbers) be what ``emit(builder, *operands)`` builds."""
-
-    class _Template(AbstractTemplate):
-        def generic(self, args: Sequence[Any], kws: Any) -> Any:
-            vector = _common_vector(args) if len(args) == arity else None
-            return signature(_MASK if compares else vector, *args) if vector else None
-
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        vector: Any = _common_vector(sig.args)
-        return emit(builder, *(_as_vector(context, builder, v, k, vector) for v, k in zip(args, sig.args, strict=True)))
-
-    for function in functions:
-        infer_global(function)(type("_Template", (_Template,), {}))
-        combinations = (
-            [(_Vector,)] if arity == 1 else [(_Vector, _Vector), (_Vector, types.Number), (types.Number, _Vector)]
-        )
-        for combination in combinations:
-            lower_builtin(function, *combination)(lower)
-
-
-def _register_mask_operator(functions: Sequence[Any], arity: int, emit: Callable[..., Any]) -> None:
-    class _Template(AbstractTemplate):
-        def generic(self, args: Sequence[Any], kws: Any) -> Any:
-            fits = len(args) == arity and isinstance(args[0], _Mask) and set(args) == {args[0]}
-            return signature(args[0], *args) if fits else None
-
-    for function in functions:
-        infer_global(function)(type("_Template", (_Template,), {}))
-        lower_builtin(function, *[_Mask] * arity)(lambda context, builder, sig, args: emit(builder, *args))
-
-
-_register_operator([operator.add, operator.iadd], 2, lambda builder, a, b: builder.fadd(a, b))
-_register_operator([operator.sub, operator.isub], 2, lambda builder, a, b: builder.fsub(a, b))
-_register_operator([operator.mul, operator.imul], 2, lambda builder, a, b: builder.fmul(a, b))
-_register_operator([operator.truediv, operator.itruediv], 2, lambda builder, a, b: builder.fdiv(a, b))
-_register_operator([operator.neg], 1, lambda builder, a: builder.fneg(a))
-_register_operator([operator.lt], 2, lambda builder, a, b: builder.fcmp_ordered("<", a, b), compares=True)
-_register_operator([operator.le], 2, lambda builder, a, b: builder.fcmp_ordered("<=", a, b), compares=True)
-_register_operator([operator.gt], 2, lambda builder, a, b: builder.fcmp_ordered(">", a, b), compares=True)
-_register_operator([operator.ge], 2, lambda builder, a, b: builder.fcmp_ordered(">=", a, b), compares=True)
-_register_mask_operator([operator.and_, operator.iand], 2, lambda builder, a, b: builder.and_(a, b))
-_register_mask_operator([operator.or_, operator.ior], 2, lambda builder, a, b: builder.or_(a, b))
-_register_mask_operator([operator.invert], 1, lambda builder, a: builder.not_(a))
 
 
 # --- memory
@@ -144,7 +33,7 @@ def address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return builder.gep(data, [context.cast(builder, args[1], sig.args[1], types.intp)])
 
 
-def _vector_of(array: Any) -> _Vector:
+def _vector_of(array: Any) -> Vector:
     if not (isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.float32):
         raise TypeError(f"a contiguous float32 array is needed, got {array}")
     return VECTOR
@@ -183,7 +72,7 @@ def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         pointer = builder.bitcast(address(context, builder, sig, args), vector.ir.as_pointer())
-        operand = _as_vector(context, builder, args[2], sig.args[2], vector)
+        operand = as_vector(context, builder, args[2], sig.args[2], vector)
         builder.store(operand, pointer, align=vector.element.bitwidth // 8)
         return context.get_dummy_value()
 
@@ -246,19 +135,19 @@ def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
 # ----------------------------------------------------------------------------------------------------------
 
 
-def _call(builder: Any, name: str, vector: _Vector, *operands: Any) -> Any:
+def _call(builder: Any, name: str, vector: Vector, *operands: Any) -> Any:
     kind = ir.FunctionType(vector.ir, [vector.ir] * len(operands))
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.{vector.suffix}"), operands)
 
 
 def _function(emit: Callable[..., Any], *kinds: Any) -> Any:
     """An intrinsic that is ``emit(builder, vector type, *operands)`` of vectors, or of vectors and numbers."""
-    vector = _common_vector(kinds)
+    vector = common_vector(kinds)
     if vector is None:
         return None
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        operands = (_as_vector(context, builder, v, k, vector) for v, k in zip(args, sig.args, strict=True))
+        operands = (as_vector(context, builder, v, k, vector) for v, k in zip(args, sig.args, strict=True))
         return emit(builder, vector, *operands)
 
     return vector(*kinds), codegen
@@ -269,7 +158,7 @@ def splat(typing_context: Any, scalar: Any) -> Any:
     """``scalar`` in all of 16 float32."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _as_vector(context, builder, args[0], sig.args[0], VECTOR)
+        return as_vector(context, builder, args[0], sig.args[0], VECTOR)
 
     return VECTOR(scalar), codegen
 
@@ -316,12 +205,12 @@ def ceil(typing_context: Any, a: Any) -> Any:
 @intrinsic
 def select(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
     """``a`` where ``mask``, else ``b``; one of the two may be a number."""
-    vector = _common_vector((a, b))
-    if vector is None or mask != _MASK:
+    vector = common_vector((a, b))
+    if vector is None or mask != MASK:
         return None
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        x, y = (_as_vector(context, builder, args[k], sig.args[k], vector) for k in (1, 2))
+        x, y = (as_vector(context, builder, args[k], sig.args[k], vector) for k in (1, 2))
         return builder.select(args[0], x, y)
 
     return vector(mask, a, b), codegen
@@ -343,9 +232,9 @@ def mask_from_bits(typing_context: Any, bits: Any) -> Any:
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         wide_bits = context.cast(builder, args[0], sig.args[0], types.uint64)
-        return builder.bitcast(builder.trunc(wide_bits, ir.IntType(LANES)), _MASK.ir)
+        return builder.bitcast(builder.trunc(wide_bits, ir.IntType(LANES)), MASK.ir)
 
-    return _MASK(bits), codegen
+    return MASK(bits), codegen
 
 
 @intrinsic
@@ -359,7 +248,7 @@ def lowest_bit(typing_context: Any, bits: Any) -> Any:
     return types.uint64(bits), codegen
 
 
-def _polynomial(builder: Any, vector: _Vector, x: Any, coefficients: Sequence[float]) -> Any:
+def _polynomial(builder: Any, vector: Vector, x: Any, coefficients: Sequence[float]) -> Any:
     """``sum_k coefficients[k] x^k``."""
     value = vector.constant(coefficients[-1])
     for coefficient in coefficients[-2::-1]:
@@ -382,7 +271,7 @@ def exp2(typing_context: Any, a: Any) -> Any:
     2^a = 2^n 2^f: adding 1.5 * 2^23 leaves the nearest integer n in the low bits of the mantissa.
     """
 
-    def emit(builder: Any, vector: _Vector, x: Any) -> Any:
+    def emit(builder: Any, vector: Vector, x: Any) -> Any:
         magic = vector.constant(1.5 * 2.0**MANTISSA_BITS)
         shifted = builder.fadd(x, magic)
         fraction = builder.fsub(x, builder.fsub(shifted, magic))
@@ -397,7 +286,7 @@ def exp2(typing_context: Any, a: Any) -> Any:
 def log2(typing_context: Any, a: Any) -> Any:
     """``log2(a)`` of positive, normal numbers, within 2e-7 of the larger of it and 1; any value elsewhere."""
 
-    def emit(builder: Any, vector: _Vector, x: Any) -> Any:
+    def emit(builder: Any, vector: Vector, x: Any) -> Any:
         # The bits above those of sqrt(1/2), shifted down, are the exponent n of x = 2^n m.
         bits = builder.bitcast(x, vector.bits_ir)
         exponent = builder.ashr(builder.sub(bits, vector.bits(_BITS_OF_ROOT_HALF)), vector.bits(MANTISSA_BITS))

@@ -12,6 +12,7 @@ from gsbench.raster.triton.geometry import (
     dot,
     from_camera,
     image_axes,
+    image_rows,
     load_quaternion,
     load_vector,
     rotation_matrix,
@@ -20,9 +21,13 @@ from gsbench.raster.triton.geometry import (
     times,
     to_view,
 )
-from gsbench.raster.triton.harmonics import pull_back_colors
+from gsbench.raster.triton.harmonics import F0, store_gradients
 from gsbench.raster.triton.layout import (
     CLAMPED,
+    FACTORS,
+    G_COLOR,
+    LAST,
+    NOT_SEEN,
     RECORD,
     ROW,
     SUM_ABS_T,
@@ -36,6 +41,7 @@ from gsbench.raster.triton.layout import (
     SUM_H_Y,
     SUM_H_YY,
     SUM_RED,
+    TO,
 )
 
 
@@ -95,16 +101,40 @@ def _store_vector(array, index, values, mask):
     tl.store(array + 3 * index + 2, values[2], mask=mask)
 
 
+@triton.jit
+def _store_splitting(place, d00, d01, d11, shear, rows, mask):
+    """Write F^T U^T (D G D - h D) U F for the derivative F = ``rows`` of the mean on the image, ``d`` what is between.
+
+    The second derivative of alpha by the mean on the image is alpha (u u^T - C), with u = C (dx, dy) and the conic
+    C = U^T D U; summed with weights h / alpha that is U^T (D G D - h D) U.
+    """
+    r0 = (rows[0][0] + shear * rows[1][0], rows[0][1] + shear * rows[1][1], rows[0][2] + shear * rows[1][2])
+    r1 = rows[1]
+    s0 = (d00 * r0[0] + d01 * r1[0], d00 * r0[1] + d01 * r1[1], d00 * r0[2] + d01 * r1[2])
+    s1 = (d01 * r0[0] + d11 * r1[0], d01 * r0[1] + d11 * r1[1], d01 * r0[2] + d11 * r1[2])
+    xy, xz, yz = r0[0] * s0[1] + r1[0] * s1[1], r0[0] * s0[2] + r1[0] * s1[2], r0[1] * s0[2] + r1[1] * s1[2]
+    tl.store(place, r0[0] * s0[0] + r1[0] * s1[0], mask=mask)
+    tl.store(place + 1, xy, mask=mask)
+    tl.store(place + 2, xz, mask=mask)
+    tl.store(place + 3, xy, mask=mask)
+    tl.store(place + 4, r0[1] * s0[1] + r1[1] * s1[1], mask=mask)
+    tl.store(place + 5, yz, mask=mask)
+    tl.store(place + 6, xz, mask=mask)
+    tl.store(place + 7, yz, mask=mask)
+    tl.store(place + 8, r0[2] * s0[2] + r1[2] * s1[2], mask=mask)
+
+
 @triton.jit(do_not_specialize=["count"])
 def backproject(
     means,
     log_scales,
     quaternions,
     logits,
-    sh_rest,
+    last,
     count,
     v,
     record_ints,
+    color_slopes,
     row_counts,
     first_units,
     pair_ends,
@@ -118,11 +148,20 @@ def backproject(
     g_sh_rest,
     g_screen,
     g_absolute,
+    g_splitting,
+    factors,
+    factor_ints,
     DEGREE: tl.constexpr,
+    DEFERRED: tl.constexpr,
     ABSOLUTE: tl.constexpr,
+    SPLITTING: tl.constexpr,
     GROUP: tl.constexpr,
 ):
-    """Write the gradients of the Gaussians that were seen; those of the others stay as they are."""
+    """Write the gradients of the Gaussians that were seen; those of the others stay as they are.
+
+    If ``DEFERRED``, ``factors`` [N, 8] gets what the gradient of harmonics is made of, in place of ``g_sh_rest``, and
+    the ``last`` [N] step of each; ``factor_ints`` is its memory.
+    """
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     row_count = tl.load(row_counts + index, mask=index < count, other=0)
     seen = row_count > 0
@@ -142,7 +181,22 @@ def backproject(
     distance = tl.sqrt(dot(offset, offset))
     inverse_distance = 1.0 / tl.where(distance > 0, distance, 1.0)
     to = scaled(offset, (inverse_distance, inverse_distance, inverse_distance))
-    pulled = pull_back_colors(to, g_rgb, sh_rest, g_sh_dc, g_sh_rest, index, seen, DEGREE)
+    _store_vector(g_sh_dc, index, scaled(g_rgb, (F0, F0, F0)), seen)
+    zero = tl.zeros_like(distance)
+    pulled = (zero, zero, zero)
+    if DEGREE > 0:
+        for c in tl.static_range(3):
+            slope = load_vector(color_slopes + 3 * c, 3 * index, seen)
+            pulled = (pulled[0] + g_rgb[c] * slope[0], pulled[1] + g_rgb[c] * slope[1], pulled[2] + g_rgb[c] * slope[2])
+    if DEFERRED:
+        place = index * FACTORS
+        for k in tl.static_range(3):
+            tl.store(factors + place + TO + k, to[k], mask=seen)
+            tl.store(factors + place + G_COLOR + k, g_rgb[k], mask=seen)
+        step = tl.load(last + index, mask=seen, other=NOT_SEEN)
+        tl.store(factor_ints + place + LAST, step, mask=index < count)
+    else:
+        store_gradients(to, g_rgb, g_sh_rest, index, seen, DEGREE)
     radial = dot(pulled, to)
     from_x = (pulled[0] - radial * to[0]) * inverse_distance
     from_y = (pulled[1] - radial * to[1]) * inverse_distance
@@ -156,7 +210,8 @@ def backproject(
     inverse_z = 1.0 / tl.where(seen, z, 1.0)
     axis_x, axis_y, slope_x, slope_y = image_axes(x * inverse_z, y * inverse_z, inverse_z, v)
     scales = (tl.exp(log_scale[0]), tl.exp(log_scale[1]), tl.exp(log_scale[2]))
-    m0, m1 = scaled(times(axis_x, matrix), scales), scaled(times(axis_y, matrix), scales)
+    n0, n1 = times(axis_x, matrix), times(axis_y, matrix)
+    m0, m1 = scaled(n0, scales), scaled(n1, scales)
     _, xy, yy, a = spread(m0, m1)
     e, shear = 1.0 / yy, -xy / yy  # power = -(a t^2 + e dy^2) / 2, t = dx + shear dy
 
@@ -170,37 +225,34 @@ def backproject(
         tl.store(g_absolute + 2 * index, a * abs_t * half_width, mask=seen)
         tl.store(g_absolute + 2 * index + 1, abs_y * half_height, mask=seen)
 
-    # d loss / d M = U^T (D G D) (U M), with D = diag(a, e), U = [[1, shear], [0, 1]], G the second moments of h over
-    # (t, dy).
-    p00, p01, p11 = a * a * h_tt, a * e * h_ty, e * e * h_yy
-    n0 = (m0[0] + shear * m1[0], m0[1] + shear * m1[1], m0[2] + shear * m1[2])
-    g0 = (p00 * n0[0] + p01 * m1[0], p00 * n0[1] + p01 * m1[1], p00 * n0[2] + p01 * m1[2])
-    g1 = (
-        shear * g0[0] + p01 * n0[0] + p11 * m1[0],
-        shear * g0[1] + p01 * n0[1] + p11 * m1[1],
-        shear * g0[2] + p01 * n0[2] + p11 * m1[2],
-    )
+    # M = N S, N = A R: d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U = [[1, shear], [0, 1]], G the second
+    # moments of h over (t, dy). The first row of U M is short for a needle: U N comes first.
+    q00, q01, q11 = a * a * h_tt, a * e * h_ty, e * e * h_yy
+    if SPLITTING:
+        free = image_rows(x * inverse_z, y * inverse_z, inverse_z, v)
+        _store_splitting(g_splitting + 9 * index, q00 - a * h, q01, q11 - e * h, shear, free, seen)
+    u0 = (n0[0] + shear * n1[0], n0[1] + shear * n1[1], n0[2] + shear * n1[2])
+    g0 = (q00 * u0[0] + q01 * n1[0], q00 * u0[1] + q01 * n1[1], q00 * u0[2] + q01 * n1[2])
+    g1 = (q01 * u0[0] + q11 * n1[0], q01 * u0[1] + q11 * n1[1], q01 * u0[2] + q11 * n1[2])
+    variances = scaled(scales, scales)
+    along = (u0[0] * g0[0] + n1[0] * g1[0], u0[1] * g0[1] + n1[1] * g1[1], u0[2] * g0[2] + n1[2] * g1[2])
+    _store_vector(g_log_scales, index, scaled(along, variances), seen)
 
-    # M = A R S: the scales, then R through B = A^T (d loss / d M) S.
-    g_scales = (g0[0] * m0[0] + g1[0] * m1[0], g0[1] * m0[1] + g1[1] * m1[1], g0[2] * m0[2] + g1[2] * m1[2])
-    _store_vector(g_log_scales, index, g_scales, seen)
-    s0, s1 = scaled(g0, scales), scaled(g1, scales)
-    b00, b11 = axis_x[0] * s0[0] + axis_y[0] * s1[0], axis_x[1] * s0[1] + axis_y[1] * s1[1]
-    b22 = axis_x[2] * s0[2] + axis_y[2] * s1[2]
-    b01, b10 = axis_x[0] * s0[1] + axis_y[0] * s1[1], axis_x[1] * s0[0] + axis_y[1] * s1[0]
-    b02, b20 = axis_x[0] * s0[2] + axis_y[0] * s1[2], axis_x[2] * s0[0] + axis_y[2] * s1[0]
-    b12, b21 = axis_x[1] * s0[2] + axis_y[1] * s1[2], axis_x[2] * s0[1] + axis_y[2] * s1[1]
-    g_w = 2 * (qx * (b21 - b12) + qy * (b02 - b20) + qz * (b10 - b01))
-    g_x = 2 * (qw * (b21 - b12) + qy * (b01 + b10) + qz * (b02 + b20) - 2 * qx * (b11 + b22))
-    g_y = 2 * (qw * (b02 - b20) + qx * (b01 + b10) + qz * (b12 + b21) - 2 * qy * (b00 + b22))
-    g_z = 2 * (qw * (b10 - b01) + qx * (b02 + b20) + qy * (b12 + b21) - 2 * qz * (b00 + b11))
-    along = g_w * qw + g_x * qx + g_y * qy + g_z * qz
-    tl.store(g_quaternions + 4 * index, (g_w - along * qw) * inverse_norm, mask=seen)
-    tl.store(g_quaternions + 4 * index + 1, (g_x - along * qx) * inverse_norm, mask=seen)
-    tl.store(g_quaternions + 4 * index + 2, (g_y - along * qy) * inverse_norm, mask=seen)
-    tl.store(g_quaternions + 4 * index + 3, (g_z - along * qz) * inverse_norm, mask=seen)
+    # Turned by small angles w about its own axes, R S^2 R^T changes by a commutator: the gradient at w has differences
+    # of variances as factors. Taken first, they make that of a ball 0, where the rounding of terms that cancel would
+    # become full steps of Adam. The quaternion moves by q (0, w) / 2.
+    w_x = (u0[1] * g0[2] + n1[1] * g1[2]) * (scales[1] - scales[2]) * (scales[1] + scales[2])
+    w_y = (u0[2] * g0[0] + n1[2] * g1[0]) * (scales[2] - scales[0]) * (scales[2] + scales[0])
+    w_z = (u0[0] * g0[1] + n1[0] * g1[1]) * (scales[0] - scales[1]) * (scales[0] + scales[1])
+    twice = inverse_norm + inverse_norm
+    tl.store(g_quaternions + 4 * index, -(qx * w_x + qy * w_y + qz * w_z) * twice, mask=seen)
+    tl.store(g_quaternions + 4 * index + 1, (qw * w_x + qy * w_z - qz * w_y) * twice, mask=seen)
+    tl.store(g_quaternions + 4 * index + 2, (qw * w_y + qz * w_x - qx * w_z) * twice, mask=seen)
+    tl.store(g_quaternions + 4 * index + 3, (qw * w_z + qx * w_y - qy * w_x) * twice, mask=seen)
 
     # A = J W: d loss / d A, then J's entries, then the position in the view.
+    s0, s1 = scaled(g0, variances), scaled(g1, variances)
+    s1 = (s1[0] + shear * s0[0], s1[1] + shear * s0[1], s1[2] + shear * s0[2])
     a0 = (dot(s0, matrix[0]), dot(s0, matrix[1]), dot(s0, matrix[2]))
     a1 = (dot(s1, matrix[0]), dot(s1, matrix[1]), dot(s1, matrix[2]))
     j00, j02 = a0[0] * v.r00 + a0[1] * v.r01 + a0[2] * v.r02, a0[0] * v.r20 + a0[1] * v.r21 + a0[2] * v.r22

@@ -12,10 +12,14 @@ import triton.language as tl
 
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.triton.layout import (
+    BEHIND_BLUE,
+    BEHIND_GREEN,
+    BEHIND_RED,
     BLOCK_HEIGHT,
     BLOCK_PIXELS,
     BLOCK_WIDTH,
     BLUE,
+    BORDER,
     CURVE_T,
     CURVE_Y,
     GREEN,
@@ -28,8 +32,10 @@ from gsbench.raster.triton.layout import (
     RECORD,
     RED,
     ROW,
+    SEGMENT,
     SHEAR,
     STEPS,
+    TRANSMITTANCE,
 )
 
 ALPHA_MAX = tl.constexpr(CONSTANTS.alpha_max)
@@ -107,6 +113,7 @@ def composite(
     transmittance,
     last,
     past,
+    borders,
     slots,
     last_slots,
 ):
@@ -115,7 +122,8 @@ def composite(
     In: ``starts`` [blocks + 1], ``entries`` [pairs] the Gaussians of the lists, ``records`` [N + 1, 16] with one that
     cannot be seen at ``closing``. Out: ``image`` [H, W, 3], ``alpha`` [H, W]; for the backward pass, by block, lane and
     step, the final ``transmittance`` and ``last``, past the last entry that was looked at before the pixel stopped;
-    ``past`` [blocks], their maximum; ``last_slots`` [blocks], the entry before it in ``slots`` [pairs], -1 for none.
+    ``past`` [blocks], their maximum; ``last_slots`` [blocks], the entry before it in ``slots`` [pairs], -1 for none;
+    the ``borders`` that were crossed.
     """
     block = tl.load(order + tl.program_id(0)).to(tl.int32)
     inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
@@ -130,27 +138,50 @@ def composite(
     entry = tl.load(entries + begin + 1, mask=begin + 1 < end, other=closing)
     alive = True
     position = begin
+    places = block_places()
+    first_border = borders + (begin // SEGMENT).to(tl.int64) * BORDER + places
+    crossed = 0
     while (position < end) & alive:
-        for _ in tl.static_range(UNROLL):
-            record = ahead
-            ahead = load_record(records, entry)
-            entry = tl.load(entries + position + 2, mask=position + 2 < end, other=closing)
-            position += 1
-            power, _, _ = log2_alpha(record, x, y)
-            opacity = tl.where(power >= LOG2_ALPHA_MIN, tl.minimum(tl.exp2(power), ALPHA_MAX), 0.0)
-            weight = light * opacity
-            after = light - weight
-            stopped = after < TRANSMITTANCE_MIN
-            weight = tl.where(stopped, 0.0, weight)
-            light = tl.where(stopped, -tl.abs(light), after)
-            seen = tl.where(stopped, seen, position)
-            red = tl.fma(weight, record[6], red)
-            green = tl.fma(weight, record[7], green)
-            blue = tl.fma(weight, record[8], blue)
-        alive = tl.max(tl.max((light > 0).to(tl.int32), 0), 0) > 0
+        border = tl.minimum(position + SEGMENT, end)
+        while (position < border) & alive:
+            for _ in tl.static_range(UNROLL):
+                record = ahead
+                ahead = load_record(records, entry)
+                entry = tl.load(entries + position + 2, mask=position + 2 < end, other=closing)
+                position += 1
+                power, _, _ = log2_alpha(record, x, y)
+                opacity = tl.where(power >= LOG2_ALPHA_MIN, tl.minimum(tl.exp2(power), ALPHA_MAX), 0.0)
+                weight = light * opacity
+                after = light - weight
+                stopped = after < TRANSMITTANCE_MIN
+                weight = tl.where(stopped, 0.0, weight)
+                light = tl.where(stopped, -tl.abs(light), after)
+                seen = tl.where(stopped, seen, position)
+                red = tl.fma(weight, record[6], red)
+                green = tl.fma(weight, record[7], green)
+                blue = tl.fma(weight, record[8], blue)
+            alive = tl.max(tl.max((light > 0).to(tl.int32), 0), 0) > 0
+        if (position < end) & alive:
+            place = first_border + crossed * BORDER
+            tl.store(place + TRANSMITTANCE, tl.abs(light))
+            tl.store(place + BEHIND_RED, red)  # for now, what the segment before it has
+            tl.store(place + BEHIND_GREEN, green)
+            tl.store(place + BEHIND_BLUE, blue)
+            red, green, blue = tl.zeros_like(light), tl.zeros_like(light), tl.zeros_like(light)
+            crossed += 1
+
+    # Colours are those of the last segment. Sums from there on are what lies behind each border; none is a difference.
+    tl.debug_barrier()
+    for k in range(0, crossed):
+        place = first_border + (crossed - 1 - k) * BORDER
+        before = tl.load(place + BEHIND_RED), tl.load(place + BEHIND_GREEN), tl.load(place + BEHIND_BLUE)
+        tl.store(place + BEHIND_RED, red)
+        tl.store(place + BEHIND_GREEN, green)
+        tl.store(place + BEHIND_BLUE, blue)
+        red, green, blue = red + before[0], green + before[1], blue + before[2]
 
     light = tl.abs(light)
-    state = block * BLOCK_PIXELS + block_places()
+    state = block * BLOCK_PIXELS + places
     tl.store(transmittance + state, light)
     tl.store(last + state, seen)
     stop = tl.minimum(tl.max(tl.max(seen, 0), 0), end)
@@ -219,10 +250,35 @@ def _lane_sums(h, weight, t, dy, g, record, ABSOLUTE: tl.constexpr):
         return moments + colors
 
 
-@triton.jit(do_not_specialize=["closing", "width", "height", "blocks_x"])
+@triton.jit
+def _segment(order, starts, blocks, inner):
+    """The block and the first entry of the segment that this program has; perhaps one that is not there.
+
+    The ``inner`` first programs have those behind the border of their number p, which only the list can have that holds
+    the entry before (p + 1) * SEGMENT; then follow the first segments of the blocks in ``order``.
+    """
+    program = tl.program_id(0)
+    if program >= inner:
+        block = tl.load(order + program - inner).to(tl.int32)
+        first = tl.load(starts + block)
+    else:
+        least = (program + 1) * SEGMENT
+        block, above = 0, blocks
+        while block + 1 < above:
+            middle = (block + above) // 2
+            before = tl.load(starts + middle) < least
+            block, above = tl.where(before, middle, block), tl.where(before, above, middle)
+        begin = tl.load(starts + block)
+        first = begin + tl.cdiv(least - begin, SEGMENT) * SEGMENT
+    return block, first
+
+
+@triton.jit(do_not_specialize=["blocks", "inner", "closing", "width", "height", "blocks_x"])
 def decomposite(
     order,
     starts,
+    blocks,
+    inner,
     entries,
     slots,
     records,
@@ -234,23 +290,26 @@ def decomposite(
     transmittance,
     last,
     past,
+    borders,
     g_image,
     g_alpha,
     rows_out,
     HAS_ALPHA: tl.constexpr,
     ABSOLUTE: tl.constexpr,
 ):
-    """Write the gradient sums of one block's pairs to their rows of ``rows_out`` [pairs, 16], back to front.
+    """Write the gradient sums of one segment's pairs to their rows of ``rows_out`` [pairs, 16], back to front.
 
     Behind a Gaussian lies light S = sum of later (c . g) alpha T plus what the background gets; the loss changes with
-    its alpha by T (c . g) - S / (1 - alpha). Going back to front S grows from the background's part, so that nothing
-    cancels. ``slots`` [pairs] has the row of each entry. Rows of entries that no pixel came to stay as they are.
-    ``g_alpha`` is read if ``HAS_ALPHA``.
+    its alpha by T (c . g) - S / (1 - alpha). Going back to front S grows from the background's part and what lies
+    behind the segment, so that nothing cancels. ``slots`` [pairs] has the row of each entry. Rows of entries that no
+    pixel came to stay as they are. ``g_alpha`` is read if ``HAS_ALPHA``.
     """
-    block = tl.load(order + tl.program_id(0)).to(tl.int32)
+    block, begin = _segment(order, starts, blocks, inner)
+    end = tl.load(past + block)
+    if begin >= end:
+        return
     inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
-    begin = tl.load(starts + block)
-    stop = tl.maximum(tl.load(past + block), begin)  # as it is: knowing so spares 9 instructions of 385 in the loop
+    stop = tl.minimum(begin + SEGMENT, end)
     lane = tl.arange(0, LANES)
     number, stores = _number_of_sum(lane, ABSOLUTE)
 
@@ -259,13 +318,20 @@ def decomposite(
         tl.load(g_image + 3 * pixel + 1, mask=inside, other=0.0),
         tl.load(g_image + 3 * pixel + 2, mask=inside, other=0.0),
     )
-    state = block * BLOCK_PIXELS + block_places()
+    places = block_places()
+    state = block * BLOCK_PIXELS + places
     light = tl.load(transmittance + state)
     seen = tl.load(last + state)
     behind = g[0] * tl.load(background) + g[1] * tl.load(background + 1) + g[2] * tl.load(background + 2)
     if HAS_ALPHA:
         behind -= tl.load(g_alpha + pixel, mask=inside, other=0.0)
     behind *= light
+    if stop < end:
+        border = borders + (begin // SEGMENT).to(tl.int64) * BORDER + places
+        behind = tl.fma(g[0], tl.load(border + BEHIND_RED), behind)
+        behind = tl.fma(g[1], tl.load(border + BEHIND_GREEN), behind)
+        behind = tl.fma(g[2], tl.load(border + BEHIND_BLUE), behind)
+        light = tl.load(border + TRANSMITTANCE)
 
     ahead = load_record(records, tl.load(entries + stop - 1, mask=begin < stop, other=closing))
     entry = tl.load(entries + stop - 2, mask=begin + 1 < stop, other=closing)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gsbench.gaussians.deferred import Coasting, DeferredHarmonics
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, RenderOutput
 from gsbench.raster.footprint import Footprint, view_depths
@@ -17,9 +19,23 @@ from gsbench.raster.readback import Readback
 from gsbench.raster.triton.backprojection import backproject, sum_units
 from gsbench.raster.triton.binning import find_units, summarise, write_pairs
 from gsbench.raster.triton.composite import composite, decomposite
+from gsbench.raster.triton.deferred import Factors, Pending, Tables
 from gsbench.raster.triton.footprint import cover, sum_cover
 from gsbench.raster.triton.launch import launch, launch_grid
-from gsbench.raster.triton.layout import BLOCK_PIXELS, RECORD, ROW, TILE, Grid, View, make_grid, make_view
+from gsbench.raster.triton.layout import (
+    BLOCK_PIXELS,
+    BORDER,
+    COLOR_SLOPES,
+    FACTORS,
+    RECORD,
+    ROW,
+    TILE,
+    Grid,
+    View,
+    count_borders,
+    make_grid,
+    make_view,
+)
 from gsbench.raster.triton.memory import UNITS_AT_FIRST
 from gsbench.raster.triton.projection import project
 from gsbench.raster.triton.toolchain import load_driver
@@ -44,6 +60,7 @@ class TritonRasterizer:
             raise ValueError(f"the Triton rasterizer has tiles of {TILE.value} px, the contract {CONSTANTS.tile}")
         self._frames = WorkspacePool()
         self._scratch = WorkspacePool()
+        self._tables: WeakKeyDictionary[Coasting, Tables] = WeakKeyDictionary()
 
     def render(
         self,
@@ -52,8 +69,34 @@ class TritonRasterizer:
         sh_degree: int,
         background: Tensor,
         absolute_gradient: bool = False,
+        splitting_matrix: bool = False,
     ) -> RenderOutput:
         """Render as ``raster.base.Rasterizer`` says. Raises ValueError naming the parameter that cannot be used."""
+        return self._render(gaussians, None, camera, sh_degree, background, absolute_gradient, splitting_matrix)
+
+    def render_deferred(
+        self,
+        gaussians: Gaussians,
+        harmonics: DeferredHarmonics,
+        camera: Camera,
+        sh_degree: int,
+        background: Tensor,
+        absolute_gradient: bool = False,
+        splitting_matrix: bool = False,
+    ) -> RenderOutput:
+        """Render as ``raster.base.DeferringRasterizer`` says."""
+        return self._render(gaussians, harmonics, camera, sh_degree, background, absolute_gradient, splitting_matrix)
+
+    def _render(
+        self,
+        gaussians: Gaussians,
+        harmonics: DeferredHarmonics | None,
+        camera: Camera,
+        sh_degree: int,
+        background: Tensor,
+        absolute_gradient: bool,
+        splitting_matrix: bool,
+    ) -> RenderOutput:
         check_settings(gaussians, camera, sh_degree, background)
         if gaussians.means.dtype != torch.float32:
             raise ValueError(f"means: raster=triton needs float32, got {gaussians.means.dtype}")
@@ -61,17 +104,27 @@ class TritonRasterizer:
             load_driver()
         screen_points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         absolute = torch.zeros_like(screen_points) if absolute_gradient else None
+        probe = screen_points.new_zeros(len(gaussians), 3, 3, requires_grad=True) if splitting_matrix else None
         kept = _Kept()
+        tensors = gaussians.tensors()
+        if harmonics is not None:  # autograd does not see what is changed behind its back, and gets no gradient for
+            tensors["sh_rest"] = tensors["sh_rest"].detach()
         image, alpha, radii = _Render.apply(
-            self, kept, camera, sh_degree, absolute, background, screen_points, *gaussians.tensors().values()
+            self, kept, harmonics, camera, sh_degree, absolute, background, screen_points, probe, *tensors.values()
         )
         footprint = partial(_footprint, self, kept, gaussians.map(Tensor.detach), camera)
-        return RenderOutput(image, alpha, radii, screen_points, absolute, footprint)
+        return RenderOutput(image, alpha, radii, screen_points, absolute, footprint, probe)
+
+    def _pending(self, harmonics: DeferredHarmonics | None) -> Pending:
+        if harmonics is None:
+            return Pending(None, None)
+        tables = self._tables.setdefault(harmonics.coasting, Tables(harmonics.values.device))
+        return Pending(harmonics, tables.follow(harmonics.coasting))
 
 
 @dataclass
 class _Frame:
-    """What the forward pass leaves for the backward pass; the memory belongs to a workspace."""
+    """Results that the forward pass leaves for the backward pass; the memory belongs to a workspace."""
 
     grid: Grid
     view: View
@@ -79,6 +132,7 @@ class _Frame:
     units: int
     pairs: int
     records: Tensor  # [N + 1, 16] the last cannot be seen
+    color_slopes: Tensor  # [N, 9]
     row_counts: Tensor  # [N] int32 units of each Gaussian
     first_units: Tensor  # [N] int64
     unit_widths: Tensor  # [units] int32 pairs of each unit
@@ -91,6 +145,7 @@ class _Frame:
     transmittance: Tensor  # [blocks * BLOCK_PIXELS]
     last: Tensor  # [blocks * BLOCK_PIXELS] int32
     past: Tensor  # [blocks] int32
+    borders: Tensor  # [count_borders(pairs) * BORDER]
     last_slots: Tensor  # [blocks] int64
 
 
@@ -98,6 +153,7 @@ def _forward(
     frame_memory: Workspace,
     scratch: Workspace,
     gaussians: Gaussians,
+    pending: Pending,
     camera: Camera,
     degree: int,
     background: Tensor,
@@ -109,13 +165,26 @@ def _forward(
     grid, view = make_grid(camera), make_view(camera)
     count, blocks = len(gaussians), grid.blocks
     records = frame_memory.take("records", (count + 1) * RECORD.value, torch.float32)
+    color_slopes = frame_memory.take("color_slopes", count * COLOR_SLOPES.value, torch.float32)
     row_counts = frame_memory.take("row_counts", count, torch.int32)
     keys = scratch.take("depth_keys", count, torch.int32)
     flags = scratch.take("flags", 1, torch.int32).zero_()
     record_ints = records.view(torch.int32)
     parameters = [tensor.detach() for tensor in gaussians.tensors().values()]
     launch(project, count + 1, 128)(
-        *parameters, count, view, records, record_ints, keys, row_counts, radii, flags, DEGREE=degree
+        *parameters,
+        *pending.tensors(parameters[-1]),
+        count,
+        view,
+        records,
+        record_ints,
+        color_slopes,
+        keys,
+        row_counts,
+        radii,
+        flags,
+        DEGREE=degree,
+        DEFERRED=pending.harmonics is not None,
     )
 
     depth_order = scratch.take("depth_order", count, torch.int64)
@@ -179,6 +248,7 @@ def _forward(
         units,
         pairs,
         records,
+        color_slopes,
         row_counts,
         first_units,
         widths,
@@ -191,6 +261,7 @@ def _forward(
         frame_memory.take("transmittance", blocks * BLOCK_PIXELS.value, torch.float32),
         frame_memory.take("last", blocks * BLOCK_PIXELS.value, torch.int32),
         frame_memory.take("past", blocks, torch.int32),
+        frame_memory.take("borders", count_borders(pairs) * BORDER.value, torch.float32),
         frame_memory.take("last_slots", blocks, torch.int64),
     )
     launch_grid(composite, blocks)(
@@ -208,6 +279,7 @@ def _forward(
         frame.transmittance,
         frame.last,
         frame.past,
+        frame.borders,
         slots,
         frame.last_slots,
         num_warps=1,
@@ -225,17 +297,26 @@ def _backward(
     scratch: Workspace,
     frame: _Frame,
     gaussians: Gaussians,
+    pending: Pending,
     background: Tensor,
     g_image: Tensor,
     g_alpha: Tensor | None,
     absolute: Tensor | None,
-) -> tuple[list[Tensor], Tensor]:
-    """The gradients of the six tensors and of ``screen_points``; fills ``absolute`` [N, 2] if it is given."""
+    want_splitting: bool,
+) -> tuple[list[Tensor | None], Tensor, Tensor | None]:
+    """The gradients of the six tensors, of ``screen_points`` and of the splitting probe; fills ``absolute`` [N, 2] if
+    it is given.
+
+    With harmonics that are put off the gradient of ``sh_rest`` is None, and its factors go there.
+    """
     grid, count = frame.grid, len(gaussians)
     rows = scratch.take("rows", frame.pairs * ROW.value, torch.float32)
-    launch_grid(decomposite, grid.blocks)(
+    inner = count_borders(frame.pairs)
+    launch_grid(decomposite, inner + grid.blocks)(
         frame.order,
         frame.starts,
+        grid.blocks,
+        inner,
         frame.entries,
         frame.slots,
         frame.records,
@@ -247,6 +328,7 @@ def _backward(
         frame.transmittance,
         frame.last,
         frame.past,
+        frame.borders,
         g_image,
         g_image if g_alpha is None else g_alpha,
         rows,
@@ -255,30 +337,47 @@ def _backward(
         num_warps=1,
     )
     _sum_units(frame, rows)
-    means, log_scales, quaternions, logits, _, sh_rest = gaussians.tensors().values()
-    gradients = [torch.zeros_like(tensor) for tensor in gaussians.tensors().values()]
+    means, log_scales, quaternions, logits, *_ = gaussians.tensors().values()
+    deferred = pending.harmonics is not None
+    *gradients, g_sh_rest = (
+        torch.zeros_like(tensor[:0] if deferred and name == "sh_rest" else tensor)
+        for name, tensor in gaussians.tensors().items()
+    )
+    factors = means.new_empty(count if deferred else 0, FACTORS.value)
     g_screen = torch.zeros_like(means[:, :2])
+    g_splitting = means.new_zeros(count, 3, 3) if want_splitting else None
     launch(backproject, count, 128)(
         means,
         log_scales,
         quaternions,
         logits,
-        sh_rest,
+        frame.row_counts if pending.harmonics is None else pending.harmonics.last,
         count,
         frame.view,
         frame.records.view(torch.int32),
+        frame.color_slopes,
         frame.row_counts,
         frame.first_units,
         frame.pair_ends,
         frame.unit_widths,
         rows,
         *gradients,
+        g_sh_rest,
         g_screen,
         g_screen if absolute is None else absolute,
+        g_screen if g_splitting is None else g_splitting,
+        factors,
+        factors.view(torch.int32),
         DEGREE=frame.degree,
+        DEFERRED=deferred,
         ABSOLUTE=absolute is not None,
+        SPLITTING=want_splitting,
     )
-    return gradients, g_screen
+    if pending.harmonics is None or pending.tables is None:
+        return [*gradients, g_sh_rest], g_screen, g_splitting
+    if frame.degree > 0:
+        pending.harmonics.receive(Factors(pending.tables, factors, frame.degree))
+    return [*gradients, None], g_screen, g_splitting
 
 
 def _footprint(
@@ -328,7 +427,7 @@ class _Holder:
 
 
 class _Kept:
-    """What a render keeps for the backward pass and for its footprint, and the hold on the memory of it."""
+    """State that a render keeps for the backward pass and for its footprint, and the hold on the memory of it."""
 
     frame: _Frame
     holder: _Holder
@@ -342,11 +441,13 @@ class _Render(torch.autograd.Function):
         ctx: Any,
         rasterizer: TritonRasterizer,
         kept: _Kept,
+        harmonics: DeferredHarmonics | None,
         camera: Camera,
         degree: int,
         absolute: Tensor | None,
         background: Tensor,
         screen_points: Tensor,
+        probe: Tensor | None,
         *tensors: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         gaussians = Gaussians(*(tensor.contiguous() for tensor in tensors))
@@ -358,9 +459,10 @@ class _Render(torch.autograd.Function):
         with torch.cuda.device_of(background):
             memory = rasterizer._frames.lease(kept.holder, device)
             scratch = rasterizer._scratch.lease(scratch_holder, device)
-            kept.frame = _forward(memory, scratch, gaussians, camera, degree, background, image, alpha, radii)
-        ctx.rasterizer, ctx.kept, ctx.absolute = rasterizer, kept, absolute
-        opacity = alpha if ctx.needs_input_grad[5] else None
+            pending = rasterizer._pending(harmonics)
+            kept.frame = _forward(memory, scratch, gaussians, pending, camera, degree, background, image, alpha, radii)
+        ctx.rasterizer, ctx.kept, ctx.pending, ctx.absolute = rasterizer, kept, pending, absolute
+        opacity = alpha if ctx.needs_input_grad[6] else None
         ctx.save_for_backward(opacity, background, *gaussians.tensors().values())
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
@@ -378,8 +480,16 @@ class _Render(torch.autograd.Function):
         holder = _Holder()
         with torch.cuda.device_of(background):
             scratch = ctx.rasterizer._scratch.lease(holder, background.device)
-            gradients, g_screen = _backward(
-                scratch, ctx.kept.frame, Gaussians(*tensors), background, g_image, g_alpha, ctx.absolute
+            gradients, g_screen, g_splitting = _backward(
+                scratch,
+                ctx.kept.frame,
+                Gaussians(*tensors),
+                ctx.pending,
+                background,
+                g_image,
+                g_alpha,
+                ctx.absolute,
+                ctx.needs_input_grad[8],
             )
         g_background = None if alpha is None else (g_image * (1 - alpha).unsqueeze(-1)).sum((0, 1))
-        return None, None, None, None, None, g_background, g_screen, *gradients
+        return None, None, None, None, None, None, g_background, g_screen, g_splitting, *gradients

@@ -90,10 +90,17 @@ def image_axes(slope_x, slope_y, inverse_z, v):
     """A = J W, the derivative of the pixel with respect to the world position, as two rows; the clamped slopes."""
     slope_x = tl.minimum(tl.maximum(slope_x, v.slope_x_min), v.slope_x_max)
     slope_y = tl.minimum(tl.maximum(slope_y, v.slope_y_min), v.slope_y_max)
+    first, second = image_rows(slope_x, slope_y, inverse_z, v)
+    return first, second, slope_x, slope_y
+
+
+@triton.jit
+def image_rows(slope_x, slope_y, inverse_z, v):
+    """The derivative of the pixel with respect to the world position at x/z, y/z = the slopes, as two rows."""
     jx, jy = inverse_z * v.fx, inverse_z * v.fy
     first = (jx * (v.r00 - slope_x * v.r20), jx * (v.r01 - slope_x * v.r21), jx * (v.r02 - slope_x * v.r22))
     second = (jy * (v.r10 - slope_y * v.r20), jy * (v.r11 - slope_y * v.r21), jy * (v.r12 - slope_y * v.r22))
-    return first, second, slope_x, slope_y
+    return first, second
 
 
 @triton.jit

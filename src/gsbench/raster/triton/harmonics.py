@@ -15,111 +15,135 @@ REST = tl.constexpr(3 * NUM_SH_REST)  # numbers of a Gaussian
 
 
 @triton.jit
-def _add(rgb, value, place, k: tl.constexpr, mask):
-    """``rgb`` plus the basis function ``value`` times the k-th coefficients of degree 1 and up."""
+def basis(direction, DEGREE: tl.constexpr):
+    """The basis functions of degrees 1 to ``DEGREE``, at least 1, at unit directions."""
+    x, y, z = direction
+    values = (y * -F1, z * F1, x * -F1)
+    if DEGREE >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        quadratic = (x * y * D0, y * z * D1, (2 * zz - xx - yy) * D2, x * z * D3, (xx - yy) * D4)
+        values = values + quadratic  # type: ignore[assignment]
+        if DEGREE >= 3:
+            cubic = (
+                y * (3 * xx - yy) * T0,
+                x * y * z * T1,
+                y * (4 * zz - xx - yy) * T2,
+                z * (2 * zz - 3 * xx - 3 * yy) * T3,
+                x * (4 * zz - xx - yy) * T4,
+                z * (xx - yy) * T5,
+                x * (xx - 3 * yy) * T6,
+            )
+            values = values + cubic  # type: ignore[assignment]
+    return values
+
+
+@triton.jit
+def coasting_direction(first, second):
+    """Direction in which Adam's moments carry a value without gradients; 0 where there never was one."""
+    return tl.where(second > 0, first / tl.sqrt(second), 0.0)
+
+
+@triton.jit
+def _coefficients(sh_rest, first, second, coasted, index, k: tl.constexpr, mask, DEFERRED: tl.constexpr):
+    """The k-th coefficients of degree 1 and up, in red, green and blue, after the steps that they have missed."""
+    place = index * REST + 3 * k
+    red = tl.load(sh_rest + place, mask=mask, other=0.0)
+    green = tl.load(sh_rest + place + 1, mask=mask, other=0.0)
+    blue = tl.load(sh_rest + place + 2, mask=mask, other=0.0)
+    if DEFERRED:
+        behind = coasted != 0
+        m0, v0 = tl.load(first + place, mask=behind, other=0.0), tl.load(second + place, mask=behind, other=0.0)
+        m1, v1 = tl.load(first + place + 1, mask=behind, other=0.0), tl.load(second + place + 1, mask=behind, other=0.0)
+        m2, v2 = tl.load(first + place + 2, mask=behind, other=0.0), tl.load(second + place + 2, mask=behind, other=0.0)
+        red -= coasting_direction(m0, v0) * coasted
+        green -= coasting_direction(m1, v1) * coasted
+        blue -= coasting_direction(m2, v2) * coasted
+    return red, green, blue
+
+
+@triton.jit
+def _add(sums, coefficients, factor):
     return (
-        rgb[0] + value * tl.load(place + 3 * k, mask=mask, other=0.0),
-        rgb[1] + value * tl.load(place + 3 * k + 1, mask=mask, other=0.0),
-        rgb[2] + value * tl.load(place + 3 * k + 2, mask=mask, other=0.0),
+        sums[0] + coefficients[0] * factor,
+        sums[1] + coefficients[1] * factor,
+        sums[2] + coefficients[2] * factor,
     )
 
 
 @triton.jit
-def colors(direction, dc, sh_rest, index, mask, DEGREE: tl.constexpr):
-    """SH + 0.5 (not clamped) at the unit ``direction`` of each Gaussian ``index``, whose constant terms are ``dc``."""
+def colors(
+    direction,
+    dc,
+    sh_rest,
+    first,
+    second,
+    coasted,
+    index,
+    mask,
+    DEGREE: tl.constexpr,
+    DEFERRED: tl.constexpr,
+):
+    """SH + 0.5 (not clamped) at the unit ``direction`` of each Gaussian ``index``, whose constant terms are ``dc``, and
+    its derivatives by x, y and z of the direction (not yet tangential), each for red, green and blue.
+
+    If ``DEFERRED``, coefficients have coasted on Adam's moments ``first`` and ``second``, as far as ``coasted`` says.
+    """
     x, y, z = direction
     rgb = (dc[0] * F0 + 0.5, dc[1] * F0 + 0.5, dc[2] * F0 + 0.5)
-    place = sh_rest + index * REST
+    zero = tl.zeros_like(x)
+    by_x, by_y, by_z = (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
     if DEGREE >= 1:
-        rgb = _add(rgb, y * -F1, place, 0, mask)
-        rgb = _add(rgb, z * F1, place, 1, mask)
-        rgb = _add(rgb, x * -F1, place, 2, mask)
+        values = basis(direction, DEGREE)
+        c = _coefficients(sh_rest, first, second, coasted, index, 0, mask, DEFERRED)
+        rgb, by_y = _add(rgb, c, values[0]), _add(by_y, c, -F1)
+        c = _coefficients(sh_rest, first, second, coasted, index, 1, mask, DEFERRED)
+        rgb, by_z = _add(rgb, c, values[1]), _add(by_z, c, F1)
+        c = _coefficients(sh_rest, first, second, coasted, index, 2, mask, DEFERRED)
+        rgb, by_x = _add(rgb, c, values[2]), _add(by_x, c, -F1)
     if DEGREE >= 2:
+        c = _coefficients(sh_rest, first, second, coasted, index, 3, mask, DEFERRED)
+        rgb, by_x, by_y = _add(rgb, c, values[3]), _add(by_x, c, D0 * y), _add(by_y, c, D0 * x)
+        c = _coefficients(sh_rest, first, second, coasted, index, 4, mask, DEFERRED)
+        rgb, by_y, by_z = _add(rgb, c, values[4]), _add(by_y, c, D1 * z), _add(by_z, c, D1 * y)
+        c = _coefficients(sh_rest, first, second, coasted, index, 5, mask, DEFERRED)
+        rgb, by_x = _add(rgb, c, values[5]), _add(by_x, c, -2 * D2 * x)
+        by_y, by_z = _add(by_y, c, -2 * D2 * y), _add(by_z, c, 4 * D2 * z)
+        c = _coefficients(sh_rest, first, second, coasted, index, 6, mask, DEFERRED)
+        rgb, by_x, by_z = _add(rgb, c, values[6]), _add(by_x, c, D3 * z), _add(by_z, c, D3 * x)
+        c = _coefficients(sh_rest, first, second, coasted, index, 7, mask, DEFERRED)
+        rgb, by_x, by_y = _add(rgb, c, values[7]), _add(by_x, c, 2 * D4 * x), _add(by_y, c, -2 * D4 * y)
+    if DEGREE >= 3:
         xx, yy, zz = x * x, y * y, z * z
-        rgb = _add(rgb, x * y * D0, place, 3, mask)
-        rgb = _add(rgb, y * z * D1, place, 4, mask)
-        rgb = _add(rgb, (2 * zz - xx - yy) * D2, place, 5, mask)
-        rgb = _add(rgb, x * z * D3, place, 6, mask)
-        rgb = _add(rgb, (xx - yy) * D4, place, 7, mask)
-        if DEGREE >= 3:
-            rgb = _add(rgb, y * (3 * xx - yy) * T0, place, 8, mask)
-            rgb = _add(rgb, x * y * z * T1, place, 9, mask)
-            rgb = _add(rgb, y * (4 * zz - xx - yy) * T2, place, 10, mask)
-            rgb = _add(rgb, z * (2 * zz - 3 * xx - 3 * yy) * T3, place, 11, mask)
-            rgb = _add(rgb, x * (4 * zz - xx - yy) * T4, place, 12, mask)
-            rgb = _add(rgb, z * (xx - yy) * T5, place, 13, mask)
-            rgb = _add(rgb, x * (xx - 3 * yy) * T6, place, 14, mask)
-    return rgb
+        xy, yz, xz = x * y, y * z, x * z
+        c = _coefficients(sh_rest, first, second, coasted, index, 8, mask, DEFERRED)
+        rgb, by_x, by_y = _add(rgb, c, values[8]), _add(by_x, c, 6 * T0 * xy), _add(by_y, c, 3 * T0 * (xx - yy))
+        c = _coefficients(sh_rest, first, second, coasted, index, 9, mask, DEFERRED)
+        rgb, by_x = _add(rgb, c, values[9]), _add(by_x, c, T1 * yz)
+        by_y, by_z = _add(by_y, c, T1 * xz), _add(by_z, c, T1 * xy)
+        c = _coefficients(sh_rest, first, second, coasted, index, 10, mask, DEFERRED)
+        rgb, by_x = _add(rgb, c, values[10]), _add(by_x, c, -2 * T2 * xy)
+        by_y, by_z = _add(by_y, c, T2 * (4 * zz - xx - 3 * yy)), _add(by_z, c, 8 * T2 * yz)
+        c = _coefficients(sh_rest, first, second, coasted, index, 11, mask, DEFERRED)
+        rgb, by_x = _add(rgb, c, values[11]), _add(by_x, c, -6 * T3 * xz)
+        by_y, by_z = _add(by_y, c, -6 * T3 * yz), _add(by_z, c, T3 * (6 * zz - 3 * xx - 3 * yy))
+        c = _coefficients(sh_rest, first, second, coasted, index, 12, mask, DEFERRED)
+        rgb, by_x = _add(rgb, c, values[12]), _add(by_x, c, T4 * (4 * zz - 3 * xx - yy))
+        by_y, by_z = _add(by_y, c, -2 * T4 * xy), _add(by_z, c, 8 * T4 * xz)
+        c = _coefficients(sh_rest, first, second, coasted, index, 13, mask, DEFERRED)
+        rgb, by_x = _add(rgb, c, values[13]), _add(by_x, c, 2 * T5 * xz)
+        by_y, by_z = _add(by_y, c, -2 * T5 * yz), _add(by_z, c, T5 * (xx - yy))
+        c = _coefficients(sh_rest, first, second, coasted, index, 14, mask, DEFERRED)
+        rgb, by_x, by_y = _add(rgb, c, values[14]), _add(by_x, c, 3 * T6 * (xx - yy)), _add(by_y, c, -6 * T6 * xy)
+    return rgb, by_x, by_y, by_z
 
 
 @triton.jit
-def _pull(g_rgb, value, place, g_place, k: tl.constexpr, mask):
-    """Store the gradients of the k-th coefficients; returns the gradient at the basis function ``value``."""
-    g_basis = g_rgb[0] * tl.load(place + 3 * k, mask=mask, other=0.0)
-    g_basis += g_rgb[1] * tl.load(place + 3 * k + 1, mask=mask, other=0.0)
-    g_basis += g_rgb[2] * tl.load(place + 3 * k + 2, mask=mask, other=0.0)
-    tl.store(g_place + 3 * k, value * g_rgb[0], mask=mask)
-    tl.store(g_place + 3 * k + 1, value * g_rgb[1], mask=mask)
-    tl.store(g_place + 3 * k + 2, value * g_rgb[2], mask=mask)
-    return g_basis
-
-
-@triton.jit
-def pull_back_colors(direction, g_rgb, sh_rest, g_sh_dc, g_sh_rest, index, mask, DEGREE: tl.constexpr):
-    """Store the gradients of the coefficients; returns the gradient (not yet tangential) at the direction."""
-    x, y, z = direction
-    place, g_place = sh_rest + index * REST, g_sh_rest + index * REST
-    tl.store(g_sh_dc + 3 * index, g_rgb[0] * F0, mask=mask)
-    tl.store(g_sh_dc + 3 * index + 1, g_rgb[1] * F0, mask=mask)
-    tl.store(g_sh_dc + 3 * index + 2, g_rgb[2] * F0, mask=mask)
-    gx, gy, gz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
+def store_gradients(direction, g_rgb, g_sh_rest, index, mask, DEGREE: tl.constexpr):
+    """Store the gradients of the coefficients of degree 1 and up."""
     if DEGREE >= 1:
-        gy -= _pull(g_rgb, y * -F1, place, g_place, 0, mask) * F1
-        gz += _pull(g_rgb, z * F1, place, g_place, 1, mask) * F1
-        gx -= _pull(g_rgb, x * -F1, place, g_place, 2, mask) * F1
-    if DEGREE >= 2:
-        xx, yy, zz = x * x, y * y, z * z
-        g = _pull(g_rgb, x * y * D0, place, g_place, 3, mask) * D0
-        gx += g * y
-        gy += g * x
-        g = _pull(g_rgb, y * z * D1, place, g_place, 4, mask) * D1
-        gy += g * z
-        gz += g * y
-        g = _pull(g_rgb, (2 * zz - xx - yy) * D2, place, g_place, 5, mask) * (2 * D2)
-        gx -= g * x
-        gy -= g * y
-        gz += 2 * g * z
-        g = _pull(g_rgb, x * z * D3, place, g_place, 6, mask) * D3
-        gx += g * z
-        gz += g * x
-        g = _pull(g_rgb, (xx - yy) * D4, place, g_place, 7, mask) * (2 * D4)
-        gx += g * x
-        gy -= g * y
-        if DEGREE >= 3:
-            g = _pull(g_rgb, y * (3 * xx - yy) * T0, place, g_place, 8, mask) * T0
-            gx += g * 6 * x * y
-            gy += g * 3 * (xx - yy)
-            g = _pull(g_rgb, x * y * z * T1, place, g_place, 9, mask) * T1
-            gx += g * y * z
-            gy += g * x * z
-            gz += g * x * y
-            g = _pull(g_rgb, y * (4 * zz - xx - yy) * T2, place, g_place, 10, mask) * T2
-            gx -= g * 2 * x * y
-            gy += g * (4 * zz - xx - 3 * yy)
-            gz += g * 8 * y * z
-            g = _pull(g_rgb, z * (2 * zz - 3 * xx - 3 * yy) * T3, place, g_place, 11, mask) * T3
-            gx -= g * 6 * x * z
-            gy -= g * 6 * y * z
-            gz += g * (6 * zz - 3 * xx - 3 * yy)
-            g = _pull(g_rgb, x * (4 * zz - xx - yy) * T4, place, g_place, 12, mask) * T4
-            gx += g * (4 * zz - 3 * xx - yy)
-            gy -= g * 2 * x * y
-            gz += g * 8 * x * z
-            g = _pull(g_rgb, z * (xx - yy) * T5, place, g_place, 13, mask) * T5
-            gx += g * 2 * x * z
-            gy -= g * 2 * y * z
-            gz += g * (xx - yy)
-            g = _pull(g_rgb, x * (xx - 3 * yy) * T6, place, g_place, 14, mask) * T6
-            gx += g * 3 * (xx - yy)
-            gy -= g * 6 * x * y
-    return gx, gy, gz
+        values = basis(direction, DEGREE)
+        for k in tl.static_range(0, (DEGREE + 1) * (DEGREE + 1) - 1):
+            place = g_sh_rest + index * REST + 3 * k
+            tl.store(place, values[k] * g_rgb[0], mask=mask)
+            tl.store(place + 1, values[k] * g_rgb[1], mask=mask)
+            tl.store(place + 2, values[k] * g_rgb[2], mask=mask)

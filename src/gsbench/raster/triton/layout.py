@@ -22,6 +22,14 @@ LANE_COLUMNS = tl.constexpr(4)
 STEPS = tl.constexpr(4)  # pixels of a lane
 BLOCK_PIXELS = tl.constexpr(128)
 
+# The backward pass walks a list in segments, a program each. Where one ends and compositing went on is a border, with
+# what a program needs to begin there. The border behind the segment from entry e on has the number e // SEGMENT. Those
+# of a list are SEGMENT entries apart, and the first segment of the next begins behind them: no two have one number.
+SEGMENT = tl.constexpr(256)  # entries; a multiple of those of one round of the kernels
+BORDER = tl.constexpr(4 * 128)  # numbers of float32: of each pixel, by lane and step, those that follow
+TRANSMITTANCE = tl.constexpr(0)
+BEHIND_RED, BEHIND_GREEN, BEHIND_BLUE = tl.constexpr(128), tl.constexpr(256), tl.constexpr(384)  # blended behind it
+
 # A record: what compositing needs of one Gaussian, 16 float32. With d = pixel - mean and t = dx + SHEAR dy,
 # log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2: the conic as a sum of squares, which, unlike
 # a dx^2 + 2b dx dy + c dy^2, does not cancel for needles and is never positive.
@@ -43,6 +51,14 @@ SUM_H, SUM_H_T, SUM_H_Y = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
 SUM_H_TT, SUM_H_TY, SUM_H_YY = tl.constexpr(3), tl.constexpr(4), tl.constexpr(5)
 SUM_RED, SUM_GREEN, SUM_BLUE = tl.constexpr(6), tl.constexpr(7), tl.constexpr(8)
 SUM_ABS_T, SUM_ABS_Y = tl.constexpr(9), tl.constexpr(10)  # |h t|, |h (d power / d dy)|
+
+COLOR_SLOPES = tl.constexpr(9)  # derivatives of red by x, y and z of the direction, of green, of blue
+
+# Parts of the gradient of a Gaussian's harmonics, 8 float32.
+FACTORS = tl.constexpr(8)
+TO, G_COLOR = tl.constexpr(0), tl.constexpr(3)  # direction from the camera, gradient of the colour
+LAST = tl.constexpr(6)  # int32: the step up to which the harmonics had come
+NOT_SEEN = tl.constexpr(-1)  # in its place, where no block lists the Gaussian
 
 LOG2_E = tl.constexpr(1 / math.log(2.0))
 ALPHA_MIN = tl.constexpr(CONSTANTS.alpha_min)
@@ -95,6 +111,11 @@ class View(NamedTuple):
     center_x: float
     center_y: float
     center_z: float
+
+
+def count_borders(pairs: int) -> int:
+    """Borders that lists with so many entries can have at most."""
+    return max(pairs - 1, 0) // SEGMENT.value
 
 
 def make_grid(camera: Camera) -> Grid:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 # Bytes that stay from step to step, in the workspaces of `executor`.
-BYTES_OF_GAUSSIAN = 64 + 3 * 4 + 3 * 8  # record; depth and key, rows of blocks; their places, the order
+BYTES_OF_GAUSSIAN = (
+    64 + 36 + 3 * 4 + 3 * 8
+)  # record; slopes of the colour; depth and key, rows of blocks; their places, the order
 BYTES_OF_UNIT = 3 * 4 + 8  # a row of blocks of a Gaussian: owner, first block, width; end of its pairs
 BYTES_OF_PAIR = 64 + 8 + 2 * 4 + 2 * 2  # row of gradient sums; slot; Gaussian, twice; key, twice
 BYTES_OF_BLOCK = 128 * (4 + 4) + 3 * 4 + 2 * 8  # of 128 pixels transmittance and last entry; list, last slot
+BYTES_OF_BORDER = 128 * 4 * 4  # of 128 pixels transmittance and colour
+PAIRS_OF_BORDER = 256  # between two, where a list is walked backward by several programs
 BYTES_OF_RENDER = 64 + 4 + 4 + 3 * 8  # the record that cannot be seen, the end of the lists, flags, status
 UNITS_AT_FIRST = 2  # rows of blocks that a Gaussian has room for, before they are counted
 
@@ -22,6 +26,7 @@ def workspace_bytes(gaussians: int, units: int, pairs: int, blocks: int) -> int:
         + BYTES_OF_UNIT * units
         + BYTES_OF_PAIR * pairs
         + BYTES_OF_BLOCK * blocks
+        + BYTES_OF_BORDER * (max(pairs - 1, 0) // PAIRS_OF_BORDER)
     )
 
 

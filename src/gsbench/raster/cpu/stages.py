@@ -1,0 +1,304 @@
+"""Stages of the compiled rasterizer in order, forward and backward, shared out among threads; and the footprint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsbench.gaussians.deferred import DeferredHarmonics
+from gsbench.gaussians.model import NUM_SH_REST, Gaussians
+from gsbench.raster.base import CONSTANTS
+from gsbench.raster.cpu import layout as at
+from gsbench.raster.cpu.backprojection import backproject_shard
+from gsbench.raster.cpu.binning import (
+    BUCKETS,
+    PASSES,
+    balance_tiles,
+    fill_shard,
+    pair_shard,
+    sort_by_depth,
+    start_tiles,
+)
+from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_tiles, decomposite_tiles
+from gsbench.raster.cpu.deferred import CHUNK, Factors, pending_of
+from gsbench.raster.cpu.footprint import cover_tiles
+from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, project_shard
+from gsbench.raster.cpu.shuffle import REST
+from gsbench.raster.cpu.vector import LANES
+from gsbench.raster.cpu.workspace import HEADROOM, Arena, ShardRunner, TensorPool
+from gsbench.raster.footprint import Footprint, view_depths
+from gsbench.raster.validate import raise_for_values
+from gsbench.scene.camera import Camera
+
+# Fixed, so that the bits of every result are the same for any number of threads.
+GAUSSIAN_SHARDS = 16
+TILE_SHARDS = 8  # each has its own gradient rows: 64 bytes per Gaussian
+
+
+class Workshop:
+    """Threads that the stages run on, and memory for the tensors that they give."""
+
+    def __init__(self, threads: int) -> None:
+        self.runner = ShardRunner(threads)
+        self.tensors = TensorPool()
+        self.pairs_of_shard = 0  # of tile and record: the room that sufficed so far
+
+
+@dataclass
+class Frame:
+    """Results of the forward pass for the backward pass; the arrays belong to ``arena``."""
+
+    view: at.View
+    degree: int
+    visible: NDArray[np.int64]  # [GAUSSIAN_SHARDS] records
+    records: NDArray[np.float32]  # [N * RECORD]
+    starts: NDArray[np.int64]  # [tiles + 1]
+    entries: NDArray[np.int32]  # [pairs] records, by tile, front to back
+    masks: NDArray[np.uint16]  # [pairs] blocks that were blended
+    processed: NDArray[np.int64]  # [tiles] end of the entries that were looked at
+    transmittance: NDArray[np.float32]  # [tiles * TILE_PIXELS]
+    last: NDArray[np.float32]  # [tiles * TILE_PIXELS]
+    bounds: NDArray[np.int64]  # [TILE_SHARDS + 1] tiles
+    tile_shard: NDArray[np.uint8]  # [tiles]
+    background: NDArray[np.float32]  # [3]
+
+
+def _edges(count: int, shards: int) -> list[int]:
+    return [count * shard // shards for shard in range(shards + 1)]
+
+
+def forward(
+    workshop: Workshop,
+    arena: Arena,
+    gaussians: Gaussians,
+    harmonics: DeferredHarmonics | None,
+    camera: Camera,
+    degree: int,
+    background: NDArray[np.float32],
+    image: Tensor,
+    alpha: Tensor,
+    radii: Tensor,
+) -> Frame:
+    """Project, sort, bin, composite into ``image``, ``alpha`` and ``radii``."""
+    run = workshop.runner.run
+    count = len(gaussians)
+    view = at.make_view(camera, CONSTANTS)
+    tiles = view.tiles_x * view.tiles_y
+    arrays, pending = _arrays(gaussians), pending_of(harmonics)
+    records = arena.take("records", (count * at.RECORD,), np.float32)
+    record_ints = records.view(np.int32)
+    keys = arena.take("keys", (count,), np.uint64)
+    flags = np.zeros((GAUSSIAN_SHARDS, 2), np.int64)
+    edges = _edges(count, GAUSSIAN_SHARDS)
+    radii_array = radii.numpy()
+
+    def project(shard: int) -> None:
+        begin, end = edges[shard], edges[shard + 1]
+        project_shard(
+            at.kernel_memory(),
+            begin,
+            end,
+            *arrays,
+            pending,
+            degree,
+            view,
+            records,
+            record_ints,
+            keys,
+            radii_array,
+            flags[shard],
+        )
+
+    run(GAUSSIAN_SHARDS, project)
+    if flags[:, BAD_VALUE].any():
+        raise_for_values(gaussians)
+
+    order = arena.take("order", (int(flags[:, VISIBLE].sum()),), np.uint64)
+    digits = np.empty((PASSES, BUCKETS), np.int64)
+    spare = arena.take("spare", order.shape, np.uint64)
+    sort_by_depth(np.array(edges[:-1]), flags[:, VISIBLE].copy(), keys, order, spare, digits)
+
+    counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
+    starts = arena.take("starts", (tiles + 1,), np.int64)
+    cuts = _edges(len(order), GAUSSIAN_SHARDS)
+    made = np.zeros(GAUSSIAN_SHARDS, np.int64)  # pairs of tile and record
+
+    def pair(shard: int) -> None:
+        made[shard] = pair_shard(
+            cuts[shard],
+            cuts[shard + 1],
+            order,
+            records,
+            record_ints,
+            view.tiles_x,
+            LOG2_ALPHA_MIN,
+            counts[shard],
+            pairs[shard],
+        )
+
+    room = workshop.pairs_of_shard
+    pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
+    run(GAUSSIAN_SHARDS, pair)
+    if made.max() > room:  # once in a while, as the scene grows
+        room = workshop.pairs_of_shard = int(made.max() * HEADROOM)
+        pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
+        run(GAUSSIAN_SHARDS, pair)
+    start_tiles(counts, starts)
+    total = int(starts[tiles])
+    entries = arena.take("entries", (total,), np.int32)
+    run(GAUSSIAN_SHARDS, lambda shard: fill_shard(made[shard], pairs[shard], counts[shard], entries))
+
+    frame = Frame(
+        view,
+        degree,
+        flags[:, VISIBLE],
+        records,
+        starts,
+        entries,
+        arena.take("masks", (total,), np.uint16),
+        arena.take("processed", (tiles,), np.int64),
+        arena.take("transmittance", (tiles * at.TILE_PIXELS,), np.float32),
+        arena.take("last", (tiles * at.TILE_PIXELS,), np.float32),
+        np.empty(TILE_SHARDS + 1, np.int64),
+        arena.take("tile_shard", (tiles,), np.uint8),
+        background,
+    )
+    balance_tiles(starts, TILE_SHARDS, frame.bounds, frame.tile_shard)
+    image_array, alpha_array = image.numpy().reshape(-1), alpha.numpy().reshape(-1)
+
+    def composite(shard: int) -> None:
+        composite_tiles(*_tiles_of(frame, shard), *_blending_of(frame), image_array, alpha_array)
+
+    run(TILE_SHARDS, composite)
+    return frame
+
+
+def _tiles_of(frame: Frame, shard: int) -> tuple[Any, ...]:
+    """The arguments that all kernels share which walk through the entries of tiles."""
+    return (
+        at.kernel_memory(),
+        int(frame.bounds[shard]),
+        int(frame.bounds[shard + 1]),
+        frame.starts,
+        frame.entries,
+        frame.masks,
+        frame.processed,
+        frame.records,
+        frame.view.width,
+        frame.view.height,
+    )
+
+
+def _blending_of(frame: Frame) -> tuple[Any, ...]:
+    """The further arguments that the two compositing kernels share."""
+    return frame.background, frame.transmittance, frame.last
+
+
+def backward(
+    workshop: Workshop,
+    arena: Arena,
+    frame: Frame,
+    gaussians: Gaussians,
+    harmonics: DeferredHarmonics | None,
+    g_image: NDArray[np.float32],
+    g_alpha: NDArray[np.float32],
+    absolute: Tensor | None,
+    want_splitting: bool,
+) -> tuple[list[Tensor | None], Tensor, Tensor | None]:
+    """The gradients of the six tensors, of ``screen_points`` and of the splitting probe; fills ``absolute`` [N, 2] if
+    it is given.
+
+    With ``harmonics`` the gradient of ``sh_rest`` is None, and its factors go there.
+    """
+    count = len(gaussians)
+    rows = arena.take("rows", (TILE_SHARDS, count * at.ROW), np.float32, zero=True)
+    want_absolute = None if absolute is None else True
+
+    def decomposite(shard: int) -> None:
+        decomposite_tiles(*_tiles_of(frame, shard), *_blending_of(frame), g_image, g_alpha, rows[shard], want_absolute)
+
+    workshop.runner.run(TILE_SHARDS, decomposite)
+
+    means, log_scales, quaternions, logits, _, sh_rest = _arrays(gaussians)
+    take = workshop.tensors.empty
+    gradients = {name: take(tuple(tensor.shape)) for name, tensor in gaussians.tensors().items() if name != "sh_rest"}
+    g_screen = take((count, 2))
+    g_absolute = np.empty((0, 2), np.float32) if absolute is None else absolute.numpy()
+    g_splitting = take((count, 3, 3)) if want_splitting else None
+    edges = _edges(count, GAUSSIAN_SHARDS)
+    # A shard's chunks of factors: as many as its Gaussians could fill.
+    chunks = [edge // LANES + shard for shard, edge in enumerate(edges)]
+    g_sh_rest = take((count if harmonics is None else 0, NUM_SH_REST, 3))
+    factors = take((0 if harmonics is None else chunks[-1] * CHUNK,))
+    common = (
+        means,
+        log_scales,
+        quaternions,
+        logits,
+        sh_rest,
+        pending_of(harmonics),
+        frame.degree,
+        frame.view,
+        frame.records.view(np.int32),
+        frame.tile_shard,
+        rows.reshape(-1),
+        gradients["means"].numpy(),
+        gradients["log_scales"].numpy(),
+        gradients["quaternions"].numpy(),
+        gradients["opacity_logits"].numpy().reshape(count, 1),
+        gradients["sh_dc"].numpy(),
+        g_sh_rest.numpy().reshape(-1, REST),
+        factors.numpy(),
+        factors.numpy().view(np.int32),
+        g_screen.numpy(),
+        g_absolute,
+        np.empty((0, 9), np.float32) if g_splitting is None else g_splitting.numpy().reshape(-1, 9),
+    )
+
+    def backproject(shard: int) -> None:
+        begin, end, visible = edges[shard], edges[shard + 1], int(frame.visible[shard])
+        backproject_shard(at.kernel_memory(), begin, end, visible, chunks[shard], *common)
+
+    workshop.runner.run(GAUSSIAN_SHARDS, backproject)
+    if harmonics is None:
+        return [*gradients.values(), g_sh_rest], g_screen, g_splitting
+    if frame.degree > 0:
+        visible = [int(number) for number in frame.visible]
+        harmonics.receive(Factors(workshop.runner, factors, chunks[:-1], visible, frame.degree, count))
+    return [*gradients.values(), None], g_screen, g_splitting
+
+
+def _arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:
+    """The six tensors as arrays that share their memory; ``sh_rest`` as [N * 45]."""
+    means, log_scales, quaternions, logits, sh_dc, sh_rest = (t.detach().numpy() for t in gaussians.tensors().values())
+    return means, log_scales, quaternions, logits, sh_dc, sh_rest.reshape(-1)
+
+
+def footprint(
+    workshop: Workshop, frame: Frame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
+) -> Footprint:
+    """See ``raster.base.RenderOutput``."""
+    count = len(gaussians)
+    covered = np.zeros((TILE_SHARDS, count), np.int32)
+    sums, distances = np.zeros((2, TILE_SHARDS, count), np.float32)
+    asked = np.empty(0, np.float32) if values is None else values.detach().float().contiguous().numpy().reshape(-1)
+
+    def cover(shard: int) -> None:
+        cover_tiles(
+            *_tiles_of(frame, shard),
+            frame.records.view(np.int32),
+            frame.last,
+            asked,
+            covered[shard],
+            sums[shard],
+            distances[shard],
+        )
+
+    workshop.runner.run(TILE_SHARDS, cover)
+    totals = (torch.from_numpy(shards.sum(0, dtype=shards.dtype)) for shards in (covered, sums, distances))
+    return Footprint(next(totals), view_depths(gaussians, camera), *totals)
