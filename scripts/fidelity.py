@@ -41,6 +41,11 @@ TAIL = """
 What the rasterizer and the optimiser do is compared elsewhere: every executor with the float64 reference
 (`tests/raster`), the learning rates and the schedule in `tests/pipeline`. Presets of learning rates stand in
 `conf/train/` with their sources.
+
+DashGaussian's schedule of sizes (`train.resolution_schedule`; YouyuChen0207/DashGaussian 4e3b560,
+`utils/schedule_utils.py`, `train_dash.py:75`, `:182`) is stated again in `tests/train/test_resolution.py`: the
+same size at every iteration. Otherwise there: it prunes before it grows, clones and splits each take the whole
+allowance, and the window over a spectrum of odd sides is a pixel off its mean. Here small pictures have 8 bits.
 """
 
 
@@ -158,6 +163,15 @@ ARMS = {
         (("test_mrnf", "test_mrnf_round"),),
         "weights of all iterations (views are drawn in the round), Canny's edges, rates that follow the cloud; what "
         "later versions add",
+    ),
+    "steepgs": Arm(
+        "arXiv 2505.05587, its splitting matrix and halves; facebookresearch/SteepGS 63eee45, `arguments/__init__.py`, "
+        "`scene/gaussian_model.py:530`",
+        f"{ROUND}; the matrix with second derivatives by autograd (`tests/raster/test_splitting.py`, to 1e-9) and with "
+        "what halves do to a loss",
+        (("test_steep_gs", "test_steep_gs_round"),),
+        "the three estimators of the matrix in its code, each of which departs from the paper's formula; there "
+        "opacities stay whole unless asked; its condition of a vanishing gradient, which is off there; a cap",
     ),
     "quantile": Arm(
         "nerfstudio-project/gsplat, pull request 941 (open), its description",

@@ -106,12 +106,20 @@ def test_it_grows_to_three_times_the_budget_and_selects_down_to_it() -> None:
     assert trainable.optimizer.param_groups[3]["lr"] == pytest.approx(0.05)
 
 
-def test_at_the_end_of_its_time_the_budget_is_met_whatever_the_opacities() -> None:
+def test_at_the_end_of_its_time_the_budget_is_met_whatever_the_opacities(caplog: pytest.LogCaptureFixture) -> None:
     densifier = GNS(max_gaussians=20)
     trainable, _ = started(densifier, 0)
     event = densifier.refine(23_000, trainable, torch.Generator().manual_seed(0))
     assert (event.pruned_opacity, event.after) == (COUNT - 20, 20)
     assert event.balances()
+    assert f"ended with {COUNT} Gaussians, and {COUNT - 20} of them were drawn to go" in caplog.text
+
+
+def test_a_selection_that_has_met_its_budget_warns_of_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    densifier = GNS(max_gaussians=COUNT - 1)
+    trainable, _ = started(densifier, 0)
+    assert densifier.refine(16_050, trainable, torch.Generator().manual_seed(0)).after == COUNT - 1
+    assert caplog.text == ""
 
 
 def test_the_selection_survives_saving() -> None:

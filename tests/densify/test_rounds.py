@@ -46,7 +46,10 @@ def observe(
     points = torch.zeros(count, 2, dtype=torch.float64, requires_grad=True)
     points.grad = torch.from_numpy(rng.exponential(2e-4, (count, 2)))
     radii = torch.from_numpy(rng.integers(0, 3, count).astype(np.int32))
-    densifier.observe(step, RenderOutput(torch.empty(0), torch.empty(0), radii, points, points.grad))
+    probe = torch.zeros(count, 3, 3, dtype=torch.float64, requires_grad=True)
+    probe.grad = torch.zeros_like(probe)
+    empty = torch.empty(0)
+    densifier.observe(step, RenderOutput(empty, empty, radii, points, points.grad, splitting_probe=probe))
     return points.grad.numpy(), radii.numpy()
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import logging
 from pathlib import Path
 
 import pytest
 import torch
 
-from gsbench.densify import ADC, GNS, MCMC, MRNF, Densifier, FastGS, NoDensifier, ResGS, Volumetric
+from gsbench.densify import ADC, GNS, MCMC, MRNF, Densifier, FastGS, NoDensifier, ResGS, SteepGS, Volumetric
 from gsbench.errors import TrainingError
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
@@ -20,8 +19,9 @@ from gsbench.raster.readback import Readback
 from gsbench.scene.types import Scene
 from gsbench.train import trainer
 from gsbench.train.checkpoint import CheckpointWriter
+from gsbench.train.draws import CameraOrder, generator
 from gsbench.train.options import TrainConfig
-from gsbench.train.trainer import CameraOrder, Status, Trainer, generator, learning_rates, snapshot_file
+from gsbench.train.trainer import Status, Trainer, learning_rates, snapshot_file
 
 CPU = torch.device("cpu")
 
@@ -103,8 +103,9 @@ def test_same_seed_same_bits_other_seed_not(
         lambda: GNS(start=20, stop=60, interval=20, max_gaussians=90, pressure_length=1.0, overgrowth=2.0),
         lambda: small(ResGS, phase_ends=[0.3, 0.6], fade_interval=15, fade_stop=100),
         lambda: small(FastGS, error_threshold=0.05, least_count=0.0, max_gaussians=200),
+        lambda: small(SteepGS),
     ],
-    ids=["adc", "volumetric", "mcmc", "mrnf", "gns", "resgs", "fastgs"],
+    ids=["adc", "volumetric", "mcmc", "mrnf", "gns", "resgs", "fastgs", "steepgs"],
 )
 def test_interrupted_training_ends_in_the_same_bits(
     make, tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
@@ -251,9 +252,7 @@ def test_a_densifier_that_was_never_due_is_told(
     rasterizer: Rasterizer,
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(logging.getLogger("gsbench"), "propagate", True)
     train(tiny_scene, truth, rasterizer, tmp_path / "adc", ADC(start=500), iterations=15)
     assert "not one refinement was due in 15 iterations" in caplog.text
     caplog.clear()

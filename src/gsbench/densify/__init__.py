@@ -2,7 +2,7 @@
 
 from gsbench.densify.absgs import AbsGS
 from gsbench.densify.adc import ADC
-from gsbench.densify.base import Densifier, DensifyContext, NoDensifier, Refinement, Rule
+from gsbench.densify.base import Densifier, DensifyContext, NoDensifier, Refinement, Rule, Statistic
 from gsbench.densify.budgeted import Budgeted
 from gsbench.densify.edge_aware import EdgeAware
 from gsbench.densify.fast_gs import FastGS
@@ -15,6 +15,7 @@ from gsbench.densify.pixel_gs import PixelGS
 from gsbench.densify.quantile import QuantileADC
 from gsbench.densify.res_gs import ResGS
 from gsbench.densify.scores import TrainingViews
+from gsbench.densify.steep_gs import SteepGS
 from gsbench.densify.taming import Taming
 from gsbench.densify.volumetric import Volumetric
 from gsbench.events import Cause, RefineEvent
@@ -40,6 +41,8 @@ __all__ = [
     "Refinement",
     "ResGS",
     "Rule",
+    "Statistic",
+    "SteepGS",
     "Taming",
     "TrainingViews",
     "Volumetric",

@@ -12,7 +12,7 @@ from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import NEVER, Refinement, Rule
+from gsbench.densify.base import NEVER, Refinement, Rule, Statistic
 from gsbench.densify.budget import admit
 from gsbench.densify.budgeted import Budgeted
 from gsbench.densify.operations import revised_logits
@@ -39,7 +39,7 @@ class ADC(Budgeted):
     which a Gaussian was visible.
     """
 
-    STATISTICS: ClassVar[dict[str, torch.dtype]] = {
+    STATISTICS: ClassVar[Mapping[str, torch.dtype | Statistic]] = {
         "gradient_sum": torch.float32,  # NDC, since the last refinement
         "visible_count": torch.int32,  # iterations
         "max_radii": torch.int32,  # px

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,6 +31,8 @@ class DensifyContext:
     white_background: bool = False
     device: torch.device = CPU  # of the Gaussians
     views: TrainingViews | None = None
+    # A count that the training wants a round to stay below, for the most that there may ever be (None: not said).
+    limit: Callable[[Refinement, int | None], int] | None = None
 
     @property
     def training_views(self) -> TrainingViews:
@@ -53,6 +55,13 @@ class Refinement:
 Rule = Callable[[Refinement], None]
 
 
+class Statistic(NamedTuple):
+    """A statistic of more than one number for each Gaussian: ``Statistic(torch.float32, (3, 3))`` is [N, 3, 3]."""
+
+    dtype: torch.dtype
+    shape: tuple[int, ...] = ()
+
+
 class Densifier:
     """Base of all densifiers, and the one that never changes the Gaussians (``densify=none``).
 
@@ -61,8 +70,9 @@ class Densifier:
     ``after_step``. A subclass says what happens by ``rules``, and what it gathers by ``STATISTICS``, besides those of
     its own base; and which of its parts can be taken out by ``SWITCHES``, for ``gsbench ablate``.
 
-    State: ``context``; ``lineage``; and ``statistics``, one tensor [N] for each name in ``STATISTICS``, zero at the
-    start. They follow every ``edit`` (the new have zero), are saved, and are on the device of the Gaussians.
+    State: ``context``; ``lineage``; and ``statistics``, one tensor [N] for each name in ``STATISTICS``, or [N, …] for a
+    `Statistic` with a shape, zero at the start. They follow every ``edit`` (the new have zero), are saved, and are on
+    the device of the Gaussians.
 
     Examples:
         A rule that clones, every ``interval`` iterations, what is nearly opaque:
@@ -91,10 +101,11 @@ class Densifier:
         (20, 9, 29)
     """
 
-    STATISTICS: ClassVar[dict[str, torch.dtype]] = {}
+    STATISTICS: ClassVar[Mapping[str, torch.dtype | Statistic]] = {}
     SWITCHES: ClassVar[Mapping[str, Switch]] = {}
     needs_absolute_gradient: bool = False
     needs_footprint: bool = False  # ``RenderOutput.footprint``, which not every rasterizer gives
+    needs_splitting_matrix: bool = False  # ``RenderOutput.splitting_probe``, likewise
 
     context: DensifyContext
     lineage: Lineage
@@ -227,7 +238,8 @@ class Densifier:
         self.statistics = {name: saved[name].to(context.device, copy=True) for name in self.STATISTICS}
 
     def _zeros(self, count: int, device: torch.device) -> dict[str, Tensor]:
-        return {name: torch.zeros(count, dtype=dtype, device=device) for name, dtype in self.STATISTICS.items()}
+        kinds = {name: Statistic(k) if isinstance(k, torch.dtype) else k for name, k in self.STATISTICS.items()}
+        return {name: torch.zeros(count, *k.shape, dtype=k.dtype, device=device) for name, k in kinds.items()}
 
 
 class NoDensifier(Densifier):

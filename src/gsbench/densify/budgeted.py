@@ -30,6 +30,8 @@ class Budgeted(Densifier):
     - ``curve``: as ``hard``, with a limit that rises to it over the window;
     - ``governor``: the thresholds are moved so that the count follows that curve and ends at it (`govern`).
 
+    With ``soft`` and ``hard`` the training may have a limit of its own for each round (``train.resolution_schedule``).
+
     A subclass asks `allowance` for the first four. For ``freeze`` and ``governor`` it says, by ``forecast``, what count
     a round would lead to, and multiplies its own thresholds by ``strictness`` and its opacity cull by ``cull``.
     """
@@ -62,7 +64,12 @@ class Budgeted(Densifier):
         """The number of Gaussians that may be added now; None for no limit."""
         initial = self.lineage.initial_count
         limit = limit_at(refinement.step, self.start, self.stop, initial, self.max_gaussians, self.cap)
-        return allowance(len(refinement.gaussians), limit, self.cap)
+        count = len(refinement.gaussians)
+        allowed = allowance(count, limit, self.cap)
+        if self.context.limit is None or self.cap not in ("soft", "hard"):
+            return allowed
+        most = self.context.limit(refinement, self.max_gaussians if self.cap == "hard" else None)
+        return max(0, most - count) if allowed is None else max(0, min(allowed, most - count))
 
     def forecast(self, refinement: Refinement) -> int:
         """The number of Gaussians that there would be after a round with the present ``strictness`` and ``cull``."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsbench.densify.absgs import AbsGS
 from gsbench.densify.base import Refinement, Rule
-from gsbench.densify.scores import draw, draw_views, to_unit_range
+from gsbench.densify.scores import draw, draw_views, error_map, to_unit_range
 from gsbench.gaussians.model import Gaussians
 from gsbench.settings import Fraction, OpenFraction
 
@@ -71,9 +71,8 @@ class FastGS(AbsGS):
         """Count the bad pixels of a view that each Gaussian is blended into, [N]; also returns the loss of the view."""
         views = self.context.training_views
         render = views.render(index, gaussians, step)
-        error = (render.image - views.image(index).to(render.image) / 255).abs().mean(-1)  # [H, W]
-        bad = to_unit_range(error) > self.error_threshold
-        return render.require_footprint(bad.to(error)).values, views.loss(index, render.image)
+        bad = error_map(render.image, views.image(index)) > self.error_threshold
+        return render.require_footprint(bad.to(render.image)).values, views.loss(index, render.image)
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         over, large = super().candidates(refinement)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -16,6 +17,8 @@ from gsbench.densify.scores import draw
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction
+
+log = logging.getLogger(__name__)
 
 # Of the authors' code, in the iterations of its schedule: pressure from 15,000 to 23,000, every 50 of them.
 SOFT_SHARE = 1 / 8  # of the time under pressure: the opaque are spared, and nobody is pruned
@@ -129,6 +132,13 @@ class GNS(EdgeAware):
         """Keep as many as the budget has, drawn by opacity, and end the selection."""
         opacities = refinement.gaussians.values.opacities.detach()
         kept = draw(torch.ones_like(opacities, dtype=torch.bool), opacities, self.max_gaussians, refinement.rng)
+        if len(opacities) > CLOSE * self.max_gaussians:
+            log.warning(
+                "the pressure on opacities ended with %d Gaussians, and %d of them were drawn to go: it was too "
+                "short; raise densify.pressure_length, or lower densify.interval (the pressure's is half of it)",
+                len(opacities),
+                int((~kept).sum()),
+            )
         refinement.event.pruned_opacity += int((~kept).sum())
         if not kept.all():
             self.edit(refinement, keep=kept)

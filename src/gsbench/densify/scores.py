@@ -79,6 +79,14 @@ def edge_map(image: Tensor) -> Tensor:
     return to_unit_range(edges.float())
 
 
+def error_map(image: Tensor, photograph: Tensor) -> Tensor:
+    """The mean absolute error of ``image`` [H, W, 3] over the channels, [H, W], shifted and scaled to [0, 1].
+
+    ``photograph`` is [H, W, 3] uint8.
+    """
+    return to_unit_range((image - photograph.to(image) / 255).abs().mean(-1))
+
+
 def to_unit_range(values: Tensor) -> Tensor:
     """``values`` shifted and scaled to [0, 1]; 0 where all are equal."""
     low, high = values.amin(), values.amax()

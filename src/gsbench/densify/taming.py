@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsbench.densify.adc import ADC
 from gsbench.densify.base import Refinement, Rule
-from gsbench.densify.scores import blended_sums, by_median, draw, draw_views, edge_map, to_unit_range
+from gsbench.densify.scores import blended_sums, by_median, draw, draw_views, edge_map, error_map
 from gsbench.gaussians.model import Gaussians
 
 LEAST_SCORE = 1e-6  # keeps the inverse finite by which the faint are drawn for pruning (the authors' code)
@@ -68,8 +68,8 @@ class Taming(ADC):
         views = self.context.training_views
         photograph = views.image(index)
         image = views.render(index, gaussians, step).image
-        error = (image - photograph.to(image) / 255).abs().mean(-1)  # [H, W]
-        pixels = self.weight_error * to_unit_range(error) + self.weight_edge * edge_map(photograph).to(error)
+        error = error_map(image, photograph)
+        pixels = self.weight_error * error + self.weight_edge * edge_map(photograph).to(error)
         sums, render = blended_sums(views, index, gaussians, step, torch.ones_like(image))
         footprint, visible = render.require_footprint(pixels), render.visible
         terms = (

@@ -12,17 +12,13 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from gsbench.eval.images import as_unit_range
 from gsbench.eval.ssim import ssim_map
 from gsbench.raster.executors import find
 
 SSIM_WEIGHT = 0.2
 
 Loss = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
-
-
-def as_unit_range(image: Tensor, dtype: torch.dtype) -> Tensor:
-    """``image`` as ``dtype``; 8-bit values are divided by 255."""
-    return image.to(dtype) / 255 if image.dtype == torch.uint8 else image.to(dtype)
 
 
 def torch_photometric_loss(

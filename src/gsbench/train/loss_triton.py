@@ -21,11 +21,34 @@ from gsbench.raster.triton.toolchain import load_driver
 from gsbench.raster.triton.workspace import WorkspacePool
 
 STRIP = 128  # numbers of a row that a program takes
-ROWS = 32  # rows that it takes
+LEAST_ROWS = 8  # that it takes
+# Of an H100 or H200, for which the programs are counted. Each multiprocessor holds four: 65,536 registers, at most 128
+# in each of 128 lanes.
+MULTIPROCESSORS, PROGRAMS_HELD = 132, 4
 RADIUS = tl.constexpr(WINDOW_RADIUS)
 CHANNELS = tl.constexpr(3)
 W0, W1, W2, W3, W4, W5 = (tl.constexpr(weight) for weight in window()[WINDOW_RADIUS:].tolist())  # from the centre
 F_C1, F_C2 = tl.constexpr(C1), tl.constexpr(C2)
+
+
+def rows_of_program(height: int, numbers: int) -> int:
+    """Rows that a program takes of an image of ``height`` rows of ``numbers``.
+
+    It filters ``2 * RADIUS`` rows more than it takes, so fewer programs do less work, but multiprocessors without one
+    do none. All programs run at once; of their possible numbers on a multiprocessor that is best by which the fullest
+    filters fewest rows. One program alone counts as two there: it leaves the time open that it waits for its memory.
+    The image's size alone decides, so that sums have the same bits on every GPU.
+    """
+    strips = triton.cdiv(numbers, STRIP)
+
+    def rows(held: int) -> int:
+        return max(LEAST_ROWS, triton.cdiv(height, max(1, held * MULTIPROCESSORS // strips)))
+
+    def filtered(held: int) -> int:
+        programs = strips * triton.cdiv(height, rows(held))
+        return max(2, triton.cdiv(programs, MULTIPROCESSORS)) * (rows(held) + 2 * WINDOW_RADIUS)
+
+    return rows(min(range(1, PROGRAMS_HELD + 1), key=filtered))
 
 
 @triton.jit
@@ -73,7 +96,7 @@ def _add(sums, x, y, weight):
     return (sums[0] + wx, sums[1] + wy, tl.fma(wx, x, sums[2]), tl.fma(wy, y, sums[3]), tl.fma(wx, y, sums[4]))
 
 
-@triton.jit(do_not_specialize=["height", "numbers"])
+@triton.jit(do_not_specialize=["height", "numbers", "rows"])
 def measure_similarity(
     image,
     target,
@@ -82,26 +105,26 @@ def measure_similarity(
     numbers,
     derivatives,
     sums,
+    rows,
     DIFFERENTIATE: tl.constexpr,
     STRIP: tl.constexpr,
-    ROWS: tl.constexpr,
 ):
-    """``sums`` [programs, 2] gets this program's sums of SSIM and of |image - target|, where the target is
-    ``target * scale``.
+    """``sums`` [programs, 2] gets the sums of SSIM and of |image - target| over the ``rows`` of this program, where the
+    target is ``target * scale``.
 
     ``derivatives`` [3, H, 3 W], if ``DIFFERENTIATE``, gets the derivative of SSIM's sum with respect to the blurred
     image, its blurred square and its blurred product with the target.
     """
     number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
-    first = tl.program_id(1) * ROWS
+    first = tl.program_id(1) * rows
     zero = tl.zeros([STRIP], tl.float32)
     mean_x, mean_y, square_x, square_y, product = _zeros(zero), _zeros(zero), _zeros(zero), _zeros(zero), _zeros(zero)
     total_similarity, total_l1 = zero, zero
     plane = height.to(tl.int64) * numbers
-    for row in range(first - RADIUS, tl.minimum(first + ROWS, height) + RADIUS):
+    for row in range(first - RADIUS, tl.minimum(first + rows, height) + RADIUS):
         x = _load(image, row, number, height, numbers, 1.0)
         y = _load(target, row, number, height, numbers, scale)
-        total_l1 += tl.where((row >= first) & (row < first + ROWS), tl.abs(x - y), 0.0)
+        total_l1 += tl.where((row >= first) & (row < first + rows), tl.abs(x - y), 0.0)
         blurred = _add((zero, zero, zero, zero, zero), x, y, W0)
         for k in tl.static_range(1, RADIUS + 1):
             for side in tl.static_range(-1, 2, 2):
@@ -149,7 +172,7 @@ def add_up(sums, programs, size, ssim_weight, values, GROUP: tl.constexpr):
     tl.store(values + 2, mean_similarity)
 
 
-@triton.jit(do_not_specialize=["height", "numbers"])
+@triton.jit(do_not_specialize=["height", "numbers", "rows"])
 def differentiate(
     image,
     target,
@@ -160,18 +183,18 @@ def differentiate(
     g_loss,
     ssim_weight,
     gradient,
+    rows,
     STRIP: tl.constexpr,
-    ROWS: tl.constexpr,
 ):
     """The ``gradient`` [H, 3 W] at the image; the blur is symmetric, so it pulls derivatives back."""
     number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
-    first = tl.program_id(1) * ROWS
+    first = tl.program_id(1) * rows
     zero = tl.zeros([STRIP], tl.float32)
     d_mean, d_square, d_product = _zeros(zero), _zeros(zero), _zeros(zero)
     plane = height.to(tl.int64) * numbers
     factor = tl.load(g_loss) / (height * numbers).to(tl.float32)
     l1_factor, ssim_factor = factor * (1.0 - ssim_weight), factor * ssim_weight
-    for row in range(first - RADIUS, tl.minimum(first + ROWS, height) + RADIUS):
+    for row in range(first - RADIUS, tl.minimum(first + rows, height) + RADIUS):
         mean = W0 * _load(derivatives, row, number, height, numbers, 1.0)
         square = W0 * _load(derivatives + plane, row, number, height, numbers, 1.0)
         product = W0 * _load(derivatives + 2 * plane, row, number, height, numbers, 1.0)
@@ -220,7 +243,8 @@ class _Loss(torch.autograd.Function):
         image = image.contiguous()
         height, numbers = image.shape[0], 3 * image.shape[1]
         differentiated = ctx.needs_input_grad[1]
-        grid = -(-numbers // STRIP), -(-height // ROWS)
+        rows = rows_of_program(height, numbers)
+        grid = triton.cdiv(numbers, STRIP), triton.cdiv(height, rows)
         scale = 1 / 255 if target.dtype == torch.uint8 else 1.0
         ctx.holder = _Holder()
         with torch.cuda.device_of(image):
@@ -236,9 +260,9 @@ class _Loss(torch.autograd.Function):
                 numbers,
                 derivatives,
                 sums,
+                rows,
                 DIFFERENTIATE=differentiated,
                 STRIP=STRIP,
-                ROWS=ROWS,
             )
             launch_grid(add_up, 1)(sums, grid[0] * grid[1], float(image.numel()), loss.ssim_weight, values, GROUP=1024)
         ctx.weight, ctx.scale, ctx.derivatives = loss.ssim_weight, scale, derivatives
@@ -256,7 +280,8 @@ class _Loss(torch.autograd.Function):
         image, target = ctx.saved_tensors
         height, numbers = image.shape[0], 3 * image.shape[1]
         gradient = torch.empty_like(image)
-        grid = -(-numbers // STRIP), -(-height // ROWS)
+        rows = rows_of_program(height, numbers)
+        grid = triton.cdiv(numbers, STRIP), triton.cdiv(height, rows)
         with torch.cuda.device_of(image):
             launch_grid(differentiate, *grid)(
                 image,
@@ -268,7 +293,7 @@ class _Loss(torch.autograd.Function):
                 g_loss.contiguous(),
                 ctx.weight,
                 gradient,
+                rows,
                 STRIP=STRIP,
-                ROWS=ROWS,
             )
         return None, gradient, None

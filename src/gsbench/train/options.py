@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
@@ -33,6 +34,9 @@ class TrainConfig:
     opacity_reset_interval: PositiveInt = 3000
     mcmc_stop: NonNegativeInt = 25_000  # 3DGS-MCMC refines for longer
     step_after_refine: bool = False  # True: gsplat's order, the optimiser steps before a refinement and loses no step
+    resolution_schedule: Literal["none", "pictures", "pictures_and_count"] = (
+        "none"  # DashGaussian: small pictures first
+    )
     visible_adam: bool = False  # update visible Gaussians only; a departure from the baseline
     max_seconds: PositiveFloat | None = None  # a budget of training time; the run ends at the first iteration past it
     volume_histogram: list[NonNegativeInt] = field(default_factory=lambda: [4000, 8000, 12_000])  # iterations (Fig. 5)

@@ -21,11 +21,14 @@ class Targets:
 
     They stay on the device where all of them fit into ``budget`` bytes (None: no limit). Else each is copied there when
     it is needed: ahead of its use and beside the work of the device, if `prefetch` says in time which comes next. On a
-    CPU they are the arrays of the views themselves.
+    CPU they are the arrays of the views themselves. Masks, a third of that where there are any, are always there.
     """
 
     def __init__(self, views: Sequence[View], device: torch.device, budget: int | None = None) -> None:
         self._images = [torch.from_numpy(view.image) for view in views]
+        self._masks = [
+            None if view.mask is None else torch.from_numpy(view.mask).to(device)[..., None] for view in views
+        ]
         self._device = device
         self.bytes = sum(image.numel() for image in self._images)
         self.resident = budget is None or self.bytes <= budget
@@ -44,6 +47,10 @@ class Targets:
         """Begin to copy the image of view ``index``, which `get` will ask for next."""
         if self._stream is not None:
             self._ahead = index, self._stream.send(self._images[index])
+
+    def mask(self, index: int) -> Tensor | None:
+        """The mask of view ``index``, True where a pixel counts, [H, W, 1] on the device; None where all do."""
+        return self._masks[index]
 
     def get(self, index: int) -> Tensor:
         """The image of view ``index``, for work that is queued from here on."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import math
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
@@ -13,14 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import torch
 
 from gsbench.densify import Densifier, DensifyContext, NoDensifier
-from gsbench.densify.volume import log_volume
 from gsbench.errors import TrainingError
+from gsbench.eval.images import where_counted
 from gsbench.events import RefineEvent
-from gsbench.files import write_text
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.ply import write_ply
@@ -28,21 +24,20 @@ from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster import Rasterizer
 from gsbench.raster.base import DeferringRasterizer, RenderOutput
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
-from gsbench.runs.rows import whole_lines
 from gsbench.scene.types import Scene
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
+from gsbench.train.draws import CameraOrder, generators
+from gsbench.train.journal import append, drop_after, volume_histogram
 from gsbench.train.loss import PhotometricLoss
 from gsbench.train.loss_log import LossLog
 from gsbench.train.memory_budget import explain_full, free_bytes, room_for_images
 from gsbench.train.options import TrainConfig
+from gsbench.train.resolution import Pictures, Resolution
 from gsbench.train.targets import Targets
 from gsbench.train.training_views import SceneViews
 
 log = logging.getLogger(__name__)
-
-LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, a quarter decade each
-STREAMS = ("cameras", "densify")  # every random draw of a training belongs to one
 
 
 @dataclass(frozen=True)
@@ -53,25 +48,6 @@ class Status:
     loss: float
     num_gaussians: int
     iterations_per_second: float
-
-
-class CameraOrder:
-    """Training views in random order without replacement, drawn anew when all were used."""
-
-    def __init__(self, num_views: int, rng: torch.Generator) -> None:
-        self.num_views = num_views
-        self.rng = rng
-        self.remaining: list[int] = []
-
-    def next(self) -> int:
-        if not self.remaining:
-            self.remaining = torch.randperm(self.num_views, generator=self.rng).tolist()
-        return self.remaining.pop()
-
-    @property
-    def following(self) -> int | None:
-        """The camera that `next` will give, or None where that is not drawn yet."""
-        return self.remaining[-1] if self.remaining else None
 
 
 class Trainer:
@@ -100,7 +76,7 @@ class Trainer:
         self.background = torch.tensor(list(options.background), dtype=torch.float32, device=self.device)  # [3]
         self.gaussians = TrainableGaussians(initial, learning_rates(options), scene.extent)
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
-        self.rngs = {name: generator(seed, stream) for stream, name in enumerate(STREAMS)}
+        self.rngs = generators(seed)
         self.order = CameraOrder(len(scene.train), self.rngs["cameras"])
         self.step = 0
         self.seconds = 0.0
@@ -112,7 +88,12 @@ class Trainer:
         views = SceneViews(
             scene.train, self.targets, rasterizer, self.background, self.loss, partial(sh_degree_at, options)
         )
-        self.context = DensifyContext(scene.extent, bool((self.background == 1).all()), self.device, views)
+        self.pictures = Pictures(scene.train, self.targets, self.device, room)
+        scheduled = options.resolution_schedule != "none"
+        self.resolution = Resolution(options, scene.train, len(initial)) if scheduled else None
+        limit = self.resolution.limit if self.resolution is not None and self.resolution.limits_count else None
+        is_white = bool((self.background == 1).all())
+        self.context = DensifyContext(scene.extent, is_white, self.device, views, limit)
         densifier.begin(initial, self.context)
         self._defer()
 
@@ -147,15 +128,17 @@ class Trainer:
                 out_of_time = options.max_seconds is not None and self.seconds >= options.max_seconds
                 last = self.step == options.iterations or out_of_time
                 if event is not None:
-                    _append(events, event.as_dict())
+                    append(events, event.as_dict())
                 if self.step in options.volume_histogram:
                     with (folder / HISTOGRAMS).open("a") as stream:
-                        _append(stream, self._volume_histogram())
+                        append(stream, volume_histogram(self.step, self.gaussians.values.log_scales.detach()))
                 if self.step % options.log_every == 0 or last:
                     record = self.losses.settle() | counts | {"sh_degree": self.sh_degree}
+                    if self.resolution is not None:
+                        record["scale"] = self.scale
                     self.seconds = before + time.perf_counter() - started
                     rate = (self.step - first_step) / max(self.seconds - before, 1e-9)
-                    _append(metrics, record | {"seconds": round(self.seconds, 3)})
+                    append(metrics, record | {"seconds": round(self.seconds, 3)})
                     on_status(Status(self.step, self.losses.smoothed, len(self.gaussians), rate))
                 minutes = (time.monotonic() - last_checkpoint) / 60
                 due = self.step % options.checkpoint_every == 0 or minutes >= options.checkpoint_minutes
@@ -177,16 +160,17 @@ class Trainer:
         """
         self.step += 1
         step, options = self.step, self.options
-        self.gaussians.set_step(step)
+        self.gaussians.set_step(step if self.resolution is None else self.resolution.position_step(step))
         index = self.order.next()
-        target = self.targets.get(index)
+        _, targets = self.pictures.at(self.scale)
+        target = targets.get(index)
         if self.order.following is not None:
-            self.targets.prefetch(self.order.following)
+            targets.prefetch(self.order.following)
         try:
             render = self.render(index)
         except ValueError as error:  # the optimiser has driven a parameter out of range
             raise TrainingError(f"iteration {step}: {error}; {_last_state(folder)}") from error
-        loss, l1, ssim = self.loss(render.image, target)
+        loss, l1, ssim = self.loss(where_counted(render.image, target, targets.mask(index)), target)
         regularizer = self.densifier.regularizer(self.gaussians.values)
         total = loss if regularizer is None else loss + regularizer
         self.losses.add(step, loss, l1, ssim, total)
@@ -199,6 +183,8 @@ class Trainer:
         if options.step_after_refine:
             self._optimize(render.visible)
         event = self.densifier.refine(step, self.gaussians, self.rngs["densify"])
+        if event is not None and self.resolution is not None:
+            self.resolution.observe(event)
         if not options.step_after_refine:
             self._optimize(render.visible)
         self.densifier.after_step(step, self.gaussians, self.rngs["densify"])
@@ -208,12 +194,13 @@ class Trainer:
 
     def render(self, index: int) -> RenderOutput:
         """The training view ``index`` as the present iteration draws it, with a graph."""
-        deferred, camera = self.gaussians.deferred, self.scene.train[index].camera
+        deferred, camera = self.gaussians.deferred, self.pictures.at(self.scale)[0][index]
         rest = camera, self.sh_degree, self.background, self.densifier.needs_absolute_gradient
+        beyond: dict[str, Any] = {"splitting_matrix": True} if self.densifier.needs_splitting_matrix else {}
         if deferred is None:
-            return self.rasterizer.render(self.gaussians.values, *rest)
+            return self.rasterizer.render(self.gaussians.values, *rest, **beyond)
         rasterizer = cast("DeferringRasterizer", self.rasterizer)  # or else nothing would be deferred
-        return rasterizer.render_deferred(self.gaussians.leaves, deferred, *rest)
+        return rasterizer.render_deferred(self.gaussians.leaves, deferred, *rest, **beyond)
 
     def _defer(self) -> None:
         """Put off steps of harmonics where the rasterizer can, and the optimiser is the plain one of 3DGS."""
@@ -233,14 +220,13 @@ class Trainer:
     def sh_degree(self) -> int:
         return sh_degree_at(self.options, self.step)
 
+    @property
+    def scale(self) -> int:
+        """The number by which the sides of the pictures are divided in the present iteration."""
+        return 1 if self.resolution is None else self.resolution.scale(self.step)
+
     def _optimize(self, visible: torch.Tensor) -> None:
         self.gaussians.optimizer_step(self.sh_degree, visible if self.options.visible_adam else None)
-
-    def _volume_histogram(self) -> dict[str, Any]:
-        volumes = (log_volume(self.gaussians.values.log_scales.detach()) / math.log(10)).cpu().numpy()
-        clipped = np.clip(volumes, LOG_VOLUME_BINS[0], LOG_VOLUME_BINS[-1])
-        counts, edges = np.histogram(clipped, LOG_VOLUME_BINS)
-        return {"step": self.step, "log10_edges": edges.tolist(), "counts": counts.tolist()}
 
     def _state(self) -> dict[str, Any]:
         self.losses.settle()  # no state is saved that a loss would have condemned
@@ -250,6 +236,7 @@ class Trainer:
             "smoothed_loss": self.losses.smoothed,
             "gaussians": self.gaussians.state_dict(),
             "densifier": self.densifier.state_dict(),
+            "momentum": None if self.resolution is None else self.resolution.momentum,
             "rngs": {name: rng.get_state() for name, rng in self.rngs.items()},
             "remaining_views": list(self.order.remaining),
         }
@@ -263,6 +250,8 @@ class Trainer:
             )
             self._defer()
             self.densifier.load_state_dict(state["densifier"], self.context)
+            if self.resolution is not None:
+                self.resolution.momentum = state["momentum"]
             for name, rng in self.rngs.items():
                 rng.set_state(state["rngs"][name])
             self.order.remaining = list(state["remaining_views"])
@@ -288,23 +277,3 @@ def sh_degree_at(options: TrainConfig, step: int) -> int:
 def learning_rates(options: TrainConfig) -> LearningRates:
     """The learning rates among the settings of a training."""
     return LearningRates(**{field.name: getattr(options, field.name) for field in fields(LearningRates)})
-
-
-def generator(seed: int, stream: int) -> torch.Generator:
-    """A CPU generator for one stream of a trial's randomness; streams of all seeds are independent."""
-    state = np.random.SeedSequence([seed, stream]).generate_state(1, np.uint64)[0]
-    return torch.Generator().manual_seed(int(state >> np.uint64(1)))
-
-
-def drop_after(path: Path, step: int) -> None:
-    """Remove the records later than ``step``, and a torn last line, from a JSON-lines file, if it is there.
-
-    A kill meanwhile leaves the file as it was: what is lost here is in no checkpoint.
-    """
-    if path.exists():
-        write_text(path, "".join(f"{line}\n" for line, at in whole_lines(path) if at <= step))
-
-
-def _append(stream: Any, record: dict[str, Any]) -> None:
-    stream.write(json.dumps(record) + "\n")
-    stream.flush()

@@ -1,0 +1,129 @@
+"""SteepGS: who sits on a saddle of the loss is split along the direction in which a split lowers it most."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, NamedTuple
+
+import torch
+from annotated_types import Interval, Lt
+from torch import Tensor
+
+from gsbench.densify.adc import ADC, Grown
+from gsbench.densify.base import NEVER, Refinement, Statistic
+from gsbench.densify.budget import admit
+from gsbench.densify.operations import faded, standard_normal
+from gsbench.events import Cause
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster.base import RenderOutput
+from gsbench.settings import Switch
+
+
+class Saddles(NamedTuple):
+    """Candidates by rising index, with what `SteepGS.steepest` says of them."""
+
+    indices: Tensor  # [C]
+    values: Tensor  # [C]
+    directions: Tensor  # [C, 3]
+    large: Tensor  # mask [N], of all
+
+    def mask(self) -> Tensor:
+        """Mask [N] of the candidates."""
+        mask = torch.zeros_like(self.large)
+        mask[self.indices] = True
+        return mask
+
+
+@dataclass
+class SteepGS(ADC):
+    """ADC of those whom a split would help, and halves that go apart where it helps most (Wang et al., CVPR 2025).
+
+    Of arXiv 2505.05587: to second order, two halves that a Gaussian leaves at small distances +-d change the loss by d
+    S d / 2, with S the splitting matrix: the sum over pixels of (d loss / d s) times the second derivative of s, the
+    opacity times the density there, by the mean. So only who has an S with an eigenvalue below zero gains by a split,
+    most along the eigenvector of the least one; and of all weights of two halves a half each is the best.
+
+    A candidate of ADC grows only if the least eigenvalue of its S, averaged over the iterations in which it was
+    visible, is below ``eigenvalue_threshold``, in units of the loss by the squared scene extent (None: no condition).
+    All become two of ``opacity_factor`` times the opacity on either side along the eigenvector: the large of scales
+    divided by ``split_shrink``, each at the length of a draw from the parent's density; the small as large as before,
+    at the present step of Adam on the means. The parent goes. Under a budget those of the least eigenvalues come first.
+    ``split_children`` and ``revised_opacity`` have no meaning here.
+    """
+
+    STATISTICS: ClassVar[Mapping[str, torch.dtype | Statistic]] = {
+        "splitting_sum": Statistic(torch.float32, (3, 3))  # per world unit squared, since the last refinement
+    }
+    needs_splitting_matrix = True
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "saddle": Switch({"eigenvalue_threshold": None}, "the condition that a split lowers the loss"),
+        "halving": Switch({"opacity_factor": 1.0}, "halves of half the opacity"),
+        "opacity_reset": Switch(
+            {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
+        ),
+    }
+
+    eigenvalue_threshold: Annotated[float, Lt(0)] | None = -1e-6
+    opacity_factor: Annotated[float, Interval(gt=0, le=1)] = 0.5
+
+    def observe(self, step: int, render: RenderOutput) -> None:
+        super().observe(step, render)
+        if step < self.stop:
+            self.statistics["splitting_sum"] += render.require_splitting_matrix()
+
+    def steepest(self, index: Tensor) -> tuple[Tensor, Tensor]:
+        """The least eigenvalue [S] of the mean splitting matrix of those at ``index`` [S], of the loss by the squared
+        extent, and its eigenvector [S, 3], whose largest component is positive."""
+        seen = self.statistics["visible_count"][index].clamp_min(1)  # [S]
+        mean = self.statistics["splitting_sum"][index].double() / seen[:, None, None]  # [S, 3, 3]
+        values, vectors = torch.linalg.eigh(mean)  # in rising order
+        least = vectors[..., 0]
+        largest = least.gather(-1, least.abs().argmax(-1, keepdim=True))  # [S, 1]
+        return values[:, 0] * self.context.extent**2, least * largest.sign()
+
+    def saddles(self, refinement: Refinement) -> Saddles:
+        """The candidates of ADC whom a split would help."""
+        over, large = super().candidates(refinement)
+        index = over.nonzero().squeeze(-1)  # [C]
+        values, directions = self.steepest(index)
+        if self.eigenvalue_threshold is not None:
+            helped = values < self.eigenvalue_threshold
+            index, values, directions = index[helped], values[helped], directions[helped]
+        return Saddles(index, values, directions, large)
+
+    def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
+        saddles = self.saddles(refinement)
+        return saddles.mask(), saddles.large
+
+    def grown(self, refinement: Refinement) -> Grown:
+        values = refinement.gaussians.values
+        over, large = self.candidates(refinement)
+        return Grown(
+            torch.where(over, 2, 1),
+            values.log_scales - math.log(self.split_shrink) * (over & large).unsqueeze(-1),
+            torch.where(over, faded(values.opacity_logits, self.opacity_factor), values.opacity_logits),
+        )
+
+    def grow_by_gradient(self, refinement: Refinement) -> None:
+        """Put two halves in the place of each candidate."""
+        gaussians = refinement.gaussians
+        saddles = self.saddles(refinement)
+        gained = torch.zeros(len(gaussians), dtype=torch.float64, device=gaussians.device)
+        gained[saddles.indices] = -saddles.values
+        selected, blocked = admit(saddles.mask(), gained, 1, self.allowance(refinement))
+        parents = selected.nonzero().squeeze(-1)  # [S]
+        chosen, is_large = gaussians.values.detach().select(parents), saddles.large[parents].unsqueeze(-1)
+        direction = saddles.directions[selected[saddles.indices]].to(chosen.means)  # [S, 3]
+        noise = standard_normal((2 * len(parents), 3), refinement.rng, chosen.means)
+        lengths = (noise * chosen.scales.repeat(2, 1)).norm(dim=-1, keepdim=True)  # [2 S, 1]
+        lengths = torch.where(is_large.repeat(2, 1), lengths, gaussians.position_rate)
+        children = Gaussians.concatenate([chosen, chosen])
+        children.means = children.means + lengths * torch.cat([direction, -direction])
+        children.log_scales = children.log_scales - math.log(self.split_shrink) * is_large.repeat(2, 1)
+        children.opacity_logits = faded(children.opacity_logits, self.opacity_factor)
+        self.edit(refinement, ~selected, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
+        refinement.event.split_gradient += len(parents)
+        refinement.event.blocked_by_cap += blocked

@@ -1,0 +1,98 @@
+"""Training on small pictures first, and on no more Gaussians than they can show (DashGaussian, arXiv 2503.18402)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from gsbench.densify import Refinement
+from gsbench.events import RefineEvent
+from gsbench.scene.camera import Camera
+from gsbench.scene.masks import resize_mask
+from gsbench.scene.types import View
+from gsbench.train.options import TrainConfig
+from gsbench.train.spectrum import Levels, levels
+from gsbench.train.targets import Targets
+
+# Of the authors' code (utils/schedule_utils.py).
+FIRST_MOMENTUM = 5  # times the initial count: what may be added before growth was seen
+KEPT_MOMENTUM = 0.98
+MOST_MOMENTUM = 1_000_000  # that one round adds to it
+MOST_GROWTH = 0.2  # of the count, in a round
+
+
+class Resolution:
+    """The size of the pictures at each iteration, and the count that goes with it.
+
+    Sizes follow from the pictures and the window of ``options`` alone; they change after a round of that window.
+    """
+
+    def __init__(self, options: TrainConfig, views: Sequence[View], initial: int) -> None:
+        self.options, self.initial = options, initial
+        self.levels: Levels = levels([view.image for view in views], options.densify_stop)
+        self.momentum = FIRST_MOMENTUM * initial  # Gaussians above ``initial`` that the whole pictures may have
+
+    def scale(self, step: int) -> int:
+        """The number by which the sides of the pictures are divided at iteration ``step``."""
+        options = self.options
+        if step > options.densify_stop:
+            return 1
+        last = (step - 1) // options.densify_interval * options.densify_interval  # round
+        return self.levels.at(last if last > options.densify_start else 0)
+
+    def position_step(self, step: int) -> float:
+        """The place of iteration ``step`` in the schedule of the means' learning rate, which waits until the pictures
+        are divided by less than two."""
+        end, wait = self.options.position_steps, self.levels.full_from
+        return end * max(0, step - wait) / max(end - wait, 1)
+
+    @property
+    def limits_count(self) -> bool:
+        return self.options.resolution_schedule == "pictures_and_count"
+
+    def limit(self, refinement: Refinement, most: int | None) -> int:
+        """The count that a round is to stay below, where the whole pictures may have ``most``, or, for None, what was
+        asked for so far.
+
+        n0 + (n - n0) / s^(2 - x), for n0 initial Gaussians, pictures divided by s and x of the window done, and n in
+        the last round; and a fifth more than there were before the round.
+        """
+        options, step = self.options, refinement.step
+        above = self.momentum if most is None else most - self.initial
+        if step + options.densify_interval < options.densify_stop:
+            above = int(above / self.scale(step) ** (2 - step / options.densify_stop))
+        return min(self.initial + above, int((1 + MOST_GROWTH) * refinement.event.before))
+
+    def observe(self, event: RefineEvent) -> None:
+        """Take note of how many candidates a round had: those that grew, and those that were refused."""
+        candidates = sum(getattr(event, name) for name in RefineEvent.GROWN) + event.blocked_by_cap
+        self.momentum = max(self.momentum, int(KEPT_MOMENTUM * self.momentum + min(MOST_MOMENTUM, candidates)))
+
+
+class Pictures:
+    """The training views at the size of an iteration. They are kept at one size besides the full one."""
+
+    def __init__(self, views: Sequence[View], targets: Targets, device: torch.device, budget: int | None) -> None:
+        self._full, self._device, self._budget = views, device, budget
+        self._targets = {1: targets}
+        self._cameras: dict[int, list[Camera]] = {1: [view.camera for view in views]}
+
+    def at(self, scale: int) -> tuple[list[Camera], Targets]:
+        """Cameras and images with sides divided by ``scale``."""
+        if scale not in self._targets:
+            small = [_smaller(view, scale) for view in self._full]
+            self._targets = {1: self._targets[1], scale: Targets(small, self._device, self._budget)}
+            self._cameras = {1: self._cameras[1], scale: [view.camera for view in small]}
+        return self._cameras[scale], self._targets[scale]
+
+
+def _smaller(view: View, scale: int) -> View:
+    """The filter is that of the authors' code; `scene.images.resize_image` rounds once in each direction, upwards."""
+    width, height = max(1, view.camera.width // scale), max(1, view.camera.height // scale)
+    image = torch.from_numpy(view.image).permute(2, 0, 1).unsqueeze(0).float()  # [1, 3, H, W]
+    small = torch.nn.functional.interpolate(image, (height, width), mode="bilinear", antialias=True)
+    pixels = small.round().to(torch.uint8).squeeze(0).permute(1, 2, 0).contiguous().numpy()  # [height, width, 3]
+    mask = None if view.mask is None else resize_mask(view.mask, width, height)
+    return replace(view, camera=view.camera.resized(width, height), image=pixels, mask=mask)

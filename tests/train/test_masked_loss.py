@@ -1,0 +1,123 @@
+"""A loss with a mask: what is ignored adds nothing to it and has no gradient; what counts weighs what it did."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from gsbench.eval.images import where_counted
+from gsbench.raster import create_rasterizer
+from gsbench.scene.camera import Camera
+from gsbench.scene.types import View
+from gsbench.train.loss import PhotometricLoss
+from gsbench.train.targets import Targets
+from gsbench.train.training_views import SceneViews
+
+HEIGHT, WIDTH = 37, 53
+
+
+@pytest.fixture
+def picture() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A render, a photograph and the mask [H, W, 1] of a disc and a margin."""
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(HEIGHT, WIDTH, 3, generator=generator)
+    target = (torch.rand(HEIGHT, WIDTH, 3, generator=generator) * 255).to(torch.uint8)
+    rows, columns = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    mask = ((rows - 18) ** 2 + (columns - 20) ** 2 > 81) & (columns < 45)
+    return image, target, mask[..., None]
+
+
+def test_the_loss_with_a_mask_is_its_definition(picture) -> None:
+    """L1 summed over what counts; SSIM by scikit-image, of pictures that are equal under the mask; over all pixels."""
+    image, target, mask = picture
+    loss, l1, ssim = PhotometricLoss(0.2, threads=1)(where_counted(image, target, mask), target)
+    truth, counts = target.numpy() / 255.0, mask.numpy()[..., 0]
+    wanted_l1 = np.abs(image.numpy() - truth)[counts].sum() / image.numel()
+    padded = [np.pad(np.where(mask.numpy(), x, truth), ((5, 5), (5, 5), (0, 0))) for x in (image.numpy(), truth)]
+    _, full = structural_similarity(
+        *padded, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=-1, data_range=1, full=True
+    )
+    wanted_ssim = full[5:-5, 5:-5].mean()
+    assert float(l1) == pytest.approx(wanted_l1, abs=1e-6)
+    assert float(ssim) == pytest.approx(wanted_ssim, abs=1e-5)
+    assert float(loss) == pytest.approx(0.8 * wanted_l1 + 0.2 * (1 - wanted_ssim), abs=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_no_gradient_and_no_value_comes_from_under_the_mask(picture, dtype: torch.dtype) -> None:
+    image, target, mask = picture
+    results = []
+    for noise in (0.0, 5.0):
+        drawn = (image + noise * ~mask).to(dtype).requires_grad_()
+        loss, *_ = PhotometricLoss(threads=1)(where_counted(drawn, target, mask), target)
+        loss.backward()
+        assert drawn.grad is not None
+        assert (drawn.grad[~mask.expand(-1, -1, 3)] == 0).all()
+        results.append((loss.detach(), drawn.grad))
+    assert torch.equal(results[0][0], results[1][0])
+    assert torch.equal(results[0][1], results[1][1])
+
+
+def test_far_from_the_mask_a_pixel_pulls_as_without_one(picture) -> None:
+    """So thresholds on gradients mean the same: the loss is divided by all pixels, not by those that count.
+
+    Far: 11 px, a window on a window.
+    """
+    image, target, _ = picture
+    mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    mask[:, 30:] = False
+    gradients = []
+    for chosen in (None, mask):
+        drawn = image.clone().requires_grad_()
+        PhotometricLoss(threads=1)(where_counted(drawn, target, chosen), target)[0].backward()
+        gradients.append(drawn.grad)
+    torch.testing.assert_close(gradients[0][:, :19], gradients[1][:, :19], rtol=0, atol=0)
+    assert not torch.equal(gradients[0][:, 20:30], gradients[1][:, 20:30])
+
+
+def test_densifiers_see_no_error_under_a_mask(picture) -> None:
+    from gsbench.gaussians.initial import gaussians_from_cloud
+
+    _, target, mask = picture
+    camera = Camera(WIDTH, HEIGHT, 50.0, 50.0, WIDTH / 2, HEIGHT / 2, np.eye(3), np.array([0.0, 0.0, 3.0]))
+    views = [View("a", camera, target.numpy(), mask.numpy()[..., 0])]
+    rng = np.random.default_rng(0)
+    cloud = rng.normal(size=(40, 3)), rng.integers(0, 256, (40, 3), dtype=np.uint8)
+    device = torch.device("cpu")
+    gaussians = gaussians_from_cloud(*cloud, device)
+    targets, background = Targets(views, device), torch.zeros(3)
+    scene = SceneViews(
+        views,
+        targets,
+        create_rasterizer("reference", device, 1),
+        background,
+        PhotometricLoss(threads=1),
+        lambda step: 0,
+    )
+    image = scene.render(0, gaussians, 1).image
+    error = (image - scene.image(0) / 255).abs().sum(-1)
+    assert (error[~mask[..., 0]] == 0).all()
+    assert (error[mask[..., 0]] > 0).any()
+    inside = torch.nn.functional.max_pool2d(mask[None, None, ..., 0].float(), 11, 1, 5)[0, 0] == 0
+    assert inside.any()
+    assert (scene.dissimilarity(0, image)[inside] < 1e-6).all()
+
+
+def test_masks_shrink_with_the_pictures(picture) -> None:
+    from gsbench.train.resolution import Pictures
+
+    _, target, mask = picture
+    camera = Camera(WIDTH, HEIGHT, 50.0, 50.0, WIDTH / 2, HEIGHT / 2, np.eye(3), np.array([0.0, 0.0, 3.0]))
+    views = [View("a", camera, target.numpy(), mask.numpy()[..., 0]), View("b", camera, target.numpy())]
+    device = torch.device("cpu")
+    pictures = Pictures(views, Targets(views, device), device, None)
+    for scale in (1, 2, 5):
+        cameras, targets = pictures.at(scale)
+        small = targets.mask(0)
+        assert small is not None
+        assert small.shape == (cameras[0].height, cameras[0].width, 1) == (*targets.get(0).shape[:2], 1)
+        assert targets.mask(1) is None
+        assert small.float().mean() <= mask.float().mean() + 0.02
+        assert small.any()

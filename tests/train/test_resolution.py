@@ -1,0 +1,289 @@
+"""The schedule of sizes against a restatement of the rule; small pictures, the count that follows, and resuming."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from gsbench.analysis.attribution import ingredients
+from gsbench.densify import ADC, GNS, MCMC, MRNF, Densifier, DensifyContext, EdgeAware, FastGS, Refinement, SteepGS
+from gsbench.events import RefineEvent
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster import create_rasterizer
+from gsbench.raster.base import Rasterizer
+from gsbench.runs.hashing import config_hash
+from gsbench.scene.types import Scene, View
+from gsbench.train.options import TrainConfig
+from gsbench.train.resolution import Pictures, Resolution
+from gsbench.train.spectrum import Levels, levels
+from gsbench.train.targets import Targets
+from gsbench.train.trainer import Status, Trainer
+from tests.config.test_schema import composed
+from tests.gaussians.helpers import random_gaussians
+from tests.train.conftest import orbit_camera
+from tests.train.test_trainer import CPU, cloud, options, records, same, small
+
+SHORT = {"densify_start": 20, "densify_stop": 100, "densify_interval": 20}
+
+
+def soft_pictures(count: int, height: int, width: int, seed: int) -> list[NDArray[np.uint8]]:
+    """Noise whose amplitude falls with the frequency, as that of photographs does."""
+    rng = np.random.default_rng(seed)
+    frequency = np.hypot(np.fft.fftfreq(height)[:, None] * height, np.fft.fftfreq(width)[None] * width) + 1
+    pictures = []
+    for k in range(count):
+        noise = np.fft.fft2(rng.normal(size=(height, width, 3)), axes=(0, 1)) / frequency[..., None] ** (1.3 + 0.1 * k)
+        wave = np.fft.ifft2(noise, axes=(0, 1)).real
+        pictures.append((255 * (wave - wave.min()) / np.ptp(wave)).astype(np.uint8))
+    return pictures
+
+
+def stated_again(pictures: list[NDArray[np.uint8]], until: int) -> list[int]:
+    """The scale of each iteration from 0 to ``until``, one bisection at a time; for even sides."""
+    height, width, _ = pictures[0].shape
+
+    def window(spectrum: NDArray[np.float64], scale: float) -> float:
+        tall, wide = int(height / scale) // 2, int(width / scale) // 2
+        return float(spectrum[height // 2 - tall : height // 2 + tall, width // 2 - wide : width // 2 + wide].sum())
+
+    def solve(spectrum: NDArray[np.float64], share: float) -> float:
+        low, high = 0.0, 1.0
+        for _ in range(64):
+            middle = (low + high) / 2
+            low, high = (middle, high) if window(spectrum, 1 / middle) < share else (low, middle)
+        return 1 / high
+
+    spectra = []
+    for picture in pictures:
+        channels = [np.abs(np.fft.fftshift(np.fft.fft2(picture[..., c] / 255.0))) for c in range(3)]
+        spectra.append(sum(channels[1:], channels[0]))
+    largest = min([8.0] + [solve(spectrum, spectrum.sum() / 4) for spectrum in spectra])
+    mean = sum(spectra[1:], spectra[0]) / len(spectra)
+    first, whole = window(mean, largest), float(mean.sum())
+    shares = [first + (whole - first) * i / 31 for i in range(32)]
+    scales = [largest, *(solve(mean, share) for share in shares[1:-1]), 1.0]
+    begins = [int(until * math.log(share / first) / math.log(whole / first)) for share in shares[:-1]] + [until]
+    answers = []
+    for step in range(until):
+        i = max(k for k in range(32) if begins[k] <= step)
+        way = (step - begins[i]) / (begins[i + 1] - begins[i])
+        answers.append(int((scales[i] ** -2 + way * (scales[i + 1] ** -2 - scales[i] ** -2)) ** -0.5 + 1e-9))
+    return [*answers, 1]
+
+
+@pytest.mark.parametrize(("height", "width", "until"), [(48, 64, 1000), (90, 60, 15_000), (40, 40, 300)])
+def test_the_schedule_of_sizes(height: int, width: int, until: int) -> None:
+    pictures = soft_pictures(3, height, width, height)
+    found = levels(pictures, until)
+    expected = stated_again(pictures, until)
+    assert [found.at(step) for step in range(until + 1)] == expected
+    assert expected[0] > 2  # or else nothing was tested
+    assert expected == sorted(expected, reverse=True)
+    assert found.at(10 * until) == 1
+
+
+def test_pictures_of_several_shapes_and_without_content() -> None:
+    mixed = [*soft_pictures(2, 47, 63, 1), *soft_pictures(1, 64, 31, 2)]
+    found = levels(mixed, 500)
+    assert found.scales[-1] == 1
+    assert list(found.begins) == sorted(set(found.begins))
+    assert list(found.scales) == sorted(found.scales, reverse=True)
+    black = levels([*mixed, np.zeros((8, 8, 3), np.uint8)], 500)
+    assert {black.at(step) for step in range(501)} == {1}
+    grey = levels([np.full((8, 8, 3), 99, np.uint8)], 500)  # all is the mean: any size shows it
+    assert grey.at(500) == 1
+
+
+def weights(size: int, smaller: int) -> NDArray[np.float64]:
+    """Of a triangle as wide as two small pixels to each side, [smaller, size]."""
+    scale = size / smaller
+    centres = (np.arange(smaller) + 0.5) * scale
+    triangle = np.maximum(0, 1 - np.abs(np.arange(size) + 0.5 - centres[:, None]) / scale)
+    return triangle / triangle.sum(1, keepdims=True)
+
+
+@pytest.mark.parametrize(("scale", "height", "width"), [(2, 16, 20), (3, 10, 13), (8, 4, 5)])
+def test_a_small_picture_is_the_filtered_one_from_the_same_place(scale: int, height: int, width: int) -> None:
+    camera = orbit_camera(0.3)
+    (image,) = soft_pictures(1, camera.height, camera.width, 5)
+    view = View("a.png", camera, image)
+    cameras, targets = Pictures([view], Targets([view], CPU), CPU, None).at(scale)
+    small = cameras[0]
+    assert (small.width, small.height) == (width, height)
+    rows, columns = weights(camera.height, height), weights(camera.width, width)
+    expected = np.einsum("ih,hwc,jw->ijc", rows, image / 1.0, columns)
+    assert np.abs(targets.get(0).numpy() - expected).max() <= 0.5 + 1e-4
+    x, y, z = camera.rotation @ np.array([0.1, -0.2, 0.3]) + camera.translation
+    across, down = (camera.fx * x / z + camera.cx) / camera.width, (camera.fy * y / z + camera.cy) / camera.height
+    assert (small.fx * x / z + small.cx) / width == pytest.approx(across)
+    assert (small.fy * y / z + small.cy) / height == pytest.approx(down)
+
+
+def scheduled(scene: Scene, kind: str = "pictures_and_count", **changes: object) -> Resolution:
+    return Resolution(options(resolution_schedule=kind, **(SHORT | changes)), scene.train, 100)
+
+
+def test_sizes_change_after_rounds_and_rates_wait_for_them(tiny_scene: Scene) -> None:
+    resolution = scheduled(tiny_scene)
+    scales = [resolution.scale(step) for step in range(1, 121)]
+    assert scales[0] >= 2
+    assert set(scales[:40]) == {scales[0]}  # the first round is at 40
+    for i in range(0, 100, 20):
+        assert len(set(scales[i : i + 20])) == 1
+    assert set(scales[100:]) == {1}
+    wait = resolution.levels.full_from
+    assert 0 < wait < 100
+    assert resolution.position_step(wait) == resolution.position_step(1) == 0
+    assert resolution.position_step(120) == 120
+    assert resolution.position_step((120 + wait) / 2) == pytest.approx(60)  # type: ignore[arg-type]
+
+
+def test_the_count_that_a_round_may_reach(tiny_scene: Scene) -> None:
+    resolution = scheduled(tiny_scene)
+    resolution.scale = lambda step: 3  # type: ignore[method-assign]
+
+    def limit(step: int, before: int, most: int | None = None) -> int:
+        event = RefineEvent(step=step, before=before)
+        return resolution.limit(Refinement(step, None, torch.Generator(), event), most)  # type: ignore[arg-type]
+
+    assert limit(40, 10_000) == 100 + int(500 / 3 ** (2 - 0.4))
+    assert limit(60, 10_000, most=4100) == 100 + int(4000 / 3 ** (2 - 0.6))
+    assert limit(80, 10_000, most=4100) == 4100  # the last round
+    assert limit(80, 1000, most=4100) == 1200
+    resolution.observe(RefineEvent(step=40, before=0, cloned=2, split_gradient=3, split_volume=4, blocked_by_cap=5))
+    assert resolution.momentum == int(0.98 * 500 + 14)
+    resolution.momentum = 50_000_000
+    resolution.observe(RefineEvent(step=40, before=0, cloned=5_000_000))
+    assert resolution.momentum == 50_000_000
+    resolution.momentum = 40_000_000
+    resolution.observe(RefineEvent(step=40, before=0, cloned=5_000_000))
+    assert resolution.momentum == int(0.98 * 40_000_000 + 1_000_000)
+
+
+def test_caps_of_a_curve_of_their_own_keep_it() -> None:
+    limits: list[int | None] = []
+
+    def limit(refinement: Refinement, most: int | None) -> int:
+        limits.append(most)
+        return 7
+
+    for cap, allowed, asked in (("soft", 2, [None]), ("hard", 2, [9]), ("curve", 0, []), ("governor", None, [])):
+        densifier = ADC(max_gaussians=9, cap=cap)  # type: ignore[arg-type]
+        gaussians = random_gaussians(5, 0)
+        densifier.begin(gaussians, DensifyContext(1.0, limit=limit))
+        event = RefineEvent(step=500, before=5)
+        limits.clear()
+        assert densifier.allowance(Refinement(500, gaussians, torch.Generator(), event)) == allowed  # type: ignore[arg-type]
+        assert limits == asked
+
+
+@pytest.fixture(scope="module")
+def rasterizer() -> Rasterizer:
+    return create_rasterizer("cpu", CPU, threads=1)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        small,
+        lambda: small(FastGS, error_threshold=0.05, least_count=0.0, max_gaussians=200),
+        lambda: small(SteepGS),
+        lambda: small(EdgeAware, max_gaussians=200, cap="root"),
+        lambda: MCMC(start=20, stop=110, interval=20),
+        lambda: MRNF(start=0, stop=110, interval=20, decay_until=120),
+        lambda: GNS(start=20, stop=60, interval=20, max_gaussians=90, pressure_length=1.0, overgrowth=2.0),
+    ],
+    ids=["adc", "fastgs", "steepgs", "edgeaware", "mcmc", "mrnf", "gns"],
+)
+def test_interrupted_in_the_middle_it_ends_in_the_same_bits(
+    make, tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:  # type: ignore[no-untyped-def]
+    settings = options(resolution_schedule="pictures_and_count", checkpoint_every=30, **SHORT)
+
+    def trainer(densifier: Densifier) -> Trainer:
+        return Trainer(tiny_scene, cloud(truth), densifier, rasterizer, settings, 0)
+
+    for name in ("whole", "broken"):
+        (tmp_path / name).mkdir()
+    whole = trainer(make()).run(tmp_path / "whole")
+
+    class StopError(Exception):
+        pass
+
+    def stop_at_70(status: Status) -> None:
+        if status.step == 70:
+            raise StopError
+
+    with pytest.raises(StopError):
+        trainer(make()).run(tmp_path / "broken", stop_at_70)
+    again = trainer(make())
+    assert same(whole, again.run(tmp_path / "broken"))
+    for name in ("events.jsonl",):
+        assert (tmp_path / "broken" / name).read_text() == (tmp_path / "whole" / name).read_text()
+    sizes = {record["scale"] for record in records(tmp_path / "whole" / "metrics.jsonl")}
+    assert 1 in sizes
+    assert max(sizes) >= 2
+
+
+def test_masks_are_as_small_as_their_pictures(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    """What a mask ignores has no part in a small picture either: whatever stands there, the training is the same."""
+    trained = []
+    for value in (0, 255):
+        views = []
+        for view in tiny_scene.train:
+            counts = np.ones(view.image.shape[:2], bool)
+            counts[:24, :28] = False
+            image = view.image.copy()
+            image[:3, :3] = value  # at half the size farther away than two windows of SSIM reach
+            views.append(replace(view, image=image, mask=counts))
+        scene = replace(tiny_scene, train=tuple(views))
+        folder = tmp_path / str(value)
+        folder.mkdir()
+        settings = options(resolution_schedule="pictures", iterations=30, position_steps=30, **SHORT)
+        trainer = Trainer(scene, cloud(truth), small(), rasterizer, settings, 0)
+        trainer.resolution.levels = Levels((0, 100), (2.0, 1.0))  # type: ignore[union-attr]
+        assert trainer.pictures.at(2)[1].mask(0).shape == (16, 20, 1)  # type: ignore[union-attr]
+        trained.append(trainer.run(folder))
+    assert same(*trained)
+
+
+def test_pictures_alone_leave_the_count_to_the_densifier(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    counts = {}
+    for kind in ("none", "pictures", "pictures_and_count"):
+        folder = tmp_path / kind
+        folder.mkdir()
+        settings = options(resolution_schedule=kind, **SHORT)
+        Trainer(tiny_scene, cloud(truth), small(), rasterizer, settings, 0).run(folder)
+        counts[kind] = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
+    assert any(event["blocked_by_cap"] for event in counts["pictures_and_count"])
+    assert not any(event["blocked_by_cap"] for event in counts["pictures"] + counts["none"])
+    for event in counts["pictures_and_count"]:
+        assert event["after"] <= 1.2 * event["before"]
+    assert "scale" not in records(tmp_path / "none" / "metrics.jsonl")[0]
+
+
+def test_it_is_an_ingredient_of_its_own_and_results_of_before_keep_their_hash() -> None:
+    without, with_it = composed(), composed("train.resolution_schedule=pictures")
+    assert config_hash(without) != config_hash(with_it)
+    earlier = {**without, "train": {k: v for k, v in without["train"].items() if k != "resolution_schedule"}}
+    assert config_hash(earlier) == config_hash(without)
+    plain = {"densify._target_": "gsbench.densify.ADC", "train.resolution_schedule": "none"}
+    assert ingredients(plain, plain | {"train.resolution_schedule": "pictures"}) == ("resolution schedule",)
+
+
+def test_a_name_that_is_none_is_refused() -> None:
+    with pytest.raises(
+        ValueError, match=r"train\.resolution_schedule must be 'none', 'pictures' or 'pictures_and_count'"
+    ):
+        TrainConfig(name="x", resolution_schedule="spectrum")  # type: ignore[arg-type]
