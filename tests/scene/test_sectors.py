@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,15 +14,9 @@ from gsbench.scene.columns import ANGLE, DISTANCE
 from gsbench.scene.courtyard.render import ring_camera
 from gsbench.scene.nearness import nearness
 from gsbench.scene.sectors import arrange, sector_of
+from tests.scene import cameras
 
-
-def looking(center: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Camera:
-    """A camera at ``center`` that looks at ``target``."""
-    forward = (target - center) / np.linalg.norm(target - center)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Camera(40, 30, 50.0, 50.0, 20.0, 15.0, rotation, -rotation @ center)
+looking = partial(cameras.looking, size=(40, 30), focal=50.0)
 
 
 def ring(degrees: list[float], radius: float = 3.0) -> list[Camera]:

@@ -48,9 +48,9 @@ class Dataset:
         return tuple(sorted(scene for archive in self.archives for scene in archive.scenes))
 
 
-def read_catalog(file: Path = CATALOG_FILE) -> dict[str, Dataset]:
-    """The data sets of a catalogue by name."""
-    content: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
+def read_catalog() -> dict[str, Dataset]:
+    """The data sets of gsbench's catalogue by name."""
+    content: dict[str, Any] = yaml.safe_load(CATALOG_FILE.read_text(encoding="utf-8"))
     return {name: _dataset(name, entry) for name, entry in content.items()}
 
 

@@ -184,7 +184,7 @@ class Fetcher:
         return f"{files.scene}: {describe(self.data, files, record)}: {news}; {verdict}"
 
     def _compare(self, files: SceneFiles, new: SceneRecord, known: SceneRecord | None, pinned: str | None) -> str:
-        """What can be said of the checksums; raises `InputError` where they are not those that are expected."""
+        """Words on the checksums; raises `InputError` where they are not those that are expected."""
         if pinned is not None:
             if new.sha256 != pinned:
                 raise InputError(

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from gsbench.init.colmap.alignment import Array
-from gsbench.scene.colmap import points_of, read_model
+from gsbench.scene.colmap import points_of
 
 SIDE_INCHES = 8.0
 DPI = 120
@@ -21,13 +21,8 @@ ROUND = 0.05  # second over first: below it they lie on a line
 VIEW_LINE = 0.06  # length of the lines of sight, as a share of the picture's side
 
 
-def plot_cloud(model_dir: Path, path: Path, title: str | None = None) -> None:
-    """Draw the COLMAP model in ``model_dir`` from above into the PNG ``path``; ``InputError`` if it cannot be read."""
-    draw_cloud(read_model(model_dir), path, title)
-
-
-def draw_cloud(model: pycolmap.Reconstruction, path: Path, title: str | None = None) -> None:
-    """Draw a model as `plot_cloud` does: points in their colours, cameras in red with their lines of sight."""
+def draw_cloud(model: pycolmap.Reconstruction, path: Path, title: str) -> None:
+    """Draw a model from above into the PNG ``path``: points in their colours, cameras in red with lines of sight."""
     points, colors = points_of(model)
     if len(points) > MAX_POINTS:
         chosen = np.random.default_rng(0).permutation(len(points))[:MAX_POINTS]
@@ -53,7 +48,7 @@ def draw_cloud(model: pycolmap.Reconstruction, path: Path, title: str | None = N
     plot.set_ylim(low[1], high[1])
     plot.set_aspect("equal")
     plot.set_xlabel("model units")
-    plot.set_title(title or f"{model.num_points3D():,} points, {len(images)} cameras, from above")
+    plot.set_title(title)
     figure.savefig(path, format="png", metadata={"Software": None})
 
 

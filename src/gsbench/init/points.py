@@ -92,14 +92,20 @@ def one_in_each_voxel(
 def seen_colors(points: Array, capture: Capture, model: pycolmap.Reconstruction) -> NDArray[np.int16]:
     """Colours [P, 3] of ``points`` in the photograph of the nearest training camera that they fall into; -1 in none.
 
-    What stands between is not looked for: the nearest camera is the least likely to have something there.
+    What stands between is not looked for: the nearest camera is the least likely to have something there. Pixels that
+    a mask ignores give no colour.
     """
     from gsbench.scene.images import read_image
+    from gsbench.scene.masks import read_mask
 
     colors = np.full((len(points), 3), -1, dtype=np.int16)
     nearest = np.full(len(points), np.inf)
     for name in capture.train_names:
         seen, pixels, distance = in_view(points, name, model)
+        if name in capture.masks and len(seen):
+            column, row = pixels.astype(np.int64).T
+            counts = read_mask(capture.masks[name])[row, column]  # [V]
+            seen, pixels, distance = seen[counts], pixels[counts], distance[counts]
         nearer = distance < nearest[seen]
         kept, (column, row) = seen[nearer], pixels[nearer].astype(np.int64).T
         if len(kept):

@@ -41,14 +41,15 @@ class Sfm(ColmapInitializer):
     guided_matching: bool = False
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
-        from gsbench.init.colmap.database import database_counts, strongest_descriptors
+        from gsbench.init.colmap.database import colmap_masks, database_counts, strongest_descriptors
         from gsbench.init.colmap.reconstruct import Verification
         from gsbench.init.colmap.sift import extract_sift
         from gsbench.init.colmap.sift_matching import match_sift
         from gsbench.init.preview import STRONGEST, proposed_pairs
 
         with timer.phase("extract"):
-            extract_sift(task.database, task.images, task.names, self, self.num_threads, progress)
+            masks = colmap_masks(task.capture.masks, task.work_dir)
+            extract_sift(task.database, task.images, task.names, self, self.num_threads, progress, masks)
         if database_counts(task.database)["features"] == 0:
             raise InputError(f"{self.name}: no keypoint in any image: lower init.peak_threshold, or check the photos")
         pairs, counts = task.pairs, {}

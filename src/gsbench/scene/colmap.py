@@ -15,6 +15,7 @@ from gsbench.scene.camera import Camera
 from gsbench.scene.colmap_files import check_model
 from gsbench.scene.images import check_size, image_size
 from gsbench.scene.names import match_names
+from gsbench.scene.prepare import CameraModel
 from gsbench.scene.types import Capture
 
 PINHOLE_MODELS = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
@@ -69,7 +70,7 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
 
     Only the images in ``capture.image_names`` remain, under those names; cameras (and 2D points) are rescaled to the
     sizes of the files, so a model of the full size serves ``images_4``; 3D points that fewer than two of the images see
-    are dropped. Images that the model has no pose for are left out.
+    are dropped, unless the model says of no point who sees it. Images that the model has no pose for are left out.
 
     Raises `InputError` if there is no model, or an image and its camera differ in aspect by more than rounding.
     """
@@ -144,14 +145,6 @@ def rescaled_camera(camera: pycolmap.Camera, width: int, height: int, camera_id:
     return copy
 
 
-def camera_of(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Camera:
-    """The pinhole camera of one registered image.
-
-    Raises `InputError` if its COLMAP camera is neither PINHOLE nor SIMPLE_PINHOLE.
-    """
-    return pinhole_camera(model.cameras[image.camera_id], image.cam_from_world())
-
-
 def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) -> Camera:
     """A COLMAP camera and pose as a `Camera`; `InputError` if the camera is not an undistorted pinhole."""
     if camera.model not in PINHOLE_MODELS:
@@ -168,12 +161,6 @@ def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) ->
     )
 
 
-def cameras_of(model: pycolmap.Reconstruction) -> dict[str, Camera]:
-    """The cameras of all registered images by name, sorted; `InputError` if one is not (SIMPLE_)PINHOLE."""
-    cameras = {image.name: camera_of(model, image) for image in model.images.values() if image.has_pose}
-    return dict(sorted(cameras.items()))
-
-
 def reference_cameras(model: pycolmap.Reconstruction, names: Iterable[str]) -> list[Camera]:
     """The poses of the registered images ``names``, with the focal lengths of their cameras, distorted or not.
 
@@ -187,11 +174,6 @@ def reference_cameras(model: pycolmap.Reconstruction, names: Iterable[str]) -> l
         places = (focal, focal, camera.width / 2, camera.height / 2)
         found.append(Camera(*size, *places, pose.rotation.matrix(), np.array(pose.translation)))
     return found
-
-
-def rigid_pose(camera: Camera) -> pycolmap.Rigid3d:
-    """The world-to-camera pose of a `Camera` in pycolmap's type."""
-    return pycolmap.Rigid3d(np.column_stack([camera.rotation, camera.translation]))
 
 
 def points_of(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
@@ -212,23 +194,35 @@ def write_model(
     ``cloud``, positions [P, 3] and colours [P, 3], becomes its points, which no image observes; without it there are
     none.
     """
+    frames = {}
+    for name, camera in cameras.items():
+        pinhole = CameraModel("PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy))
+        frames[name] = pinhole, camera.rotation, camera.translation
+    write_frames(folder, frames, text, cloud)
+
+
+def write_frames(
+    folder: Path,
+    frames: Mapping[str, tuple[CameraModel, NDArray[np.float64], NDArray[np.float64]]],
+    text: bool = False,
+    cloud: tuple[NDArray[np.float64], NDArray[np.uint8]] | None = None,
+) -> None:
+    """Write cameras of any model with their rotations [3, 3] and translations [3] from the world as a COLMAP model.
+
+    Equal cameras are one; ``cloud`` is that of `write_model`.
+    """
     model = pycolmap.Reconstruction()
-    ids: dict[tuple[float, ...], int] = {}
-    for image_id, (name, camera) in enumerate(sorted(cameras.items()), start=1):
-        intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        if intrinsics not in ids:
-            ids[intrinsics] = len(ids) + 1
+    ids: dict[CameraModel, int] = {}
+    for image_id, (name, (camera, rotation, translation)) in enumerate(sorted(frames.items()), start=1):
+        if camera not in ids:
+            ids[camera] = len(ids) + 1
+            size = {"width": camera.width, "height": camera.height}
             model.add_camera_with_trivial_rig(
-                pycolmap.Camera(
-                    camera_id=ids[intrinsics],
-                    model=pycolmap.CameraModelId.PINHOLE,
-                    width=camera.width,
-                    height=camera.height,
-                    params=list(intrinsics[2:]),
-                )
+                pycolmap.Camera(camera_id=ids[camera], model=camera.name, params=list(camera.params), **size)
             )
-        image = pycolmap.Image(name=name, camera_id=ids[intrinsics], image_id=image_id)
-        model.add_image_with_trivial_frame(image, rigid_pose(camera))
+        image = pycolmap.Image(name=name, camera_id=ids[camera], image_id=image_id)
+        pose = pycolmap.Rigid3d(np.column_stack([rotation, translation]))
+        model.add_image_with_trivial_frame(image, pose)
     for point, color in zip(*cloud, strict=True) if cloud is not None else ():
         model.add_point3D(point, pycolmap.Track(), color)
     folder.mkdir(parents=True, exist_ok=True)
@@ -236,9 +230,10 @@ def write_model(
 
 
 def _copy_points(model: pycolmap.Reconstruction, target: pycolmap.Reconstruction, image_ids: set[int]) -> None:
+    observed = any(point.track.elements for point in model.points3D.values())
     for point_id, point in sorted(model.points3D.items()):
         elements = [element for element in point.track.elements if element.image_id in image_ids]
-        if len(elements) < MIN_TRACK:
+        if observed and len(elements) < MIN_TRACK:
             continue
         copy = pycolmap.Point3D(xyz=point.xyz, color=point.color, error=point.error, track=pycolmap.Track(elements))
         target.add_point3D_with_id(point_id, copy)

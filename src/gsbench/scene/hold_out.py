@@ -18,12 +18,11 @@ Cameras = Callable[[Sequence[str]], Sequence[Camera]]
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Result of a rule on sorted names; ``words`` say how, ``put_away`` are test views that are not looked at."""
+    """Result of a rule on sorted names; ``words`` say how."""
 
     train: tuple[str, ...]
     test: tuple[str, ...]
     words: str
-    put_away: tuple[str, ...] = ()
 
 
 def hold_out(
@@ -41,7 +40,7 @@ def hold_out(
     again = replace(rule, split="every_nth", train_list=None, test_list=None) if rule.by_lists else rule
     learned, judged, how = _divide(train, again, (None, None), cameras)
     away = f"the {counted(len(test), 'test view')} ({words}) put away unseen"
-    return HeldOut(learned, judged, f"for validation {how}, with {away}", test)
+    return HeldOut(learned, judged, f"for validation {how}, with {away}")
 
 
 def _divide(

@@ -16,6 +16,7 @@ from gsbench.errors import InputError
 from gsbench.files import require_regular
 
 Resample = Literal["lanczos", "area", "bicubic"]
+Behind = Literal["black", "white"]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 # Formats of files with these names. Pillow would read some forty formats, whatever the name.
@@ -31,27 +32,27 @@ def image_size(path: Path) -> tuple[int, int]:
 
     Raises `InputError` if the file is missing or no image.
     """
-    with _open(path) as image:
+    with open_image(path) as image:
         return image.size
 
 
 def exif_orientation(path: Path) -> int:
     """The EXIF orientation tag, 1 (upright) where there is none that can be read."""
-    with _open(path) as image:
+    with open_image(path) as image:
         try:
             return int(image.getexif().get(EXIF_ORIENTATION, 1))
-        except Exception:  # noqa: BLE001 - as in `_open`; the pixels may be sound
+        except Exception:  # noqa: BLE001 - as in `open_image`; the pixels may be sound
             return 1
 
 
-def read_image(path: Path) -> NDArray[np.uint8]:
+def read_image(path: Path, behind: Behind = "black") -> NDArray[np.uint8]:
     """The image as [H, W, 3] uint8 RGB.
 
-    Grey and palette images become RGB, 16-bit values keep their high byte, and transparent pixels are laid over black
-    (the default background of 3DGS). Raises `InputError` if the file is missing, truncated, no image, or holds 32-bit
-    or float pixels.
+    Grey and palette images become RGB, 16-bit values keep their high byte, and transparent pixels are laid over what
+    is ``behind`` (black is the default background of 3DGS). Raises `InputError` if the file is missing, truncated, no
+    image, or holds 32-bit or float pixels.
     """
-    with _open(path) as image:
+    with open_image(path) as image:
         if image.mode in _WIDE_MODES:
             raise InputError(f"{path}: pixels of type {image.mode!r} have no defined white: convert it to 8-bit RGB")
         try:
@@ -63,7 +64,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
             return np.repeat(grey[..., None], 3, axis=2)
         if image.has_transparency_data:
             rgba = image.convert("RGBA")
-            image = Image.alpha_composite(Image.new("RGBA", rgba.size, (0, 0, 0, 255)), rgba)
+            image = Image.alpha_composite(Image.new("RGBA", rgba.size, behind), rgba)
         return np.array(image.convert("RGB"), dtype=np.uint8)
 
 
@@ -106,7 +107,8 @@ def same_up_to_rounding(size: tuple[int, int], reference: tuple[int, int]) -> bo
     return lowest <= highest
 
 
-def _open(path: Path) -> Image.Image:
+def open_image(path: Path) -> Image.Image:
+    """The image as Pillow opens it, pixels not read yet; raises `InputError` if the file is missing or no image."""
     require_regular(path)
     try:
         return Image.open(path, formats=FORMATS)

@@ -24,8 +24,9 @@ from gsbench.logs import Progress, no_progress
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import Resample, check_size, image_size, read_image
+from gsbench.scene.masks import Mask, read_mask
 from gsbench.scene.names import MIN_IMAGES
-from gsbench.scene.prepare import CameraModel, Intrinsics, Job, intrinsics_of, prepare_all
+from gsbench.scene.prepare import CameraModel, Intrinsics, Job, intrinsics_of, mask_file, prepare_all
 from gsbench.scene.sizes import downscaled_size
 from gsbench.scene.types import Capture, Scene, View
 from gsbench.words import some_of
@@ -64,6 +65,13 @@ def load_scene(
     entries = json.loads((folder / CAMERAS_FILE).read_text(encoding="utf-8"))["views"]
     _report_unregistered(capture, set(entries))
 
+    def mask_of(name: str) -> Mask | None:
+        if name not in capture.masks:
+            return None
+        file = entries[name]["file"]
+        counts = read_mask(folder / mask_file(file) if file else capture.masks[name])
+        return None if counts.all() else counts
+
     def view(name: str) -> View:
         entry = entries[name]
         image = read_image(folder / entry["file"] if entry["file"] else capture.images / name)
@@ -72,7 +80,7 @@ def load_scene(
             raise InputError(f"{folder}: {name} is not as it was prepared: delete this folder and run again")
         if principal_point == "centred":
             camera = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
-        return View(name=name, camera=camera, image=image)
+        return View(name, camera, image, mask_of(name))
 
     names = [name for name in capture.image_names if name in entries]
     with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
@@ -109,7 +117,8 @@ def _build(
             file = f"{index:05d}.png" if changed else ""
             entries[name] = {"file": file, "pose": pose}
             if changed:
-                jobs[name] = Job(capture.images / name, model, work / file, downscale, max_size, resample)
+                mask = capture.masks.get(name)
+                jobs[name] = Job(capture.images / name, model, work / file, downscale, max_size, resample, mask)
             else:
                 entries[name] |= asdict(intrinsics_of(model))
         for name, intrinsics in zip(jobs, prepare_all(list(jobs.values()), threads, progress), strict=True):

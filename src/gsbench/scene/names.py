@@ -25,14 +25,14 @@ def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
     files = set(files)
     by_stem: dict[str, list[str]] = defaultdict(list)
     for file in files:
-        by_stem[_stem(file)].append(file)
+        by_stem[stem_of(file)].append(file)
     matches: dict[str, str] = {}
     claims: dict[str, list[str]] = defaultdict(list)
     for name in wanted:
         if name in files:
             matches[name] = name
-        elif len(by_stem[_stem(name)]) == 1:
-            claims[by_stem[_stem(name)][0]].append(name)
+        elif len(by_stem[stem_of(name)]) == 1:
+            claims[by_stem[stem_of(name)][0]].append(name)
     taken = set(matches.values())
     matches.update({names[0]: file for file, names in claims.items() if len(names) == 1 and file not in taken})
     return matches
@@ -93,7 +93,8 @@ def split_names(
     return training, testing
 
 
-def _stem(name: str) -> str:
+def stem_of(name: str) -> str:
+    """The path of an image without its extension."""
     path = PurePosixPath(name)
     return (path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path).as_posix()
 

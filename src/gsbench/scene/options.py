@@ -9,6 +9,7 @@ from annotated_types import Ge, Interval
 from pydantic import NonNegativeInt, PositiveInt
 
 from gsbench.errors import InputError
+from gsbench.scene.images import Behind
 from gsbench.scene.sizes import MIN_SIZE, check_final_size
 from gsbench.scene.split import SECTORS, TEST_EVERY, SplitName, SplitRule
 from gsbench.settings import MISSING, FolderName, PathName, check_settings
@@ -19,10 +20,12 @@ MAX_SIZE = 16_384  # px, of a picture of the courtyard
 @dataclass
 class SceneConfig:
     name: FolderName = MISSING
-    kind: Literal["colmap", "photos", "courtyard"] = MISSING
+    kind: Literal["colmap", "photos", "transforms", "courtyard"] = MISSING
     path: PathName | None = None  # folder of the capture
     images: PathName | None = None  # image folder below path; null: images
     sparse: PathName | None = None  # model folder below path; null: sparse/0 or sparse
+    transparent: Behind = "black"  # what transparent pixels are laid over
+    masks: PathName | None = None  # folder below path of a mask for each image: black is ignored; null: all counts
     downscale: PositiveInt = 1  # divide both sides by it
     max_size: Annotated[int, Ge(MIN_SIZE)] | None = None  # longest side, px; never enlarges
     resample: Literal["lanczos", "area", "bicubic"] = "lanczos"
@@ -53,6 +56,8 @@ class SceneConfig:
                 "scene.split=sector needs the cameras, and these photographs came without: give a COLMAP model "
                 "(scene=colmap)"
             )
+        if self.kind == "courtyard" and self.masks is not None:
+            raise InputError("scene.masks: the courtyard's photographs are made here and have none: leave it out")
         if self.kind == "courtyard":
             check_final_size((self.width, self.height), self.downscale, self.max_size, "the courtyard")
 

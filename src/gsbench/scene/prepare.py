@@ -20,6 +20,7 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.images import Resample, read_image, resize_image
+from gsbench.scene.masks import WHITE, read_mask, resize_mask, write_mask
 from gsbench.scene.sizes import downscaled_size
 from gsbench.system.isolate import CrashError, run_isolated
 
@@ -60,7 +61,10 @@ class Intrinsics:
 
 @dataclass(frozen=True)
 class Job:
-    """One image to prepare: where it is, its camera (of the file's size), and the PNG to write."""
+    """One image to prepare: where it is, its camera (of the file's size), and the PNG to write.
+
+    The ``mask``, where there is one, is prepared with it, into `mask_file` beside the target.
+    """
 
     source: Path
     camera: CameraModel
@@ -68,6 +72,12 @@ class Job:
     downscale: int = 1
     max_size: int | None = None
     resample: Resample = "lanczos"
+    mask: Path | None = None
+
+
+def mask_file(image_file: str) -> str:
+    """The name of the prepared mask of a prepared image."""
+    return Path(image_file).with_suffix(".mask.png").name
 
 
 def intrinsics_of(camera: CameraModel) -> Intrinsics:
@@ -115,7 +125,21 @@ def prepare_image(job: Job) -> Intrinsics:
     image = resize_image(image, width, height, job.resample)
     job.target.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(image).save(job.target, format="PNG", compress_level=_PNG_COMPRESSION)
+    if job.mask is not None:
+        _prepare_mask(job.mask, job, width, height)
     return intrinsics.resized(width, height)
+
+
+def _prepare_mask(source: Path, job: Job, width: int, height: int) -> None:
+    """Write the mask as the image is: a pixel counts where nothing ignored is mixed into its own area."""
+    counts = read_mask(source)
+    if job.camera.distorted:
+        levels = np.repeat(counts[..., None].astype(np.uint8) * WHITE, 3, axis=2)  # [H, W, 3]
+        counts = undistort(levels, job.camera)[0][..., 0] == WHITE
+    counts = resize_mask(counts, width, height)
+    if not counts.any():
+        raise InputError(f"{source}: no pixel is left that counts at {width}x{height} px: leave its image out")
+    write_mask(counts, job.target.with_name(mask_file(job.target.name)))
 
 
 def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np.uint8], Intrinsics]:

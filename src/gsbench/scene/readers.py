@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 from gsbench.datasets.catalog import how_to_get
 from gsbench.errors import InputError
@@ -14,8 +16,10 @@ from gsbench.files import require_regular
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.hold_out import Cameras, hold_out
 from gsbench.scene.images import IMAGE_SUFFIXES
+from gsbench.scene.masks import check_sizes, find_masks
 from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, check_picture_names, match_names, select_images
 from gsbench.scene.split import EVERY_NTH, TEST_LIST, TRAIN_LIST, SplitRule
+from gsbench.scene.transforms import Transforms
 from gsbench.scene.types import Capture
 from gsbench.words import some_of
 
@@ -32,11 +36,13 @@ def read_colmap(
     max_images: int = MAX_IMAGES,
     split: SplitRule = EVERY_NTH,
     exact_poses: bool = False,
+    masks: str | None = None,
 ) -> Capture:
     """Read a COLMAP folder: ``path/<images>`` (else "images") and ``path/<sparse>`` (else "sparse/0" or "sparse").
 
     The photos are those that the model has a pose for and that are in the folder; a file may have another extension
-    than the model says. See `select_images` for which are kept and `SplitRule` for which are held out.
+    than the model says. See `select_images` for which are kept and `SplitRule` for which are held out. ``masks`` is the
+    folder of their masks below ``path`` (see `gsbench.scene.masks.find_masks`).
 
     Raises `InputError` if a folder is missing, the model is damaged, or fewer than three photos are usable.
     """
@@ -47,7 +53,8 @@ def read_colmap(
     folder = _subfolder(root, images or "images", "scene.images")
     model = read_model(model_folder)
     wanted = registered_names(model)
-    matches = match_names(wanted, list_images(folder))
+    mask_folder, there = _beside_masks(root, folder, masks)
+    matches = match_names(wanted, there)
     missing = [image for image in wanted if image not in matches]
     if missing:
         log.warning(
@@ -57,8 +64,37 @@ def read_colmap(
     files = {file: image for image, file in matches.items()}
     return _capture(
         name, folder, sorted(matches.values()), model_folder, exact_poses, max_images, split, root,
-        lambda names: reference_cameras(model, [files[file] for file in names]),
+        lambda names: reference_cameras(model, [files[file] for file in names]), mask_folder, there,
     )  # fmt: skip
+
+
+def read_transforms(
+    name: str,
+    path: Path | str,
+    said: Transforms,
+    model: Path,
+    max_images: int = MAX_IMAGES,
+    split: SplitRule = EVERY_NTH,
+    masks: str | None = None,
+) -> Capture:
+    """Read the photographs that ``transforms.json`` in ``path`` names, with the cameras in the COLMAP folder ``model``.
+
+    ``said`` is what `gsbench.scene.transforms.read_transforms` reads of the file, ``model`` what
+    `gsbench.scene.colmap.write_frames` makes of that. ``split=list`` takes the views that the file, or
+    its part in Blender's scenes, says. ``masks`` is a folder of masks; without it those that the file names are taken.
+    """
+    from gsbench.scene.colmap import read_model, reference_cameras
+
+    root = existing_folder(name, path)
+    names = list(said.frames)
+    _require_enough(len(names), root, "that its transforms.json names are")
+    own = {image: frame.mask for image, frame in said.frames.items() if frame.mask is not None}
+    capture = _capture(
+        name, root, names, model, False, max_images, split, root,
+        lambda chosen: reference_cameras(read_model(model), chosen),
+        None if masks is None else _subfolder(root, masks, "scene.masks"), names, own, said.split,
+    )  # fmt: skip
+    return replace(capture, read_from=said.sources)
 
 
 def read_photos(
@@ -67,10 +103,12 @@ def read_photos(
     images: str | None = None,
     max_images: int = MAX_IMAGES,
     split: SplitRule = EVERY_NTH,
+    masks: str | None = None,
 ) -> Capture:
     """Read bare photographs: all images in ``path/<images>``, or ``path/images`` if there is one, or ``path``.
 
-    Sub-folders are read too. Any COLMAP model beside them is left alone.
+    Sub-folders are read too, but for ``masks``, the folder of their masks below ``path``. Any COLMAP model beside them
+    is left alone.
 
     Raises `InputError` if the folder is missing or holds fewer than three images.
     """
@@ -79,9 +117,19 @@ def read_photos(
         folder = _subfolder(root, images, "scene.images")
     else:
         folder = root / "images" if (root / "images").is_dir() else root
-    names = list_images(folder)
+    mask_folder, names = _beside_masks(root, folder, masks)
     _require_enough(len(names), folder, f"({', '.join(sorted(s[1:] for s in IMAGE_SUFFIXES))})")
-    return _capture(name, folder, names, None, False, max_images, split, root)
+    return _capture(name, folder, names, None, False, max_images, split, root, None, mask_folder, names)
+
+
+def _beside_masks(root: Path, folder: Path, masks: str | None) -> tuple[Path | None, list[str]]:
+    """The folder of masks, and the images in ``folder`` that are none."""
+    if masks is None:
+        return None, list_images(folder)
+    home = _subfolder(root, masks, "scene.masks")
+    if home.resolve() == folder.resolve():
+        raise InputError(f"scene.masks: {home} is the folder of the images: put the masks into one of their own")
+    return home, [name for name in list_images(folder) if not (folder / name).resolve().is_relative_to(home.resolve())]
 
 
 def existing_folder(name: str, path: Path | str) -> Path:
@@ -134,11 +182,20 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
         return []
 
 
-def fingerprint(folder: Path, names: Iterable[str], model_files: Iterable[Path] = ()) -> str:
-    """sha256 over names and contents of the images, sorted, and of the model's files; independent of where they lie."""
+def fingerprint(
+    folder: Path,
+    names: Iterable[str],
+    model_files: Iterable[Path] = (),
+    masks: Mapping[str, Path] = MappingProxyType({}),
+) -> str:
+    """sha256 over names and contents of the images, sorted, of the model's files and of ``masks`` by image.
+
+    It is independent of where they lie.
+    """
     digest = hashlib.sha256()
     entries = [(f"image/{name}", folder / name) for name in sorted(names)]
     entries += [(f"model/{file.name}", file) for file in sorted(model_files)]
+    entries += [(f"mask/{name}", file) for name, file in sorted(masks.items())]
     for label, file in entries:
         require_regular(file)
         try:
@@ -160,8 +217,12 @@ def _capture(
     split: SplitRule,
     root: Path,
     cameras: Cameras | None = None,
+    mask_folder: Path | None = None,
+    there: Sequence[str] = (),
+    own_masks: Mapping[str, Path] = MappingProxyType({}),
+    own_split: tuple[list[str], list[str]] | None = None,
 ) -> Capture:
-    lists = _read_lists(root, split)
+    lists = own_split if own_split and split.asks_the_capture else _read_lists(root, split)
     train, test = (None if wanted is None else _resolve(wanted, names, folder) for wanted in lists)
     if train is not None and test is not None:
         names = sorted({*train, *test})
@@ -169,6 +230,10 @@ def _capture(
     kept = tuple(sorted([*held_out.train, *held_out.test]))
     check_picture_names(held_out.test, folder)
     _require_enough(len(kept), folder, "in the split lists" if split.by_lists else "left by the split")
+    masks = {image: own_masks[image] for image in kept if image in own_masks}
+    if mask_folder is not None:
+        masks = find_masks(mask_folder, kept, there)
+    check_sizes(folder, masks)
     return Capture(
         name=name,
         images=folder,
@@ -176,8 +241,9 @@ def _capture(
         test_names=held_out.test,
         model=model,
         exact_poses=exact_poses,
-        fingerprint=fingerprint(folder, kept, model_files(model) if model is not None else ()),
+        fingerprint=fingerprint(folder, kept, model_files(model) if model is not None else (), masks),
         held_out=held_out.words,
+        masks=masks,
     )
 
 

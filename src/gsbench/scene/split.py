@@ -36,6 +36,11 @@ class SplitRule:
     def by_lists(self) -> bool:
         return self.split == "list" or self.train_list is not None or self.test_list is not None
 
+    @property
+    def asks_the_capture(self) -> bool:
+        """Return whether a capture that says itself what it holds out is to be followed."""
+        return self.split == "list" and self.train_list is None and self.test_list is None
+
     def check(self) -> None:
         """Raise InputError for settings that contradict each other."""
         lists = [key for key in ("train_list", "test_list") if getattr(self, key) is not None]

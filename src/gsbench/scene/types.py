@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -23,6 +23,8 @@ class Capture:
     of them held out. ``model`` is a COLMAP sparse folder with reference cameras, or None for bare photographs;
     ``exact_poses`` says that its poses are the truth (a procedural scene), not an estimate. ``fingerprint`` is a sha256
     over names and contents of all that was selected. ``held_out`` says in words which views are the test views.
+    ``masks`` are the files of the images' masks by name; none where every pixel counts. ``read_from`` are further files
+    of the user's that say which cameras there are.
     """
 
     name: str
@@ -33,6 +35,8 @@ class Capture:
     exact_poses: bool
     fingerprint: str
     held_out: str = ""
+    masks: Mapping[str, Path] = field(default_factory=dict)
+    read_from: tuple[Path, ...] = ()
 
     @property
     def train_names(self) -> tuple[str, ...]:
@@ -42,11 +46,21 @@ class Capture:
 
 @dataclass(frozen=True)
 class View:
-    """One photograph with its camera; ``image`` is [H, W, 3] uint8, sRGB."""
+    """One photograph with its camera; ``image`` is [H, W, 3] uint8, sRGB.
+
+    ``mask`` [H, W] is True where a pixel counts, None where all do; the others hold what `gsbench.scene.masks.fill`
+    made.
+    """
 
     name: str
     camera: Camera
     image: NDArray[np.uint8]
+    mask: NDArray[np.bool_] | None = None
+
+    @property
+    def counted(self) -> float:
+        """The share of pixels that count."""
+        return 1.0 if self.mask is None else float(self.mask.mean())
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,12 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.scene.colmap import cameras_of, read_model
+from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.layout import BOX, SPHERE, build_layout
 from gsbench.scene.courtyard.render import courtyard_cameras, render_courtyard, render_view, surface_distance
 from gsbench.scene.load import load_scene
 from gsbench.scene.readers import read_colmap
+from tests.scene.cameras import cameras_of
 
 
 @pytest.fixture(scope="module")

@@ -45,6 +45,19 @@ def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
     return folder
 
 
+def colmap_masks(masks: Mapping[str, Path], work_dir: Path) -> Path | None:
+    """A folder below ``work_dir`` of links to the masks of images by name, as COLMAP names them; None for no masks."""
+    if not masks:
+        return None
+    folder = work_dir / "masks"
+    shutil.rmtree(folder, ignore_errors=True)
+    for name, file in masks.items():
+        link = folder / f"{name}.png"
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(file.resolve())
+    return folder
+
+
 def reference_groups(reference: pycolmap.Reconstruction) -> list[tuple[pycolmap.Camera, list[str]]]:
     """The reference's cameras, taken as known, each with the images that have a pose, in order of their names."""
     groups: dict[int, list[str]] = {}

@@ -189,7 +189,7 @@ def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:
 
 
 def _is_plausible(model: pycolmap.Reconstruction) -> bool:
-    """Whether points are seen under angles that tell their depth; copies of one photograph give none."""
+    """Return whether points are seen under angles that tell their depth; copies of one photograph give none."""
     centers = {image.image_id: image.projection_center() for image in model.images.values() if image.has_pose}
     angles = [_widest_angle(point, centers) for point in model.points3D.values() if point.track.length() > 1]
     return bool(angles) and float(np.median(angles)) >= MIN_ANGLE_DEG

@@ -36,9 +36,18 @@ class SiftSettings(Protocol):
 
 
 def extract_sift(
-    database: Path, images: Path, names: Sequence[str], sift: SiftSettings, threads: int, progress: Progress
+    database: Path,
+    images: Path,
+    names: Sequence[str],
+    sift: SiftSettings,
+    threads: int,
+    progress: Progress,
+    masks: Path | None = None,
 ) -> None:
-    """Detect and describe keypoints in the images ``names``, which are in the database."""
+    """Detect and describe keypoints in the images ``names``, which are in the database.
+
+    ``masks`` is a folder of masks as COLMAP names them: there are no keypoints where they are black.
+    """
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = threads
@@ -47,11 +56,19 @@ def extract_sift(
     options.sift.peak_threshold = sift.peak_threshold
     options.sift.edge_threshold = sift.edge_threshold
     options.sift.first_octave = sift.first_octave
+    reading = pycolmap.ImageReaderOptions()
+    if masks is not None:
+        reading.mask_path = masks
     progress("extract", 0, len(names))
     size = max(IMAGES_PER_CALL, IMAGES_PER_THREAD * threads)
     for start in range(0, len(names), size):
         part = list(names[start : start + size])
         pycolmap.extract_features(
-            database, images, image_names=part, extraction_options=options, device=pycolmap.Device.cpu
+            database,
+            images,
+            image_names=part,
+            reader_options=reading,
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
         )
         progress("extract", start + len(part), len(names))

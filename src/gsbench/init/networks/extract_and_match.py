@@ -20,6 +20,7 @@ from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.init.networks.matching import build_matcher, match_within_memory
 from gsbench.init.preview import STRONGEST, proposed_pairs
 from gsbench.logs import Progress
+from gsbench.scene.masks import read_mask
 from gsbench.scene.types import Capture
 
 CACHE_BYTES = 1 << 30  # of descriptors held in memory while pairs are matched
@@ -49,7 +50,7 @@ def open_store(job: NetworkJob) -> FeatureStore:
     """The store of features and matches for the job's settings and weights."""
     extraction = {**job.settings.extraction(), "weights": _digest(job.extractor_weights)}
     matching = {**job.settings.matching(), "weights": _digest(job.matcher_weights)}
-    return FeatureStore(job.work_dir, job.capture.images, extraction, matching)
+    return FeatureStore(job.work_dir, job.capture.images, extraction, matching, job.capture.masks)
 
 
 def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
@@ -152,6 +153,8 @@ def _extract_all(
             extractor = extractor or build_extractor(settings, job.extractor_weights, device)
             path = job.capture.images / name
             features = extract_features(path, extractor, settings.max_image_size, settings.max_keypoints, device)
+            if name in job.capture.masks:
+                features = features.within(read_mask(job.capture.masks[name]))
             store.write_features(name, features)
         if len(features.keypoints) == 0:
             empty.append(name)

@@ -11,13 +11,14 @@ import zipfile
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.errors import GsbenchError
-from gsbench.files import atomic
+from gsbench.files import atomic, file_sha256
 from gsbench.init.networks.features import Features
 
 KEY_DIGITS = 24
@@ -27,11 +28,19 @@ FORMAT_VERSION = 1  # to be raised when the same settings give other features
 class FeatureStore:
     """Store of features and matches below ``folder``: ``features/<key>.npz`` and ``matches/<key>.npy``.
 
-    ``extraction`` and ``matching`` are the settings (plain values) that features and matches depend on.
+    ``extraction`` and ``matching`` are the settings (plain values) that features and matches depend on, ``masks`` those
+    of images by name.
     """
 
-    def __init__(self, folder: Path, images: Path, extraction: Mapping[str, Any], matching: Mapping[str, Any]) -> None:
-        self.folder, self.images = folder, images
+    def __init__(
+        self,
+        folder: Path,
+        images: Path,
+        extraction: Mapping[str, Any],
+        matching: Mapping[str, Any],
+        masks: Mapping[str, Path] = MappingProxyType({}),
+    ) -> None:
+        self.folder, self.images, self.masks = folder, images, masks
         self._extraction, self._matching = dict(extraction), dict(matching)
         for part in ("features", "matches"):
             (folder / part).mkdir(parents=True, exist_ok=True)
@@ -96,7 +105,8 @@ class FeatureStore:
 
     def _hash_image(self, name: str) -> str:
         content = hashlib.sha256((self.images / name).read_bytes()).hexdigest()
-        return _key([FORMAT_VERSION, content, self._extraction])
+        masks = [file_sha256(self.masks[name])] if name in self.masks else []
+        return _key([FORMAT_VERSION, content, self._extraction, *masks])
 
 
 def _key(value: object) -> str:

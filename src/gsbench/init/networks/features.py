@@ -28,6 +28,14 @@ class Features:
         scale = np.array(self.file_size, dtype=np.float64) / self.network_size
         return ((self.keypoints.astype(np.float64) + 0.5) * scale).astype(np.float32)
 
+    def within(self, mask: NDArray[np.bool_]) -> Features:
+        """The features on pixels that count in ``mask`` [H, W], which is of the file's size."""
+        height, width = mask.shape
+        columns, rows = np.floor(self.colmap_keypoints).astype(np.int64).T  # [K] each
+        kept = mask[rows.clip(0, height - 1), columns.clip(0, width - 1)]
+        chosen = self.keypoints[kept], self.descriptors[kept], self.scores[kept]
+        return Features(*chosen, self.network_size, self.file_size)
+
     def strongest(self, count: int) -> Features:
         """The first ``count`` features."""
         return Features(

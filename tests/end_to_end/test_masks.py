@@ -1,0 +1,193 @@
+"""Masks in whole trials: not one bit of an ignored pixel enters one, an edited mask makes a new one."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import shutil
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from gsbench.cli import run
+from gsbench.init import Dim, Sfm, SiftKornia
+from gsbench.init.base import MODEL_FOLDER
+from gsbench.init.colmap.initializer import ColmapInitializer
+from gsbench.scene.colmap import read_model
+from gsbench.scene.courtyard.render import render_courtyard
+from gsbench.scene.masks import read_mask
+from gsbench.scene.readers import read_colmap
+from tests.end_to_end.conftest import trial_of
+
+SIZE = 192, 144
+QUICK = [
+    "scene=colmap", "densify=adc", "train.iterations=80", "train.densify_start=20", "train.densify_interval=20",
+    "train.densify_stop=70", "eval.download=false", "eval.lpips=[]", "tracking=none", "device=cpu", "scene.masks=masks",
+]  # fmt: skip
+SIFT = ["init=sfm", "init.first_octave=0", "init.max_num_features=1500", "init.two_view_tracks=true"]
+SAME = ("point_cloud.ply", "events.jsonl", "lineage.npz", "per_view.csv")
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A COLMAP folder with masks of a disc that wanders and of a margin, and the same with noise below them."""
+    folder = tmp_path_factory.mktemp("masked")
+    clean, noisy = folder / "clean", folder / "noisy"
+    width, height = SIZE
+    render_courtyard(clean, views=10, width=width, height=height)
+    rows, columns = np.mgrid[:height, :width]
+    (clean / "masks").mkdir()
+    names = sorted(path.name for path in (clean / "images").iterdir())
+    for place, name in enumerate(names):
+        ignored = ((rows - 70) ** 2 + (columns - 40 - 10 * place) ** 2 < 30**2) | (rows > 130)
+        Image.fromarray(np.where(ignored, 0, 255).astype(np.uint8)).save(clean / "masks" / f"{name}.png")
+    shutil.copytree(clean, noisy)
+    rng = np.random.default_rng(0)
+    for name in names:
+        ignored = np.asarray(Image.open(clean / "masks" / f"{name}.png")) == 0
+        pixels = np.array(Image.open(clean / "images" / name))
+        pixels[ignored] = rng.integers(0, 256, (ignored.sum(), 3))
+        Image.fromarray(pixels).save(noisy / "images" / name)
+    return clean, noisy
+
+
+trial = partial(trial_of, QUICK)
+
+
+def bits(folder: Path) -> dict[str, str]:
+    names = [*SAME, *(f"{kind}/{file.name}" for kind in ("renders", "masks") for file in (folder / kind).iterdir())]
+    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        SIFT,
+        pytest.param(["init=sift_kornia"], marks=pytest.mark.slow),
+        pytest.param([*SIFT, "scene.max_size=96"], marks=pytest.mark.slow),
+        pytest.param(
+            ["init=random", "densify=taming", "init.count=3000", "densify.max_gaussians=6000"], marks=pytest.mark.slow
+        ),
+        pytest.param(["init=random", "densify=fastgs"], marks=pytest.mark.slow),
+        pytest.param(["init=random", "train.resolution_schedule=pictures"], marks=pytest.mark.slow),
+    ],
+    ids=["sfm", "kornia", "smaller", "taming", "fastgs", "schedule"],
+)
+def test_not_one_bit_under_a_mask_enters_a_trial(captures: tuple[Path, Path], tmp_path: Path, words: list[str]) -> None:
+    folders = [trial(tmp_path, capture, *words) for capture in captures]
+    assert bits(folders[0]) == bits(folders[1])
+    clean, noisy = (json.loads((folder / "results.json").read_text()) for folder in folders)
+    assert clean["hashes"]["data"] != noisy["hashes"]["data"], "the photographs differ, and results say so"
+    for key in ("metrics", "num_init_points", "num_gaussians", "causes", "events"):
+        assert clean.get(key) == noisy.get(key), key
+    clouds = [_points(folder) for folder in folders]
+    assert clouds[0] == clouds[1]
+    with (folders[0] / "per_view.csv").open() as stream:
+        shares = [float(row["counted"]) for row in csv.DictReader(stream)]
+    assert all(0.5 < share < 0.9 for share in shares)
+
+
+def _points(folder: Path) -> dict[str, str]:
+    """The digests of the cloud and the cameras that the trial began with."""
+    key = json.loads((folder / "results.json").read_text())["hashes"]["init"]
+    model = folder.parents[3] / "store" / "init" / key / MODEL_FOLDER
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in model.iterdir()}
+
+
+@pytest.mark.slow
+def test_without_masks_the_noise_is_seen(captures: tuple[Path, Path], tmp_path: Path) -> None:
+    """So the test above can fail."""
+    clean, noisy = (trial(tmp_path, capture, *SIFT, "scene.masks=null") for capture in captures)
+    digests = [hashlib.sha256((folder / "point_cloud.ply").read_bytes()).hexdigest() for folder in (clean, noisy)]
+    assert digests[0] != digests[1]
+    assert "counted" not in (clean / "per_view.csv").read_text()
+    assert not (clean / "masks").exists()
+
+
+def test_an_edited_mask_makes_the_trial_anew_and_one_that_is_put_back_finds_it(
+    captures: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capture = tmp_path / "edited"
+    shutil.copytree(captures[0], capture)
+    words = ["init=random", "init.count=500", "densify=none", "train.iterations=5"]
+    folder = trial(tmp_path / "runs", capture, *words)
+    first = json.loads((folder / "results.json").read_text())
+    mask = sorted((capture / "masks").iterdir())[3]  # of a training view
+    before = mask.read_bytes()
+    pixels = np.array(Image.open(mask))
+    pixels[:60] = 0
+    Image.fromarray(pixels).save(mask)
+    capsys.readouterr()
+    trial(tmp_path / "runs", capture, *words)
+    assert "was done" not in capsys.readouterr().err
+    second = json.loads((folder / "results.json").read_text())
+    assert first["hashes"]["train"] != second["hashes"]["train"]
+    assert first["hashes"]["config"] == second["hashes"]["config"]
+    mask.write_bytes(before)
+    trial(tmp_path / "runs", capture, *words)
+    assert json.loads((folder / "results.json").read_text())["hashes"] == first["hashes"]
+
+
+def test_bad_masks_end_in_one_line_before_any_work(
+    captures: tuple[Path, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    capture = tmp_path / "bad"
+    shutil.copytree(captures[0], capture)
+    mask = sorted((capture / "masks").iterdir())[2]
+
+    def said(*words: str) -> str:
+        capfd.readouterr()
+        assert run([*QUICK, f"scene.path={capture}", f"runs={tmp_path / 'runs'}", *words]) != 0
+        lines = [line for line in capfd.readouterr().err.splitlines() if str(capture) in line]
+        return lines[-1]
+
+    Image.new("L", SIZE, 0).save(mask)
+    assert f"{mask}: the mask is black all over" in said("init=random")
+    Image.new("L", (20, 20), 255).save(mask)
+    assert f"{mask}: the mask is 20x20 px" in said("init=random")
+    mask.unlink()
+    assert f"add {mask.name}" in said("init=random")
+    assert "no such folder; set scene.masks to one of: images, masks, sparse" in said("init=random", "scene.masks=msk")
+
+
+def test_another_program_is_refused_with_masks(captures: tuple[Path, Path], tmp_path: Path, capfd) -> None:
+    words = ["init=random", "densify=external/program", "densify.command='echo {data} {output}'"]
+    words += ["allow_targets=[echo]", "densify.version=1", "densify.result=point_cloud.ply", f"runs={tmp_path}"]
+    assert run([*[word for word in QUICK if "densify" not in word], f"scene.path={captures[0]}", *words]) != 0
+    assert "another program is not told of masks" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("make", [Sfm, SiftKornia, Dim])
+def test_no_keypoint_is_on_an_ignored_pixel(
+    captures: tuple[Path, Path], tmp_path: Path, make: type[ColmapInitializer], request: pytest.FixtureRequest
+) -> None:
+    """Without `prepare`, so that there is something to be found below the masks."""
+    options = {"init": {"first_octave": 0, "max_num_features": 1500}, "net": {"max_keypoints": 500}}
+    words = options["init" if make is Sfm else "net"] | {"two_view_tracks": True}
+    if make is Dim:
+        words |= {"extractor": "aliked", "matcher": "mutual_nearest", "aliked_model": "t16", "download": False}
+        words |= {"weights": request.getfixturevalue("shared") / "weights"}
+    capture = read_colmap("masked", captures[0], masks="masks")
+    work = tmp_path / "work"
+    try:
+        make(threads=1, **words).run(capture, tmp_path / "out", work_dir=work)
+    except Exception as error:
+        if make is Dim and "weights" in str(error):
+            pytest.skip(str(error))
+        raise
+    seen = 0
+    with pycolmap.Database.open(work / "database.db") as database:
+        for image in database.read_all_images():
+            points = np.floor(database.read_keypoints(image.image_id)[:, :2]).astype(int)
+            counts = read_mask(capture.masks[image.name])
+            height, width = counts.shape
+            inside = counts[points[:, 1].clip(0, height - 1), points[:, 0].clip(0, width - 1)]
+            assert inside.all(), image.name
+            seen += len(points)
+    assert seen > 200
+    assert len(read_model(tmp_path / "out" / MODEL_FOLDER).points3D) > 0

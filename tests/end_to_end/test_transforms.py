@@ -1,0 +1,147 @@
+"""A COLMAP scene written as transforms.json by other code, and read back: the same cameras, the same training."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from gsbench.cli import run
+from gsbench.init import Sfm
+from gsbench.init.base import MODEL_FOLDER
+from gsbench.pipeline.steps.capture import CaptureSource
+from gsbench.scene.courtyard.render import render_courtyard
+from gsbench.scene.load import load_scene
+from gsbench.scene.options import SceneConfig
+from gsbench.scene.readers import read_colmap
+from gsbench.scene.types import Scene
+
+# What `ns-process-data` does to COLMAP's coordinates: x and y exchanged, z turned round.
+APPLIED = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
+QUICK = [
+    "init=dataset", "train.iterations=40", "train.densify_start=10", "train.densify_interval=10",
+    "train.densify_stop=30", "eval.download=false", "eval.lpips=[]", "tracking=none", "device=cpu",
+]  # fmt: skip
+
+
+def as_nerfstudio(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write the model's cameras and points beside ``folder``/images as nerfstudio's documents describe the format."""
+    frames: list[dict[str, Any]] = []
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        focal, cx, cy, *radial = camera.params if camera.model_name == "SIMPLE_RADIAL" else camera.params[[0, 2, 3]]
+        world_from_camera = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
+        world_from_camera[:, 1:3] *= -1  # OpenCV to OpenGL: y and z turn round
+        matrix = np.vstack([APPLIED, [0, 0, 0, 1]]) @ world_from_camera
+        own = {"w": camera.width, "h": camera.height, "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy}
+        own |= {"k1": radial[0], "k2": 0.0, "p1": 0.0, "p2": 0.0} if radial else {}
+        frames.append({"file_path": f"images/{image.name}", "transform_matrix": matrix.tolist()} | own)
+    points = [point for _, point in sorted(model.points3D.items())]
+    rows = [[*(APPLIED[:, :3] @ point.xyz), *point.color] for point in points]
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n" + "".join(f"property double {c}\n" for c in "xyz")
+    header += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
+    lines = [" ".join([*map(repr, map(float, row[:3])), *map(str, map(int, row[3:]))]) for row in rows]
+    (folder / "sparse_pc.ply").write_text(header + "\n".join(lines) + "\n")
+    document = {"camera_model": "OPENCV", "frames": frames, "applied_transform": APPLIED.tolist()}
+    (folder / "transforms.json").write_text(json.dumps(document | {"ply_file_path": "sparse_pc.ply"}))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a COLMAP model with points, and the same as transforms.json."""
+    folder = tmp_path_factory.mktemp("transforms") / "yard"
+    render_courtyard(folder, views=10, width=192, height=144)
+    sfm = Sfm(threads=1, first_octave=0, max_num_features=1500, two_view_tracks=True)
+    sfm.run(read_colmap("courtyard", folder), folder.parent / "sfm")
+    shutil.rmtree(folder / "sparse")
+    shutil.copytree(folder.parent / "sfm" / MODEL_FOLDER, folder / "sparse" / "0")
+    as_nerfstudio(pycolmap.Reconstruction(folder / "sparse" / "0"), folder)
+    return folder
+
+
+def trial(runs: Path, kind: str, folder: Path, *words: str) -> Path:
+    assert run([*QUICK, f"scene={kind}", f"scene.path={folder}", f"runs={runs}", f"name={kind}", *words]) == 0
+    (found,) = {path.parent for path in (runs / kind).glob("*/*/*/results.json")}
+    return found
+
+
+def test_the_training_is_that_of_the_colmap_scene(scene: Path, tmp_path: Path) -> None:
+    colmap = trial(tmp_path, "colmap", scene)
+    read = trial(tmp_path, "transforms", scene)
+    first, second = (json.loads((folder / "results.json").read_text()) for folder in (colmap, read))
+    assert first["num_init_points"] == second["num_init_points"] > 100
+    assert first["scene_extent"] == pytest.approx(second["scene_extent"], rel=1e-9)
+    assert first["metrics"]["psnr"] == pytest.approx(second["metrics"]["psnr"], abs=0.02)
+    for view in (colmap / "ground_truth").iterdir():
+        stem = f"images__{view.name}"
+        same = [np.asarray(Image.open(path)) for path in (view, read / "ground_truth" / stem)]
+        np.testing.assert_array_equal(*same)
+        pair = [
+            np.asarray(Image.open(path)).astype(int)
+            for path in (colmap / "renders" / view.name, read / "renders" / stem)
+        ]
+        assert np.abs(pair[0] - pair[1]).mean() < 0.5  # levels
+
+
+def test_an_edited_file_makes_the_trial_anew(scene: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "edited"
+    shutil.copytree(scene, folder)
+    words = ["densify=none", "train.iterations=3"]
+    before = trial(tmp_path / "runs", "transforms", folder, *words)
+    digest = hashlib.sha256((before / "point_cloud.ply").read_bytes()).hexdigest()
+    document = json.loads((folder / "transforms.json").read_text())
+    for frame in document["frames"]:
+        frame["fl_x"] *= 1.02
+    (folder / "transforms.json").write_text(json.dumps(document))
+    after = trial(tmp_path / "runs", "transforms", folder, *words)
+    assert after == before
+    assert hashlib.sha256((after / "point_cloud.ply").read_bytes()).hexdigest() != digest
+
+
+def test_without_points_the_file_says_which_initialiser(scene: Path, tmp_path: Path, capfd) -> None:
+    folder = tmp_path / "bare"
+    shutil.copytree(scene, folder)
+    document = json.loads((folder / "transforms.json").read_text())
+    document.pop("ply_file_path")
+    (folder / "transforms.json").write_text(json.dumps(document))
+    assert run([*QUICK, "scene=transforms", f"scene.path={folder}", f"runs={tmp_path / 'runs'}"]) != 0
+    assert "has no points: use init=sfm or init=random" in capfd.readouterr().err
+    assert trial(tmp_path / "runs", "transforms", folder, "init=random", "init.count=500")
+
+
+def _scene(capture: Any, cache: Path) -> Scene:
+    return load_scene(capture, capture.model, cache, max_size=300)
+
+
+def test_photographs_with_distortion_come_out_the_same(shared: Path, tmp_path: Path) -> None:
+    """Real photographs: COLMAP's SIMPLE_RADIAL as nerfstudio's OPENCV with k1."""
+    source = shared / "data" / "herz_jesus_p25"
+    folder = tmp_path / "church"
+    folder.mkdir()
+    (folder / "images").symlink_to(source / "images")
+    model = pycolmap.Reconstruction(source / "sparse" / "0")
+    assert {camera.model_name for camera in model.cameras.values()} == {"SIMPLE_RADIAL"}
+    as_nerfstudio(model, folder)
+    config = SceneConfig(name="church", kind="transforms", path=str(folder), max_images=6)
+    captured = CaptureSource(config)
+    assert captured.step is not None
+    (tmp_path / "made").mkdir()
+    captured.step.build(tmp_path / "made")
+    read = _scene(captured.read(tmp_path / "made"), tmp_path / "cache")
+    first = _scene(read_colmap("church", source, max_images=6), tmp_path / "cache")
+    assert len(read.train) == len(first.train) == 5
+    for one, other in zip(first.train, read.train, strict=True):
+        assert other.name == f"images/{one.name}"
+        np.testing.assert_allclose(one.camera.rotation, other.camera.rotation, atol=1e-12)
+        np.testing.assert_allclose(one.camera.translation, other.camera.translation, atol=1e-11)
+        for key in ("width", "height", "fx", "fy", "cx", "cy"):
+            assert math.isclose(getattr(one.camera, key), getattr(other.camera, key), rel_tol=1e-12)
+        assert np.abs(one.image.astype(int) - other.image).max() <= 1

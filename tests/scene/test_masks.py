@@ -1,0 +1,255 @@
+"""Masks: which file belongs to which photograph, what is no mask, and what is left of what they hide."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.scene.load import load_scene
+from gsbench.scene.masks import fill, find_masks, prepare, prepared_mask, read_mask, resize_mask
+from gsbench.scene.options import SceneConfig
+from gsbench.scene.readers import read_colmap, read_photos
+from gsbench.scene.types import Capture
+
+MakeScene = Callable[..., Path]
+
+
+def save(path: Path, pixels: np.ndarray, **options: object) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, **options)
+    return path
+
+
+def half(width: int = 40, height: int = 30) -> np.ndarray:
+    """A mask [H, W] that ignores the left half."""
+    mask = np.full((height, width), 255, dtype=np.uint8)
+    mask[:, : width // 2] = 0
+    return mask
+
+
+def with_masks(root: Path, naming: Callable[[str], str] = lambda name: f"{name}.png") -> Path:
+    for path in sorted((root / "images").rglob("*.*")):
+        save(root / "masks" / naming(path.relative_to(root / "images").as_posix()), half(*Image.open(path).size))
+    return root
+
+
+@pytest.mark.parametrize("naming", [lambda name: f"{name}.png", lambda name: f"{name.rpartition('.')[0]}.png"])
+@pytest.mark.parametrize("read", [read_colmap, read_photos])
+def test_masks_are_found_by_the_names_of_colmap_and_of_nerfstudio(make_scene: MakeScene, naming, read) -> None:
+    names = tuple(f"cam/{k}.jpg" for k in range(4))
+    capture = read("toy", with_masks(make_scene(names=names), naming), masks="masks")
+    root = capture.images.parent
+    assert capture.masks == {name: root / "masks" / naming(name) for name in names}
+    assert capture.image_names == names
+
+
+def test_colmaps_name_wins_and_a_shared_stem_is_refused(tmp_path: Path) -> None:
+    for name in ("a.jpg.png", "a.png"):
+        save(tmp_path / name, half())
+    assert find_masks(tmp_path, ["a.jpg"], ["a.jpg"]) == {"a.jpg": tmp_path / "a.jpg.png"}
+    assert find_masks(tmp_path, ["a.jpg"], ["a.jpg", "a.tif"]) == {"a.jpg": tmp_path / "a.jpg.png"}
+    with pytest.raises(InputError, match=r"a\.png fits several images: name that of a\.tif a\.tif\.png"):
+        find_masks(tmp_path, ["a.jpg", "a.tif"], ["a.jpg", "a.tif"])
+
+
+def test_masks_below_bare_photographs_are_no_photographs(make_scene: MakeScene) -> None:
+    root = with_masks(make_scene()) / "images"
+    (root.parent / "masks").rename(root / "masks")
+    capture = read_photos("toy", root, masks="masks")
+    assert capture.image_names == tuple(f"{k:02d}.png" for k in range(6))
+    with pytest.raises(InputError, match="is the folder of the images"):
+        read_photos("toy", root, images=".", masks=".")
+
+
+def test_a_missing_mask_and_a_missing_folder_are_named(make_scene: MakeScene) -> None:
+    root = with_masks(make_scene())
+    (root / "masks" / "03.png.png").unlink()
+    with pytest.raises(InputError, match=r"no mask of 03\.png in .*masks: add 03\.png\.png \(all white") as caught:
+        read_colmap("toy", root, masks="masks")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match=r"no such folder; set scene\.masks to one of: images, masks, sparse"):
+        read_colmap("toy", root, masks="mask")
+
+
+def test_a_mask_of_another_size_is_refused(make_scene: MakeScene) -> None:
+    root = with_masks(make_scene())
+    path = save(root / "masks" / "02.png.png", half(20, 15))
+    with pytest.raises(InputError, match=rf"{path}: the mask is 20x15 px and its image 02\.png 40x30"):
+        read_colmap("toy", root, masks="masks")
+
+
+def test_the_courtyard_has_no_masks() -> None:
+    with pytest.raises(InputError, match="courtyard"):
+        SceneConfig(name="courtyard", kind="courtyard", masks="masks")
+
+
+@pytest.mark.parametrize(
+    ("pixels", "options", "counts"),
+    [
+        (half(), {}, half() > 0),
+        (half() // 255, {}, half() > 0),  # labels 0 and 1
+        (half() > 0, {}, half() > 0),  # one bit
+        (np.repeat(half()[..., None], 3, axis=2), {}, half() > 0),
+        (half().astype(np.uint16) * 257, {}, half() > 0),
+        (np.full((5, 7), 255, np.uint8), {}, np.ones((5, 7), bool)),
+        (np.full((5, 7), 1, np.uint8), {}, np.ones((5, 7), bool)),
+    ],
+)
+def test_black_is_ignored_and_all_else_counts(tmp_path: Path, pixels, options, counts) -> None:
+    np.testing.assert_array_equal(read_mask(save(tmp_path / "m.png", pixels, **options)), counts)
+
+
+def test_a_mask_in_a_palette_or_with_opaque_alpha_is_read(tmp_path: Path) -> None:
+    Image.fromarray(half()).convert("P").save(tmp_path / "p.png")
+    Image.fromarray(half()).convert("RGBA").save(tmp_path / "a.png")
+    for name in ("p.png", "a.png"):
+        np.testing.assert_array_equal(read_mask(tmp_path / name), half() > 0)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "said"),
+    [
+        (np.zeros((5, 7), np.uint8), "black all over"),
+        (np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8), "in colours, and no mask"),
+        (np.random.default_rng(0).integers(0, 256, (20, 30), dtype=np.uint8), "% of its pixels are grey"),
+        (np.stack([half(), half(), half(), half()], -1), "not by transparency"),
+    ],
+)
+def test_what_is_no_mask_is_refused_in_one_line_that_names_it(tmp_path: Path, pixels, said) -> None:
+    path = save(tmp_path / "m.png", pixels)
+    with pytest.raises(InputError, match=said) as caught:
+        read_mask(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_damaged_mask_is_refused(tmp_path: Path) -> None:
+    path = save(tmp_path / "m.png", np.random.default_rng(0).integers(0, 2, (64, 64), dtype=np.uint8) * 255)
+    path.write_bytes(path.read_bytes()[:-60])
+    with pytest.raises(InputError, match=r"m\.png: the mask is damaged"):
+        read_mask(path)
+    path.write_text("white")
+    with pytest.raises(InputError, match=r"m\.png: not a readable image"):
+        read_mask(path)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 23), st.integers(1, 23), st.integers(0, 2**32 - 1))
+def test_what_is_filled_in_owes_nothing_to_what_was_there(height: int, width: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    counts = rng.random((height, width)) < rng.random()
+    counts[rng.integers(height), rng.integers(width)] = True
+    one, other = rng.integers(0, 256, (2, height, width, 3), dtype=np.uint8)
+    other[counts] = one[counts]
+    filled = fill(one, counts)
+    np.testing.assert_array_equal(filled, fill(other, counts))
+    np.testing.assert_array_equal(filled[counts], one[counts])
+    low, high = one[counts].min(axis=0), one[counts].max(axis=0)
+    assert ((filled >= low) & (filled <= high)).all(), "means of what counts"
+
+
+def test_a_plane_is_filled_with_its_own_colour_and_a_ramp_without_a_step() -> None:
+    plain = np.full((50, 60, 3), (10, 200, 90), dtype=np.uint8)
+    counts = np.ones((50, 60), bool)
+    counts[10:40, 15:45] = False
+    np.testing.assert_array_equal(fill(np.where(counts[..., None], plain, 0).astype(np.uint8), counts), plain)
+    ramp = np.repeat(np.repeat(np.linspace(0, 240, 60)[None, :, None], 50, 0), 3, 2).astype(np.uint8)
+    filled = fill(ramp, counts).astype(int)
+    assert np.abs(np.diff(filled[25, :, 0])).max() < 60, "black in its place would make a step of 180"
+
+
+@pytest.mark.parametrize(("width", "height"), [(25, 18), (10, 9), (20, 12), (17, 13)])
+def test_a_resized_pixel_counts_where_all_in_its_area_do(width: int, height: int) -> None:
+    """In its area is what has its centre there; what has it on the edge may belong to either side."""
+    counts = np.random.default_rng(1).random((36, 50)) > 0.05
+    found = resize_mask(counts, width, height)
+
+    def centres(place: int, sides: int, of: int, slack: float) -> list[int]:
+        low, high = place * of / sides - slack, (place + 1) * of / sides + slack
+        return [k for k in range(of) if low < k + 0.5 < high]
+
+    for row in range(height):
+        for column in range(width):
+            inner, outer = (
+                counts[np.ix_(centres(row, height, 36, slack), centres(column, width, 50, slack))].all()
+                for slack in (-1e-6, 1e-6)
+            )
+            assert outer <= found[row, column] <= inner
+
+
+def prepared(root: Path, folder: Path, **options: object) -> Capture:
+    """The capture as the pipeline hands it on: `prepare` has been over it."""
+    capture = read_colmap("toy", root, masks="masks", **options)  # type: ignore[arg-type]
+    for name in capture.image_names:
+        prepare(folder, capture.images, capture.masks, name)
+    masks = {name: prepared_mask(folder, name) for name in capture.masks}
+    return Capture(**(vars(capture) | {"images": folder / "images", "masks": masks}))
+
+
+def test_views_have_their_masks_at_the_final_size(make_scene: MakeScene, tmp_path: Path) -> None:
+    capture = prepared(with_masks(make_scene()), tmp_path / "made")
+    as_is = load_scene(capture, capture.model, tmp_path / "cache")  # type: ignore[arg-type]
+    small = load_scene(capture, capture.model, tmp_path / "cache", downscale=2)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(as_is.train[0].mask, half() > 0)
+    np.testing.assert_array_equal(small.train[0].mask, half(20, 15) > 0)
+    assert small.train[0].counted == 0.5
+    again = load_scene(capture, capture.model, tmp_path / "cache", downscale=2)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(again.train[0].mask, small.train[0].mask)
+
+
+def test_a_mask_is_undistorted_with_its_photograph(make_scene: MakeScene, tmp_path: Path) -> None:
+    """A photograph that is as its mask, white and black, stays so: a pixel counts where it is white."""
+    root = make_scene(size=(120, 90), model="SIMPLE_RADIAL", params=(100, 60, 45, 0.15))
+    for path in (root / "images").iterdir():
+        disc = np.hypot(*np.mgrid[-45:45, -60:60]) > 20
+        save(path, np.repeat(disc[..., None] * np.uint8(255), 3, axis=2))
+        save(root / "masks" / f"{path.name}.png", disc * np.uint8(255))
+    raw = read_colmap("toy", root, masks="masks")
+    scene = load_scene(raw, raw.model, tmp_path / "cache")  # type: ignore[arg-type]
+    view = scene.train[0]
+    assert view.mask is not None
+    assert view.mask.shape != (90, 120), "undistorting changes the size"
+    np.testing.assert_array_equal(view.mask, view.image[..., 0] == 255)
+
+
+def test_a_mask_of_which_nothing_is_left_is_named(make_scene: MakeScene, tmp_path: Path) -> None:
+    root = with_masks(make_scene(size=(320, 240)))
+    mask = np.zeros((240, 320), np.uint8)
+    mask[100:103, 100:103] = 255
+    save(root / "masks" / "04.png.png", mask)
+    capture = read_colmap("toy", root, masks="masks")
+    with pytest.raises(InputError, match=r"04\.png\.png: no pixel is left that counts at 32x24 px"):
+        load_scene(capture, capture.model, tmp_path / "cache", downscale=10)  # type: ignore[arg-type]
+
+
+def test_the_fingerprint_knows_masks_and_is_as_before_without(make_scene: MakeScene) -> None:
+    root = make_scene()
+    before = read_colmap("toy", root).fingerprint
+    with_masks(root)
+    first = read_colmap("toy", root, masks="masks").fingerprint
+    save(root / "masks" / "01.png.png", 255 - half())
+    assert len({before, first, read_colmap("toy", root, masks="masks").fingerprint}) == 3
+    assert read_colmap("toy", root).fingerprint == before
+
+
+def test_what_is_prepared_keeps_exif_and_is_a_photograph_to_colmap(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = "Canon", "Canon EOS"
+    exif.get_ifd(0x8769)[0xA405] = 35  # focal length in 35 mm film
+    image = Image.fromarray(np.full((30, 45, 3), 90, np.uint8))
+    (tmp_path / "in").mkdir()
+    image.save(tmp_path / "in" / "a.jpg", exif=exif.tobytes())
+    save(tmp_path / "m.png", half(45, 30))
+    prepare(tmp_path / "out", tmp_path / "in", {"a.jpg": tmp_path / "m.png"}, "a.jpg")
+    cameras = [pycolmap.infer_camera_from_image(tmp_path / place / "a.jpg") for place in ("in", "out/images")]
+    assert cameras[0].has_prior_focal_length
+    assert cameras[1].has_prior_focal_length
+    assert cameras[0].params.tolist() == cameras[1].params.tolist()
