@@ -17,8 +17,9 @@ from torch import Tensor
 
 from gsbench.errors import InputError, TrainingError
 from gsbench.eval.facts import LPIPS, METRICS, MORE, MetricFacts, facts_of, further_keys, lpips_variants
+from gsbench.eval.images import as_unit_range, where_counted
 from gsbench.eval.measures import Conditions
-from gsbench.eval.metric import Metric, UnavailableError
+from gsbench.eval.metric import MaskedMetric, Metric, UnavailableError
 from gsbench.eval.protocol import Protocol
 
 
@@ -72,21 +73,32 @@ class Evaluator:
                 self._leave_out(facts.key, error)
         self._metrics |= extra
 
-    def evaluate_view(self, render: NDArray[Any] | Tensor, ground_truth: NDArray[Any] | Tensor) -> dict[str, float]:
+    def evaluate_view(
+        self,
+        render: NDArray[Any] | Tensor,
+        ground_truth: NDArray[Any] | Tensor,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> dict[str, float]:
         """The metrics of one view; images are [H, W, 3], uint8 or floating point in [0, 1].
+
+        Where ``mask`` [H, W] is False the render is not looked at: it gets the photograph's pixels before anything is
+        measured, and the metrics that are means over pixels leave these out (see `MaskedMetric`).
 
         A metric that cannot be computed is absent and stands in ``unavailable``. Raises ``TrainingError`` where the
         render holds a non-finite value.
         """
         image, target = self._prepare(render), self._prepare(ground_truth)  # [H, W, 3]
+        counts = None if mask is None else torch.as_tensor(mask, device=self.device)  # [H, W]
+        image = where_counted(image, target, None if counts is None else counts[..., None])
         if border := self.protocol.crop:
             image, target = (x[border:-border, border:-border] for x in (image, target))
+            counts = None if counts is None else counts[border:-border, border:-border]
         values = {}
         for key, metric in self._metrics.items():
             if key in self.unavailable:
                 continue
             try:
-                value = self._measured(key, metric, image, target)
+                value = self._measured(key, metric, image, target, counts)
                 if not math.isfinite(value):
                     raise UnavailableError(f"the value of a view is {value}")
                 values[key] = value
@@ -94,9 +106,13 @@ class Evaluator:
                 self._leave_out(key, error)
         return values
 
-    def _measured(self, key: str, metric: Metric, image: Tensor, target: Tensor) -> float:
+    def _measured(self, key: str, metric: Metric, image: Tensor, target: Tensor, counts: Tensor | None) -> float:
         try:
-            value: Any = metric.measure(image, target)
+            value: Any
+            if counts is not None and isinstance(metric, MaskedMetric):
+                value = metric.measure_masked(image, target, counts)
+            else:
+                value = metric.measure(image, target)
         except SystemExit as error:
             raise InputError(f"eval.extra.{key} ended the process (exit code {error.code}): it must return") from error
         if isinstance(value, Tensor | np.ndarray | np.generic) and math.prod(value.shape) == 1:
@@ -118,11 +134,11 @@ class Evaluator:
             if not self.protocol.eight_bit:
                 return tensor.float().clamp(0, 1)
             tensor = quantize(tensor)
-        return tensor.float() / 255
+        return as_unit_range(tensor, torch.float32)
 
 
 def _load(facts: MetricFacts, conditions: Conditions) -> Metric:
-    """What computes one of gsbench's own metrics; raises UnavailableError where it lacks something."""
+    """Make one of gsbench's own metrics; raises UnavailableError where it lacks something."""
     module, _, name = facts.target.rpartition(".")
     metric: Metric = getattr(importlib.import_module(module), name)(conditions, **facts.options)
     return metric

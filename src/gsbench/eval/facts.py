@@ -120,6 +120,19 @@ METRICS = (
     _structural("iw_ssim", "IW-SSIM", 1, "IwSsim", 1.0, "the same, weighted by the information that a place carries"),
     _structural("fsim", "FSIMc", 1, "Fsim", 1.0, "edges and lines: phase congruency, contrast and colour there"),
     _structural("gmsd", "GMSD", -1, "Gmsd", 0.5, "how unevenly the gradients agree"),
+    MetricFacts(
+        "dists",
+        "DISTS",
+        -1,
+        3,
+        "",
+        0.005,
+        True,
+        setting=MORE,
+        target=f"{MEASURES}.DistsMetric",
+        lowest=0.0,
+        words="textures and structures that vgg sees, wherever a texture's grains lie",
+    ),
 )
 
 

@@ -1,4 +1,4 @@
-"""Helpers that metrics share: the shapes of a pair of images, and the luminance of RGB."""
+"""Helpers that metrics and the loss share: values, masks and shapes of images, and the luminance of RGB."""
 
 from __future__ import annotations
 
@@ -6,6 +6,19 @@ import torch
 from torch import Tensor
 
 LUMA = (0.299, 0.587, 0.114)  # of red, green and blue: ITU-R BT.601
+
+
+def as_unit_range(image: Tensor, dtype: torch.dtype) -> Tensor:
+    """``image`` as ``dtype``; 8-bit values are divided by 255."""
+    return image.to(dtype) / 255 if image.dtype == torch.uint8 else image.to(dtype)
+
+
+def where_counted(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    """``image`` [H, W, 3] with the pixels of ``target`` (uint8 or floating) where ``mask`` [H, W, 1] is False.
+
+    Both are equal there, so those pixels are no error and have no gradient; None: all pixels count.
+    """
+    return image if mask is None else torch.where(mask, image, as_unit_range(target, image.dtype))
 
 
 def as_batch(image: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsbench.errors import InputError
@@ -173,7 +174,7 @@ class Lpips:
         self.net = net
         self.backbone = BACKBONES[net]
         stack = self.backbone.build()
-        _load_features(stack, features, net)
+        load_features(stack, features, f"lpips {net}")
         last = max(self.backbone.taps)
         self._layers = stack[: last + 1].requires_grad_(False).eval().to(device)
         self._heads = [head.to(device) for head in _head_weights(self.backbone, heads, net)]  # [C] each
@@ -182,19 +183,22 @@ class Lpips:
         self.device = torch.device(device)
 
     @torch.no_grad()
-    def __call__(self, first: Tensor, second: Tensor) -> Tensor:
+    def __call__(self, first: Tensor, second: Tensor, mask: Tensor | None = None) -> Tensor:
         """Distances [B] of two batches [B, 3, H, W], which are fed to the network as they are.
 
         LPIPS is defined for inputs in [-1, 1]: pass ``2 * x - 1`` for images in [0, 1]. The evaluation of 3DGS passes
         [0, 1] itself, which is what a metric named ``..._raw`` does here.
+
+        With a ``mask`` [H, W], each layer's mean over places is weighted by the share of a place's pixels that count.
         """
         if first.shape != second.shape or first.ndim != 4 or first.shape[1] != 3:
             raise ValueError(f"lpips compares batches [B, 3, H, W], got {tuple(first.shape)} and {tuple(second.shape)}")
         if min(first.shape[-2:]) < self.backbone.min_size:
             raise ValueError(f"lpips {self.net} needs sides of at least {self.backbone.min_size} px")
-        return torch.stack([self._pair(a[None], b[None]) for a, b in zip(first, second, strict=True)])  # [B]
+        weights = None if mask is None else mask.to(self.device, torch.float32)[None, None]  # [1, 1, H, W]
+        return torch.stack([self._pair(a[None], b[None], weights) for a, b in zip(first, second, strict=True)])  # [B]
 
-    def _pair(self, first: Tensor, second: Tensor) -> Tensor:
+    def _pair(self, first: Tensor, second: Tensor, weights: Tensor | None = None) -> Tensor:
         """The distance [] of two images [1, 3, H, W], which pass the layers in step, so that no features are kept."""
         first, second = (
             (image.to(self.device, torch.float32) - self._shift) / self._scale for image in (first, second)
@@ -204,7 +208,10 @@ class Lpips:
         for index, layer in enumerate(self._layers.children()):
             first, second = layer(first), layer(second)  # [1, C, h, w] each
             if index in self.backbone.taps:
-                total = total + _feature_distance(first, second, next(heads))
+                here = (
+                    None if weights is None else F.adaptive_avg_pool2d(weights, (first.shape[2], first.shape[3]))[0, 0]
+                )  # [h, w]
+                total = total + _feature_distance(first, second, next(heads), here)
         return total
 
 
@@ -213,12 +220,12 @@ def load_lpips(
 ) -> Lpips:
     """An LPIPS network from weights in ``folder``, the usual places or a download; may raise ``MissingWeights``."""
     backbone = BACKBONES[net]
-    features = _find_any(backbone.features, folder, download)
+    features = find_any(backbone.features, folder, download)
     heads = find_weights(backbone.heads, folder, download)
     return Lpips(net, load_state(features), load_state(heads), device)
 
 
-def _find_any(specs: tuple[WeightsFile, ...], folder: Path | None, download: bool) -> Path:
+def find_any(specs: tuple[WeightsFile, ...], folder: Path | None, download: bool) -> Path:
     """The first of ``specs`` that is at hand; else the first of all, downloaded where allowed."""
     for spec in specs[1:]:
         try:
@@ -228,8 +235,15 @@ def _find_any(specs: tuple[WeightsFile, ...], folder: Path | None, download: boo
     return find_weights(specs[0], folder, download)
 
 
-def _feature_distance(first: Tensor, second: Tensor, head: Tensor) -> Tensor:
-    """Spatial mean of the weighted squared difference of unit feature vectors; maps [1, C, h, w], head [C]."""
+def _feature_distance(first: Tensor, second: Tensor, head: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Spatial mean of the weighted squared difference of unit feature vectors; maps [1, C, h, w], head [C].
+
+    ``weights`` [h, w] are those of the places in the mean; None: all equal.
+    """
+    if weights is not None:
+        first, second = (x / (x.square().sum(dim=1, keepdim=True).sqrt() + NORM_EPSILON) for x in (first, second))
+        places = ((first - second).square()[0] * head[:, None, None]).sum(dim=0)  # [h, w]
+        return (places * weights).sum().double() / weights.sum().double()
     total = torch.zeros((), dtype=torch.float64 if first.device.type == "cpu" else torch.float32, device=first.device)
     for a, b in zip(first[0].split(ROWS_AT_A_TIME, dim=1), second[0].split(ROWS_AT_A_TIME, dim=1), strict=True):
         a = a / (a.square().sum(dim=0).sqrt() + NORM_EPSILON)  # [C, rows, w]
@@ -239,14 +253,13 @@ def _feature_distance(first: Tensor, second: Tensor, head: Tensor) -> Tensor:
     return total / (first.shape[2] * first.shape[3])
 
 
-def _load_features(stack: nn.Sequential, state: Mapping[str, Tensor], net: str) -> None:
+def load_features(stack: nn.Sequential, state: Mapping[str, Tensor], who: str) -> None:
+    """Load a backbone's published weights into its layers; raises InputError naming ``who`` for those of another."""
     expected = stack.state_dict().keys()
     renamed = {key.removeprefix("features."): value for key, value in state.items()}
     missing = [key for key in expected if key not in renamed]
     if missing:
-        raise InputError(
-            f"the weights of lpips {net} lack {missing[0]!r} and {len(missing) - 1} more: not that network"
-        )
+        raise InputError(f"the weights of {who} lack {missing[0]!r} and {len(missing) - 1} more: not that network")
     stack.load_state_dict({key: renamed[key].float() for key in expected})
 
 

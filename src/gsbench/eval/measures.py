@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from gsbench.eval import fsim, gmsd, multiscale
+from gsbench.eval.dists import VGG, load_dists
 from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import UnavailableError
-from gsbench.eval.metrics import flip, psnr
+from gsbench.eval.metrics import flip, flip_map, psnr
 from gsbench.eval.protocol import Protocol
-from gsbench.eval.ssim import ssim
+from gsbench.eval.ssim import masked_ssim, ssim
 from gsbench.weights import MissingWeights
 
 
@@ -52,6 +53,9 @@ class Psnr:
     def measure(self, image: Tensor, truth: Tensor) -> float:
         return min(float(psnr(_exact(image), _exact(truth))), self._cap)
 
+    def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
+        return self.measure(image[mask][None], truth[mask][None])
+
 
 class Ssim:
     """Structural similarity with the protocol's padding."""
@@ -62,6 +66,9 @@ class Ssim:
     def measure(self, image: Tensor, truth: Tensor) -> float:
         return float(ssim(_exact(image), _exact(truth), self._padding))
 
+    def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
+        return float(masked_ssim(_exact(image), _exact(truth), mask, self._padding))
+
 
 class LpipsMetric:
     """LPIPS by one network, fed [-1, 1] as it is defined or, ``raw``, [0, 1]."""
@@ -70,11 +77,17 @@ class LpipsMetric:
         self._network, self._raw = conditions.network(net), raw
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
+        return self._distance(image, truth)
+
+    def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
+        return self._distance(image, truth, mask)
+
+    def _distance(self, image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
         _need_size(image, self._network.backbone.min_size)
         first, second = (x.permute(2, 0, 1).unsqueeze(0) for x in (image, truth))  # [1, 3, H, W] each
-        if self._raw:
-            return float(self._network(first, second))
-        return float(self._network(2 * first - 1, 2 * second - 1))
+        if not self._raw:
+            first, second = 2 * first - 1, 2 * second - 1
+        return float(self._network(first, second, mask))
 
 
 class Flip:
@@ -88,6 +101,9 @@ class Flip:
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
         return float(flip(image, truth, self._ppd))
+
+    def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
+        return float(flip_map(image, truth, self._ppd)[mask].mean())
 
 
 class Structural:
@@ -121,6 +137,20 @@ class Fsim(Structural):
 
 class Gmsd(Structural):
     function, smallest = staticmethod(gmsd.gmsd), gmsd.MIN_SIZE
+
+
+class DistsMetric:
+    """DISTS, by VGG16 and its own weights, where these are at hand."""
+
+    def __init__(self, conditions: Conditions) -> None:
+        try:
+            self._network = load_dists(conditions.weights, conditions.download, conditions.device)
+        except MissingWeights as error:
+            raise UnavailableError(str(error), awaited=True) from None
+
+    def measure(self, image: Tensor, truth: Tensor) -> float:
+        _need_size(image, VGG.min_size)
+        return float(self._network(image, truth))
 
 
 def _need_size(image: Tensor, smallest: int) -> None:

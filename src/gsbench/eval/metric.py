@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -31,8 +31,21 @@ class Metric(Protocol):
     def measure(self, image: Tensor, truth: Tensor) -> float:
         """The value of one view; both are [H, W, 3], float32 in [0, 1], on the evaluation's device.
 
-        They hold what the protocol compares: images rounded to 8 bits. May raise `UnavailableError`.
+        They hold what the protocol compares: images rounded to 8 bits. May raise `UnavailableError`. Where a mask
+        ignores pixels, both images have the same there.
         """
+        ...
+
+
+@runtime_checkable
+class MaskedMetric(Metric, Protocol):
+    """Metric that can leave out the pixels that a mask ignores.
+
+    Any other is given equal pixels there, and counts them.
+    """
+
+    def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
+        """The value of one view over the pixels that count: ``mask`` [H, W] bool, and the images of `measure`."""
         ...
 
 

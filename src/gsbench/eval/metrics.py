@@ -41,3 +41,13 @@ def flip(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
     ]
     values = torch.tensor(means, device=image.device)  # [B]
     return values[0] if image.ndim == 3 else values
+
+
+def flip_map(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
+    """The FLIP error of every pixel, [H, W], of images [H, W, 3]; otherwise as `flip`."""
+    import flip_evaluator
+
+    check_pair(image, target)
+    test, reference = (x.float().cpu().contiguous().numpy() for x in (image, target))
+    errors, *_ = flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False, parameters={"ppd": ppd})
+    return torch.as_tensor(errors, device=image.device).reshape(image.shape[:2])

@@ -10,15 +10,17 @@ from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.images import image_size, read_image
+from gsbench.scene.masks import read_mask
 
 
 @dataclass(frozen=True)
 class Pair:
-    """A view with the files of its photograph and of what was rendered for it."""
+    """A view with the files of its photograph and of what was rendered for it, and of its mask, if it has one."""
 
     view: str
     photograph: Path
     picture: Path
+    mask: Path | None = None
 
 
 def check_sizes(pairs: Sequence[Pair]) -> None:
@@ -37,6 +39,7 @@ def measure(pairs: Sequence[Pair], evaluator: Evaluator, report: Progress = no_p
     check_sizes(pairs)
     per_view = {}
     for done, pair in enumerate(pairs, 1):
-        per_view[pair.view] = evaluator.evaluate_view(read_image(pair.picture), read_image(pair.photograph))
+        mask = None if pair.mask is None else read_mask(pair.mask)
+        per_view[pair.view] = evaluator.evaluate_view(read_image(pair.picture), read_image(pair.photograph), mask)
         report("views", done, len(pairs))
     return per_view

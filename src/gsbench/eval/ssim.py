@@ -49,6 +49,20 @@ def ssim(image: Tensor, target: Tensor, padding: SsimPadding = "zero") -> Tensor
     return values[0] if image.ndim == 3 else values
 
 
+def masked_ssim(image: Tensor, target: Tensor, mask: Tensor, padding: SsimPadding = "zero") -> Tensor:
+    """`ssim` of two images [H, W, 3] over the pixels that count in ``mask`` [H, W]; not a number where there is none.
+
+    The mean is over the windows whose centre counts. With "valid" these lie inside the image, as always.
+    """
+    check_pair(image, target)
+    x, y = as_batch(image), as_batch(target)
+    if padding == "valid":
+        check_size(x, WINDOW_SIZE, "ssim without padding")
+        mask = mask[WINDOW_RADIUS:-WINDOW_RADIUS, WINDOW_RADIUS:-WINDOW_RADIUS]
+    luminance, structure = ssim_parts(x, y, padding)
+    return (luminance * structure)[0][:, mask].mean()
+
+
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     """SSIM at every pixel and channel, [3, H, W], of two images [H, W, 3] in [0, 1], zeros outside."""
     luminance, structure = ssim_parts(as_batch(image), as_batch(target), "zero")

@@ -19,7 +19,14 @@ from gsbench.runs.layout import GROUND_TRUTH, LINEAGE, POINT_CLOUD, RESULTS, STO
 from gsbench.runs.stages import INIT
 from gsbench.runs.store import Store
 from gsbench.scene.camera import Camera
-from gsbench.scene.colmap import PINHOLE_MODELS, pinhole_camera, points_of, read_model
+from gsbench.scene.colmap import (
+    PINHOLE_MODELS,
+    pinhole_camera,
+    points_of,
+    read_model,
+    reference_cameras,
+    registered_names,
+)
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
 from gsbench.scene.types import View
@@ -92,10 +99,7 @@ def model_file(trial: TrialResult) -> Path:
 def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
     """Read what the viewer draws of ``trial``; raises InputError naming the file that is missing or damaged."""
     gaussians = read_ply(model_file(trial), device)
-    runs = trial.path.parents[3]
-    model_dir = Store(runs / STORE).folder(INIT, trial.record.hashes.get("init", "")) / MODEL_FOLDER
-    if not model_dir.is_dir():
-        raise InputError(f"{model_dir} is gone, which has the cameras of {trial.label}: run this trial again")
+    model_dir = _model_folder(trial)
     background = trial.config.get("train.background", (0.0, 0.0, 0.0))
     return ViewedTrial(
         label=f"{trial.scene} {trial.init}-{trial.densify} seed {trial.seed}",
@@ -118,6 +122,20 @@ def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
     if len(causes) != num_gaussians:
         raise InputError(f"{path} is of {len(causes)} Gaussians, the model has {num_gaussians}: run this trial again")
     return causes
+
+
+def placed_cameras(trial: TrialResult) -> list[Camera]:
+    """The places and directions of all cameras of the trial, test views included; not for rendering."""
+    model = read_model(_model_folder(trial))
+    return reference_cameras(model, registered_names(model))
+
+
+def _model_folder(trial: TrialResult) -> Path:
+    runs = trial.path.parents[3]
+    folder = Store(runs / STORE).folder(INIT, trial.record.hashes.get("init", "")) / MODEL_FOLDER
+    if not folder.is_dir():
+        raise InputError(f"{folder} is gone, which has the cameras of {trial.label}: run this trial again")
+    return folder
 
 
 def read_test_views(trial: TrialResult, model_dir: Path) -> tuple[View, ...]:

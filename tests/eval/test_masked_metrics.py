@@ -1,0 +1,121 @@
+"""Metrics over the pixels that count, against other programs and against what must not matter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from gsbench.eval.evaluator import Evaluator
+from gsbench.eval.lpips import load_lpips
+from gsbench.eval.protocol import PAPER, STANDARD
+
+HEIGHT, WIDTH = 64, 80
+
+
+@pytest.fixture
+def pair() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    truth = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    render = np.clip(truth + rng.integers(-40, 41, truth.shape), 0, 255).astype(np.uint8)
+    mask = np.ones((HEIGHT, WIDTH), dtype=bool)
+    mask[10:40, 5:40] = False
+    return render, truth, mask
+
+
+def evaluator(protocol=STANDARD, shared=None, **options) -> Evaluator:
+    weights = None if shared is None else shared / "weights"
+    return Evaluator(protocol, lpips=["squeeze"] if shared else [], weights=weights, download=False, **options)
+
+
+def test_psnr_is_of_the_pixels_that_count(pair) -> None:
+    render, truth, mask = pair
+    found = evaluator().evaluate_view(render, truth, mask)["psnr"]
+    squared = ((render.astype(float) - truth) / 255)[mask] ** 2
+    assert found == pytest.approx(-10 * np.log10(squared.mean()), abs=1e-6)
+
+
+@pytest.mark.parametrize(("protocol", "inside"), [(STANDARD, True), (PAPER, False)])
+def test_ssim_is_scikit_images_map_where_pixels_count(pair, protocol, inside) -> None:
+    render, truth, mask = pair
+    shown = np.where(mask[..., None], render, truth) / 255
+    border = 0 if inside else 5
+    images = [np.pad(x, ((border, border), (border, border), (0, 0))) for x in (shown, truth / 255)]
+    _, full = structural_similarity(
+        *images, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=-1, data_range=1, full=True
+    )
+    full = full[5:-5, 5:-5]
+    counts = mask[5:-5, 5:-5] if inside else mask
+    found = evaluator(protocol).evaluate_view(render, truth, mask)["ssim"]
+    assert found == pytest.approx(full[counts].mean(), abs=1e-9)
+
+
+def test_not_one_metric_sees_what_is_under_the_mask(pair, shared) -> None:
+    render, truth, mask = pair
+    noisy = np.where(mask[..., None], render, 255 - render)
+    more = ["gmsd", "fsim"]
+    one, other = (evaluator(shared=shared, more=more).evaluate_view(x, truth, mask) for x in (render, noisy))
+    assert one.keys() >= {"psnr", "ssim", "lpips_squeeze", "flip", "gmsd", "fsim"}
+    assert one == other
+    assert one != evaluator(shared=shared, more=more).evaluate_view(render, truth)
+
+
+def test_a_mask_of_ones_changes_nothing(pair, shared) -> None:
+    render, truth, mask = pair
+    plain = evaluator(shared=shared).evaluate_view(render, truth)
+    full = evaluator(shared=shared).evaluate_view(render, truth, np.ones_like(mask))
+    assert full == pytest.approx(plain, rel=1e-6)
+
+
+def test_ignoring_what_is_perfect_makes_a_view_worse_and_what_is_bad_better(pair, shared) -> None:
+    render, truth, mask = pair
+    half_right = np.where(mask[..., None], render, truth)
+    plain = evaluator(shared=shared).evaluate_view(half_right, truth)
+    masked = evaluator(shared=shared).evaluate_view(half_right, truth, mask)
+    assert masked["psnr"] < plain["psnr"]
+    assert masked["ssim"] < plain["ssim"]
+    assert masked["lpips_squeeze"] > plain["lpips_squeeze"]
+    assert masked["flip"] > plain["flip"]
+
+
+def test_lpips_of_a_mask_is_the_mean_of_its_maps_where_pixels_count(shared) -> None:
+    """Two pictures side by side, far enough apart for the network: the mask chooses the distance of one of them."""
+    rng = np.random.default_rng(3)
+    network = load_lpips("squeeze", shared / "weights", download=False)
+    left, right = torch.rand(2, 1, 3, 256, 256, generator=torch.Generator().manual_seed(1)) * 2 - 1
+    other = (left + torch.from_numpy(rng.normal(0, 0.4, left.shape)).float()).clamp(-1, 1)
+    first, second = torch.cat([left, right], -1), torch.cat([other, right], -1)
+    alone = float(network(left, other))
+    for chosen, wanted in (((slice(None), slice(0, 256)), alone), ((slice(None), slice(256, 512)), 0.0)):
+        mask = torch.zeros(256, 512, dtype=torch.bool)
+        mask[chosen] = True
+        assert float(network(first, second, mask)) == pytest.approx(wanted, abs=0.03 * alone)
+
+
+def test_a_view_without_a_window_that_counts_says_so(pair) -> None:
+    render, truth, mask = pair
+    mask = np.zeros_like(mask)
+    mask[:3] = True  # no window lies in the picture there
+    judge = evaluator(STANDARD)
+    values = judge.evaluate_view(render, truth, mask)
+    assert "ssim" not in values
+    assert "psnr" in values
+    assert "ssim" in judge.unavailable
+
+
+def test_an_own_metric_gets_the_mask_if_it_asks(pair) -> None:
+    render, truth, mask = pair
+
+    class Plain:
+        direction = -1
+
+        def measure(self, image, truth):
+            return float((image - truth).abs().mean())
+
+    class Masked(Plain):
+        def measure_masked(self, image, truth, mask):
+            return float((image - truth).abs()[mask].mean())
+
+    found = evaluator(extra={"plain": Plain(), "masked": Masked()}).evaluate_view(render, truth, mask)
+    assert found["plain"] == pytest.approx(found["masked"] * mask.mean(), rel=1e-5)
