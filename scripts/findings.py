@@ -1,7 +1,7 @@
-"""The tables and curves of docs/findings.md, made from the result files that are kept in docs/findings/.
+"""The tables and curves of docs/findings.md and docs/first_findings.md, from the files that are kept in docs/findings/.
 
     python scripts/findings.py collect RUNS   copy what the page needs out of a runs folder
-    python scripts/findings.py                write the tables into the page and draw the curves
+    python scripts/findings.py                write the tables into both pages and draw the curves
 
 A table of differences is one family of tests (Holm). It stands in the page as ``differences of EXPERIMENT`` (every arm
 minus the baseline) or as ``differences of EXPERIMENT: ARM, ARM against ARM``. The page's own test makes the tables anew
@@ -16,18 +16,20 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
+import findings_archives as archives
 import pandas as pd
+from findings_pairs import difference, facts, pair, row
 from PIL import Image
 
 from gsbench.analysis.frame import to_frame
-from gsbench.analysis.pairing import Paired
-from gsbench.analysis.results import Experiment, list_experiments, read_experiment, read_views
+from gsbench.analysis.per_view import read_views
+from gsbench.analysis.results import Experiment, read_experiment
 from gsbench.analysis.statistics import Comparison, compare_family
-from gsbench.eval.facts import MetricFacts, find
+from gsbench.runs.experiments import list_experiments
 
-PAGE = Path(__file__).parents[1] / "docs" / "findings.md"
-DATA = PAGE.with_suffix("")
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = (DOCS / "findings.md", DOCS / "first_findings.md")
+DATA = DOCS / "findings"
 EXPERIMENTS = ("bonsai_growth", "fair_governor", "fair_hard", "initialisers")
 BASELINES = ("adc", "sfm")  # what the others are held against: among densifiers, among initialisers
 METRICS = {"lpips_squeeze": ("LPIPS (squeeze)", 3), "psnr": ("PSNR, dB", 2), "ssim": ("SSIM", 3), "flip": ("FLIP", 3)}
@@ -41,8 +43,9 @@ SECTION = re.compile(
 
 
 def collect(runs: Path) -> None:
-    """Write one row a trial, and the count after every round, into the files beside the page."""
+    """Write archives, one row a trial, and the count after every round, into the files beside the pages."""
     DATA.mkdir(exist_ok=True)
+    archives.collect(runs)
     kept = [*WHICH, "num_init_points", "num_gaussians", "seconds_train", *METRICS, *(f"event_{c}" for c in CAUSES)]
     for name in EXPERIMENTS:
         if name in list_experiments(runs):
@@ -90,12 +93,12 @@ def _picture(experiment: Experiment, zoom: int = 2) -> Image.Image:
 def arms_table(frame: pd.DataFrame) -> list[str]:
     """An arm a row: mean over scenes of the mean over seeds, and the deviation of that mean's trials over seeds."""
     columns = {"num_gaussians": ("Gaussians", 0), **METRICS, "seconds_train": ("training, s", 0)}
-    lines = [_row(["arm", *(title for title, _ in columns.values())]), _row(["---"] + ["--:"] * len(columns))]
+    lines = [row(["arm", *(title for title, _ in columns.values())]), row(["---"] + ["--:"] * len(columns))]
     for arm in _arms(frame):
         own = frame[frame.arm == arm]
         by_seed = own.groupby("seed")[list(columns)].mean()
         cells = [f"{by_seed[k].mean():,.{d}f} ± {by_seed[k].std():,.{d}f}" for k, (_, d) in columns.items()]
-        lines.append(_row([arm, *cells]))
+        lines.append(row([arm, *cells]))
     return lines
 
 
@@ -111,10 +114,10 @@ def scenes_table(frame: pd.DataFrame) -> list[str]:
 
 def _by_scene(frame: pd.DataFrame, title: str, cell: Callable[[pd.DataFrame], str]) -> list[str]:
     scenes = list(dict.fromkeys(frame.scene))
-    lines = [_row([title, *scenes]), _row(["---"] + ["--:"] * len(scenes))]
+    lines = [row([title, *scenes]), row(["---"] + ["--:"] * len(scenes))]
     for arm in _arms(frame):
         groups = [frame[(frame.arm == arm) & (frame.scene == scene)] for scene in scenes]
-        lines.append(_row([arm, *("" if own.empty else cell(own) for own in groups)]))
+        lines.append(row([arm, *("" if own.empty else cell(own) for own in groups)]))
     return lines
 
 
@@ -126,22 +129,12 @@ def differences_table(frame: pd.DataFrame, against: str | None = None, arms: Seq
     against = against or _baseline(frame)
     found = compared(frame, against, arms)
     lines = [
-        _row([f"minus {against}", *(title for title, _ in METRICS.values())]),
-        _row(["---"] * (1 + len(METRICS))),
+        row([f"minus {against}", *(title for title, _ in METRICS.values())]),
+        row(["---"] * (1 + len(METRICS))),
     ]
     for arm in dict.fromkeys(arm for arm, _ in found):
-        lines.append(_row([arm, *(_difference(found[arm, metric]) for metric in METRICS)]))
+        lines.append(row([arm, *(difference(found[arm, metric], METRICS[metric][1]) for metric in METRICS)]))
     return lines
-
-
-def _difference(c: Comparison) -> str:
-    _, digits = METRICS[c.metric]
-    interval = f" [{c.interval.low:+.{digits}f}, {c.interval.high:+.{digits}f}]" if c.interval else ""
-    p = c.p_family
-    chance = "" if p is None else f"p {p:.3f}" if p >= 0.001 else "p < .001"
-    if c.verdict != "no evidence":
-        chance = f"**{chance}**"
-    return ", ".join(filter(None, [f"{c.mean:+.{digits}f}{interval}", chance]))
 
 
 def compared(
@@ -150,29 +143,19 @@ def compared(
     """Compare each of ``arms`` (default: all others) with ``against`` in each metric, as one family of tests."""
     against = against or _baseline(frame)
     keys = [(arm, metric) for arm in arms or _arms(frame) if arm != against for metric in METRICS]
-    members = [(pair(frame, arm, metric, against), _facts(metric).direction) for arm, metric in keys]
+    members = [(pair(frame, arm, metric, against), facts(metric).direction) for arm, metric in keys]
     return dict(zip(keys, compare_family(members), strict=True))
 
 
 def events_table(frame: pd.DataFrame) -> list[str]:
     """Table of what the refinements did, by cause, in thousands of Gaussians, as the mean of the trials."""
     causes = [c for c in frame.columns if c.startswith("event_")]
-    lines = [_row(["arm", *(c.removeprefix("event_").replace("_", " ") for c in causes)])]
-    lines.append(_row(["---"] + ["--:"] * len(causes)))
+    lines = [row(["arm", *(c.removeprefix("event_").replace("_", " ") for c in causes)])]
+    lines.append(row(["---"] + ["--:"] * len(causes)))
     for arm in _arms(frame):
         means = frame[frame.arm == arm][causes].mean()
-        lines.append(_row([arm, *(f"{value / 1000:,.1f}" for value in means)]))
+        lines.append(row([arm, *(f"{value / 1000:,.1f}" for value in means)]))
     return lines
-
-
-def pair(frame: pd.DataFrame, arm: str, metric: str, against: str) -> Paired:
-    """Two arms as the program pairs them, but for the views: a trial's mean stands for them, so none is drawn anew."""
-    one, other = (frame[frame.arm == name].set_index(["scene", "seed"])[metric].sort_index() for name in (against, arm))
-    both = one.index.intersection(other.index)
-    difference = (other[both] - one[both]).dropna()
-    scenes = tuple(dict.fromkeys(difference.index.get_level_values("scene")))
-    matrices = tuple(np.asarray(difference[scene], float)[:, None] for scene in scenes)
-    return Paired(metric, scenes, matrices, float(one[both].groupby("scene").mean().mean()), ())
 
 
 def read(name: str) -> pd.DataFrame:
@@ -194,16 +177,6 @@ def _arms(frame: pd.DataFrame) -> list[str]:
     return sorted(dict.fromkeys(frame.arm), key=lambda arm: arm != _baseline(frame))
 
 
-def _facts(metric: str) -> MetricFacts:
-    facts = find(metric)
-    assert facts is not None
-    return facts
-
-
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
 TABLES = {
     "arms": arms_table,
     "clouds": clouds_table,
@@ -219,10 +192,15 @@ def with_tables(page: str) -> str:
 
 
 def _table(found: re.Match[str]) -> list[str]:
-    frame = read(found["experiment"])
-    if found["against"] is None:
+    name, arms = found["experiment"], found["arms"].split(", ") if found["arms"] else []
+    if archives.archive_of(name).is_file():
+        if arms:
+            return archives.TABLES_OF_ARMS[found["table"]](name, arms, found["against"])
+        return archives.TABLES[found["table"]](name)
+    frame = read(name)
+    if not arms:
         return TABLES[found["table"]](frame)
-    return differences_table(frame, found["against"], found["arms"].split(", "))
+    return differences_table(frame, found["against"], arms)
 
 
 def draw() -> None:
@@ -240,12 +218,12 @@ def draw() -> None:
         scenes = list(dict.fromkeys(rounds.scene))
         size = (1 + 3.2 * len(scenes), 3 * len(drawn))
         figure, axes = plt.subplots(len(drawn), len(scenes), figsize=size, squeeze=False, sharex="col")
-        for (column, label), row in zip(drawn.items(), axes, strict=True):
-            for axis, scene in zip(row, scenes, strict=True):
+        for (column, label), panels in zip(drawn.items(), axes, strict=True):
+            for axis, scene in zip(panels, scenes, strict=True):
                 for arm, own in rounds[rounds.scene == scene].groupby("arm", sort=False):
                     axis.plot(own.step, own[column], label=arm)
                 axis.set(title=scene, xlabel="iteration", yscale="log" if column == "strictness" else "linear")
-            row[0].set_ylabel(label)
+            panels[0].set_ylabel(label)
         axes[0][0].legend(fontsize=7)
         figure.tight_layout()
         figure.savefig(file.with_suffix(".png"), dpi=80)
@@ -256,5 +234,6 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["collect"]:
         collect(Path(sys.argv[2]))
     else:
-        PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+        for page in PAGES:
+            page.write_text(with_tables(page.read_text(encoding="utf-8")), encoding="utf-8")
         draw()

@@ -1,10 +1,11 @@
-"""The sentences of docs/findings.md that hold figures, with the figures computed from the result files."""
+"""The sentences of docs/first_findings.md that hold figures, with the figures computed from the result files."""
 
 from __future__ import annotations
 
 import functools
 import importlib.util
 import re
+import sys
 from types import ModuleType
 
 import numpy as np
@@ -33,7 +34,10 @@ FROM_ELSEWHERE = (
 @functools.cache
 def script() -> ModuleType:
     """scripts/findings.py as a module."""
-    spec = importlib.util.spec_from_file_location("findings", ROOT / "scripts" / "findings.py")
+    folder = ROOT / "scripts"
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))  # for its neighbours, as where it runs
+    spec = importlib.util.spec_from_file_location("findings", folder / "findings.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -45,7 +49,7 @@ def script() -> ModuleType:
 def tables() -> dict[tuple[str, str], dict[tuple[str, str], Comparison]]:
     """Every table of differences on the page, by (experiment, baseline)."""
     found = {}
-    for m in script().SECTION.finditer(script().PAGE.read_text(encoding="utf-8")):
+    for m in script().SECTION.finditer((script().DOCS / "first_findings.md").read_text(encoding="utf-8")):
         if m["table"] == "differences":
             frame, arms = script().read(m["experiment"]), m["arms"].split(", ") if m["arms"] else None
             against = m["against"] or next(arm for arm in script().BASELINES if arm in set(frame.arm))

@@ -1,4 +1,4 @@
-"""docs/findings.md says what its result files say."""
+"""The pages of findings say what their result files say."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from tests.docs import findings_said as said
 MAX_BYTES = 300_000
 FIGURE = re.compile(r"[+−]\d*\.?\d+|(?<![\w.])\.\d+")  # a difference, or what is written without its leading zero
 findings = said.script()
+PAGE = findings.DOCS / "first_findings.md"
 
 
 def prose() -> str:
     """The page without tables, commands and marks of emphasis, on one line."""
-    page = re.sub(r"<!--.*?-->", "", findings.PAGE.read_text(encoding="utf-8"))
+    page = re.sub(r"<!--.*?-->", "", PAGE.read_text(encoding="utf-8"))
     lines = [line for line in page.splitlines() if not line.startswith(("|", "    "))]
     return re.sub(r"\s+", " ", re.sub(r"[*`]", "", " ".join(lines)))
 
@@ -87,7 +88,7 @@ def test_a_table_of_differences_is_one_family_and_calls_nothing_better() -> None
     sizes = {table: {c.family for c in found.values()} for table, found in said.tables().items()}
     assert sizes["fair_governor", "adc"] == {20}
     assert all(size == {len(said.tables()[table])} for table, size in sizes.items())
-    page = findings.with_tables(findings.PAGE.read_text(encoding="utf-8"))
+    page = findings.with_tables(PAGE.read_text(encoding="utf-8"))
     assert not re.search(r"^\|.*(better|worse)", page, re.MULTILINE)
     assert not re.search(r"clearly|\*\*(better|worse)", page)
 
@@ -103,7 +104,7 @@ def test_mcmc_has_rounds_of_its_own() -> None:
 
 
 def test_the_tables_of_the_page_are_those_of_the_result_files() -> None:
-    page = findings.PAGE.read_text(encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8")
     assert len(findings.SECTION.findall(page)) >= 4
     assert findings.with_tables(page) == page
     assert "nan" not in page
@@ -120,14 +121,14 @@ def test_curves_can_be_drawn_from_the_published_files(tmp_path: Path, monkeypatc
 
 
 def test_every_file_that_the_page_names_is_there_and_small() -> None:
-    page = findings.PAGE.read_text(encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8")
     for name in re.findall(r"\((findings/[^)]+)\)", page):
-        assert (findings.PAGE.parent / name).is_file(), name
+        assert (findings.DOCS / name).is_file(), name
     assert all(path.stat().st_size < MAX_BYTES for path in findings.DATA.iterdir())
 
 
 def test_the_experiments_of_the_page_are_configurations() -> None:
-    page = findings.PAGE.read_text(encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8")
     named = set(re.findall(r"\+experiment=(\w+)", page))
     assert named >= {"bonsai_growth", "fair_governor", "fair_hard", "initialisers"}
     assert all((ROOT / "conf" / "experiment" / f"{name}.yaml").is_file() for name in named)

@@ -1,0 +1,180 @@
+"""Commands, settings and files that the documents name are there: verbs, their options, groups, choices and keys.
+
+Read from the text, not run; values other than choices are checked where commands run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import inspect
+import io
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from gsbench.config.command_words import GROUPS, OPTIONS, options
+from gsbench.config.old_names import RENAMED
+from gsbench.config.schema import ComponentConfig, LaunchConfig, TrackingConfig
+from gsbench.eval.options import EvalConfig
+from gsbench.external.settings import External
+from gsbench.raster.options import RasterConfig
+from gsbench.scene.options import SceneConfig
+from gsbench.train.options import TrainConfig
+from gsbench.verbs.queries import QUERIES
+from gsbench.verbs.table import VERBS
+from tests.conftest import ROOT
+
+DOCUMENTS = [
+    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+FENCED = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)  # run by tests/docs/test_examples.py
+SPAN = re.compile(r"`([^`]+)`")
+COMMAND = re.compile(r"^ {4,}((?:[A-Z_]+=\S+ )*gsbench(?: .*)?)$", re.MULTILINE)
+SETTING = re.compile(r"^([+~]*)([a-z_][\w.]*)=(.*)$")
+FILE = re.compile(r"^[\w.-]+(/[\w.-]+)+\.(py|yaml|md|sh)$")
+OUR_FILES = ("src/", "conf/", "docs/", "tests/")  # other names with a slash may be of other programs' files
+VERBATIM = re.compile(r"^[\w/]+$")  # a choice that is a name, and no placeholder, pattern or expression
+OWN = {"mine", "mycluster", "NAME"}  # names that examples give to a reader's own
+TOP = {"name", "seed", "device", "threads", "runs", "allow_targets"}
+CLASSES: dict[str, tuple[type, ...]] = {
+    "scene": (SceneConfig,),
+    "densify": (ComponentConfig, External),
+    "init": (ComponentConfig,),
+    "raster": (RasterConfig,),
+    "train": (TrainConfig,),
+    "eval": (EvalConfig,),
+    "tracking": (TrackingConfig,),
+    "launch": (LaunchConfig,),
+}
+NO_SETTINGS = {"key", "stable", "grow_grad2d"}  # words of Hydra's grammar, of torch and of gsplat
+
+
+@cache
+def keys_of(group: str) -> frozenset[str]:
+    """The settings of a group: those of its dataclass, of its files, and of the classes that these name."""
+    known = {field.name for kind in CLASSES.get(group, ()) for field in dataclasses.fields(kind)}
+    for file in (ROOT / "conf" / group).rglob("*.yaml"):
+        content: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
+        known |= {str(key) for key in content}
+        module, _, name = str(content.get("_target_", "")).rpartition(".")
+        if module and name != External.__name__:  # which stands there for a class of another room
+            known |= set(inspect.signature(getattr(importlib.import_module(module), name)).parameters)
+    return frozenset(known)
+
+
+@cache
+def options_of(verb: str) -> frozenset[str]:
+    with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
+        importlib.import_module(VERBS[verb][0]).main(["--help"], Path("runs"))
+    return frozenset(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", text.getvalue()))
+
+
+def fault_of_setting(word: str) -> str:
+    """The reason why a word ``key=value`` can be no setting of gsbench's own; "" where it can, or is no such word."""
+    match = SETTING.match(word.strip("'\","))
+    if match is None or match[2] in NO_SETTINGS:
+        return ""
+    sign, key, value = match.groups()
+    group, _, rest = key.partition(".")
+    if group == "hydra":
+        return ""
+    if not rest and key in GROUPS:
+        choices = {*options(key), *(old.removeprefix(f"{key}/") for old in RENAMED), *OWN}
+        given = [choice for choice in re.split(r"[,|]", value.replace("\\", "")) if VERBATIM.match(choice)]
+        missing = sorted(set(given) - choices)
+        return f"{key} has no choice {', '.join(missing)}" if missing else ""
+    if sign.startswith("+"):
+        return ""  # a setting that a class of the reader's own brings
+    if rest and group in GROUPS:
+        return "" if rest.split(".")[0] in keys_of(group) else f"{group} has no setting {rest}"
+    everywhere = TOP.union(*(keys_of(name) for name in GROUPS if name != "experiment"))
+    return "" if key in everywhere else f"no setting is called {key}"
+
+
+def faults_of_command(command: str) -> Iterator[str]:
+    """The words of a command that gsbench would not know."""
+    words = command.partition("gsbench")[2].partition(" #")[0].split()
+    words = words[: words.index("|")] if "|" in words else words
+    verb = words[0] if words and re.fullmatch(r"[a-z]+", words[0]) else None
+    if verb is not None and verb not in VERBS:
+        yield f"no verb {verb}"
+        return
+    known = {*OPTIONS, *QUERIES} if verb is None else {*options_of(verb), "--help"}
+    for word in words:
+        if re.match(r"--?[a-z]", word) and word.split("=")[0] not in known:
+            yield f"{verb or 'a trial'} has no option {word}"
+        elif not word.startswith("-") and (fault := fault_of_setting(word)):
+            yield fault
+
+
+def faults_of(text: str) -> list[str]:
+    """The faults of a document, each with its line."""
+    text = FENCED.sub(lambda found: "\n" * found[0].count("\n"), text)
+    joined = re.sub(r"\\\n +", lambda found: " " * (len(found[0]) - 1) + "\0", text)  # a command goes on in a line
+    found = [(match.start(1), match[1]) for match in (*COMMAND.finditer(joined), *SPAN.finditer(joined))]
+    faults = []
+    for start, words in sorted(found):
+        line = joined[:start].count("\n") + joined[:start].count("\0") + 1
+        words = " ".join(words.replace("\0", " ").split())
+        if re.match(r"(?:[A-Z_]+=\S+ )*gsbench( |$)", words):
+            faults += [f"{line}: {fault}: {words}" for fault in faults_of_command(words)]
+        else:
+            named = [word for word in words.split() if "." in word.partition("=")[0] or word == words]
+            faults += [f"{line}: {fault}: {words}" for word in named if (fault := fault_of_setting(word))]
+        if FILE.match(words) and words.startswith(OUR_FILES) and Path(words).stem not in OWN:
+            faults += [] if (ROOT / words).is_file() else [f"{line}: no file {words}"]
+    return faults
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_what_a_document_names_is_there(document: Path) -> None:
+    assert faults_of(document.read_text(encoding="utf-8")) == []
+
+
+def test_every_file_of_the_house_is_there() -> None:
+    """In the page on the code, files are named from ``src/gsbench``."""
+    spans = SPAN.findall((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
+    named = [span for span in spans if FILE.match(span)]
+    assert len(named) > 60
+    places = [(ROOT / folder / name for folder in ("", "src", "src/gsbench", "docs")) for name in named]
+    found = [any(place.is_file() for place in places_of) for places_of in places]
+    assert [name for name, there in zip(named, found, strict=True) if not there] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("    gsbench tabels x", "no verb tabels"),
+        ("say `gsbench tables x --formt csv`", "tables has no option --formt"),
+        ("    gsbench -m --dryrun seed=0,1", "a trial has no option --dryrun"),
+        ("    A=/x gsbench scene=gardn", "scene has no choice gardn"),
+        ("    gsbench -m densify=adc,volumetrik", "densify has no choice volumetrik"),
+        ("    gsbench -m densify=adc \\\n        train.iteration=5", "train has no setting iteration"),
+        ("`densify=adc|absgrd`", "densify has no choice absgrd"),
+        ("one `densify.volume_treshold=0.5`", "densify has no setting volume_treshold"),
+        ("one `points_form=train`", "no setting is called points_form"),
+        ("`launch.parralel=2`", "launch has no setting parralel"),
+        ("+ `+experiment=tabel1`", "experiment has no choice tabel1"),
+        ("in `tests/test_trust.py`", "no file tests/test_trust.py"),
+    ],
+)
+def test_a_wrong_word_is_found(text: str, fault: str) -> None:
+    assert "\n" not in text or faults_of(text)[0].startswith("1: ")
+    assert [fault in found for found in faults_of(text)] == [True]
+
+
+def test_right_words_are_no_faults() -> None:
+    right = """
+    gsbench -m scene=garden densify=external/opensplat densify.options.program=x +densify.mine=1 seed=0,1,2 | tee x
+    gsbench tables x --format csv   # no=comment
+`densify=glob(*)` `key=interval(a, b)` `train=…` `hydra.verbose=true` `densify/volumetric.py` `~densify.cap`
+"""
+    assert faults_of(right) == []
