@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch is imported, as the program itself does
@@ -41,3 +42,15 @@ def _own_search_path(monkeypatch: pytest.MonkeyPatch) -> None:
     """Forget what the program, called within a test, tells its children of where not to import from."""
     monkeypatch.setenv("PYTHONSAFEPATH", "")  # so that it is known here, and put back at the end
     monkeypatch.delenv("PYTHONSAFEPATH")
+
+
+@pytest.fixture
+def caplog(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
+    """Catch gsbench's own lines, too, whose logger passes nothing on once a command has run, in whichever order."""
+    from gsbench.logs import LOGGER, set_up_logging
+
+    handlers, propagate = LOGGER.handlers[:], LOGGER.propagate
+    set_up_logging()
+    LOGGER.addHandler(caplog.handler)
+    yield caplog
+    LOGGER.handlers[:], LOGGER.propagate = handlers, propagate  # a stream that this test had is closed then

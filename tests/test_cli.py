@@ -379,3 +379,19 @@ def test_a_stop_while_a_native_module_is_imported_is_told_as_a_stop(
     monkeypatch.setattr(cli, "_trials", lambda argv: importlib.import_module("nosuch_module"))
     with pytest.raises(ModuleNotFoundError):
         cli.run(["seed=1"])
+
+
+@pytest.mark.parametrize("module", ["gsbench.errors", "gsbench.logs", "gsbench.words"])
+def test_ctrl_c_while_the_first_modules_load_is_one_line(module: str, tmp_path: Path) -> None:
+    program = (
+        "import sys\n"
+        "class Interrupt:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name == {module!r}: raise KeyboardInterrupt\n"
+        f"sys.modules.pop({module!r}, None)\n"
+        "sys.meta_path.insert(0, Interrupt())\n"
+        "from gsbench.cli import main\nmain()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 130
+    assert done.stderr == "gsbench: stopped before it began\n"

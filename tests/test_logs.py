@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from gsbench import cli
 from gsbench.errors import InputError
-from gsbench.logs import LOGGER, log_to, printable_output
+from gsbench.logs import LOGGER, log_to, printable_output, set_up_logging
 from gsbench.words import printable
 
 OBEYED = [
@@ -103,3 +103,15 @@ def test_streams_come_back_and_stay_streams(monkeypatch: pytest.MonkeyPatch) -> 
     assert sys.stdout is stream
     assert stream.buffer.getvalue() == b"\\x1b[31m\na\\x07b"  # type: ignore[attr-defined]
     assert logging.getLogger("gsbench") is LOGGER
+
+
+def test_lines_go_to_what_is_stderr_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LOGGER, "handlers", [])
+    set_up_logging()
+    closed, now = io.StringIO(), io.StringIO()
+    monkeypatch.setattr(sys, "stderr", closed)
+    LOGGER.warning("one")
+    closed.close()
+    monkeypatch.setattr(sys, "stderr", now)
+    LOGGER.warning("two")
+    assert now.getvalue() == "two\n"

@@ -111,6 +111,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "scene.width=1e9": "scene.width must be",
     "scene=photos": "scene.path is not set",
     "scene=photos scene.path=nosuch": "does not exist",
+    "scene=transforms scene.path=nosuch": "does not exist",
     "scene=photos scene.path=~/x": "quotes of their own",
     "init=ply": "init.path is not set",
     # components

@@ -5,23 +5,29 @@ Nothing here loads torch, so that ``--help`` and the verbs that only read files 
 
 from __future__ import annotations
 
-import importlib
-import os
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
-from gsbench import __version__
-from gsbench.errors import GsbenchError, InputError
-from gsbench.files import checked_runs_folder, storage_errors
-from gsbench.logs import printable_output, set_up_logging
-from gsbench.system.own_modules import SAFE_PATH
-from gsbench.verbs.table import VERBS
-from gsbench.words import closest
+INTERRUPTED = 130  # 128 + SIGINT, as shells count
+
+try:
+    import importlib
+    import os
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from gsbench import __version__
+    from gsbench.errors import GsbenchError, InputError
+    from gsbench.files import checked_runs_folder, storage_errors
+    from gsbench.logs import printable_output, set_up_logging
+    from gsbench.system.own_modules import SAFE_PATH
+    from gsbench.verbs.table import VERBS
+    from gsbench.words import closest
+except KeyboardInterrupt:  # Ctrl-C before `run` could catch it
+    print("gsbench: stopped before it began", file=sys.stderr)
+    sys.exit(INTERRUPTED)
 
 HELP = ("--help", "-h")
 DONE, TRIAL_FAILED, BAD_INPUT = 0, 1, 2
-INTERRUPTED = 130  # 128 + SIGINT, as shells count
 
 
 def main() -> None:
@@ -68,7 +74,7 @@ def run(argv: list[str]) -> int:
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
-    """Whether a Ctrl-C is behind an error: native modules that it stops while they are imported raise ImportError."""
+    """Return whether a Ctrl-C is behind an error: native modules that it stops while they load raise ImportError."""
     return error is not None and (
         isinstance(error, KeyboardInterrupt) or _is_interrupt(error.__cause__ or error.__context__)
     )

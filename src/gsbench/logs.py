@@ -56,9 +56,13 @@ def printable_output() -> Iterator[None]:
 
 
 class _People(logging.StreamHandler[TextIO]):
-    """Shows lines from INFO on, and all of the loggers that are ``watched``."""
+    """Shows lines from INFO on, and all of the loggers that are ``watched``, on what is stderr at that moment."""
 
     watched: tuple[str, ...] = ()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.stream = sys.stderr  # another than at the start, where a program that calls gsbench redirects it
+        super().emit(record)
 
     def filter(self, record: logging.LogRecord) -> bool:
         family = f"{record.name}."

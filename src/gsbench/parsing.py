@@ -24,6 +24,7 @@ MOST_YAML_BYTES = 1 << 20  # a configuration has 2 to 10 kB, and its parser take
 MOST_DEPTH = 40  # levels of nesting: ours have up to six, and what a user's class is given adds a few
 MOST_WORD = 4000  # characters of plain YAML: what could be a number
 MOST_VALUES = 100_000  # of YAML, whose aliases let a few lines stand for billions
+MOST_OF_LINE = 300  # characters of a message about a file
 LARGEST_INT = 2**64  # beyond the seeds of torch and times in ns
 KEYS = {str, int}
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -37,10 +38,10 @@ class DamagedError(InputError):
         super().__init__(f"{path} {self.reason}")
 
 
-def one_line(text: str, most: int = 300) -> str:
+def one_line(text: str) -> str:
     """A text for people, whatever a file or a library put into it."""
     line = " ".join(text.split())
-    return line if len(line) <= most else f"{line[:most]}…"
+    return line if len(line) <= MOST_OF_LINE else f"{line[:MOST_OF_LINE]}…"
 
 
 def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
@@ -122,8 +123,8 @@ def parse_yaml(content: bytes, path: Path) -> Any:
 
 
 def _danger_in_yaml(text: str) -> str:
-    """What of YAML must not reach its loader: depth (it goes down by recursion in C), merges that multiply, numbers
-    whose digits take hours; "" where there is nothing."""
+    """Name what of YAML must not reach its loader: depth (it goes down by recursion in C), merges that multiply,
+    numbers whose digits take hours; "" where there is nothing."""
     level = 0
     for event in yaml.parse(text, Loader=LOADER):
         if getattr(event, "tag", None) is not None:

@@ -57,6 +57,14 @@ def read_typed(path: Path, kind: type[T]) -> T:
     return typed(read_bytes(path), kind, path)
 
 
+def read_if_sound(path: Path, kind: type[T]) -> T | None:
+    """The JSON file as an object of ``kind``; None where it is absent or damaged."""
+    try:
+        return read_typed(path, kind)
+    except (FileNotFoundError, DamagedError):
+        return None
+
+
 def typed(content: bytes, kind: type[T], path: Path) -> T:
     """JSON as an object of the type ``kind``, of the file ``path``; raises DamagedError naming the first misfit.
 

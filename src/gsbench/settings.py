@@ -147,7 +147,7 @@ def _converted(value: Any, field: dataclasses.Field[Any], cls: type, key: str) -
 
 
 def _has_switch_for_number(given: Any, result: Any) -> bool:
-    """Whether a ``true`` became a number, which pydantic lets pass."""
+    """Return whether a ``true`` became a number, which pydantic lets pass."""
     if isinstance(given, Sequence) and not isinstance(given, str):
         return any(map(_has_switch_for_number, given, result))
     return isinstance(given, bool) and not isinstance(result, bool)

@@ -26,7 +26,6 @@ log = logging.getLogger(__name__)
 
 WEIGHTS_VARIABLE = "GSBENCH_WEIGHTS"
 DOWNLOAD_TIMEOUT_SECONDS = 10.0  # of inactivity: without a network the answer must come at once
-SHA256_DIGITS = 64
 SAFETENSORS_SUFFIX = ".safetensors"
 
 
@@ -146,7 +145,7 @@ def hub_cache() -> Path:
 
 
 def _search_folders(folder: Path | None) -> list[tuple[Path, bool]]:
-    """Where to look, in order, and whether sub-folders count."""
+    """Folders to look in, in order, each with whether its sub-folders count."""
     folders: list[tuple[Path, bool]] = []
     if folder is not None:
         if not folder.is_dir():

@@ -5,12 +5,15 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 
 MAX_NAMED = 3  # names that an error or warning lists before it only counts
 # Characters that a terminal obeys in place of showing: control characters, but for line feed and tab; line separators;
 # marks that turn the direction of writing (UAX #9); halves of characters, which names of files may have.
 OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+
+# A path from the root or the home folder within a sentence, up to a blank or what ends the naming of one.
+PLACE = re.compile(r"""(?<![^\s=(['"`])(?:~[\w.-]*)?/[^\s,;:'"`)\]]+""")
 
 
 def counted(count: int, noun: str) -> str:
@@ -54,6 +57,16 @@ def readable_bytes(count: int | None) -> str:
         if count >= size:
             return f"{count / size:.3g} {unit}"
     return f"{count} bytes"
+
+
+def without_places(text: str) -> str:
+    """The text, with the last name of each path of this machine in its place.
+
+    Examples:
+        >>> without_places("weights not found (looked in /home/me/weights, ~/.cache/torch; no /): see https://a.org/b")
+        'weights not found (looked in weights, torch; no /): see https://a.org/b'
+    """
+    return PLACE.sub(lambda found: PurePath(found[0]).name, text)
 
 
 def is_path(value: str) -> bool:

@@ -29,10 +29,13 @@ class GsbenchLauncher(Launcher):
 
 
 class GsbenchSweeper(Sweeper):
-    """The grid of all listed values, or several joined, handed to the launcher as a whole."""
+    """The grid of all listed values, or several joined, handed to the launcher as a whole.
 
-    def __init__(self, params: dict[str, Any]) -> None:
-        self.params = params
+    ``tune`` says what of each arm is tuned before that.
+    """
+
+    def __init__(self, params: dict[str, Any], tune: dict[str, Any] | None = None) -> None:
+        self.params, self.tune = params, tune or {}
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         from hydra.core.plugins import Plugins
@@ -45,7 +48,7 @@ class GsbenchSweeper(Sweeper):
     def sweep(self, arguments: list[str]) -> Any:
         from gsbench.app.sweeps import sweep
 
-        return sweep(self.task, self.context, self.config, self.launcher, self.params, arguments)
+        return sweep(self.task, self.context, self.config, self.launcher, self.params, self.tune, arguments)
 
 
 class OptunaSweeper(GsbenchSweeper):
@@ -64,12 +67,14 @@ class OptunaSweeper(GsbenchSweeper):
 
 LAUNCHER = {"_target_": "hydra_plugins.gsbench.GsbenchLauncher"}
 SWEEPER = {"_target_": "hydra_plugins.gsbench.GsbenchSweeper", "params": {}, "grids": []}
+# gsbench.app.tuning
+TUNE = {"points": None, "metric": None, "direction": None, "seed": 100, "ranges": {}}
 SEARCH = {  # gsbench.app.search; the last two are other names of n_trials and n_jobs
     **{"metric": "psnr", "direction": None, "n_trials": 20, "n_jobs": 1, "seed": 0, "params": {}},
     **{"trials": None, "at_once": None},
 }
 ConfigStore.instance().store(group="hydra/launcher", name="gsbench", node=LAUNCHER, provider="gsbench")
-ConfigStore.instance().store(group="hydra/sweeper", name="gsbench", node=SWEEPER, provider="gsbench")
+ConfigStore.instance().store(group="hydra/sweeper", name="gsbench", node={**SWEEPER, "tune": TUNE}, provider="gsbench")
 ConfigStore.instance().store(
     group="hydra/sweeper",
     name="optuna",

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import random
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import yaml
 
-from gsbench.analysis.attribution import ELSEWHERE, NO_RECORD, RULES, attribute, attribution_sentence, ingredients
+from gsbench.analysis.attribution import (
+    ELSEWHERE,
+    NO_RECORD,
+    RULES,
+    _under_the_same_settings,
+    attribute,
+    attribution_sentence,
+    ingredients,
+    representatives,
+)
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.report.build import build_report
@@ -122,6 +134,21 @@ def test_what_a_command_changed_in_all_arms_is_no_difference(tmp_path: Path) -> 
     )
 
 
+def test_a_shipped_arm_of_the_same_class_is_no_stand_in_for_another() -> None:
+    """`absgrad`, `adc` and `revised` are of one class: what `adc` is shipped with, nobody changed."""
+    adc, few = config("adc"), config("adc", max_gaussians=9, cap="hard")
+    alike = _under_the_same_settings(config("absgrad"), adc, few)
+    assert set(ingredients(alike, few)) == {"gradient", "threshold", "budget"}
+    both = (arm | {"densify.split_size": 0.5} for arm in (adc, few))
+    assert _under_the_same_settings(config("absgrad"), *both)["densify.split_size"] == 0.5
+    own = config("absgrad"), config("absgrad", max_gaussians=9)
+    assert set(ingredients(_under_the_same_settings(config("adc"), *own), own[1])) == {
+        "gradient",
+        "threshold",
+        "budget",
+    }
+
+
 def test_where_nothing_isolates_that_is_said(tmp_path: Path) -> None:
     own = densifier("adc", interval=50) | {"_target_": "mine.Patient", "patience": 3}
     trials = trials_of(tmp_path, {"adc": densifier("adc"), "patient": own})
@@ -209,3 +236,23 @@ def test_experiments_list_the_control_of_every_mixed_arm() -> None:
                 checked += 1
                 assert controls.get(arm) in alone, f"{file.name}: {alone} isolate what {arm} does"
     assert checked >= 2
+
+
+def test_the_pair_that_stands_for_two_arms_is_as_alike_as_there_is() -> None:
+    arms = ("sfm", "a"), ("sfm", "b")
+    generator = random.Random(0)
+    for _ in range(200):
+        trials = [
+            SimpleNamespace(arm=arm, scene=generator.randrange(3), seed=generator.randrange(3))
+            for arm in arms
+            for _ in range(generator.randrange(1, 4))
+        ]
+        generator.shuffle(trials)
+        one, other = ([trial for trial in trials if trial.arm == arm] for arm in arms)
+        pairs = itertools.product(one, other)
+        expected = min(pairs, key=lambda pair: (pair[0].scene != pair[1].scene, pair[0].seed != pair[1].seed))
+        found = representatives(trials, *arms)  # type: ignore[arg-type]
+        assert found[0] is expected[0]
+        assert found[1] is expected[1]
+    with pytest.raises(ValueError, match="no trial of sfm-c"):
+        representatives(trials, arms[0], ("sfm", "c"))  # type: ignore[arg-type]

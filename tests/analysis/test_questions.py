@@ -246,7 +246,7 @@ def test_split_is_told_from_results_or_from_the_configuration(tmp_path: Path) ->
     trials = write_splits(tmp_path, {}, sector=3, sectors=4, match_views=True).trials
     assert {trial.split for trial in trials} == {"every_nth, matched with 4", "sector 3 of 4, matched"}
     one = next(trial for trial in trials if trial.question == "extrapolation")
-    assert one.conditions()["split"] == one.split
+    assert one.conditions["split"] == one.split
 
 
 def test_no_chart_joins_the_two_questions(tmp_path: Path) -> None:

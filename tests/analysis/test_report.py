@@ -383,3 +383,10 @@ def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> N
     assert "Verdicts, " not in page
     assert "not held against each other" in page
     assert "densify.volume_threshold = 0.6841 (point 1)" in page
+
+
+def test_a_forest_has_a_scale_whatever_its_range() -> None:
+    """A range of -.09 to .09 had zero as its one tick."""
+    for reach in (0.0886, 0.09, 0.11, 1.0, 3.3, 940.0):
+        chart = forest_plot("t", [ForestRow("a", 0.1 * reach, -reach, reach)], "difference", 1)
+        assert chart.count('class="grid"') >= 2, reach

@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.analysis.results import list_experiments, load_experiment, read_views
+from gsbench.analysis.per_view import read_views
+from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
+from gsbench.runs.experiments import list_experiments
 from gsbench.runs.rows import read_curve
 from tests.analysis.synthetic import Plan, write_runs
 

@@ -94,6 +94,17 @@ def test_a_clear_difference_ends_at_the_first_look(sweep: Callable[..., int], ru
     assert (verdict.decision.outcome, verdict.decision.seeds, verdict.beforehand) == ("for", 2, True)
 
 
+def test_a_decided_sweep_given_again_runs_nothing(
+    sweep: Callable[..., int], runs: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert sweep(Fake(clear)) == 0
+    again = Fake(clear)
+    with caplog.at_level(logging.INFO):
+        assert sweep(again) == 0
+    assert not again.batches
+    assert "4 of 8 trials were not needed" in caplog.text
+
+
 def test_noise_gets_all_seeds_and_each_trial_is_launched_once(sweep: Callable[..., int], runs: Path) -> None:
     fake = Fake(noise)
     assert sweep(fake) == 0

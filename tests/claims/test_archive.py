@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from gsbench.analysis.results import load_experiment, read_views
+from gsbench.analysis.per_view import read_views
+from gsbench.analysis.results import load_experiment
 from gsbench.claims.archive import unpack_archive, write_archive
 from gsbench.cli import run
 from gsbench.errors import InputError
@@ -67,7 +68,10 @@ def test_no_pixels_and_no_paths_of_the_machine(tmp_path: Path) -> None:
     config["runs"], config["scene"]["path"] = "/home/alice/runs", "/home/alice/photos/garden"
     (path / "config.yaml").write_text(json.dumps(config))
     results = json.loads((path / "results.json").read_text())
-    results["unavailable"] = {"lpips_alex": "no such file", "where": "/home/alice/weights/a.pth"}
+    looked = (
+        "weights not found: a.pth (looked in /home/alice/weights, /home/alice/.cache/torch; switched off): get them"
+    )
+    results["unavailable"] = {"lpips_alex": looked, "where": "/home/alice/weights/a.pth"}
     (path / "results.json").write_text(json.dumps(results))
     write_archive(load_experiment(runs, "exp"), tmp_path / "exp.zip")
     content = members(tmp_path / "exp.zip")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,10 @@ import yaml
 
 from gsbench.claims.file import parse_claims
 from gsbench.claims.page import make_page, to_html, to_markdown
-from gsbench.claims.sweep import Check, prepare, run_looks, with_seed
+from gsbench.claims.sweep import Check, prepare, run_looks
 from gsbench.cli import run
 from gsbench.config.compose import Composed
+from gsbench.config.sweep_jobs import with_seed
 from gsbench.errors import InputError
 from gsbench.runs.declaration import DeclaredPlan, read_plans
 from gsbench.runs.trial_files import TrialPaths
@@ -50,6 +52,8 @@ class FakeRunner:
         for trial in trials:
             paths, values = TrialPaths.of(trial.values), trial.values
             if values["seed"] == self.fails:
+                paths.folder.mkdir(parents=True)
+                (paths.folder / "failed.json").write_text('{"error": "InputError", "message": "no room\\nat all"}')
                 continue
             arm = values["densify"]["name"]
             rng = np.random.default_rng([values["seed"], arm == "adc"])
@@ -83,8 +87,11 @@ def test_a_failed_seed_makes_its_claim_wait_and_its_return_decides(tmp_path: Pat
     check, runner = check_of(tmp_path), FakeRunner(noise=0.001, fails=1)
     (verdict,) = run_looks(check, DECLARED, runner, ready)
     assert (verdict.word, runner.batches) == ("undecided", [4])
-    assert "waits for courtyard" in verdict.reason
+    assert "waits for courtyard; failed: courtyard/sfm-adc seed 1 (" in verdict.reason
+    assert verdict.reason.endswith("): no room")  # once for both arms, of which the reason is the same
     runner.fails = None
+    for failed in list(tmp_path.rglob("failed.json")):
+        shutil.rmtree(failed.parent)
     (verdict,) = run_looks(check, DECLARED, runner, ready)
     assert (verdict.word, runner.batches) == ("supported", [4, 2])
 
@@ -145,6 +152,7 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     arms = {"few": {"init.count": 200}, "many": {"init.count": 300, "train.opacity": 0.03}}
     claim = content()["claims"][0] | {"baseline": "few", "arm": "many"}
     claims = [claim | {"id": "points"}, claim | {"id": "size", "not_testable": "too large", "metric": "ssim"}]
+    claims.append(claim | {"id": "texture", "metric": "error_textured", "direction": "lower", "least": "2%"})
     path = tmp_path / "claims.yaml"
     path.write_text(json.dumps(content() | {"settings": settings, "arms": arms, "claims": claims, "seeds": 2}))
     assert run(["check", str(path), "--dry-run"]) == 0
@@ -168,6 +176,13 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     assert run(["check", str(path)]) == 0
     assert ((home / "claims.md").read_text(), (home / "claims.html").read_text()) == first
     assert read_plans(home) == [plan]
+    archive = tmp_path / "published" / "check_it.zip"
+    assert run(["export", "--results", "check_it", "--out", str(archive)]) == 0
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "elsewhere"))
+    capsys.readouterr()
+    assert run(["check", str(path), "--from", str(archive)]) == 0
+    assert capsys.readouterr().out == first[0]
+    assert not (tmp_path / "elsewhere").exists()
 
 
 @pytest.mark.parametrize("key", ["allow_targets", "+allow_targets"])

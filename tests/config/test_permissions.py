@@ -163,3 +163,19 @@ def test_harmless_variables_need_no_permission() -> None:
 def test_a_version_command_cannot_hide_behind_what_is_known_later() -> None:
     with pytest.raises(InputError, match=r"nothing is known as \{output\}"):
         compose_one([*PROGRAM, "densify.version_command=['{output}/x']", "allow_targets=[python]"])
+
+
+def test_retry_sends_nothing_to_a_tracker_that_a_strange_folder_names(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address = "http://127.0.0.1:9"
+    strange_runs({"tracking": {"uri": address}})
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.setattr("gsbench.app.command.run_trials", no_trial)
+    assert cli.run(["retry", "x"]) == 2
+    assert f"to allow it, type tracking.uri={address}" in capsys.readouterr().err
+    began: list[Any] = []
+    monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", address)
+    assert cli.run(["retry", "x"]) == 0
+    assert len(began) == 1

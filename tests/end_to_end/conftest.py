@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+
+from gsbench.cli import run
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -59,3 +61,10 @@ def gsbench(environment: dict[str, str], tmp_path: Path) -> Run:
         )
 
     return run
+
+
+def trial_of(settings: Sequence[str], runs: Path, capture: Path, *words: str) -> Path:
+    """Run one trial of the capture in a folder within this process; returns the trial's folder."""
+    assert run([*settings, f"scene.path={capture}", f"runs={runs}", f"name={capture.name}", *words]) == 0
+    (folder,) = {path.parent for path in (runs / capture.name).glob("*/*/*/results.json")}
+    return folder

@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from tests.end_to_end.conftest import SMALL, Run
+from tests.processes import bytes_written
 
 pytestmark = pytest.mark.end_to_end
 
@@ -70,7 +71,7 @@ def wait_for(runs: Path, pattern: str, process: subprocess.Popen[str], seconds: 
 
 
 def training_log_size(runs: Path) -> int:
-    return sum(path.stat().st_size for path in runs.glob("store/train/.*.partial/metrics.jsonl"))
+    return bytes_written(runs, "store/train/.*.partial/metrics.jsonl")
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsbench.cli import run
 from gsbench.init import Sfm
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.readers import read_colmap
+from tests.end_to_end.conftest import trial_of
 
 QUICK = [
     "scene=colmap", "densify=adc", "train.iterations=120", "train.densify_start=20", "train.densify_interval=20",
@@ -42,10 +43,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return clean, noisy
 
 
-def trial(runs: Path, capture: Path, *words: str) -> Path:
-    assert run([*QUICK, f"scene.path={capture}", f"runs={runs}", f"name={capture.name}", *words]) == 0
-    (folder,) = {path.parent for path in (runs / capture.name).glob("*/*/*/results.json")}
-    return folder
+trial = partial(trial_of, QUICK)
 
 
 def bits(folder: Path) -> dict[str, str]:

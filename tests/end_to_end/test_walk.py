@@ -19,7 +19,7 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 import gsbench
 from gsbench import settings
 from gsbench.cli import run
-from gsbench.config import compose
+from gsbench.config import sweep_jobs
 from gsbench.densify import Volumetric
 from gsbench.gaussians.trainable import TrainableGaussians
 from tests.end_to_end.conftest import SMALL
@@ -91,7 +91,7 @@ def test_from_the_yaml_to_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         return compose_job(*given)
 
     monkeypatch.setattr(ConfigLoaderImpl, "load_sweep_config", counted)
-    watch(compose, "settle")
+    watch(sweep_jobs, "settle")
     watch(settings, "_converted", lambda value, field, cls, key: key == KEY)
     watch(Volumetric, "split_by_volume")
     watch(TrainableGaussians, "edit", lambda *given: calls["split_by_volume"] > 0)

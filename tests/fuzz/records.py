@@ -8,6 +8,7 @@ noticed and how many were read, and the case that ended in anything else.
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 import os
@@ -22,14 +23,17 @@ from typing import Any
 
 from gsbench.analysis.explain import explain_cell
 from gsbench.analysis.frame import to_frame
+from gsbench.analysis.per_view import read_views
 from gsbench.analysis.report.search_charts import search_part
 from gsbench.analysis.report.sections import event_charts, training_charts, volume_charts
-from gsbench.analysis.results import load_experiment, read_views
+from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import build_table
+from gsbench.analysis.tuning import tuning_lines
 from gsbench.errors import InputError
 from gsbench.launch import queue
-from gsbench.launch.plan import Estimator, read_plan
+from gsbench.launch.experience import Experience
+from gsbench.launch.plan import read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.runs.declaration import read_declarations, read_plans
 from gsbench.runs.finished import find_finished
@@ -46,7 +50,7 @@ DONE, FAILED, EXPERIMENT = "sfm-adc", "sfm-volumetric", "exp"
 NAMES = (
     "results.json", "inputs.json", "config.yaml", "plan.json", "declared.jsonl", "metrics.jsonl", "events.jsonl",
     "volume_histograms.jsonl", "per_view.csv", "failed.json", "building.json", ".submitted.json", "search.json",
-    "mlflow.json", ".lock.holder",
+    "tuning.json", "mlflow.json", ".lock.holder",
 )  # fmt: skip
 STRANGE: tuple[str, ...] = (
     "null", "{}", "[]", '""', "true", "0", "-1", "NaN", "-Infinity", "1e400", "1e308", "9" * 400, "9" * 5000, '"x"',
@@ -131,8 +135,12 @@ def write_original(runs: Path) -> dict[str, Path]:
     point = {"number": 0, "state": "done", "settings": {"a": 0.5, "b": "x"}, "value": 20.0}
     search = {"metric": "psnr", "direction": 1, "wanted": 3, "seeds": 1, "log": ["a"], "points": [point]}
     (home / "search.json").write_text(json.dumps(search))
+    found = search | {"log": [], "points": [point | {"settings": {"densify.volume_threshold": 0.03}}]}
+    arm = {"ranges": {"densify.volume_threshold": "0.01,0.03"}, "experiment": "t", "as_it_is": True, "search": found}
+    tuning = {"hash": "h", "metric": "psnr", "seeds": [100], "scenes": ["courtyard"], "arms": {"sfm-volumetric": arm}}
+    (home / "tuning.json").write_text(json.dumps(tuning))
     places_of = {name: done / name for name in NAMES}
-    places_of |= {name: home / name for name in ("plan.json", "declared.jsonl", "search.json")}
+    places_of |= {name: home / name for name in ("plan.json", "declared.jsonl", "search.json", "tuning.json")}
     places_of |= {name: failed / name for name in ("failed.json", "building.json", ".submitted.json")}
     places_of |= {"mlflow.json": variant / "mlflow.json", "config.yaml": variant / "config.yaml"}
     assert all(path.is_file() for path in places_of.values())
@@ -223,6 +231,8 @@ def look(runs: Path, places: dict[str, Path]) -> int:
         attempt(lambda: training_charts(experiment.trials, arms))
         attempt(lambda: event_charts(experiment.trials, arms))
         attempt(lambda: volume_charts(experiment.trials, arms))
+        for first, second in itertools.pairwise(arms):
+            attempt(lambda pair=(first, second): tuning_lines(experiment.trials, pair))  # type: ignore[misc]
         for trial in experiment.trials:
             attempt(lambda trial=trial: read_views(trial))  # type: ignore[misc]
 
@@ -230,7 +240,7 @@ def look(runs: Path, places: dict[str, Path]) -> int:
     attempt(lambda: explain_cell(f"{EXPERIMENT}:courtyard:psnr:adc", runs))
     attempt(lambda: "\n".join(lines_of(states_of_experiment(home), everything=True)).encode())
     attempt(lambda: read_plan(home))
-    attempt(lambda: Estimator(runs).estimate(values_of(runs, "adc", 0, 0.03)))
+    attempt(lambda: Experience(runs).estimate(values_of(runs, "adc", 0, 0.03)))
     attempt(lambda: (read_declarations(home), read_plans(home)))
     attempt(lambda: search_part(home))
     for folder in {path.parent for path in places.values()} - {home}:

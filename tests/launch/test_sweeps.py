@@ -26,15 +26,9 @@ from gsbench.errors import InputError
 from gsbench.files import DiskFullError, explain_storage
 from gsbench.launch import serial
 from gsbench.launch.batch import run_batch
+from gsbench.launch.experience import Experience
 from gsbench.launch.outcome import Outcome
-from gsbench.launch.plan import (
-    Estimator,
-    add_to_plan,
-    describe_plan,
-    forget,
-    read_plan,
-    same_trial_elsewhere,
-)
+from gsbench.launch.plan import add_to_plan, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.launch.trial import Trial
 from gsbench.runs import finished
@@ -409,7 +403,7 @@ def test_dry_run_tells_states_and_time(runs: Path) -> None:
     assert "as in other: nothing to compute" in lines[1]
     assert lines[4] == "4 trials: 1 done, 3 missing"
     assert lines[5] == "time: about 15 min, 2 at once, judged by 2 finished trials"  # 2 x (600 + 1200) / 2, two at once
-    assert same_trial_elsewhere(TrialPaths.of(trials[1].values)) == "other"
+    assert Experience(runs).elsewhere(TrialPaths.of(trials[1].values)) == "other"
     assert describe_plan(trials[1:2])[1:] == [
         "1 trial: 1 missing",
         "time: seconds, since other experiments have the results",
@@ -419,9 +413,9 @@ def test_dry_run_tells_states_and_time(runs: Path) -> None:
 def test_estimate_prefers_the_same_scene_and_densifier_and_scales_with_iterations(runs: Path) -> None:
     finish(trial_values("densify=adc", "train.iterations=100"), seconds=10)
     finish(trial_values("densify=mcmc", "train.iterations=100"), seconds=30)
-    estimator = Estimator(runs)
-    assert estimator.estimate(trial_values("densify=adc", "train.iterations=1000")).seconds == pytest.approx(100)
-    assert estimator.estimate(trial_values("densify=none", "train.iterations=1000")).seconds == pytest.approx(200)
+    experience = Experience(runs)
+    assert experience.estimate(trial_values("densify=adc", "train.iterations=1000")).seconds == pytest.approx(100)
+    assert experience.estimate(trial_values("densify=none", "train.iterations=1000")).seconds == pytest.approx(200)
 
 
 # ---- running a sweep

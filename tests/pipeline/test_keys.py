@@ -10,6 +10,7 @@ from gsbench.config.compose import compose_one
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps import code as code_module
 from gsbench.pipeline.steps import init as init_module
+from gsbench.pipeline.steps.capture import CaptureSource
 from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs.hashing import config_hash
 from gsbench.runs.store import Store
@@ -30,11 +31,16 @@ KEYS = [
 ]
 
 
+class BareSource(CaptureSource):
+    def read(self, made: Path | None) -> Capture:
+        return BARE
+
+
 def test_the_keys_of_a_known_trial_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A photographs' trial without cameras: so the keys of the cameras that stand in for them are seen as well."""
     monkeypatch.setattr(init_module, "version", lambda package: "4.0.0")
     monkeypatch.setattr(code_module, "edited", lambda files: {})  # as in a release
     values = compose_one(WORDS).values
-    trial = TrialSteps(Parts(values), Store(tmp_path / "store"), lambda options, made: BARE)
+    trial = TrialSteps(Parts(values), Store(tmp_path / "store"), BareSource)
     keys = [("config", config_hash(values)), *((step.stage.name, step.key) for step in trial.steps())]
     assert keys == KEYS

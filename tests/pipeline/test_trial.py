@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -19,4 +20,23 @@ def test_code_that_ends_the_process_is_a_failure(code: int | str | None, tmp_pat
     paths.folder.mkdir()
     with pytest.raises(TrainingError, match="ended the process"), _recorded_failures({"seed": 0}, paths):
         sys.exit(code)
+    assert "ended the process" in json.loads((paths.folder / "failed.json").read_text())["message"]
+
+
+def test_an_end_at_once_is_a_failure_here_and_none_in_a_child(tmp_path: Path) -> None:
+    paths = TrialPaths(tmp_path, tmp_path / "x")
+    paths.folder.mkdir()
+    end_at_once = os._exit
+    with _recorded_failures({"seed": 0}, paths):
+        child = os.fork()
+        if child == 0:
+            os._exit(5)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 5
+    assert not (paths.folder / "failed.json").exists()
+    with (
+        pytest.raises(TrainingError, match=r"ended the process \(exit code 0\)"),
+        _recorded_failures({"seed": 0}, paths),
+    ):
+        os._exit(0)
+    assert os._exit is end_at_once
     assert "ended the process" in json.loads((paths.folder / "failed.json").read_text())["message"]

@@ -19,7 +19,7 @@ def test_the_name_is_that_of_the_project_file() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["name"] == DISTRIBUTION
     assert list(project["scripts"]) == ["gsbench"]
-    assert f"{DISTRIBUTION}[dim,search,slurm,tensorboard,view]" in project["optional-dependencies"]["dev"]
+    assert f"{DISTRIBUTION}[dim,search,slurm,tensorboard,video,view]" in project["optional-dependencies"]["dev"]
 
 
 def test_from_a_checkout_the_hint_installs_the_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -128,12 +128,13 @@ def test_nothing_is_left_of_a_trial_that_is_ended_while_its_tracker_hangs(signum
 def test_sync_can_be_stopped_while_the_tracker_hangs(runs: Path) -> None:
     values = trial_values(runs, name="synced")
     with Listener() as tracker:
-        folder = begin_trial(values, f"postgresql+psycopg2://x@127.0.0.1:{tracker.port}/x")
+        address = f"postgresql+psycopg2://x@127.0.0.1:{tracker.port}/x"
+        folder = begin_trial(values, address)
         write_trial(folder, values)
         results = json.loads((folder / "results.json").read_text()) | {"status": "complete"}
         (folder / "results.json").write_text(json.dumps(results))
         program = subprocess.Popen(
-            [sys.executable, "-m", "gsbench.cli", "sync", "synced"],
+            [sys.executable, "-m", "gsbench.cli", "sync", "synced", "--uri", address],
             env=child_environment() | {"GSBENCH_RUNS": str(runs)},
             stderr=subprocess.PIPE,
             text=True,

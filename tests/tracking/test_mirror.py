@@ -17,6 +17,7 @@ from gsbench.runs.trial_files import TrialPaths
 from gsbench.tracking import Mirror, connect, ensure_experiment, mirror_trial, prepare
 from gsbench.tracking.mirror import SECONDS_IN_VAIN
 from gsbench.tracking.mlflow_sink import STATE
+from tests.processes import bytes_written
 from tests.tracking.helpers import (
     RECORDS,
     begin_trial,
@@ -243,7 +244,7 @@ def test_a_database_is_whole_or_absent(tmp_path: Path) -> None:
         "import sys; from pathlib import Path; from gsbench.tracking import connect; connect(None, Path(sys.argv[1]))"
     )
     process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], env=child_environment())
-    while not any(path.stat().st_size > 0 for path in tmp_path.glob(".mlflow.db.tmp-*")):
+    while bytes_written(tmp_path, ".mlflow.db.tmp-*[0-9]") == 0:  # not its journal, which comes and goes
         assert process.poll() is None
         time.sleep(0.001)
     process.kill()

@@ -170,7 +170,7 @@ def shell(request: pytest.FixtureRequest, tmp_path: Path, runs: Path) -> Iterato
 def test_tab_completes(shell: Shell) -> None:
     (shell.log.parent / "photos").mkdir()
     assert shell.call("gsbench tab\tde\t\n") == "tables demo"
-    assert shell.call("gsbench vi\tdem\tcour\tsfm-v\t1 x\n") == "view demo:courtyard:sfm-volumetric:1 x"
+    assert shell.call("gsbench vie\tdem\tcour\tsfm-v\t1 x\n") == "view demo:courtyard:sfm-volumetric:1 x"
     assert shell.call("gsbench +experiment=thr\tseed=3\n") == "+experiment=threshold seed=3"
     assert shell.call("gsbench -m densify=adc,edge\tseed=0,1\n") == "-m densify=adc,edgeaware seed=0,1"
     assert shell.call("gsbench train.iter\t7\n") == "train.iterations=7"

@@ -147,7 +147,7 @@ def _measured(
     measure: Callable[[TrialResult, TrialResult], T],
     faults: list[str],
 ) -> Iterator[T]:
-    """What can be measured of the pairs; why others cannot goes to ``faults``."""
+    """Measurements of the pairs; the reasons why some cannot be measured go to ``faults``."""
     for pair in pairs:
         try:
             yield measure(*pair)

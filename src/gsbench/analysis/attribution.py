@@ -7,7 +7,7 @@ share a name, and a class of densifiers brings those in which it departs from AD
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +37,7 @@ RULES: dict[str, tuple[str, ...]] = {
     "gsbench.densify.PixelGS": ("weights of the gradient",),
     "gsbench.densify.QuantileADC": ("threshold by a rate", "pruning by a share"),
     "gsbench.densify.ResGS": ("residual split", "levels", "fading opacity"),
+    "gsbench.densify.SteepGS": ("saddle condition", "split along an eigenvector"),
     "gsbench.densify.Taming": ("score", "prunings"),
     "gsbench.densify.Volumetric": ("volume rule",),
 }
@@ -48,6 +49,7 @@ NAMES = {
     **{f"train.{key}": "schedule" for key in ("densify_start", "densify_stop", "densify_interval", "mcmc_stop")},
     **{f"densify.{key}": "opacity reset" for key in ("opacity_reset_interval", "opacity_reset_value")},
     "train.opacity_reset_interval": "opacity reset",
+    "train.resolution_schedule": "resolution schedule",
     **{f"densify.{key}": "budget" for key in ("max_gaussians", "cap", "governor_dimension")},
     **{f"densify.{key}": "prunings" for key in ("prune_opacity", "prune_size", "prune_screen_radius")},
     **{f"init.{key}": "cameras" for key in ("poses", "align")},
@@ -140,14 +142,30 @@ def attribution_sentence(found: Attribution, first: Arm, second: Arm) -> str:
 
 
 def representatives(trials: Iterable[TrialResult], first: Arm, second: Arm) -> tuple[TrialResult, TrialResult]:
-    """A trial of each arm, of one scene and seed where there is such a pair."""
-    own = {arm: [trial for trial in trials if trial.arm == arm] for arm in (first, second)}
-    pairs = ((one, other) for one in own[first] for other in own[second])
-    return min(pairs, key=lambda pair: (pair[0].scene != pair[1].scene, pair[0].seed != pair[1].seed))
+    """A trial of each arm, of one scene and seed where there is such a pair, else of one scene, else of one seed.
+
+    Raises ValueError for an arm without trials.
+    """
+    by_arm = by_key(trials, lambda trial: trial.arm)
+    if missing := [arm for arm in (first, second) if arm not in by_arm]:
+        raise ValueError(f"no trial of {'-'.join(missing[0])}")
+    likenesses: tuple[Callable[[TrialResult], object], ...] = (
+        lambda trial: (trial.scene, trial.seed),
+        lambda trial: trial.scene,
+        lambda trial: trial.seed,
+        lambda trial: None,
+    )
+    for likeness in likenesses:
+        others = by_key(by_arm[second], likeness)
+        one = next((trial for trial in by_arm[first] if likeness(trial) in others), None)
+        if one is not None:
+            break
+    assert one is not None
+    return one, others[likeness(one)][0]
 
 
 def _is_bundle(ingredient: str) -> bool:
-    """Whether it stands for many at once, which nobody can tell apart."""
+    """Return whether it stands for many at once, which nobody can tell apart."""
     return ingredient in (NO_RECORD, ELSEWHERE) or ingredient.startswith(BY_PROGRAM.partition("{")[0])
 
 
@@ -168,8 +186,9 @@ def _under_the_same_settings(
 ) -> dict[str, Any]:
     """The configuration ``other`` with the densifier ``arm``, and with what was changed alike in both trials' arms."""
     kept = {key: value for key, value in other.items() if not key.startswith("densify.")}
-    arms = (resolved(settings, other) for settings in shipped_arms().values())
-    as_shipped: dict[str, Any] = next((one for one in arms if one[TARGET] == other.get(TARGET)), {})
+    arms = [resolved(settings, other) for settings in shipped_arms().values()]
+    same_class = [shipped for shipped in arms if shipped[TARGET] == other.get(TARGET)]  # adc, absgrad, revised
+    as_shipped = min(same_class, key=lambda shipped: len(differing_keys(shipped, _of_arm(other))), default={})
     changed = {
         key: one[key]
         for key in arm
@@ -178,8 +197,13 @@ def _under_the_same_settings(
     return kept | dict(arm) | changed
 
 
+def _of_arm(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a configuration's densifier alone."""
+    return {key: value for key, value in config.items() if key.startswith("densify.")}
+
+
 def _belongs_to_rule(key: str, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether a setting of the densifier is there for one of two classes alone."""
+    """Return whether a setting of the densifier is there for one of two classes alone."""
     return key.startswith("densify.") and ((key in one) != (key in other))
 
 

@@ -132,12 +132,12 @@ def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration |
     else:  # the first record may be lost but for what its trials repeat: all since the next may have been added
         again = next((one.time for one in since if one.trials is not None), math.inf)
         added = tuple(trial for trial in trials if measured(trial) >= again)
-    looks = any(STOPPING in plan.plan for plan in read_plans(folder))
+    looks = any(plan.kind == STOPPING for plan in read_plans(folder))
     return ActiveDeclaration(named, seen, added, len(trials), tuple(others), looks)
 
 
 def _is_declared(trial: TrialResult, declaration: Declaration) -> bool:
-    """Whether the trial is one of those declared."""
+    """Return whether the trial is one of those declared."""
     return trial.seed in (declaration.trials or {}).get(trial_key(trial.scene, _arm(trial), trial.config_hash), ())
 
 

@@ -6,7 +6,8 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from gsbench.analysis.results import TrialResult, canonical
+from gsbench.analysis.configurations import canonical
+from gsbench.analysis.results import TrialResult
 from gsbench.runs.hashing import BEFORE
 from gsbench.runs.source import SHOWN
 from gsbench.words import counted
@@ -28,7 +29,7 @@ def differing_conditions(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
     """
     seen: dict[str, set[str]] = defaultdict(set)
     for trial in trials:
-        for key, value in trial.conditions().items():
+        for key, value in trial.conditions.items():
             seen[key].add(value)
     for part, versions in differing_code(trials).items():
         seen[part] = {short_version(version) for version in versions}
@@ -93,7 +94,7 @@ def _places(trials: Sequence[TrialResult]) -> str:
 
 
 def _when(trials: Sequence[TrialResult]) -> str:
-    """When the trials were finished: a minute, or the first and the last."""
+    """Time at which the trials were finished: a minute, or the first and the last."""
     times = sorted(trial.finished for trial in trials)
     minutes = [time.strftime("%Y-%m-%d %H:%M", time.localtime(finished)) for finished in times]
     return minutes[0] if minutes[0] == minutes[-1] else f"{minutes[0]} to {minutes[-1]}"

@@ -20,7 +20,8 @@ from gsbench.analysis.pairing import Paired, pair_trials
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import Comparison, compare_family
 from gsbench.errors import InputError
-from gsbench.runs.layout import GROUND_TRUTH, MAPS, RENDERS
+from gsbench.runs.layout import GROUND_TRUTH, MAPS, MASKS, RENDERS
+from gsbench.scene.masks import read_mask
 
 BINS = 5
 TEXTURE_SIGMA = 2.0  # px: texture energy is the gradient's square averaged over such a Gaussian
@@ -58,6 +59,12 @@ def texture_energy(image: NDArray[np.uint8]) -> Array:
     luminance = image.astype(np.float64) @ np.array(LUMINANCE)  # [H, W]
     rows, columns = np.gradient(luminance)
     return gaussian(rows**2 + columns**2, TEXTURE_SIGMA, mode="reflect", preserve_range=True)
+
+
+def read_ignored(trial: TrialResult, view: str) -> NDArray[np.bool_] | None:
+    """True where a mask ignores a pixel of the test view, [H, W]; None where all count."""
+    path = trial.path / MASKS / f"{view}.png"
+    return ~read_mask(path) if path.is_file() else None
 
 
 def absolute_error(render: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Array:
@@ -125,10 +132,13 @@ Reader = Callable[[TrialResult, str, NDArray[np.uint8]], Array]
 
 
 def _property_reader(name: str) -> Reader:
-    if name == "texture":
-        return lambda trial, view, truth: texture_energy(truth)
-    if name in MAP_PROPERTIES:
-        return lambda trial, view, truth: _read_map(trial, view, name, truth.shape[:2])
+    def read(trial: TrialResult, view: str, truth: NDArray[np.uint8]) -> Array:
+        values = texture_energy(truth) if name == "texture" else _read_map(trial, view, name, truth.shape[:2])
+        ignored = read_ignored(trial, view)
+        return values if ignored is None else np.where(ignored, np.nan, values)  # in no bin
+
+    if name == "texture" or name in MAP_PROPERTIES:
+        return read
     raise InputError(f"unknown property {name!r}; choose texture, {', '.join(MAP_PROPERTIES)}")
 
 

@@ -42,7 +42,7 @@ def explain_cell(address: str, runs: Path) -> str:
     if cell.reason:
         lines.append(f"  not available: {cell.reason}")
     lines += _paper_lines(name, scene, trials[0], shown, cell)
-    lines += ["", "Conditions"] + [f"  {key}: {value}" for key, value in trials[0].conditions().items()]
+    lines += ["", "Conditions"] + [f"  {key}: {value}" for key, value in trials[0].conditions.items()]
     lines += _baseline_lines(experiment, trials[0])
     lines += ["", "Trials"]
     for trial in trials:

@@ -16,10 +16,11 @@ from gsbench.analysis.attribution import (
     differing_keys,
     representatives,
 )
+from gsbench.analysis.configurations import canonical
 from gsbench.analysis.differences import CODE, short_version
 from gsbench.analysis.origins import cloud_of, machine_of
 from gsbench.analysis.pairing import arm_name, pair_trials
-from gsbench.analysis.results import Arm, TrialResult, canonical
+from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.shipped import REFERENCE, notes_of, resolved, shipped_arms, shipped_name
 from gsbench.analysis.tables import Column, Entry, Row, Table
 from gsbench.analysis.tuning import tuning_lines
@@ -98,7 +99,7 @@ def default_lines(trial: TrialResult) -> list[str]:
 
 
 def _is_open(value: object) -> bool:
-    """Whether a setting of a file refers to one that the trial has not recorded."""
+    """Return whether a setting of a file refers to one that the trial has not recorded."""
     return isinstance(value, str) and REFERENCE.fullmatch(value) is not None
 
 
@@ -148,7 +149,7 @@ def _each(read: Callable[[TrialResult], str | None]) -> Callable[[Sequence[Trial
 
 
 def _rounds(trial: TrialResult) -> float | None:
-    """How often the densifier refined; a log that is missing or empty says nothing."""
+    """Say how often the densifier refined; a log that is missing or empty says nothing."""
     return float(len(trial.curve(EVENTS))) or None
 
 

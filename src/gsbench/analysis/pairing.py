@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from gsbench.analysis.cells import by_key, check_averageable
 from gsbench.analysis.differences import differing_conditions
-from gsbench.analysis.results import Arm, TrialResult, read_views
+from gsbench.analysis.per_view import read_views
+from gsbench.analysis.results import Arm, TrialResult
 from gsbench.errors import InputError
 
 Views = Mapping[str, Mapping[str, float]]

@@ -121,13 +121,13 @@ def _value_at(key: str, step: str, trial: TrialResult) -> float | None:
 
 
 def _protocol_lpips(trial: TrialResult) -> str:
-    """What the trial's protocol means by LPIPS."""
+    """Key of the metric that the trial's protocol means by LPIPS."""
     protocol = protocol_of(trial.record.protocol) or PAPER
     return f"{LPIPS}{protocol.lpips or PAPER.lpips}"
 
 
 def _lpips_asked_for(trial: TrialResult) -> list[str]:
-    """What the trial's protocol means by LPIPS, unless its configuration asks for other variants alone."""
+    """Key of what the trial's protocol means by LPIPS, or keys where its configuration asks for others alone."""
     protocols, setting = _protocol_lpips(trial), trial.config.get("eval.lpips")
     asked = [f"{LPIPS}{variant}" for variant in setting] if isinstance(setting, list) else []
     return asked if asked and protocols not in asked else [protocols]

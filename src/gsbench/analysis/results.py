@@ -6,26 +6,22 @@ says that it is complete. Nothing here needs torch, so that tables over thousand
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import logging
-import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from gsbench.analysis.configurations import Configurations, Kind, canonical, load_flat_config
 from gsbench.errors import InputError
-from gsbench.parsing import DamagedError, one_line, read_yaml
-from gsbench.records import MOST
+from gsbench.parsing import DamagedError, one_line
 from gsbench.runs.declaration import QUESTIONS
-from gsbench.runs.hashing import NOT_HASHED, flatten
-from gsbench.runs.inputs import read_results, read_settings, read_unchanged
-from gsbench.runs.layout import CONFIG, FAILED, IN_RUNS, PER_VIEW, RESULTS
+from gsbench.runs.experiments import experiment_home, is_folder
+from gsbench.runs.inputs import read_results
+from gsbench.runs.layout import CONFIG, FAILED, RESULTS, SEED
 from gsbench.runs.origin import FROM_RENDERS
 from gsbench.runs.rows import read_curve
 from gsbench.runs.splits import split_text
@@ -35,69 +31,9 @@ from gsbench.runs.trial_record import TrialRecord, UnfinishedError
 
 log = logging.getLogger(__name__)
 
-TRIAL_FOLDER = re.compile(r"(?P<hash>[0-9a-f]{8})-seed(?P<seed>\d+)")
-MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
-
-ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
-GROUPS = ("scene", "init", "densify")  # of a configuration: what every trial has
+TRIAL_FOLDER = re.compile(rf"(?P<hash>[0-9a-f]{{8}}){SEED}(?P<seed>\d+)")
 
 Arm = tuple[str, str]  # initialiser, densifier
-
-
-Kind = tuple[str, str, str, str]  # scene, initialiser, densifier, hash of the configuration
-
-
-class Configurations:
-    """The settings that determine the results of an experiment's trials, read once for all of one kind.
-
-    Those that are ``known`` are not read: of trials that have not run.
-    """
-
-    def __init__(self, known: Mapping[Kind, Mapping[str, Any]] | None = None) -> None:
-        self._known: dict[Kind, Mapping[str, Any]] = dict(known or {})
-        self._texts: dict[Kind, Mapping[str, str]] = {}
-
-    def texts(self, kind: Kind, folder: Path) -> Mapping[str, str]:
-        """The same as `shared`, each as comparable text."""
-        if kind not in self._texts:
-            self._texts[kind] = {key: canonical(value) for key, value in self.shared(kind, folder).items()}
-        return self._texts[kind]
-
-    def shared(self, kind: Kind, folder: Path) -> Mapping[str, Any]:
-        """The settings of the trial in ``folder``, as those of any other of its ``kind``; {} where unreadable."""
-        if kind not in self._known:
-            self.find(kind, [folder])
-        return self._known[kind]
-
-    def find(self, kind: Kind, folders: Iterable[Path]) -> str:
-        """Read the settings of a kind from the first of ``folders`` that has them; else why the last has not."""
-        fault = ""
-        for folder in folders:
-            try:
-                found = load_flat_config(folder)
-            except FileNotFoundError:
-                fault = f"{CONFIG} is not there"
-            except DamagedError as error:
-                fault = f"{error.path.name} {error.reason}"
-            else:
-                own = {key: value for key, value in found.items() if key.split(".")[0] not in NOT_HASHED}
-                self._known[kind] = own
-                return ""
-        self._known.setdefault(kind, {})
-        return fault
-
-
-def load_flat_config(folder: Path) -> dict[str, Any]:
-    """The configuration of the trial in ``folder`` with dotted keys; raises FileNotFoundError and DamagedError.
-
-    It is read from ``inputs.json`` where that has it, which is some twenty times quicker than YAML.
-    """
-    values = read_settings(folder)
-    if values is None:
-        values = read_yaml(folder / CONFIG)
-    if not isinstance(values, dict) or not all(isinstance(values.get(group), dict) for group in GROUPS):
-        raise DamagedError(folder / CONFIG, f"is damaged: it lacks one of the groups {', '.join(GROUPS)}")
-    return flatten(values)
 
 
 @dataclass(frozen=True)
@@ -147,7 +83,7 @@ class TrialResult:
         """The reasons why metrics are missing."""
         return self.record.unavailable
 
-    @property
+    @cached_property
     def arm(self) -> Arm:
         """The name of the compared arm: the initialiser, and the densifier with its variant."""
         return self.init, f"{self.densify} {self.variant}".strip()
@@ -202,14 +138,15 @@ class TrialResult:
     @cached_property
     def files(self) -> dict[str, str]:
         """The files of gsbench that had a part in the trial, with their states then (`gsbench.runs.code`)."""
-        return {f"gsbench's {file}": str(state) for file, state in self.record.code.files.items()}
+        return {f"gsbench's {file}": state for file, state in self.record.code.files.items()}
 
     @property
     def finished(self) -> float:
         """The Unix time at which the trial was finished."""
         return (self.path / RESULTS).stat().st_mtime
 
-    def conditions(self) -> dict[str, str]:
+    @cached_property
+    def conditions(self) -> Mapping[str, str]:
         """The known conditions that trials must share before their numbers may be averaged, as comparable text."""
         known = {
             "protocol": self.record.protocol,
@@ -226,14 +163,14 @@ class TrialResult:
             known["budget"] = "null" if self.record.budget is None else canonical(asdict(self.record.budget))
         return known
 
-    @property
+    @cached_property
     def split(self) -> str:
         """The rule that holds views out, as short text; "" where neither a record nor the configuration says it."""
         if self.record.split:
             return self.record.split
         return "" if "scene.name" not in self.config else split_text(self.config)
 
-    @property
+    @cached_property
     def question(self) -> str:
         """The question that held-out views ask of a model: interpolation or extrapolation; "" for a list of views."""
         kind = re.split("[ ,]", self.split, maxsplit=1)[0]
@@ -285,6 +222,11 @@ class Experiment:
     def seeds(self) -> tuple[int, ...]:
         return tuple(sorted({trial.seed for trial in self.trials}))
 
+    @property
+    def by_folder(self) -> dict[str, TrialResult]:
+        """The trials by their folders within the experiment, ``<scene>/<arm>/<hash8>-seed<k>``."""
+        return {trial.path.relative_to(self.folder).as_posix(): trial for trial in self.trials}
+
 
 def load_experiment(runs_dir: Path, name: str) -> Experiment:
     """Read every trial of the experiment ``name``; raises ``InputError`` where there is no usable one."""
@@ -332,24 +274,8 @@ def _with_known_settings(
     return known, [(trial, faults[trial.kind]) for trial in trials if faults.get(trial.kind)]
 
 
-def list_experiments(runs_dir: Path) -> list[str]:
-    """The names of the experiments in a runs folder, sorted."""
-    if not runs_dir.is_dir():
-        return []
-    found = (entry for entry in os.scandir(runs_dir) if is_folder(entry) and not entry.name.startswith("."))
-    return sorted(entry.name for entry in found if entry.name not in IN_RUNS)
-
-
-def experiment_home(runs_dir: Path, name: str) -> Path:
-    """The folder of the experiment ``name``; raises InputError naming those there are."""
-    known = list_experiments(runs_dir)
-    if name not in known:
-        raise InputError(f"no experiment {name!r} in {runs_dir}; there: {', '.join(known) or 'none yet'}")
-    return runs_dir / name
-
-
 class _UnusableError(Exception):
-    """Why a folder is not a usable trial."""
+    """Return why a folder is not a usable trial."""
 
 
 def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialResult:
@@ -375,50 +301,6 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
     return TrialResult(path, match["hash"], record, digests=digests, settings=settings)
 
 
-def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
-    """The metrics of every test view, ``{view: {metric: value}}``; raises ``InputError`` where the file is damaged.
-
-    The file must average to the trial's own metrics, so that a truncated one cannot pass.
-    """
-    path = trial.path / PER_VIEW
-    try:
-        text = read_unchanged(path, trial.digests).decode("utf-8")
-        views = {
-            row["view"]: {key: _number(value) for key, value in row.items() if key != "view" and value != ""}
-            for row in csv.DictReader(io.StringIO(text, newline=""))
-        }
-    except FileNotFoundError:
-        raise InputError(f"{path} is missing: give the trial's own command again") from None
-    except DamagedError as error:
-        raise InputError(f"{error}: delete it, and give the trial's own command again") from None
-    except (UnicodeDecodeError, KeyError, TypeError, ValueError, csv.Error) as error:
-        raise InputError(f"{path} is damaged ({one_line(repr(error))}): give the trial's own command again") from None
-    for key, expected in trial.metrics.items():
-        values = [view[key] for view in views.values() if key in view]
-        mean = math.fsum(values) / len(values) if values else math.nan
-        if len(values) != len(views) or not math.isclose(
-            mean, expected, rel_tol=MEAN_TOLERANCE, abs_tol=MEAN_TOLERANCE
-        ):
-            raise InputError(
-                f"{path} does not average to the {key} of its trial ({mean:.6g}, not {expected:.6g}): damaged"
-            )
-    return views
-
-
-def _number(text: str) -> float:
-    value = float(text)
-    if not abs(value) <= MOST:
-        raise ValueError(f"{text} is no measured number")
-    return value
-
-
-def canonical(value: object) -> str:
-    """JSON text that is equal for equal values."""
-    if type(value) is int or (type(value) is float and math.isfinite(value)):
-        return repr(value)  # as JSON writes it; most settings are such
-    return ENCODER.encode(value)
-
-
 def _trial_folders(folder: Path) -> Iterator[str]:
     """Every folder three levels below the experiment, in no particular order."""
     for scene in _folders(folder):
@@ -433,14 +315,6 @@ def _folders(place: str | Path) -> list[str]:
     except OSError as error:
         log.warning("left out: %s cannot be read (%s)", place, error.strerror)
         return []
-
-
-def is_folder(entry: os.DirEntry[str]) -> bool:
-    """Return whether an entry is a folder, or a link to one; a link to itself is none."""
-    try:
-        return entry.is_dir()
-    except OSError:
-        return False
 
 
 def _why_unfinished(path: Path) -> str:

@@ -144,9 +144,9 @@ def compare_family(members: Sequence[tuple[Paired, int]]) -> list[Comparison]:
     """
     per_trial = [[matrix.mean(axis=1) for matrix in paired.differences] for paired, _ in members]  # [K] for each scene
     tests = [student(values) for values in per_trial]
-    adjusted = _adjust(tests)
+    adjusted = adjust(tests)
     by_scene = [[student([values]) for values in one] for one in per_trial]
-    several = iter(_adjust([test for tests in by_scene if len(tests) > 1 for test in tests]))
+    several = iter(adjust([test for tests in by_scene if len(tests) > 1 for test in tests]))
     of_scenes = [
         [next(several) for _ in tests] if len(tests) > 1 else [whole]  # one scene is the whole: one answer
         for tests, whole in zip(by_scene, adjusted, strict=True)
@@ -161,7 +161,7 @@ def compare_family(members: Sequence[tuple[Paired, int]]) -> list[Comparison]:
 
 
 @dataclass(frozen=True)
-class _Adjusted:
+class Adjusted:
     """A test as one of a family; None where there is nothing to test."""
 
     p: float | None
@@ -169,13 +169,13 @@ class _Adjusted:
     interval: Interval | None
 
 
-def _adjust(tests: Sequence[StudentT | None]) -> list[_Adjusted]:
+def adjust(tests: Sequence[StudentT | None]) -> list[Adjusted]:
     """The tests as one family: each p times Holm's factor, each interval at the level divided by the same."""
     p_values = [None if test is None else test.p for test in tests]
     return [
-        _Adjusted(None, None, None)
+        Adjusted(None, None, None)
         if test is None or factor is None
-        else _Adjusted(test.p, min(1.0, factor * test.p), test.interval(ALPHA / factor))
+        else Adjusted(test.p, min(1.0, factor * test.p), test.interval(ALPHA / factor))
         for test, factor in zip(tests, holm_factors(p_values), strict=True)
     ]
 
@@ -184,8 +184,8 @@ def _comparison(
     paired: Paired,
     direction: int,
     per_trial: Sequence[Array],
-    answer: _Adjusted,
-    scenes: Sequence[_Adjusted],
+    answer: Adjusted,
+    scenes: Sequence[Adjusted],
     beyond: BeyondScenes | None,
     family: int,
 ) -> Comparison:
@@ -279,7 +279,7 @@ def t_interval(values: Array) -> Interval | None:
 
 
 def _scene_comparisons(
-    paired: Paired, per_trial: Sequence[Array], answers: Sequence[_Adjusted], direction: int
+    paired: Paired, per_trial: Sequence[Array], answers: Sequence[Adjusted], direction: int
 ) -> tuple[SceneComparison, ...]:
     rows = zip(paired.scenes, per_trial, paired.differences, answers, strict=True)
     return tuple(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gsbench.analysis.attribution import attribute, attribution_sentence
+from gsbench.analysis.caveats import caveats
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.pairing import ViewCache, choose_pairs, controls_of
@@ -52,10 +52,10 @@ def declared_notes(experiment: Experiment) -> list[str]:
     return declared_lines(declared, judge(trials, pairs, ViewCache(), declared))
 
 
-def attribution_notes(experiment: Experiment) -> list[str]:
-    """A line for each pair of arms that differ in more than one ingredient: in which, and what would isolate one."""
+def caveat_notes(experiment: Experiment) -> list[str]:
+    """A line for each pair of arms that differ in more than one ingredient, or of which one was tuned more."""
     trials, pairs = compared_pairs(experiment)
-    return [sentence for pair in pairs if (sentence := attribution_sentence(attribute(trials, *pair), *pair))]
+    return [sentence for pair in pairs if (sentence := caveats(trials, *pair))]
 
 
 def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:

@@ -26,7 +26,7 @@ from gsbench.analysis.origins import cloud_notes, held_out_notes, machine_notes,
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Experiment, TrialResult
-from gsbench.analysis.table_notes import attribution_notes, declared_notes, origin_notes
+from gsbench.analysis.table_notes import caveat_notes, declared_notes, origin_notes
 from gsbench.analysis.translations import translation_notes
 from gsbench.words import counted, signed
 
@@ -134,7 +134,7 @@ def build_table(
     notes += _reading_notes(grid, quantities, expected, "scene" in fields) + origin_notes(trials)
     notes += (
         declared_notes(experiment)
-        + attribution_notes(experiment)
+        + caveat_notes(experiment)
         + _cost_notes(trials)
         + translation_notes(trials)
         + held_out_notes(trials)
@@ -183,7 +183,7 @@ def _best(
 
 
 def _split(cell: Cell) -> str:
-    """What was held out for a cell; cells of different splits answer different questions, and are no rivals."""
+    """Views held out for a cell, in words; cells of different splits answer different questions, and are no rivals."""
     return cell.trials[0].split if cell.trials else ""
 
 

@@ -9,28 +9,28 @@ from dataclasses import replace
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.errors import InputError
 from gsbench.eval.facts import find
-from gsbench.eval.protocol import get_protocol
+from gsbench.eval.protocol import Protocol, get_protocol, protocol_of
 from gsbench.runs.translation_record import read_translations
 from gsbench.words import signed
 
 
 def by_protocol(experiment: Experiment, name: str) -> Experiment:
     """The experiment with its trials' metrics by the protocol ``name``; raises InputError where one lacks them."""
-    wanted = get_protocol(name).id
+    wanted = get_protocol(name)
     return replace(experiment, trials=tuple(_translated(trial, wanted) for trial in experiment.trials))
 
 
-def _translated(trial: TrialResult, wanted: str) -> TrialResult:
+def _translated(trial: TrialResult, wanted: Protocol) -> TrialResult:
     own = trial.record.protocol
-    if own == wanted:
+    if own == wanted.id:
         return trial
-    found = read_translations(trial.path, trial.record).get(wanted)
+    found = read_translations(trial.path, trial.record).get(wanted.id)
     if found is None:
         raise InputError(
-            f"{trial.label} was not measured by {wanted}: gsbench evaluate {trial.experiment} "
-            f"--protocol {wanted.rpartition('-')[0]}"
+            f"{trial.label} was not measured by {wanted.id}: gsbench evaluate {trial.experiment} "
+            f"--protocol {wanted.name}"
         )
-    record = replace(trial.record, protocol=wanted, metrics=found.metrics, unavailable=found.unavailable)
+    record = replace(trial.record, protocol=wanted.id, metrics=found.metrics, unavailable=found.unavailable)
     return replace(trial, record=record, translation=found, translated_from=own)
 
 
@@ -47,8 +47,9 @@ def translation_notes(trials: Sequence[TrialResult]) -> list[str]:
         unknown |= {f"{name}: {reason}": name for name, reason in trial.translation.unknown.items()}
     if not translated:
         return []
-    own, now = translated[0].translated_from, translated[0].record.protocol
-    notes = [f"The renders of trials by {own}, measured by {now} ({get_protocol(now.rpartition('-')[0]).source})."]
+    own, now = translated[0].translated_from, protocol_of(translated[0].record.protocol)
+    assert now is not None
+    notes = [f"The renders of trials by {own}, measured by {now.id} ({now.source})."]
     for metric, parts in shares.items():
         facts = find(metric)
         assert facts is not None

@@ -1,39 +1,150 @@
-"""Tuning before or beside a comparison, as far as files tell: by which metric, on which views."""
+"""Tuning before or beside a comparison, as far as files tell: of what, with which budget, on which views."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.attribution import TARGET, differing_keys
 from gsbench.analysis.cells import by_key
-from gsbench.analysis.results import Arm, TrialResult, canonical
-from gsbench.analysis.shipped import shipped_name
-from gsbench.parsing import DamagedError
-from gsbench.runs.layout import SEARCH
-from gsbench.runs.search_record import read_search
+from gsbench.analysis.configurations import canonical
+from gsbench.analysis.declaration import measured
+from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.shipped import resolved, shipped_arms, shipped_name
+from gsbench.records import read_if_sound
+from gsbench.runs.declaration import TUNED, read_plans
+from gsbench.runs.layout import SEARCH, TUNING
+from gsbench.runs.search_record import Point, SearchRecord, is_value
+from gsbench.runs.tuning_record import TunedArm, TuningRecord
 from gsbench.words import counted, listed
 
-MOST_VALUES = 8  # of a setting, that are named
+MOST_VALUES = 8  # of a setting, or points of a search, that are named
 NOTHING = "No tuning is recorded: one choice of settings an arm was run here. What was tried elsewhere is not known."
+VALIDATION, HELD_OUT = "validation views", "its held-out views"
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The search for an arm's values: ``points``, each of as many ``trials`` of a scene, on which views."""
+
+    points: int = 0
+    trials: int = 0
+    views: str = ""
+
+    def __str__(self) -> str:
+        """``6 points of 2 seeds on validation views``, or ``none``."""
+        return f"{counted(self.points, 'point')} of {counted(self.trials, 'seed')} on {self.views}" if self else "none"
+
+    def __bool__(self) -> bool:
+        return self.points > 0
 
 
 def tuning_lines(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[str]:
-    """List, for each arm of a pair, the settings that were tried at several values in these trials, and in searches.
+    """List, for each arm of a pair, how its sweep tuned it, which values were tried in these trials, and in searches.
 
-    Every such choice was seen on the held-out views, which judge the verdict as well, unless somebody kept it apart.
+    Values that were tried in these trials were seen on the held-out views, which judge the verdict as well.
     """
-    lines = []
+    lines = [sentence] if (sentence := tuning_sentence(trials, pair)) else []
     for arm in pair:
         own = [trial for trial in trials if trial.arm == arm]
-        lines += _tried_here(trials, own[0]) + _searched(own[0])
+        lines += _tuned_here(own) + _tried_here(trials, own[0]) + _searched(own[0])
     return lines or [NOTHING]
+
+
+def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
+    """``Their tuning was unequal: sfm-adc none, sfm-volumetric 6 points of 1 seed on validation views.``
+
+    Empty where two arms had the same budget. What counts are searches whose best has the very values of an arm; several
+    values that were all run as arms are no search, since each has its verdict.
+    """
+    budgets = [_budget(next(trial for trial in trials if trial.arm == arm)) for arm in pair]
+    if len(set(budgets)) < 2:
+        return ""
+    said = listed([f"{'-'.join(arm)} {budget}" for arm, budget in zip(pair, budgets, strict=True)])
+    return f"Their tuning was unequal: {said}."
+
+
+def _budget(trial: TrialResult) -> Budget:
+    """Of the tuning by the trial's own sweep, else of the searches whose best it has: the largest."""
+    tuned = _tuned(trial)
+    if tuned is not None:
+        found = [tuned.search] if tuned.search is not None and _is_of(trial, tuned.best) else []
+    else:
+        found = [one for _, one in _searches(trial) if _is_of(trial, one.best) and not _is_shipped(trial, one.best)]
+    budgets = [Budget(len(search.points), search.seeds, _views(search)) for search in found]
+    return max(budgets, key=lambda budget: budget.points * budget.trials, default=Budget())
+
+
+def _tuned(trial: TrialResult) -> TunedArm | None:
+    """Return what the tuning of the trial's experiment says of its arm."""
+    record = _tuning_of(trial)
+    return None if record is None else record.arms.get(_arm_in_records(trial))
+
+
+def _tuning_of(trial: TrialResult) -> TuningRecord | None:
+    return read_if_sound(_home(trial) / TUNING, TuningRecord)
+
+
+def _arm_in_records(trial: TrialResult) -> str:
+    """The name that records of tunings and searches have for the trial's arm, without its variant."""
+    return f"{trial.init}-{trial.densify}"
+
+
+def _tuned_here(own: Sequence[TrialResult]) -> list[str]:
+    """Say what the sweep's tuning tried of an arm and chose, and whether these trials have it."""
+    trial = own[0]
+    record, name = _tuning_of(trial), _arm_in_records(trial)
+    if record is None or name not in record.arms:
+        return []
+    tuned = record.arms[name]
+    if tuned.search is None or tuned.best is None:
+        return [f"{name}: left as it is by the tuning of its sweep."]
+    search, best = tuned.search, tuned.best
+    chosen, where = listed(_settings(best)), listed(record.scenes)
+    if not _is_of(trial, best):
+        return [f"{name}: tuned to {chosen} by its sweep, but these trials have other values."]
+    failed = sum(point.value is None for point in search.points)
+    points = counted(len(search.points), "point") + (f" ({failed} failed)" if failed else "")
+    seeds = ", ".join(map(str, record.seeds))
+    line = (
+        f"{name}: {chosen} is the best of {points} by {record.metric} of {_views(search)} ({where}; seed {seeds}), "
+        f"{_when(own, record)}. "
+        f"Searched: {listed([f'{key}={text}' for key, text in tuned.ranges.items()])}; "
+        f"{'the first point was the arm as it is' if tuned.as_it_is else 'the arm as it is was no point'}. "
+        f"Tried: {_points(search)}."
+    )
+    values = {point.value for point in search.points if point.value is not None}
+    if len(values) == 1 and len(search.points) > 1:
+        line += " All points are equal to the last bit: what was tuned never acted."
+    return [line]
+
+
+def _when(own: Sequence[TrialResult], record: TuningRecord) -> str:
+    """Say when the tuning was declared, and whether that was before these trials were measured."""
+    plans = [plan for plan in read_plans(_home(own[0])) if plan.kind == TUNED and plan.hash == record.hash]
+    if not plans:
+        return "of which no declaration is left"
+    before = sum(measured(trial) < plans[0].time for trial in own)
+    what = f"when {before} of these {len(own)} trials had been measured" if before else "before any of these trials"
+    return f"declared {plans[0].when}, {what}"
+
+
+def _points(search: SearchRecord) -> str:
+    """``0.03 (27.31), 0.012 (27.4)``"""
+    shown = [
+        f"{', '.join(map(str, point.settings.values()))} ({'failed' if point.value is None else f'{point.value:.4g}'})"
+        for point in search.points[:MOST_VALUES]
+    ]
+    more = len(search.points) - MOST_VALUES
+    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
 
 
 def _tried_here(trials: Sequence[TrialResult], own: TrialResult) -> list[str]:
     """The settings in which arms made from one differ within an experiment: values that were tried."""
-    kin = [trial for trial in trials if trial.init == own.init and _kind(trial) == _kind(own)]
+    configurations = [group[0] for group in by_key(trials, lambda trial: trial.kind).values()]
+    kin = [trial for trial in configurations if trial.init == own.init and _kind(trial) == _kind(own)]
     choices = [group[0] for group in by_key(kin, lambda trial: trial.arm).values()]
     if len(choices) < 2 or not own.config:
         return []
@@ -54,25 +165,59 @@ def _kind(trial: TrialResult) -> object:
 
 def _searched(own: TrialResult) -> list[str]:
     """Searches in the same runs folder that proposed the very values that the arm has."""
-    runs = own.path.parents[3]
-    return [line for file in sorted(runs.glob(f"*/{SEARCH}")) if (line := _search_line(file, own)) and own.config]
+    tuned = _tuned(own)
+    lines = []
+    for name, search in _searches(own):
+        point = next((point for point in search.points if _is_of(own, point)), None)
+        if point is None or (tuned is not None and tuned.experiment == name):
+            continue
+        place = "the best" if point == search.best else "one"
+        lines.append(
+            f"{'-'.join(own.arm)}: {listed(_settings(point))} is {place} of {counted(len(search.points), 'point')} of "
+            f"the search {name}, by {search.metric} of {_views(search)}"
+            f"{', none of which is held out' if search.validation else ''}."
+        )
+    return lines
 
 
-def _search_line(file: Path, own: TrialResult) -> str:
-    try:
-        search = read_search(file.parent)
-    except (FileNotFoundError, DamagedError):
-        return ""
-    for point in search.points:
-        settings = point.settings
-        if settings and all(own.config.get(key) == settings[key] for key in settings):
-            views = "validation views, none of which is held out" if search.validation else "its held-out views"
-            chosen = listed([f"{key}={settings[key]}" for key in sorted(settings)])
-            return (
-                f"{'-'.join(own.arm)}: {chosen} is one of {counted(len(search.points), 'point')} of the search "
-                f"{file.parent.name}, by {search.metric} of {views}."
-            )
-    return ""
+def _searches(own: TrialResult) -> list[tuple[str, SearchRecord]]:
+    """The searches of a trial's arm in its runs folder, with the names of their experiments."""
+    found = []
+    for file in sorted(_home(own).parent.glob(f"*/{SEARCH}")):
+        search = read_if_sound(file, SearchRecord)
+        if search is not None and search.arm in ("", _arm_in_records(own)):
+            found.append((file.parent.name, search))
+    return found
+
+
+def _home(trial: TrialResult) -> Path:
+    """The folder of the trial's experiment."""
+    return trial.path.parents[2]
+
+
+def _views(search: SearchRecord) -> str:
+    return VALIDATION if search.validation else HELD_OUT
+
+
+def _is_of(trial: TrialResult, point: Point | None) -> bool:
+    """Return whether a trial has the very values of a point."""
+    if point is None or not point.settings:
+        return False
+    config, settings = trial.config, {key.lstrip("+~"): value for key, value in point.settings.items()}
+    return all(key in config and is_value(config[key], value) for key, value in settings.items())
+
+
+def _is_shipped(trial: TrialResult, point: Point | None) -> bool:
+    """Return whether a point of a search elsewhere has the values of the arm's own file, which need no search."""
+    name = shipped_name(trial.config)
+    if name is None or point is None:
+        return False
+    own = resolved(shipped_arms()[name], trial.config)
+    return all(key in own and is_value(own[key], value) for key, value in point.settings.items())
+
+
+def _settings(point: Point) -> list[str]:
+    return [f"{key.lstrip('+~')}={point.settings[key]}" for key in sorted(point.settings)]
 
 
 def _values(values: Sequence[Any]) -> str:

@@ -185,7 +185,7 @@ def _in_words(verdict: Verdict) -> str:
     if one.p is None or one.p_family is None:
         return f"{text}, no test: {one.test}"
     adjusted = f", both adjusted for {one.family} tests" if one.family > 1 else ""
-    return f"{text}, p {_p_text(one.p_family)}{adjusted}{beyond_words(one)}"
+    return f"{text}, p {p_text(one.p_family)}{adjusted}{beyond_words(one)}"
 
 
 def beyond_words(comparison: Comparison) -> str:
@@ -194,8 +194,9 @@ def beyond_words(comparison: Comparison) -> str:
     if beyond is None or comparison.verdict == "no evidence":
         return ""
     word = "it holds" if beyond.holds else "not shown"
-    return f"; {word} for scenes like these (p {_p_text(beyond.p_family)} over {beyond.scenes} scenes)"
+    return f"; {word} for scenes like these (p {p_text(beyond.p_family)} over {beyond.scenes} scenes)"
 
 
-def _p_text(p: float) -> str:
+def p_text(p: float) -> str:
+    """``below 0.001``, or p to three places."""
     return "below 0.001" if p < 0.001 else f"{p:.3f}"

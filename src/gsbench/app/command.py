@@ -27,7 +27,9 @@ def launch(argv: list[str]) -> int:
     words, multirun, dry_run = parse(argv)
     task = Task(list_trials, look_only=True) if dry_run else Task(run_batch)
     run_app(words, multirun, task)
-    return 0 if dry_run else summarize(task.outcomes, task.trials)
+    if dry_run or not task.trials:  # a sweep that is decided needs none
+        return 0
+    return summarize(task.outcomes, task.trials)
 
 
 def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
@@ -55,7 +57,7 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
         raise (InputError if worst.bad_input else GsbenchError)(worst.message)
     for outcome in failed:
         print(f"gsbench: failed: {outcome.label}: {outcome.message}", file=sys.stderr)
-    name = trials[0].values["name"]
+    name = trials[-1].values["name"]  # a tuning comes before, in experiments of its own
     done = sum(outcome.status == "done" for outcome in outcomes)
     if any(outcome.status == "queued" for outcome in outcomes):
         advice = f"how far the others are: gsbench status {name}"

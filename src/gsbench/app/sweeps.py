@@ -1,4 +1,7 @@
-"""The work of gsbench's sweeper: all points of its grids at once, or seed by seed until their question is decided."""
+"""The work of gsbench's sweeper: all points of its grids at once, or seed by seed until their question is decided.
+
+Either may begin by tuning its arms.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +18,14 @@ from omegaconf import DictConfig
 
 from gsbench.app.grids import words_of_grids
 from gsbench.app.task import Task, grid, launch_trials, trials_of_jobs
+from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import headline, plan_sweep
 from gsbench.claims.sweep import run_looks
 from gsbench.config.compose import explained
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.declare import declare, declare_plan, declared_metrics, planned_trials
 from gsbench.launch.trial import Trial
+from gsbench.runs.layout import RESULTS
 
 log = logging.getLogger(__name__)
 
@@ -31,10 +36,11 @@ def sweep(
     master: DictConfig,
     launcher: Launcher,
     params: Mapping[str, Any],
+    tune: Mapping[str, Any],
     words: Sequence[str],
 ) -> Sequence[JobReturn]:
     """Run all points that the words of a sweep span; ``params`` are the settings and values of
-    ``hydra.sweeper.params``.
+    ``hydra.sweeper.params``, ``tune`` says what of the arms is tuned before (`gsbench.app.tuning`).
     """
     parser = OverridesParser.create(context.config_loader)
     with explained(words):
@@ -43,6 +49,8 @@ def sweep(
             for of_grid in words_of_grids(params, task.grids, words)
             for point in grid(parser.parse_overrides(of_grid))
         ]
+    if any(value not in (None, {}) for key, value in tune.items() if key in ("points", "ranges")):
+        jobs = tuned_jobs(task, context, master, launcher, tune, jobs)
     trials = trials_of_jobs(context, master, jobs)
     until_decided = any(trial.values["launch"]["stop_when_decided"] for trial in trials)
     return (run_until_decided if until_decided else launch_trials)(task, master, launcher, trials)
@@ -74,5 +82,6 @@ def run_until_decided(
     verdicts = run_looks(stopping, declared, run, lambda trial: trial.folder in launched)
     for verdict in verdicts:
         log.info("%s", headline(verdict))
-    log.info("%d of %d trials were not needed", len(stopping.by_folder) - len(launched), len(stopping.by_folder))
+    spared = [trial for trial in trials if trial.folder not in launched and not (trial.folder / RESULTS).exists()]
+    log.info("%d of %d trials were not needed", len(spared), len(trials))
     return returned

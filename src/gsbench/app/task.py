@@ -15,8 +15,9 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig
 
 from gsbench.config.command_words import check_sweep
-from gsbench.config.compose import compose_jobs, ready_trial
+from gsbench.config.compose import ready_trial
 from gsbench.config.hydra_job import words_of
+from gsbench.config.sweep_jobs import compose_jobs
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.batch import begin_for_another_launcher
 from gsbench.launch.outcome import Outcome, objective, outcome_of_error
@@ -136,6 +137,6 @@ def _returned(trial: Trial, outcome: Outcome) -> JobReturn:
 
 
 def _outcome(trial: Trial, returned: JobReturn) -> Outcome:
-    """How a trial ended that another launcher ran."""
+    """Say how a trial ended that another launcher ran."""
     value: Any = returned._return_value  # the property of that name would write a line to stderr
     return outcome_of_error(trial.folder, value) if isinstance(value, Exception) else Outcome(trial.folder, "done")

@@ -6,6 +6,7 @@ It holds, without any pixels:
 - ``configurations.jsonl``: every configuration, with the folders of the trials that had it (their seeds apart);
 - ``per_view.csv``: the metrics of every test view;
 - ``declared.jsonl``: what was declared before trials ran, where something was;
+- ``from_pixels.jsonl``: what declared claims ask of the trials' pictures, where they ask something;
 - ``archive.json``: the version of this format and the sha256 of the files above;
 - ``ro-crate-metadata.json``: the same in the terms of RO-Crate (w3id.org/ro/crate/1.1), for other tools.
 
@@ -20,22 +21,28 @@ import io
 import json
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path, PurePath
 from typing import Any
 
 import yaml
 
 from gsbench import __version__
-from gsbench.analysis.results import Experiment, TrialResult, read_experiment, read_views
+from gsbench.analysis.per_view import read_views
+from gsbench.analysis.results import Experiment, TrialResult, read_experiment
 from gsbench.claims.crate import crate_metadata
+from gsbench.claims.measures import REGIONS, FromPixels, textured_error
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_yaml
-from gsbench.runs.layout import CONFIG, DECLARED, PER_VIEW, RESULTS
+from gsbench.runs.declaration import DeclaredPlan, read_plans
+from gsbench.runs.layout import CONFIG, DECLARED, FROM_PIXELS, PER_VIEW, RESULTS
 from gsbench.settings import is_folder_name
+from gsbench.words import without_places
 
 FORMAT, VERSION = "gsbench results", 1
+PIXELS = "from_pixels.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
 MOST_BYTES = 1 << 28  # of a file when unpacked; more than any experiment has
@@ -64,14 +71,14 @@ def write_archive(experiment: Experiment, out: Path) -> list[str]:
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
     declared = experiment.folder / DECLARED
     contents = {
-        TRIALS: _json_lines(
-            {"folder": _folder(trial), "results": _without_paths(trial.record.to_json())} for trial in kept
-        ),
+        TRIALS: _json_lines({"folder": _folder(trial), "results": _results(trial)} for trial in kept),
         CONFIGURATIONS: _json_lines(
             {"configuration": json.loads(text), "trials": trials} for text, trials in configurations.items()
         ),
         PER_VIEW: _table(rows),
     } | ({DECLARED: declared.read_bytes()} if declared.is_file() else {})
+    if any(claim.get("metric") in REGIONS for plan in read_plans(experiment.folder) for claim in _claims(plan)):
+        contents[PIXELS] = _json_lines(_measured_in_pictures(kept))
     manifest = {
         "format": FORMAT,
         "version": VERSION,
@@ -87,6 +94,18 @@ def write_archive(experiment: Experiment, out: Path) -> list[str]:
             info = zipfile.ZipInfo(name, FIXED_DATE)
             archive.writestr(info, contents[name], zipfile.ZIP_DEFLATED, compresslevel=9)
     return left_out
+
+
+def _claims(plan: DeclaredPlan) -> list[dict[str, Any]]:
+    claims = plan.plan.get("claims")
+    return [claim for claim in claims if isinstance(claim, dict)] if isinstance(claims, list) else []
+
+
+def _measured_in_pictures(trials: Sequence[TrialResult]) -> Iterator[dict[str, Any]]:
+    """A line for each trial whose pictures are there."""
+    for trial in trials:
+        with suppress(InputError):
+            yield {"folder": _folder(trial), "measures": FromPixels(error_textured=textured_error(trial)).to_json()}
 
 
 def unpack_archive(file: Path, runs: Path) -> Experiment:
@@ -171,6 +190,9 @@ def _unpack(home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: 
             writer = csv.DictWriter(stream, columns)
             writer.writeheader()
             writer.writerows(by_trial[folder])
+    for line in _lines(contents.get(PIXELS, b"")):
+        if line["folder"] in known:
+            (home / line["folder"] / FROM_PIXELS).write_text(json.dumps(line["measures"]), encoding="utf-8")
     if DECLARED in contents:
         (home / DECLARED).write_bytes(contents[DECLARED])
 
@@ -194,15 +216,29 @@ def _place(folder: object) -> str:
     return str(folder)
 
 
-def _configuration(trial: TrialResult) -> str:
-    """The trial's configuration as JSON, without what says where files lie; raises InputError where it is damaged."""
+def read_configuration(trial: TrialResult) -> dict[str, Any]:
+    """The configuration of a trial as its ``config.yaml`` has it; raises InputError where it is absent or damaged."""
     try:
         values = read_yaml(trial.path / CONFIG)
     except FileNotFoundError:
         raise InputError(f"it has no {CONFIG}") from None
     if not isinstance(values, dict):
         raise InputError(f"its {CONFIG} is no mapping")
+    return values
+
+
+def _configuration(trial: TrialResult) -> str:
+    """The trial's configuration as JSON, without what says where files lie; raises InputError where it is damaged."""
+    values = read_configuration(trial)
     return json.dumps(_without_paths({key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}))
+
+
+def _results(trial: TrialResult) -> dict[str, Any]:
+    """The record of the trial without what says where files lie, in its reasons too."""
+    record = trial.record.to_json()
+    reasons = {metric: without_places(reason) for metric, reason in record["unavailable"].items()}
+    results: dict[str, Any] = _without_paths(record | {"unavailable": reasons})
+    return results
 
 
 def _without_paths(value: Any) -> Any:

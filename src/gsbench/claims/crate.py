@@ -18,6 +18,7 @@ FILES = {  # media type, and in words what it is
     ),
     "configurations.jsonl": ("application/jsonl", "Every configuration, with the trials that had it"),
     "per_view.csv": ("text/csv", "Metrics of every test view of every trial"),
+    "from_pixels.jsonl": ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
     "declared.jsonl": ("application/jsonl", "What was declared before the trials were run"),
     "archive.json": ("application/json", "Version of the archive, and the sha256 of its files"),
 }

@@ -26,7 +26,7 @@ class Here:
         self._metrics = cache(self._missing_metrics)
 
     def __call__(self, trial: Composed, metric: str) -> str:
-        """Why the trial cannot be run here or lacks the metric, in one line; "" where nothing is missing."""
+        """Return why the trial cannot be run here or lacks the metric, in one line; "" where nothing is missing."""
         if missing := self._folders([trial]):
             return missing[0]
         values = trial.values

@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsbench.analysis.errors_by_region import absolute_error, read_image, texture_energy, view_names
+from gsbench.analysis.errors_by_region import absolute_error, read_ignored, read_image, texture_energy, view_names
 from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
 from gsbench.eval.facts import find, from_record, known_keys
-from gsbench.runs.layout import GROUND_TRUTH, RENDERS
+from gsbench.records import Number, Part, read_if_sound
+from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, RENDERS
 
 TEXTURED = "error_textured"
 TEXTURED_SHARE = 0.2  # of a photograph's pixels, those with the most texture
@@ -31,16 +32,28 @@ class Measure:
     decimals: int = 3
 
 
+@dataclass(frozen=True, kw_only=True)
+class FromPixels(Part):
+    """Measures of a trial's pictures, as an archive keeps them, which has no pictures."""
+
+    error_textured: Number
+
+
 def textured_error(trial: TrialResult) -> float:
     """Mean absolute error (8-bit levels) over the most textured fifth of each held-out photograph, mean over views.
 
-    Grass, foliage, fabric and gravel lie there. Raises InputError where renders are missing.
+    Grass, foliage, fabric and gravel lie there. Raises InputError where renders are missing, and so is their measure.
     """
+    kept = read_if_sound(trial.path / FROM_PIXELS, FromPixels)
+    if kept is not None:
+        return float(kept.error_textured)
     errors = []
     for view in view_names(trial):
         truth = read_image(trial.path / GROUND_TRUTH / f"{view}.png")
         texture = texture_energy(truth)  # [H, W]
-        inside = texture >= np.quantile(texture, 1 - TEXTURED_SHARE)
+        ignored = read_ignored(trial, view)
+        counts = np.ones(texture.shape, dtype=bool) if ignored is None else ~ignored
+        inside = counts & (texture >= np.quantile(texture[counts], 1 - TEXTURED_SHARE))
         errors.append(float(absolute_error(read_image(trial.path / RENDERS / f"{view}.png"), truth)[inside].mean()))
     return float(np.mean(errors))
 

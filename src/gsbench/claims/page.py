@@ -8,7 +8,7 @@ from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
 
-from gsbench.analysis.attribution import attribute, attribution_sentence
+from gsbench.analysis.caveats import caveats
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.report.charts import ForestRow, forest_plot
@@ -18,7 +18,7 @@ from gsbench.analysis.table_formats import to_html as table_to_html
 from gsbench.analysis.table_formats import to_markdown as table_to_markdown
 from gsbench.analysis.tables import Table
 from gsbench.claims.file import ClaimsFile
-from gsbench.claims.verdict import Verdict, Word
+from gsbench.claims.verdict import NOT_TESTABLE, Verdict, Word
 from gsbench.runs.declaration import DeclaredPlan
 from gsbench.words import counted
 
@@ -63,10 +63,19 @@ def make_page(
             1,
             f"The chance that any of the {counted(tested, 'verdict')} is false is at most {100 * file.error_rate:g} %, "
             "which they share equally, each over all its looks at the trials (docs/verdict.md). A verdict is about "
-            "these scenes at this size.",
+            f"{_scope(verdicts)} at this size.",
         )
     smaller = _size_line(file, [trial for verdict in verdicts for trial in verdict.trials])
     return Page(f"{file.name}: claims and verdicts", (*lines, *smaller), tuple(map(_section, verdicts)))
+
+
+def _scope(verdicts: Sequence[Verdict]) -> str:
+    """Return the scenes that the verdicts speak of: from six on they are the units, and so stand for others."""
+    tested = (verdict for verdict in verdicts if verdict.word != NOT_TESTABLE)
+    by_scene = {verdict.design.by_scene for verdict in tested if verdict.design is not None}
+    if by_scene == {True}:
+        return "scenes like these, which are its units,"
+    return "these scenes" if by_scene == {False} else "these scenes (from six on, scenes like these)"
 
 
 def to_markdown(page: Page) -> str:
@@ -118,9 +127,11 @@ def _section(verdict: Verdict) -> Section:
         planned = ", ".join(map(str, verdict.design.looks))
         evidence += [
             f"least effect that matters: {claim.effect}; baseline's mean {_number(verdict.baseline)}",
-            f"decided on {counted(decision.trials, 'trial')}: {counted(len(verdict.by_scene), 'scene')}, "
+            f"judged on {counted(decision.trials, 'trial')}: {counted(len(verdict.by_scene), 'scene')}, "
             f"{decision.seeds} seeds, two arms; looks planned at {planned} seeds; units are {unit}",
         ]
+    if decision is not None and decision.outcome == "undecided" and not verdict.measure.cost:
+        evidence.append(f"how many seeds and scenes would decide: {_plan_words(verdict)}")
     evidence += verdict.notes
     fairness, mixed = _fairness(verdict)
     if mixed:
@@ -135,29 +146,37 @@ def _section(verdict: Verdict) -> Section:
     )
 
 
+def _plan_words(verdict: Verdict) -> str:
+    """``gsbench plan NAME --metric psnr --difference 0.1``"""
+    least, baseline = verdict.claim.effect.size, abs(verdict.baseline or 0.0)
+    difference = least * baseline if verdict.claim.effect.relative else least
+    name = verdict.trials[0].record.experiment if verdict.trials else "NAME"
+    return f"gsbench plan {name} --metric {verdict.claim.metric} --difference {difference:.3g}"
+
+
 def _sheet(fairness: Table | None) -> str:
     return "" if fairness is None else table_to_html(fairness)
 
 
 def _fairness(verdict: Verdict) -> tuple[Table | None, str]:
-    """The fairness sheet of a claim's arms, and in which ingredients they differ where these are several."""
+    """The fairness sheet of a claim's arms, and what else than the idea may have made a difference (`caveats`)."""
     trials = with_variants(verdict.trials)
     arms = [trial.arm for trial in trials[:2]]
     if len(set(arms)) < 2:
         return None, ""
-    return fairness_table(trials, *arms), attribution_sentence(attribute(trials, *arms), *arms)
+    return fairness_table(trials, *arms), caveats(trials, *arms)
 
 
 def _declared_line(declared: DeclaredPlan, plans: Sequence[DeclaredPlan]) -> str:
     line = f"The plan {declared.hash[:12]} was declared {declared.when}; a claim says where trials were there before."
-    earlier = [plan for plan in plans if plan.hash != declared.hash]
+    earlier = [plan for plan in plans if plan.hash != declared.hash and plan.kind == declared.kind]
     if earlier:
         line += f" Before it, {counted(len(earlier), 'other plan')} had been declared under this name."
     return line
 
 
 def _size_line(file: ClaimsFile, trials: Sequence[TrialResult]) -> list[str]:
-    """What was smaller than in the paper, where the file says how large that was."""
+    """Sentence on what was smaller than in the paper, where the file says how large that was."""
     if not file.size or not trials:
         return []
     scenes = sorted({trial.scene for trial in trials})

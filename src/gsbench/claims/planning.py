@@ -87,8 +87,8 @@ def power(size: Size, difference: float, found: Components, like_these: bool) ->
     return t_power(abs(difference), math.sqrt((found.between**2 + noise) / size.scenes), size.scenes - 1)
 
 
-def sizes_needed(difference: float, found: Components, like_these: bool, wanted: float = POWER) -> list[Size]:
-    """List the fewest seeds that see ``difference`` with the ``wanted`` power, by number of scenes; [] where none do.
+def sizes_needed(difference: float, found: Components, like_these: bool) -> list[Size]:
+    """List the fewest seeds that see ``difference`` with a power of `POWER`, by number of scenes; [] where none do.
 
     Scenes that would need more seeds than ``MAX_SEEDS`` are left out, and so is what needs more scenes and no fewer
     seeds than a design before it. A statement about scenes like these starts at ``MIN_SCENES``.
@@ -99,22 +99,22 @@ def sizes_needed(difference: float, found: Components, like_these: bool, wanted:
     for scenes in range(MIN_SCENES if like_these else 1, MAX_SCENES + 1):
         most = chosen[-1].seeds - 1 if chosen else MAX_SEEDS
         for one in (Size(scenes, seeds) for seeds in range(2, most + 1)):
-            if power(one, difference, found, like_these) >= wanted:
+            if power(one, difference, found, like_these) >= POWER:
                 chosen.append(one)
                 break
     return chosen
 
 
-def smallest_difference(size: Size, found: Components, like_these: bool, wanted: float = POWER) -> float:
-    """The smallest difference that the design sees with the ``wanted`` power, found by halving."""
+def smallest_difference(size: Size, found: Components, like_these: bool) -> float:
+    """The smallest difference that the design sees with a power of `POWER`, found by halving."""
     low, high = 0.0, max(found.within, found.between or 0.0)
     if high == 0:
         return 0.0
-    while power(size, high, found, like_these) < wanted:
+    while power(size, high, found, like_these) < POWER:
         low, high = high, 2 * high
     while high - low > PRECISION * high:
         middle = (low + high) / 2
-        low, high = (low, middle) if power(size, middle, found, like_these) >= wanted else (middle, high)
+        low, high = (low, middle) if power(size, middle, found, like_these) >= POWER else (middle, high)
     return high
 
 

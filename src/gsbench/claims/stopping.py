@@ -15,8 +15,9 @@ from typing import Any, Generic
 import yaml
 
 from gsbench.analysis.cells import by_key, with_variants
+from gsbench.analysis.configurations import Configurations
 from gsbench.analysis.pairing import arm_name, choose_pairs
-from gsbench.analysis.results import Configurations, TrialResult, read_experiment
+from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.analysis.statistics import ALPHA
 from gsbench.claims.file import Claim
 from gsbench.claims.sequential import FIRST_LOOK, Design, plan_looks
@@ -27,11 +28,10 @@ from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find
 from gsbench.runs.declaration import STOPPING, DeclaredPlan, read_plans
 from gsbench.runs.hashing import flatten, sha256_of
+from gsbench.runs.layout import SEED
 from gsbench.runs.trial_files import TrialPaths
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted
-
-SEED = "-seed"  # in the name of a trial's folder, before the seed
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,7 @@ class SweepPlan:
 
     def verdicts(self, home: Path, declared: DeclaredPlan) -> list[Verdict]:
         """Verdicts of every pair, from the trials of the experiment in ``home`` that are done."""
-        trials = read_experiment(home).trials if home.is_dir() else ()
-        by_folder = {trial.path.relative_to(home).as_posix(): trial for trial in trials}
+        by_folder = read_experiment(home).by_folder if home.is_dir() else {}
         return [
             judge_claim(
                 self.claim(pair), self, self._pairs(pair, by_folder), list(pair.scenes), len(self.pairs), declared.time
@@ -201,7 +200,7 @@ def standing_verdicts(home: Path) -> list[Verdict]:
 
     Raises InputError where the record of it is damaged.
     """
-    plans = [plan for plan in read_plans(home) if STOPPING in plan.plan]
+    plans = [plan for plan in read_plans(home) if plan.kind == STOPPING]
     return SweepPlan.from_record(plans[-1].plan).verdicts(home, plans[-1]) if plans else []
 
 

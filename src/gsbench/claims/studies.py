@@ -27,6 +27,7 @@ from gsbench.analysis.statistics import MIN_SCENES
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.pooling import Study
 from gsbench.errors import InputError
+from gsbench.runs.hashing import sha256_of
 
 NERFBASELINES = "nerfbaselines"
 NERFBASELINES_METRICS = {"psnr": "psnr", "ssim": "ssim", "lpips_alex": "lpips", "lpips_vgg": "lpips_vgg"}  # our keys
@@ -134,10 +135,10 @@ def _size(trials: Sequence[TrialResult]) -> str:
 
 
 def _mark(trial: TrialResult) -> str:
-    """What tells a trial from every other: made again elsewhere, it has other seconds."""
+    """Mark that tells a trial from every other: made again elsewhere, it has other seconds."""
     record = trial.record
     told = [trial.config_hash, trial.seed, record.hashes, record.seconds, dict(trial.metrics)]
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    return sha256_of(told)
 
 
 @dataclass(frozen=True)

@@ -18,16 +18,20 @@ from gsbench.claims.file import Claim, ClaimsFile
 from gsbench.claims.sequential import plan_looks
 from gsbench.claims.verdict import Pair, PairKey, Verdict, judge_claim
 from gsbench.config.compose import Composed, compose_one
+from gsbench.config.sweep_jobs import with_seed
 from gsbench.errors import InputError
+from gsbench.records import read_if_sound
 from gsbench.runs.declaration import DeclaredPlan
 from gsbench.runs.hashing import sha256_of
-from gsbench.runs.trial_files import TrialPaths
-from gsbench.words import counted, some_of
+from gsbench.runs.layout import FAILED
+from gsbench.runs.trial_files import Failure, TrialPaths, label_of
+from gsbench.words import counted, some_of, without_places
 
 log = logging.getLogger(__name__)
 
 T = TypeVar("T", bound=Composed)
 Lacking = Callable[[Composed, str], str]  # (trial, metric) -> why it cannot be had here, or ""
+Find = Callable[[Composed], TrialResult | None]  # the trial with these settings and seed, where it is done
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,15 @@ class Check:
     def plan_hash(self) -> str:
         return sha256_of(self.plan)
 
+    @property
+    def missing(self) -> dict[str, list[str]]:
+        """Scenes that cannot be tested here with the reasons, by claim; to be published, so without places."""
+        return {
+            question.claim.id: list(map(without_places, question.missing))
+            for question in self.questions
+            if question.missing
+        }
+
     def trials(self, questions: Sequence[Question], seeds: int) -> list[Composed]:
         """The trials that the questions need for their first ``seeds`` seeds; one that several need stands once."""
         found: dict[Path, Composed] = {}
@@ -91,28 +104,43 @@ class Check:
                         found.setdefault(TrialPaths.of(trial.values).folder, trial)
         return list(found.values())
 
-    def verdicts(self, declared: DeclaredPlan) -> list[Verdict]:
-        """The verdicts from the trials that are done."""
-        trials = read_experiment(self.home).trials if self.home.is_dir() else ()
-        by_folder = {trial.path: trial for trial in trials}
+    def verdicts(self, declared: DeclaredPlan, find: Find | None = None) -> list[Verdict]:
+        """The verdicts from the trials that are done: those that ``find`` finds, or those in the runs folder."""
+        find = find or self._in_runs()
         found = []
         for question in self.questions:
-            pairs = self._pairs(question, by_folder)
+            pairs = self._pairs(question, find)
             verdict = judge_claim(question.claim, self.file, pairs, question.scenes, self.sharing, declared.time)
             if not question.testable:
                 verdict = replace(verdict, reason=question.why_not)
             elif question.missing:
                 verdict = replace(verdict, notes=(*question.missing, *verdict.notes))
+            if question.testable and not _is_final(verdict) and (failed := self._failed(question, find)):
+                verdict = replace(verdict, reason=f"{verdict.reason}; failed: {some_of(failed)}")
             found.append(verdict)
         return found
 
-    def _pairs(self, question: Question, by_folder: dict[Path, TrialResult]) -> dict[PairKey, Pair]:
+    def _failed(self, question: Question, find: Find) -> list[str]:
+        """The trials of a question that failed, each with the reason; of several with one reason the first."""
+        found: dict[str, str] = {}
+        for trial in self.trials([question], self.looks[-1]):
+            folder = TrialPaths.of(trial.values).folder
+            failure = None if find(trial) is not None else read_if_sound(folder / FAILED, Failure)
+            if failure is not None:
+                found.setdefault(failure.reason, label_of(folder))
+        return [f"{label}: {reason}" for reason, label in found.items()]
+
+    def _in_runs(self) -> Find:
+        trials = read_experiment(self.home).trials if self.home.is_dir() else ()
+        by_folder = {trial.path: trial for trial in trials}
+        return lambda trial: by_folder.get(TrialPaths.of(trial.values).folder)
+
+    def _pairs(self, question: Question, find: Find) -> dict[PairKey, Pair]:
         found: dict[PairKey, Pair] = {}
         for scene in question.scenes if question.testable else ():
             for seed in range(self.looks[-1]):
                 arms = (question.claim.baseline, question.claim.arm)
-                firsts = [with_seed(self.first[question.claim.id, scene, arm], seed) for arm in arms]
-                both = [by_folder.get(TrialPaths.of(trial.values).folder) for trial in firsts]
+                both = [find(with_seed(self.first[question.claim.id, scene, arm], seed)) for arm in arms]
                 if both[0] is not None and both[1] is not None:
                     found[scene, seed] = both[0], both[1]
         return found
@@ -194,12 +222,6 @@ def run_looks(
             if question in left and not reached and not _is_final(verdict):
                 waiting.add(question.claim.id)
     return verdicts
-
-
-def with_seed(trial: Composed, seed: int) -> Composed:
-    """The same trial with another seed."""
-    words = tuple(f"seed={seed}" if word.startswith("seed=") else word for word in trial.overrides)
-    return Composed(trial.values | {"seed": seed}, trial.yaml.replace("\nseed: 0\n", f"\nseed: {seed}\n"), words)
 
 
 def _is_final(verdict: Verdict) -> bool:

@@ -142,7 +142,7 @@ def read_record(home: Path) -> Record | None:
 
 def shares_of(record: Record, home: Path, metric: str) -> Ablation:
     """The shares in a metric; raises InputError where trials are missing or lack it."""
-    by_folder = _by_folder(home)
+    by_folder = read_experiment(home).by_folder
     trained: dict[Run, list[float]] = {}
     for run, folders in record.runs:
         values = [by_folder[folder].metrics.get(metric) if folder in by_folder else None for folder in folders]
@@ -176,7 +176,7 @@ def ablation_part(home: Path) -> AblationPart | None:
     record = read_record(home)
     if record is None:
         return None
-    trials = [one for one in _by_folder(home).values() if one.densify == record.densify]
+    trials = [one for one in read_experiment(home).by_folder.values() if one.densify == record.densify]
     design = "a fraction of the factorial, pairs' interactions included" if record.fractional else "the full factorial"
     count = counted(len(record.switches), "part")
     lines = [f"{record.densify}: {design} of {count}, {len(record.runs)} trainings for each scene and seed."]
@@ -205,7 +205,3 @@ def _row(name: str, value: float, interval: Interval | None) -> ForestRow:
 
 def _interval(interval: Interval | None, digits: str) -> str:
     return "unknown" if interval is None else f"{signed(interval.low, digits)} to {signed(interval.high, digits)}"
-
-
-def _by_folder(home: Path) -> dict[str, TrialResult]:
-    return {trial.path.relative_to(home).as_posix(): trial for trial in read_experiment(home).trials}

@@ -125,7 +125,7 @@ def judge_claim(
 
 
 def _is_equal(pair: Pair) -> bool:
-    """Whether the two models are one and the same, as far as numbers tell."""
+    """Return whether the two models are one and the same, as far as numbers tell."""
     one, other = pair
     same_count = one.record.num_gaussians == other.record.num_gaussians
     return bool(one.metrics) and one.metrics == other.metrics and same_count

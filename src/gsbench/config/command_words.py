@@ -96,7 +96,7 @@ def parse_word(word: str) -> Override:
 
 
 def _quoted(word: str) -> str:
-    """How a word would be read whose value has characters that mean something to Hydra."""
+    """Say how a word would be read whose value has characters that mean something to Hydra."""
     key, _, value = word.partition("=")
     if not KEY.fullmatch(key):
         return ""
@@ -177,5 +177,5 @@ def _check_deletion(word: str, key: str) -> None:
 
 
 def _is_choice(override: Override) -> bool:
-    """Whether the value can be one name in a group, a list of such in a sweep, or settings of the group ({a: 1})."""
+    """Return whether the value can be one name in a group, a list of them in a sweep, or its settings ({a: 1})."""
     return override.is_sweep_override() or isinstance(override.value(), str | int | float | dict)

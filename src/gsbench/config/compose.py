@@ -8,24 +8,23 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import HydraContext, RunMode
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gsbench.config.command_words import GROUPS, check_single, options
 from gsbench.config.hydra_guard import GuardedLoader, typed_permissions
 from gsbench.config.hydra_internals import VERSION_BASE
-from gsbench.config.hydra_job import CONFIG_NAME, HydraJob, number_job, words_of
+from gsbench.config.hydra_job import CONFIG_NAME, HydraJob
 from gsbench.config.old_names import know_old_names
-from gsbench.config.schema import Config, check, check_values, plain, register_schemas
+from gsbench.config.schema import check, check_values, plain, register_schemas
 from gsbench.errors import InputError
-from gsbench.settings import checked
 from gsbench.system.install import conf_dir
 from gsbench.system.own_modules import allow_modules
 from gsbench.words import closest
@@ -39,7 +38,6 @@ PLUGIN_HINTS = {  # where a word may name a plug-in of Hydra's that is not insta
     "hydra/sweeper": "; other sweepers are packages of their own",
 }
 ASKED = re.compile(r"\$\{hydra:\s*([\w.]+)\s*\}")
-SEED = re.compile(r"seed=(\d+)")
 
 
 @dataclass(frozen=True)
@@ -89,37 +87,6 @@ def _guard(hydra: Hydra, words: Sequence[str] = ()) -> None:
     hydra.config_loader = GuardedLoader(path, typed_permissions(words), os.getcwd())
 
 
-def compose_jobs(
-    context: HydraContext, master: DictConfig, jobs: Sequence[Sequence[str]], first: int = 0
-) -> list[Composed]:
-    """The trials of a sweep from the words of each; those that differ in the seed alone share a composition.
-
-    A composition stays with the job that it was made for; the job of a trial that shares it has none yet.
-    """
-    shared: dict[tuple[str, ...], DictConfig] = {}
-    trials = []
-    for_hydra, _ = words_of(master.hydra.overrides)
-    for number, words in enumerate(jobs, first):
-        given = (*for_hydra, *words)
-        seeds = [match for word in words if (match := SEED.fullmatch(word))]
-        rest = tuple(word for word in words if not SEED.fullmatch(word))
-        job = HydraJob(None, tuple(words), number, master, context.config_loader, context.callbacks)
-        if rest in shared:
-            config = shared[rest]
-            for match in seeds:
-                config.seed = checked(Config, {"seed": int(match.group(1))}, "")["seed"]
-            trials.append(_resolved(config, given, job))
-            continue
-        with explained(given):
-            config = context.config_loader.load_sweep_config(master, list(words))
-        number_job(config, number)
-        trial = settle(config, given)
-        trials.append(_resolved(trial, given, replace(job, config=config)))
-        if not _asks_hydra(trial):
-            shared[rest] = trial
-    return trials
-
-
 def compose_one(overrides: Sequence[str]) -> Composed:
     """The configuration of the single trial that ``overrides`` describe, as ``Composed.overrides`` has them."""
     check_single(overrides, "choose one")
@@ -132,45 +99,50 @@ def compose_values(overrides: Sequence[str]) -> DictConfig:
     with composing() as hydra:
         config = compose_master(hydra, overrides)
         with explained(overrides):
-            values = _without_hydra(config)
+            values = without_hydra(config)
             check_values(values)
     return values
 
 
 def ready_trial(config: DictConfig, overrides: Sequence[str], job: HydraJob | None = None) -> Composed:
     """The trial of a composed configuration, checked; ``config`` stays as it is."""
-    return _resolved(settle(config, overrides), overrides, job)
+    return resolved(settle(config, overrides), overrides, job)
 
 
 def settle(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Check ``config`` and return the trial's part of it: a copy without Hydra's own node ``hydra``."""
     with explained(overrides):  # such as an interpolation that leads nowhere
-        trial = _without_hydra(config)
+        trial = without_hydra(config)
         _check_asked(trial)
         check(trial)
     return trial
 
 
-def _without_hydra(config: DictConfig) -> DictConfig:
+def without_hydra(config: DictConfig) -> DictConfig:
     """A copy without the node ``hydra``, which stays known to the values that ask for it."""
     trial = copy.deepcopy(config)
     if "hydra" in trial:  # else Hydra has taken it already, and knows it: it runs the job
         with open_dict(trial):
             del trial["hydra"]
-        if _asks_hydra(trial):
+        if asks_hydra(trial):
             HydraConfig.instance().set_config(config)
     return trial
 
 
-def _asks_hydra(trial: DictConfig) -> bool:
-    """Whether a value asks Hydra (``${hydra:…}``): such a value differs from trial to trial, or may."""
-    return "${hydra" in repr(OmegaConf.to_container(trial, resolve=False))
+def asks_hydra(trial: DictConfig) -> bool:
+    """Return whether a value asks Hydra (``${hydra:…}``): such a value differs from trial to trial, or may."""
+    return "${hydra" in raw_text(trial)
+
+
+def raw_text(config: DictConfig) -> str:
+    """All that stands in a configuration, before any ``${…}`` is resolved."""
+    return repr(OmegaConf.to_container(config, resolve=False))
 
 
 def _check_asked(trial: DictConfig) -> None:
     """Refuse ``${hydra:…}`` for what is not known yet, which Hydra would make None or nothing in a text."""
     hydra: Any = HydraConfig.instance().cfg
-    for path in ASKED.findall(repr(OmegaConf.to_container(trial, resolve=False))):
+    for path in ASKED.findall(raw_text(trial)):
         parent, _, key = f"hydra.{path}".rpartition(".")
         node = OmegaConf.select(hydra, parent)
         if OmegaConf.is_missing(node, key):
@@ -178,7 +150,8 @@ def _check_asked(trial: DictConfig) -> None:
             raise InputError(f"${{hydra:{path}}}: {reason}")
 
 
-def _resolved(config: DictConfig, overrides: Sequence[str], job: HydraJob | None) -> Composed:
+def resolved(config: DictConfig, overrides: Sequence[str], job: HydraJob | None) -> Composed:
+    """The trial of a settled configuration."""
     with explained(overrides):
         return Composed(plain(config), OmegaConf.to_yaml(config, resolve=True), tuple(overrides), job)
 
@@ -202,8 +175,9 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
     if unknown:
         key = override.group(1) if override else unknown.group(1)
         bad = unknown.group(1)
-        if bad == "grids":
-            return "hydra.sweeper.grids: gsbench's own sweeper alone joins grids, so leave out hydra/sweeper"
+        if bad in ("grids", "tune"):
+            what = "joins grids" if bad == "grids" else "tunes arms"
+            return f"hydra.sweeper.{bad}: gsbench's own sweeper alone {what}, so leave out hydra/sweeper"
         parent = key[: key.rindex(bad)].rstrip(".") if bad in key else key.rpartition(".")[0]
         where = re.search(r"In '([^']+)'", text)
         file = ""

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from hydra.core.config_loader import ConfigLoader
 
 CONFIG_NAME = "config"  # conf/config.yaml
-OWN_FOLDER = "${runs}/.hydra"  # of Hydra's files, as conf/config.yaml has it
+OWN_NAME = ".hydra"  # of the folder of Hydra's files in the runs folder
+OWN_FOLDER = f"${{runs}}/{OWN_NAME}"  # as conf/config.yaml has it
 Result = TypeVar("Result")
 
 
@@ -140,7 +141,7 @@ def check_output_folder(master: DictConfig, multirun: bool) -> None:
         folder = Path(str(OmegaConf.select(master, key))).absolute()
     except OmegaConfBaseException:
         return
-    if folder == Path(OWN_FOLDER.replace("${runs}", str(master.runs))).absolute():
+    if folder == Path(str(master.runs), OWN_NAME).absolute():
         return  # the runs folder is looked at by who fills it, or finds all done there
     try:
         existing = next(place for place in (folder, *folder.parents) if place.exists())

@@ -183,6 +183,8 @@ def check(config: DictConfig) -> None:
         checked(ComponentConfig, {key: values.get(key) for key in ("name", "_target_")}, group)
     if late := [step for step in config.eval.at if step > config.train.iterations]:
         raise InputError(f"eval.at names iteration {late[0]}, and train.iterations is {config.train.iterations}")
+    if config.scene.transparent == "white" and list(config.train.background) != [1, 1, 1]:
+        raise InputError("scene.transparent=white: the model is rendered over the same: add train.background=[1,1,1]")
     if config.train.iterations == 0 and config.densify.get("_target_") != NO_DENSIFIER:
         raise InputError("train.iterations=0 trains nothing, so nothing grows: add densify=none")
     if is_external(config.densify):
@@ -257,6 +259,8 @@ def check_external(config: DictConfig) -> None:
         raise InputError("eval.at: another program's model is seen at its end only: leave eval.at empty")
     if config.train.max_seconds is not None:
         raise InputError("train.max_seconds: another program cannot be stopped early: give it fewer train.iterations")
+    if config.train.resolution_schedule != "none":
+        raise InputError("train.resolution_schedule: another program has its own sizes: leave it at none")
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

@@ -7,13 +7,22 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from gsbench.errors import InputError
 from gsbench.files import write_text
 from gsbench.launch.trial import Trial
-from gsbench.runs.declaration import Declaration, DeclaredPlan, Planned, read_declarations, read_plans, trial_key
-from gsbench.runs.layout import DECLARED
+from gsbench.runs.declaration import (
+    Declaration,
+    DeclaredPlan,
+    Planned,
+    kind_of_plan,
+    read_declarations,
+    read_plans,
+    trial_key,
+)
+from gsbench.runs.layout import DECLARED, SEED
 from gsbench.system.locks import hold
 
 log = logging.getLogger(__name__)
@@ -42,7 +51,7 @@ def planned_trials(trials: Sequence[Trial]) -> dict[Path, Planned]:
     found: dict[Path, dict[str, set[int]]] = {}
     for trial in trials:
         scene, arm, leaf = trial.folder.parts[-3:]
-        key = trial_key(scene, arm, leaf.partition("-seed")[0])
+        key = trial_key(scene, arm, leaf.partition(SEED)[0])
         found.setdefault(trial.paths.home, {}).setdefault(key, set()).add(trial.values["seed"])
     return {home: {key: tuple(sorted(seeds)) for key, seeds in planned.items()} for home, planned in found.items()}
 
@@ -89,18 +98,21 @@ def _together(one: Planned, other: Planned) -> Planned:
     return {key: tuple(sorted({*one.get(key, ()), *other.get(key, ())})) for key in {**one, **other}}
 
 
-def declare_plan(home: Path, plan: Mapping[str, Any], plan_hash: str) -> DeclaredPlan:
-    """Add a plan, of claims or of a sweep's looks, to the record of the experiment in ``home``; what stands there.
+def declare_plan(
+    home: Path, plan: Mapping[str, Any], plan_hash: str, missing: Mapping[str, Sequence[str]] = MappingProxyType({})
+) -> DeclaredPlan:
+    """Add a plan (of claims, a sweep's looks or its tuning) to the record of the experiment in ``home``; what stands.
 
-    One that is the latest there already stands with its time.
+    One that is the latest of its kind there already stands with its time. ``missing`` is that of a `DeclaredPlan`.
     """
     home.mkdir(parents=True, exist_ok=True)
     with hold(home / f".{DECLARED}.lock", "the declarations"):
-        known = read_plans(home)
+        every = read_plans(home)
+        known = [one for one in every if one.kind == kind_of_plan(plan)]
         if known and known[-1].hash == plan_hash:
             return known[-1]
-        declared = DeclaredPlan(int(time.time()), plan_hash, dict(plan))
-        _write(home, read_declarations(home), [*known, declared])
+        declared = DeclaredPlan(int(time.time()), plan_hash, dict(plan), missing)
+        _write(home, read_declarations(home), [*every, declared])
     if known:
         log.warning(
             "%s: another plan was declared before: trials that were measured under it count as looked at", home.name

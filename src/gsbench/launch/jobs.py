@@ -157,7 +157,7 @@ def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome
 
 
 def _read_result(path: Path) -> tuple[str, Any]:
-    """What submitit wrote when a job ended; its own reader would ask Slurm first, and run what the file names."""
+    """Read what submitit wrote when a job ended; its own reader would ask Slurm first, and run what the file names."""
     with path.open("rb") as stream:
         kind, value = _Outcomes(stream).load()
     return kind, value

@@ -8,24 +8,20 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from gsbench.errors import GsbenchError, InputError
+from gsbench.launch.experience import Experience
 from gsbench.launch.queue import ask_queue, state_in_queue
 from gsbench.launch.trial import Trial
-from gsbench.parsing import DamagedError
 from gsbench.runs.finished import NotDone, find_finished
 from gsbench.runs.hashing import sha256_of
-from gsbench.runs.inputs import read_results
-from gsbench.runs.layout import PLAN, RESULTS, STORE, TRIAL_GLOB
+from gsbench.runs.layout import PLAN, RESULTS, STORE
 from gsbench.runs.plan_file import Entry, Sweep, read_entries, write_entries
-from gsbench.runs.trial_files import TrialPaths, stage_and_step, state_of
-from gsbench.runs.trial_record import TrialRecord
+from gsbench.runs.trial_files import stage_and_step, state_of
 from gsbench.system.locks import hold
 from gsbench.words import counted, readable_time
 
@@ -87,56 +83,6 @@ def read_plan(home: Path) -> list[Planned]:
     return [Planned(home / name, entry.overrides, entry.cwd, entry.time) for name, entry in sorted(entries.items())]
 
 
-def _finished(folder: Path) -> TrialRecord | None:
-    """The results of the trial in ``folder``; None where it has none that can be relied on."""
-    try:
-        return read_results(folder)[0]
-    except (FileNotFoundError, DamagedError):
-        return None
-
-
-def same_trial_elsewhere(paths: TrialPaths) -> str | None:
-    """The other experiment, if any, that has finished the same trial: its stages are reused, not computed again."""
-    for results in paths.runs.glob(f"*/*/*/{paths.folder.name}/{RESULTS}"):
-        if results.parent != paths.folder and _finished(results.parent) is not None:
-            return results.relative_to(paths.runs).parts[0]
-    return None
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Expected seconds of work, and of how many finished trials that is learned (0: nothing is known)."""
-
-    seconds: float
-    learned_from: int
-
-
-class Estimator:
-    """Estimate of a trial's time from finished ones: most alike first (same scene and densifier), per iteration."""
-
-    def __init__(self, runs: Path) -> None:
-        found = (_finished(path.parent) for path in runs.glob(f"*/{TRIAL_GLOB}/{RESULTS}"))
-        self.finished = [results for results in found if results is not None and results.iterations]
-
-    def estimate(self, values: dict[str, Any]) -> Estimate:
-        """Seconds for the whole trial with ``values``."""
-        wanted = {
-            "scene": values["scene"]["name"],
-            "init": values["init"]["name"],
-            "densify": values["densify"]["name"],
-        }
-        for keys in (("scene", "init", "densify"), ("scene", "densify"), ("scene",), ("densify",), ()):
-            alike = [r for r in self.finished if all(getattr(r, key) == wanted[key] for key in keys)]
-            if alike:
-                iterations = values["train"]["iterations"]
-                times = [
-                    r.seconds.get("train", 0.0) * iterations / r.iterations + r.seconds.get("evaluate", 0.0)
-                    for r in alike
-                ]
-                return Estimate(statistics.fmean(times), len(alike))
-        return Estimate(0.0, 0)
-
-
 def _stage_finder(trials: Sequence[Trial]) -> Callable[[Trial], list[str]]:
     """A function that tells which stages of a trial are in the store; loads torch only where there is such a store."""
     store = trials[0].paths.runs / STORE if trials else None
@@ -164,7 +110,7 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
         0,
         dict.fromkeys(("done", "partial", "missing", "running", "queued", "failed", "damaged"), 0),
     )
-    estimator = Estimator(trials[0].paths.runs) if trials else None
+    experience = Experience(trials[0].paths.runs) if trials else None
     learned = 0
     built_stages = _stage_finder(trials)
     queue = ask_queue(trial.folder for trial in trials)
@@ -178,12 +124,12 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
             if isinstance(found := find_finished(trial.values), NotDone):
                 note = f"  will be checked: {found.reason}"
         else:
-            shared = same_trial_elsewhere(paths)
+            assert experience is not None
+            shared = experience.elsewhere(paths)
             if shared is not None:
                 note = f"  as in {shared}: nothing to compute"
             else:
-                assert estimator is not None
-                estimate = estimator.estimate(trial.values)
+                estimate = experience.estimate(trial.values)
                 done = stage_and_step(paths.folder)[1] / max(1, trial.values["train"]["iterations"])
                 remaining += estimate.seconds * (1 - min(1.0, done))
                 learned = max(learned, estimate.learned_from)

@@ -14,15 +14,14 @@ from gsbench.errors import InputError
 from gsbench.launch.trial import Trial
 from gsbench.system.install import install_command
 
-READ = ("colmap", "photos")  # the kinds of scenes that are read from scene.path
-
 
 def missing_folders(trials: Sequence[Composed]) -> list[str]:
     """A line for each folder of photographs or weights that the trials name and that is not there, and the mend."""
     from gsbench.datasets.catalog import how_to_get
     from gsbench.scene.readers import missing_folder
 
-    scenes = {(scene["name"], scene["path"]) for scene in (t.values["scene"] for t in trials) if scene["kind"] in READ}
+    given = [scene for scene in (trial.values["scene"] for trial in trials) if scene["kind"] != "courtyard"]
+    scenes = {(scene["name"], scene["path"]) for scene in given}
     folders = [(name, Path(path).expanduser()) for name, path in sorted(scenes, key=str)]
     missing = [(name, folder) for name, folder in folders if not folder.is_dir()]
     lines = [missing_folder(name, folder) for name, folder in missing]

@@ -13,8 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from gsbench.files import write_json
-from gsbench.parsing import DamagedError
-from gsbench.records import Part, read_typed
+from gsbench.records import Part, read_if_sound
 from gsbench.runs.layout import SUBMITTED
 
 SECONDS_TO_ANSWER = 60.0
@@ -69,9 +68,8 @@ def record_submission(folder: Path, job: str, log: Path) -> None:
 
 def read_submission(folder: Path) -> Submission | None:
     """The job that was last given the trial in ``folder``; None if there is none, or it has ended by itself."""
-    try:
-        note = read_typed(folder / SUBMITTED, Note)
-    except (FileNotFoundError, DamagedError):
+    note = read_if_sound(folder / SUBMITTED, Note)
+    if note is None:
         return None
     return Submission(note.job, note.log, note.user or current_user(), folder / SUBMITTED)
 

@@ -65,7 +65,7 @@ def _without_mended(trials: Sequence[TrialState]) -> list[TrialState]:
 
 
 def _twins(folder: Path) -> tuple[Path, str]:
-    """What trials of one arm and seed share."""
+    """Folder and end of the name that trials of one arm and seed share."""
     return folder.parent, folder.name.partition("-")[2]
 
 

@@ -23,6 +23,7 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import get_protocol
 from gsbench.external.settings import External
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
+from gsbench.raster.executors import offers
 from gsbench.runs.declaration import metric_and_question
 from gsbench.runs.hashing import WITHOUT_EFFECT, as_before
 from gsbench.runs.source import OWN, has_changed_since_import, source_of, unseen_imports
@@ -30,6 +31,11 @@ from gsbench.settings import checked, unknown_setting
 
 log = logging.getLogger(__name__)
 
+# Offers of rasterizers beyond the contract, by the attribute with which a densifier asks; and a refusal in words.
+ASKED_OF_RENDERS = {
+    "needs_footprint": ("has_footprint", "asks which pixels a Gaussian covers, and raster={} does not say"),
+    "needs_splitting_matrix": ("has_splitting_matrix", "asks for splitting matrices, and raster={} does not give them"),
+}
 RESERVED = ("_target_", "name", "switches")  # keys of a group that are not options of its class
 METHODS = {
     "init": ("needs_reference", "content", "run"),
@@ -104,17 +110,15 @@ def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Ra
     return rasterizer
 
 
-def check_footprint(densifier: Any, arm: str, raster: str, own: Any = None) -> None:
-    """Raise InputError where densify=``arm`` asks which pixels a Gaussian covers and raster=``raster`` does not say.
+def check_offers(densifier: Any, arm: str, raster: str, own: Any = None) -> None:
+    """Raise InputError where densify=``arm`` asks a render for something that raster=``raster`` does not give.
 
     ``own`` is the rasterizer if it is a user's.
     """
-    given = {executor.name: executor.has_footprint for executor in EXECUTORS}
-    if getattr(densifier, "needs_footprint", False) and not given.get(raster, getattr(own, "has_footprint", False)):
-        able = " or ".join(f"raster={name}" for name, footprint in given.items() if footprint)
-        raise InputError(
-            f"densify={arm} asks which pixels a Gaussian covers, and raster={raster} does not say; take {able}"
-        )
+    for asked, (offer, words) in ASKED_OF_RENDERS.items():
+        if getattr(densifier, asked, False) and not offers(raster, offer, own):
+            able = " or ".join(f"raster={executor.name}" for executor in EXECUTORS if getattr(executor, offer))
+            raise InputError(f"densify={arm} {words.format(raster)}; take {able}")
 
 
 def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str, Metric]:

@@ -19,7 +19,7 @@ from gsbench.pipeline.components import (
     build,
     build_metrics,
     build_own_rasterizer,
-    check_footprint,
+    check_offers,
     make_evaluator,
 )
 from gsbench.raster import Rasterizer, create_rasterizer
@@ -103,7 +103,7 @@ class Parts:
         made = self.own_rasterizer
         if made is None:
             made = create_rasterizer(self.values["raster"]["name"], self.device, self.threads)
-        self._check_footprint(made.name)
+        self._check_offers(made.name)
         return made
 
     @cached_property
@@ -126,7 +126,7 @@ class Parts:
         if here and self.program is not None:
             self.program.executable()
         if own is not None or name != AUTO:
-            self._check_footprint(name if own is None else own.name)
+            self._check_offers(name if own is None else own.name)
         if here:
             device = self.device
             if own is None and name != AUTO:
@@ -136,5 +136,5 @@ class Parts:
         """Make all that the trial's run will ask for, but for the evaluator. Raises InputError naming a wrong key."""
         _ = self.initializer, self.trainer, self.scene, self.train, self.eval, self.metrics, self.rasterizer
 
-    def _check_footprint(self, raster: str) -> None:
-        check_footprint(self.trainer, self.values["densify"]["name"], raster, self.own_rasterizer)
+    def _check_offers(self, raster: str) -> None:
+        check_offers(self.trainer, self.values["densify"]["name"], raster, self.own_rasterizer)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pycolmap  # noqa: F401 - here, so that what its import does to signals can be undone
 import torch
@@ -66,16 +67,34 @@ def run_trial(parts: Parts, config_yaml: str, wait: bool = True) -> TrialRecord:
 def _recorded_failures(values: dict[str, Any], paths: TrialPaths) -> Iterator[None]:
     """Write down why the block failed, before anyone beside the trial is told that it did."""
     try:
-        with storage_errors(paths.runs):
+        with storage_errors(paths.runs), _exits_as_errors():
             yield
-    except SystemExit as ended:  # whose exit code might be that of a success
-        error = TrainingError(f"code of the trial ended the process (exit code {ended.code}) instead of returning")
-        error.__cause__ = ended
-        _record_failure(error, values, paths)
-        raise error from ended
     except Exception as error:
         _record_failure(error, values, paths)
         raise
+
+
+@contextmanager
+def _exits_as_errors() -> Iterator[None]:
+    """Raise TrainingError where code of the trial ends the process, whose exit code might be that of a success.
+
+    ``os._exit`` in this process counts, too; a process that was forked from it may end so.
+    """
+    owner, end_at_once = os.getpid(), os._exit
+
+    def end(status: int) -> NoReturn:
+        if os.getpid() == owner:
+            raise SystemExit(status)
+        end_at_once(status)
+
+    os._exit = end
+    try:
+        yield
+    except SystemExit as ended:
+        text = f"code of the trial ended the process (exit code {ended.code}) instead of returning"
+        raise TrainingError(text) from ended
+    finally:
+        os._exit = end_at_once
 
 
 def _record_failure(error: Exception, values: dict[str, Any], paths: TrialPaths) -> None:
@@ -115,7 +134,7 @@ def _run(parts: Parts, config_yaml: str, paths: TrialPaths) -> TrialRecord:
         results = results_of(values, trial.capture, scene, parts.rasterizer.name, entries, code)
         published = _publish(paths.folder, entries)
         made_of = {stage.name: entries[stage.name].path for stage in (INIT, TRAIN, GROUND_TRUTH, EVALUATE)}
-        again = write_finished(paths.folder, values, results, source_files(trial.capture, store), made_of, published)
+        again = write_finished(paths.folder, values, results, source_files(trial.taken, store), made_of, published)
         (paths.folder / BUILDING).unlink(missing_ok=True)
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
     size = "" if results.num_gaussians is None else f"  {results.num_gaussians} Gaussians"
@@ -128,6 +147,7 @@ def source_files(capture: Capture, store: Store) -> list[Path]:
     if capture.images.resolve().is_relative_to(store.root.resolve()):
         return []
     images = [(capture.images / name).resolve() for name in capture.image_names]
+    images += [file.resolve() for file in (*capture.masks.values(), *capture.read_from)]
     return images + ([] if capture.model is None else [path.resolve() for path in model_files(capture.model)])
 
 
@@ -137,7 +157,8 @@ def _publish(folder: Path, entries: Mapping[str, Entry]) -> list[Path]:
     links = {folder / name: trained / name for name in PUBLISHED_TRAINING if (trained / name).exists()}
     links[folder / layout.PER_VIEW] = evaluated / layout.PER_VIEW
     pictures = {name: evaluated / name for name in (layout.RENDERS, layout.MAPS, layout.FIGURES)}
-    for name, source in (pictures | {layout.GROUND_TRUTH: entries[GROUND_TRUTH.name].path}).items():
+    truth = entries[GROUND_TRUTH.name].path
+    for name, source in (pictures | {layout.GROUND_TRUTH: truth, layout.MASKS: truth / layout.MASKS}).items():
         files = sorted([*source.glob("*.png"), *source.glob("*.npz")])
         links |= {folder / name / file.name: file for file in files}
     if (init / PICTURE_FILE).exists():

@@ -8,11 +8,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
-from pathlib import Path
 
+from gsbench.errors import InputError
 from gsbench.init import Sfm
 from gsbench.pipeline.parts import Parts
-from gsbench.pipeline.steps.capture import capture_step, read_capture
+from gsbench.pipeline.steps.capture import CaptureSource, masked, masked_step
 from gsbench.pipeline.steps.evaluate import evaluate_step, measure_step
 from gsbench.pipeline.steps.external import external_step
 from gsbench.pipeline.steps.ground_truth import ground_truth_step
@@ -24,17 +24,18 @@ from gsbench.runs.store import Store
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.types import Capture
 
-CaptureReader = Callable[[SceneConfig, Path | None], Capture]
-
 
 class TrialSteps:
     """A trial before, while and after its steps are built; each step's result is found in ``store`` under its key."""
 
-    capture: Capture  # known once `steps` is past the making of photographs
+    taken: Capture  # the user's photographs; known, as the next, once `steps` is past the making of photographs
+    capture: Capture  # what the steps look at: without what masks ignore
     views: Views
 
-    def __init__(self, parts: Parts, store: Store, read: CaptureReader = read_capture) -> None:
-        self.parts, self.store, self._read = parts, store, read
+    def __init__(
+        self, parts: Parts, store: Store, source_of: Callable[[SceneConfig], CaptureSource] = CaptureSource
+    ) -> None:
+        self.parts, self.store, self._source_of = parts, store, source_of
 
     def steps(self) -> Iterator[Step]:
         """The steps in order. A caller that wants results builds each before it asks for the next.
@@ -43,12 +44,17 @@ class TrialSteps:
         fingerprint is known, so where they are not in the store, theirs is the last step.
         """
         parts, store = self.parts, self.store
-        made = capture_step(parts.scene)
+        source = self._source_of(parts.scene)
+        made = source.step
         if made is not None:
             yield made
             if store.find(made) is None:
                 return
-        self.capture = self._read(parts.scene, None if made is None else store.path(made))
+        self.capture = self.taken = source.read(None if made is None else store.path(made))
+        replaced = masked_step(self.taken, parts.scene.transparent)
+        if replaced is not None:
+            yield replaced
+            self.capture = masked(self.taken, store.path(replaced))
         reference = None
         if parts.initializer.needs_reference(self.capture):
             reference = init_step(store, self.capture, Sfm())
@@ -64,6 +70,11 @@ class TrialSteps:
     def _train_step(self) -> Step:
         parts = self.parts
         if parts.program is not None:
+            if self.capture.masks:
+                raise InputError(
+                    f"densify={parts.values['densify']['name']}: another program is not told of masks, and would learn "
+                    "what stands in for ignored pixels: leave scene.masks out, or train with gsbench"
+                )
             return external_step(
                 self.views, parts.program, parts.train.iterations, parts.seed, parts.device, parts.threads
             )
@@ -95,19 +106,16 @@ class StepFinder:
 
     def __init__(self, store: Store) -> None:
         self.store = store
-        self._captures: dict[str, Capture] = {}
+        self._sources: dict[str, CaptureSource] = {}
 
     def built_stages(self, parts: Parts) -> list[str]:
         """The stages of the trial with these parts whose results are there, up to the first that is not."""
         built = []
-        for step in TrialSteps(parts, self.store, self._read_once).steps():
+        for step in TrialSteps(parts, self.store, self._source_of).steps():
             if self.store.find(step) is None:
                 break
             built.append(step.stage.name)
         return built
 
-    def _read_once(self, options: SceneConfig, made: Path | None) -> Capture:
-        key = json.dumps([asdict(options), str(made)])
-        if key not in self._captures:
-            self._captures[key] = read_capture(options, made)
-        return self._captures[key]
+    def _source_of(self, options: SceneConfig) -> CaptureSource:
+        return self._sources.setdefault(json.dumps(asdict(options)), CaptureSource(options))

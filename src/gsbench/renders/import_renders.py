@@ -25,7 +25,7 @@ from gsbench.renders.reference_images import Truth
 from gsbench.runs.code import files_of
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.inputs import write_finished
-from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, PER_VIEW, RENDERS
+from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, MASKS, PER_VIEW, RENDERS, SEED
 from gsbench.runs.origin import FROM_RENDERS, RENDERS_ALONE
 from gsbench.runs.stages import EVALUATE
 from gsbench.runs.trial_record import Code, TrialRecord
@@ -87,7 +87,7 @@ def find_place(word: str, scene: str | None, seed: int, truth: Truth, runs: Path
 def check_place(place: Place, truth: Truth, runs: Path) -> None:
     """Raise `InputError` where the experiment's other trials of the scene were tested on other photographs."""
     for trial in _trials(runs / place.experiment, place.scene):
-        conditions = trial.conditions()
+        conditions = trial.conditions
         size = "x".join(map(str, truth.resolution))
         if conditions["data"] != truth.data or conditions["resolution"] != size:
             raise InputError(
@@ -118,8 +118,8 @@ def enter(
     renders = {pair.view: file_sha256(pair.picture) for pair in pairs}
     identity = sha256_of({"renders": renders, "data": truth.data, "protocol": evaluator.protocol.id})
     arm = runs / place.experiment / place.scene / f"{place.init}-{place.densify}"
-    folder = arm / f"{identity[:8]}-seed{place.seed}"
-    if taken := [other for other in arm.glob(f"*-seed{place.seed}") if other != folder]:
+    folder = arm / f"{identity[:8]}{SEED}{place.seed}"
+    if taken := [other for other in arm.glob(f"*{SEED}{place.seed}") if other != folder]:
         raise InputError(
             f"seed {place.seed} of {place.init}-{place.densify} on {place.scene} is taken ({taken[0]}): give another "
             "--seed, or remove that folder"
@@ -127,8 +127,10 @@ def enter(
     for name, files in (
         (RENDERS, {png_name(pair.view): pair.picture for pair in pairs}),
         (GROUND_TRUTH, {png_name(pair.view): pair.photograph for pair in pairs}),
+        (MASKS, {png_name(pair.view): pair.mask for pair in pairs if pair.mask is not None}),
     ):
-        (folder / name).mkdir(parents=True, exist_ok=True)
+        if files:
+            (folder / name).mkdir(parents=True, exist_ok=True)
         for target, file in files.items():
             with atomic(folder / name / target, sync=False) as temporary:
                 Image.fromarray(read_image(file)).save(temporary, format="PNG")

@@ -43,7 +43,10 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
     if not renders.is_dir():
         raise InputError(f"{renders} is no folder of renders")
     matching = _match(truth, list_images(renders), options.by_order)
-    pairs = [Pair(view, path, renders / matching.pairs[view]) for view, path in truth.photographs.items()]
+    pairs = [
+        Pair(view, path, renders / matching.pairs[view], truth.masks.get(view))
+        for view, path in truth.photographs.items()
+    ]
     torch.set_num_threads(available_threads())
     evaluator = _evaluator(truth, options.protocol, options.settings)
     with progress("evaluate") as report:

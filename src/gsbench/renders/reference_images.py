@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.results import TrialResult, read_views
+from gsbench.analysis.per_view import read_views
+from gsbench.analysis.results import TrialResult
 from gsbench.config.command_words import options
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs import stages
-from gsbench.runs.layout import GROUND_TRUTH, RENDERS, RESULTS, STORE
+from gsbench.runs.layout import GROUND_TRUTH, MASKS, RENDERS, RESULTS, STORE
 from gsbench.runs.store import Store
 from gsbench.runs.trial_files import read_config
 from gsbench.scene.images import image_size
@@ -42,6 +43,7 @@ class Truth:
     config: Mapping[str, Any]
     scene: str | None = None
     init: str | None = None
+    masks: Mapping[str, Path] = field(default_factory=dict)  # of the views that ignore some pixels
 
 
 def find_truth(place: str, settings: Sequence[str], runs: Path) -> Truth:
@@ -78,6 +80,7 @@ def truth_of_trial(trial: TrialResult) -> Truth:
         read_config(trial.path),
         trial.scene,
         trial.init,
+        _masks(trial.path / MASKS, photographs),
     )
 
 
@@ -99,7 +102,15 @@ def _scene(name: str, settings: Sequence[str]) -> Truth:
     scene = trial.views.scene
     photographs = {view.name: folder / png_name(view.name) for view in scene.test}
     sizes = [(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]]
-    return Truth(photographs, f"the test views of {name}", trial.capture.fingerprint, max(sizes), config, name)
+    masks = _masks(folder / MASKS, photographs)
+    what = f"the test views of {name}"
+    return Truth(photographs, what, trial.capture.fingerprint, max(sizes), config, name, masks=masks)
+
+
+def _masks(folder: Path, views: Iterable[str]) -> dict[str, Path]:
+    """The masks that are in ``folder``, by view."""
+    files = {view: folder / png_name(view) for view in views}
+    return {view: file for view, file in files.items() if file.is_file()}
 
 
 def _folder(folder: Path, settings: Sequence[str]) -> Truth:

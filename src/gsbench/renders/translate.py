@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import combinations
 from pathlib import Path
@@ -25,12 +25,13 @@ from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.wiring import TrialSteps
-from gsbench.runs.layout import GROUND_TRUTH, POINT_CLOUD, PROTOCOLS, RENDERS, STORE, VIEWS
+from gsbench.runs.layout import GROUND_TRUTH, MASKS, POINT_CLOUD, PROTOCOLS, RENDERS, STORE, VIEWS
 from gsbench.runs.store import Store
 from gsbench.runs.translation_record import VERSION, Translation, Translations, made_of, read_translations
 from gsbench.runs.trial_files import read_config
 from gsbench.scene.images import read_image
 from gsbench.scene.load import load_scene
+from gsbench.scene.masks import Mask, read_mask
 from gsbench.scene.names import png_name
 from gsbench.scene.types import Scene
 from gsbench.system.resources import available_threads
@@ -53,13 +54,14 @@ class Material:
 
     ``renders`` and ``photographs`` are those of the trial's files, ``exact`` the renders before rounding (float32, in
     [0, 1]), ``shrunk`` gives the photographs as a protocol shrinks them. The last two raise InputError for what cannot
-    be had.
+    be had. ``masks`` are those of the views that ignore some pixels.
     """
 
     renders: Pictures
     photographs: Pictures
     exact: Callable[[], Mapping[str, NDArray[np.float32]]]
     shrunk: Callable[[Protocol], Pictures]
+    masks: Mapping[str, Mask] = field(default_factory=dict)
 
 
 def translate_trials(place: str, protocol: str | None, runs: Path) -> None:
@@ -89,7 +91,7 @@ def translate(
     ``make`` gives the evaluator that also computes the LPIPS of ``protocol``.
     """
     unknown: dict[str, str] = {}
-    photographs, exact = material.photographs, None
+    photographs, masks, exact = material.photographs, material.masks, None
     try:
         photographs = material.shrunk(protocol)
     except InputError as error:
@@ -114,7 +116,9 @@ def translate(
             state |= switches[name] if name in run else {}
         renders, truths = state.pop("renders"), state.pop("photographs")
         evaluator = Evaluator(replace(base, **state), lpips=(), flip=False)
-        per_view = {view: evaluator.evaluate_view(render, truths[view]) for view, render in renders.items()}
+        per_view = {
+            view: evaluator.evaluate_view(render, truths[view], masks.get(view)) for view, render in renders.items()
+        }
         return summarize(per_view, evaluator.unavailable)
 
     shares = {}
@@ -125,7 +129,9 @@ def translate(
             shares[metric] = shapley(matter, {run: values(run)[metric] for run in runs})
     final = make(replace(protocol, eight_bit=protocol.eight_bit or exact is None))
     renders = material.renders if exact is None else exact
-    per_view = {view: final.evaluate_view(render, photographs[view]) for view, render in renders.items()}
+    per_view = {
+        view: final.evaluate_view(render, photographs[view], masks.get(view)) for view, render in renders.items()
+    }
     return Translation(
         metrics=summarize(per_view, final.unavailable),
         unavailable=dict(final.unavailable),
@@ -178,7 +184,8 @@ def material_of(trial: TrialResult, runs: Path) -> Material:
         _, steps = source()
         return resampled(steps, protocol, photographs)
 
-    return Material(renders, photographs, exact, shrunk)
+    there = {path.name: read_mask(path) for path in sorted((trial.path / MASKS).glob("*.png"))}
+    return Material(renders, photographs, exact, shrunk, there)
 
 
 def resampled(steps: TrialSteps, protocol: Protocol, photographs: Pictures) -> Pictures:
@@ -191,6 +198,8 @@ def resampled(steps: TrialSteps, protocol: Protocol, photographs: Pictures) -> P
     capture, downscale, longest = views.capture, options.downscale, options.max_size
     folder = None if options.path is None else Path(options.path).expanduser() / "images"
     if protocol.full_size and options.images not in (None, "images") and folder is not None:
+        if capture.masks:
+            raise InputError(f"{protocol.name} shrinks photographs of the full size, and masks are of {options.images}")
         if missing := [name for name in capture.image_names if not (folder / name).is_file()]:
             raise InputError(
                 f"{protocol.name} shrinks photographs of the full size, and {folder / missing[0]} is missing"

@@ -224,7 +224,7 @@ def _parsed(file: str) -> tuple[str, list[list[str | None]]]:
 
 
 def _stamp(file: str) -> list[int]:
-    """What changes whenever a file does; empty where it is gone."""
+    """Mark that changes whenever a file does; empty where it is gone."""
     try:
         found = os.stat(PACKAGE / file)
     except FileNotFoundError:
@@ -252,7 +252,7 @@ def _keep_digests() -> None:
 
 
 def _read_by() -> list[Any]:
-    """What digests and imports are found with."""
+    """State of Python and of the code that find digests and imports."""
     return [sys.version, _stamp("runs/code.py"), _stamp("runs/imports.py")]
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import calendar
 import logging
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -31,7 +31,7 @@ STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
 
 
 TrialKey = Annotated[str, Field(pattern=r"^[^/]*/[^/]*/[^/]*$")]
-STOPPING = "stopping"  # the key of a plan of looks at a sweep, among plans of claims
+STOPPING, TUNED = "stopping", "tuning"  # keys of plans of looks at a sweep, and of tuning, among plans of claims
 Planned = Mapping[str, tuple[int, ...]]  # seeds by scene, arm and hash of the configuration (`trial_key`)
 
 
@@ -68,19 +68,34 @@ class Declaration:
 
 @dataclass(frozen=True)
 class DeclaredPlan:
-    """Plan of claims with this hash, all that decides about their verdicts, as written down at ``time``."""
+    """Plan of claims with this hash, all that decides about their verdicts, as written down at ``time``.
+
+    ``missing`` says by claim what of it could not be tested there, and why; it decides nothing.
+    """
 
     time: int
     hash: str
     plan: dict[str, Any] = field(compare=False, repr=False)
+    missing: Mapping[str, Sequence[str]] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def when(self) -> str:
         """The time, as that of a `Declaration`."""
         return _readable(self.time)
 
+    @property
+    def kind(self) -> str:
+        """The kind of plan: `STOPPING`, `TUNED`, or "" for claims; one does not take the place of another kind's."""
+        return kind_of_plan(self.plan)
+
     def to_record(self) -> dict[str, Any]:
-        return {"plan": self.plan, "hash": self.hash, "time": time.strftime(STAMP, time.gmtime(self.time))}
+        missing = {"missing": {claim: list(lines) for claim, lines in self.missing.items()}} if self.missing else {}
+        return {"plan": self.plan, "hash": self.hash, "time": time.strftime(STAMP, time.gmtime(self.time))} | missing
+
+
+def kind_of_plan(plan: Mapping[str, Any]) -> str:
+    """The `DeclaredPlan.kind` of a plan."""
+    return next((kind for kind in (STOPPING, TUNED) if kind in plan), "")
 
 
 def metric_and_question(primary: str) -> tuple[str, str]:
@@ -123,13 +138,17 @@ def unix_time(text: object) -> int | None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Line(Part):
-    """A line of ``declared.jsonl``: a metric with its trials' seeds, or a plan of claims with its hash; and when."""
+    """A line of ``declared.jsonl``: a metric with its trials' seeds, or a plan of claims with its hash; and when.
+
+    ``missing`` is that of a `DeclaredPlan`; earlier versions wrote none.
+    """
 
     time: str
     metric: str | None = None
     trials: dict[TrialKey, tuple[Count, ...]] | None = None
     plan: dict[str, Any] | None = None
     hash: str | None = None
+    missing: dict[str, list[str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if unix_time(self.time) is None:
@@ -143,8 +162,9 @@ class _Line(Part):
 
     @property
     def declared_plan(self) -> DeclaredPlan | None:
-        known = self.plan is not None and self.hash is not None
-        return DeclaredPlan(unix_time(self.time) or 0, self.hash or "", self.plan or {}) if known else None
+        if self.plan is None or self.hash is None:
+            return None
+        return DeclaredPlan(unix_time(self.time) or 0, self.hash, self.plan, self.missing)
 
 
 def _lines(folder: Path) -> list[_Line]:

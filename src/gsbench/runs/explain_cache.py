@@ -8,8 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from gsbench.parsing import DamagedError
-from gsbench.records import read_typed
+from gsbench.records import read_if_sound
 from gsbench.runs.hashing import flatten
 from gsbench.runs.layout import MANIFEST
 from gsbench.runs.step import Step
@@ -38,13 +37,12 @@ def explain_steps(steps: Iterable[Step], store: Store) -> list[str]:
 
 
 def _differences(store: Store, step: Step) -> list[str]:
-    """How the most similar result of the step's stage in the store differs."""
+    """Say how the most similar result of the step's stage in the store differs."""
     wanted = flat({"version": step.stage.version, "inputs": step.inputs})
     best: dict[str, str] | None = None
     for path in (store.root / step.stage.name).glob(f"*/{MANIFEST}"):
-        try:
-            manifest = read_typed(path, Manifest)
-        except (FileNotFoundError, DamagedError):
+        manifest = read_if_sound(path, Manifest)
+        if manifest is None:
             continue
         found = flat({"version": manifest.version, "inputs": manifest.inputs})
         if best is None or _distance(found, wanted) < _distance(best, wanted):

@@ -72,7 +72,7 @@ def find_finished(
 
 
 def _objections(folder: Path, values: dict[str, Any], results: TrialRecord, inputs: Inputs) -> Iterator[NotDone]:
-    """What of a complete trial no longer holds, the quickest to find first."""
+    """Reasons why a complete trial no longer holds, the quickest to find first."""
     present = config_hash(values)
     if results.hashes.get("config") != present or inputs.config != present:
         yield NotDone("configuration", "its results are of another configuration")

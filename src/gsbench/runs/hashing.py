@@ -15,8 +15,17 @@ DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",)}
 # Settings that are younger than results that people keep, with the value at which all is as it was before them: at
 # that value they have no part in a hash or key, and a configuration without them means it.
 LATER: dict[str, dict[str, Any]] = {
-    "scene": {"split": "every_nth", "sector": 0, "sectors": 8, "match_views": False, "validation": False},
+    "scene": {
+        "split": "every_nth",
+        "sector": 0,
+        "sectors": 8,
+        "match_views": False,
+        "validation": False,
+        "masks": None,
+        "transparent": "black",
+    },
     "init": {"points_from": "all"},
+    "train": {"resolution_schedule": "none"},
 }
 BEFORE = {f"{group}.{name}": value for group, values in LATER.items() for name, value in values.items()}
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")

@@ -129,6 +129,14 @@ def read_results(folder: Path) -> tuple[TrialRecord, Mapping[str, str]]:
     return record, promise.digests
 
 
+def sound_results(folder: Path) -> TrialRecord | None:
+    """The results of the trial in ``folder``; None where it has none that can be relied on."""
+    try:
+        return read_results(folder)[0]
+    except (FileNotFoundError, DamagedError):
+        return None
+
+
 def read_inputs(folder: Path) -> Inputs:
     """The record of the trial in ``folder``; raises FileNotFoundError and DamagedError."""
     return read_typed(folder / INPUTS, Inputs)

@@ -25,7 +25,9 @@ PLAN = "plan.json"  # the trials that were asked for
 DECLARED = "declared.jsonl"  # the metrics that verdicts were declared to be about, and when
 ABLATION = "ablation.json"  # which trials have which parts of a densifier switched on
 SEARCH, SEARCH_JOURNAL = "search.json", "search.journal"  # what a search found, and Optuna's own record of it
-TRIAL_GLOB = "*/*/*-seed*"  # the trials that are there
+TUNING = "tuning.json"  # what each arm was tuned to before the sweep, and by what
+SEED = "-seed"  # in the name of a trial's folder, between hash and seed
+TRIAL_GLOB = f"*/*/*{SEED}*"  # the trials that are there
 
 # in a trial's folder
 CONFIG = "config.yaml"
@@ -38,6 +40,7 @@ INPUTS = "inputs.json"  # what the results were made of: a finished trial is rec
 BUILDING = "building.json"  # the stage that an unfinished trial is at, and where
 INIT_REPORT = "init_report.json"
 PER_VIEW = "per_view.csv"
+FROM_PIXELS = "from_pixels.json"  # measures of pictures, in a trial that an archive brought without its pictures
 PROTOCOLS = "protocols.json"  # the same renders under the conventions of others, where somebody asked
 CURVES = "metrics.jsonl"  # of the training
 EVENTS = "events.jsonl"  # what every refinement did
@@ -46,6 +49,7 @@ POINT_CLOUD = "point_cloud.ply"
 TRAINER_LOG = "trainer.log"  # the output of another program that trained
 LINEAGE = "lineage.npz"  # for each Gaussian its parent, and the rule that made it
 RENDERS, GROUND_TRUTH, MAPS = "renders", "ground_truth", "maps"  # a file for each test view
+MASKS = "masks"  # of the test views that ignore some pixels: black there
 FIGURES = "figures"  # pictures for the report
 INITIAL_CLOUD = "initial_cloud.png"  # one of them
 ELLIPSOIDS = "ellipsoids.png"  # another

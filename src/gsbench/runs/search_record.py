@@ -29,6 +29,7 @@ class SearchRecord(Part):
     wanted: Count
     seeds: Count
     validation: bool = False  # whether validation views judged its points, so that none saw a test view
+    arm: str = ""  # INIT-DENSIFY that was searched; "": several, or not recorded
     log: list[str]
     points: list[Point]
 
@@ -39,7 +40,30 @@ class SearchRecord(Part):
         if any(isinstance(value, int | float) and value <= 0 for value in on_scale):
             raise ValueError("a setting of a log scale is not above 0")
 
+    @property
+    def best(self) -> Point | None:
+        """The point of the best value, the first of several; None where none has a value."""
+        done = [point for point in self.points if point.value is not None]
+        return max(done, key=lambda point: self.direction * (point.value or 0.0), default=None)
+
 
 def read_search(home: Path) -> SearchRecord:
     """The search of the experiment in ``home``; raises FileNotFoundError and DamagedError."""
     return read_typed(home / SEARCH, SearchRecord)
+
+
+def is_value(setting: object, of_point: object) -> bool:
+    """Return whether a setting has the value of a point, where a choice among words stands as it was typed.
+
+    Examples:
+        >>> is_value(True, "true"), is_value(0.3, "0.30"), is_value("soft", "soft"), is_value(True, 1)
+        (True, True, True, False)
+    """
+    if setting is None or isinstance(setting, bool):
+        return of_point == ("null" if setting is None else str(setting).lower())
+    if isinstance(setting, int | float) and isinstance(of_point, str):
+        try:
+            return float(of_point) == setting
+        except ValueError:
+            return False
+    return setting == of_point

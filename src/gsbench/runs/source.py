@@ -33,7 +33,7 @@ INSTALLED = frozenset({"site-packages", "dist-packages"})  # folders of packages
 
 @dataclass(frozen=True)
 class _File:
-    """What a file of a user's holds."""
+    """Content of a file of a user's."""
 
     digest: str
     imports: Imports
@@ -133,7 +133,7 @@ class _Reach:
         return hashlib.sha256(listed.encode()).hexdigest()
 
     def _find_own(self) -> ModuleSpec | None:
-        """Where the package of the class is: as it was imported, or as Python would find it."""
+        """Find the package of the class: as it was imported, or as Python would find it."""
         if self._folder is not None:
             return _find_top(self._top, [*sys.path, self._folder])
         loaded = sys.modules.get(self._top)
@@ -185,7 +185,7 @@ class _Reach:
             self.files[name if name not in self.files else f"{name} {len(self.files)}"] = digest
 
     def _find_imported(self, top: str, importer: str, file: Path, imports: Imports) -> list[ModuleSpec | None]:
-        """Where a file may find the user's package or module ``top``: in order, and as long as it is not certain.
+        """Places where a file may find the user's package or module ``top``, in order, as long as it is not certain.
 
         What this process has imported does not count, nor what it has added to ``sys.path``: both may be the doing of
         the code in question, and the answer must be the same before it runs.
@@ -239,7 +239,7 @@ def _file_of(spec: ModuleSpec) -> Path | None:
 
 
 def _is_installed(spec: ModuleSpec) -> bool:
-    """Whether a module is Python's own or of an installed package, which its version stands for."""
+    """Return whether a module is Python's own or of an installed package, which its version stands for."""
     places = [spec.origin] if spec.has_location else list(spec.submodule_search_locations or [])
     return all(place is None or _is_installed_in(os.path.dirname(place)) for place in places)
 
@@ -255,7 +255,7 @@ def _is_installed_in(folder: str) -> bool:
 
 
 def _read(module: str, path: Path) -> _File:
-    """What a file holds; read again only where it has changed."""
+    """Content of a file; read again only where it has changed."""
     found = path.stat()
     state = [found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino]
     known = _as_read.get((module, path))

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsbench.parsing import DamagedError
-from gsbench.records import Number, Part, read_typed
+from gsbench.records import Number, Part, read_if_sound
 from gsbench.runs.layout import PROTOCOLS
 from gsbench.runs.trial_record import TrialRecord
 
@@ -42,8 +41,7 @@ def made_of(record: TrialRecord) -> str:
 
 def read_translations(folder: Path, record: TrialRecord) -> dict[str, Translation]:
     """The translations of the trial in ``folder``; empty where none was made of its present renders."""
-    try:
-        known = read_typed(folder / PROTOCOLS, Translations)
-    except (FileNotFoundError, DamagedError):
+    known = read_if_sound(folder / PROTOCOLS, Translations)
+    if known is None or known.version != VERSION or known.made_of != made_of(record):
         return {}
-    return known.protocols if known.version == VERSION and known.made_of == made_of(record) else {}
+    return known.protocols

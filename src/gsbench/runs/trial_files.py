@@ -11,10 +11,10 @@ from pydantic_core import to_json
 
 from gsbench.errors import InputError
 from gsbench.parsing import DamagedError, one_line, read_tail, read_yaml
-from gsbench.records import Amount, Count, Part, read_typed, typed
+from gsbench.records import Amount, Count, Part, read_if_sound, typed
 from gsbench.runs.hashing import config_hash
 from gsbench.runs.inputs import read_results
-from gsbench.runs.layout import BUILDING, CONFIG, CURVES, FAILED, LOCK
+from gsbench.runs.layout import BUILDING, CONFIG, CURVES, FAILED, LOCK, SEED
 from gsbench.settings import FolderName
 from gsbench.system.locks import is_held
 
@@ -90,7 +90,7 @@ class TrialPaths:
         """The folders of the trial with the resolved configuration ``values``."""
         runs = Path(values["runs"]).expanduser().resolve()
         arm = f"{values['init']['name']}-{values['densify']['name']}"
-        leaf = f"{config_hash(values)[:8]}-seed{values['seed']}"
+        leaf = f"{config_hash(values)[:8]}{SEED}{values['seed']}"
         return cls(runs, runs / values["name"] / values["scene"]["name"] / arm / leaf)
 
     @property
@@ -110,7 +110,7 @@ class TrialPaths:
 
 def label_of(folder: Path) -> str:
     """Scene, arm and seed of a trial's folder, for people."""
-    hash8, _, seed = folder.name.partition("-seed")
+    hash8, _, seed = folder.name.partition(SEED)
     return f"{folder.parent.parent.name}/{folder.parent.name} seed {seed} ({hash8})"
 
 
@@ -143,18 +143,13 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 def failure_of(folder: Path) -> str:
     """The reason why a trial failed, in one line."""
-    try:
-        return read_typed(folder / FAILED, Failure).reason
-    except (FileNotFoundError, DamagedError):
-        return f"{FAILED} cannot be read"
+    failure = read_if_sound(folder / FAILED, Failure)
+    return f"{FAILED} cannot be read" if failure is None else failure.reason
 
 
 def read_building(folder: Path) -> Building:
     """The stage that the trial in ``folder`` is at; nothing said where it is at none, or that cannot be read."""
-    try:
-        return read_typed(folder / BUILDING, Building)
-    except (FileNotFoundError, DamagedError):
-        return Building()
+    return read_if_sound(folder / BUILDING, Building) or Building()
 
 
 def stage_and_step(folder: Path) -> tuple[str, int]:

@@ -43,7 +43,7 @@ def own_checkout() -> dict[str, Any]:
 
 
 def _has_filters(folder: Path) -> bool:
-    """Whether the repository itself names programs that git would run to compare files, or this cannot be told.
+    """Return whether the repository itself names programs that git would run to compare files, or this cannot be told.
 
     A capture may come as a repository; what the user's own configuration names may run.
     """
@@ -54,7 +54,7 @@ def _has_filters(folder: Path) -> bool:
 
 
 def _git(folder: Path, *words: str) -> str | None:
-    """What git says; None where there is no git, no repository, or no answer. It starts no other program."""
+    """Answer of git; None where there is no git, no repository, or no answer. It starts no other program."""
     try:
         done = subprocess.run(
             ["git", *(word for setting in STARTS_NOTHING for word in ("-c", setting)), "-C", str(folder), *words],

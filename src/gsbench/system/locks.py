@@ -15,8 +15,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from gsbench.parsing import DamagedError
-from gsbench.records import Amount, Part, read_typed
+from gsbench.records import Amount, Part, read_if_sound
 
 try:
     import fcntl
@@ -101,10 +100,7 @@ class Holder(Part):
 
 def read_holder(path: Path) -> Holder | None:
     """Read what the holder of the lock ``path`` wrote about itself; None where nothing can be read."""
-    try:
-        return read_typed(_holder_file(path), Holder)
-    except (FileNotFoundError, DamagedError):
-        return None
+    return read_if_sound(_holder_file(path), Holder)
 
 
 def describe_holder(path: Path) -> str:

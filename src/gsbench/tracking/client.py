@@ -136,7 +136,7 @@ def _create_sqlite(uri: str) -> None:
 
 
 def _follow_moved_artifacts(runs: Path) -> None:
-    """Where the runs folder was moved, point its own database to where the artifacts are now.
+    """Point the own database of a runs folder that was moved to where the artifacts are now.
 
     MLflow keeps absolute addresses, of each experiment and of each run, and has no word for changing them.
     """

@@ -21,6 +21,7 @@ from gsbench.errors import InputError
 from gsbench.runs.layout import TRIAL_GLOB
 from gsbench.runs.trial_files import label_of, read_config, state_of
 from gsbench.system.locks import BusyError, hold
+from gsbench.tracking.address import untyped_address
 from gsbench.tracking.client import connect, ensure_experiment
 from gsbench.tracking.process import TRACKER_FAILED
 from gsbench.tracking.sink import name_of
@@ -64,6 +65,10 @@ def sync() -> NoReturn:
             except InputError as error:
                 print(f"left out: {error}", file=out, flush=True)
                 continue
+            if strange := untyped_address(values["tracking"] | ({"uri": uri} if uri else {}), uri):
+                text = f"its configuration names the tracker {strange}, and --uri {strange} was not typed"
+                print(f"left out: {label_of(folder)}: {text}", file=out, flush=True)
+                continue
             if _sync_one(folder, values, runs, uri, anew, out):
                 new += 1
                 print(f"mirrored {label_of(folder)}", file=out, flush=True)
@@ -75,7 +80,7 @@ def sync() -> NoReturn:
 
 
 def _sync_one(folder: Path, values: dict[str, Any], runs: Path, uri: str | None, anew: bool, out: TextIO) -> bool:
-    """Whether something of the trial was missing. Raises MissedError where the tracker does not take it."""
+    """Return whether something of the trial was missing. Raises MissedError where the tracker does not take it."""
     options = values["tracking"] | ({"uri": uri} if uri else {})
     try:
         return mirror_trial(options, runs, folder, values, anew)

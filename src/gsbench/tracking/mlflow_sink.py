@@ -102,7 +102,7 @@ class MlflowSink:
         self.client.delete_run(self.run_id)
 
     def _known(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """How far the trial is mirrored here; empty where it never was, was elsewhere, or was since computed anew."""
+        """Say how far the trial is mirrored here; empty where it never was, was elsewhere, or computed anew since."""
         from mlflow.exceptions import MlflowException
 
         if state.get("uri") not in (self._uri(), self.client.tracking_uri) or "run_id" not in state:
@@ -193,7 +193,7 @@ class MlflowSink:
         return int(self._started + 1000 * seconds)
 
     def _uri(self) -> str:
-        """Where the run is: the tracker's address, or a word for the runs folder's own, which may move with it."""
+        """Address of the run: the tracker's address, or a word for the runs folder's own, which may move with it."""
         uri = str(self.client.tracking_uri)
         return OWN_DATABASE if uri == default_uri(self._record.runs) else uri
 

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.errors import InputError
-from gsbench.parsing import DamagedError
 from gsbench.runs import layout
 from gsbench.runs.hashing import flatten, sha256_of
-from gsbench.runs.inputs import read_results
+from gsbench.runs.inputs import sound_results
 from gsbench.runs.plan_file import read_entries
 from gsbench.runs.rows import read_curve
 from gsbench.runs.stages import TRAIN
@@ -68,10 +67,7 @@ class TrackedFiles:
 
     def results(self) -> TrialRecord | None:
         """The content of ``results.json``; empty where there is none."""
-        try:
-            return read_results(self.folder)[0]
-        except (FileNotFoundError, DamagedError):
-            return None
+        return sound_results(self.folder)
 
     def results_hash(self) -> str | None:
         """The hash of the results, by which a mirror knows whether it shows them."""

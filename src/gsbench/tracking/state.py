@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsbench.parsing import DamagedError
-from gsbench.records import Count, Part, read_typed
+from gsbench.records import Count, Part, read_if_sound
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +30,5 @@ class MirrorState(Part):
 
 def read_state(file: Path) -> dict[str, Any]:
     """Read the state in ``file``; empty, as if nothing were mirrored yet, where it is absent or damaged."""
-    try:
-        state = read_typed(file, MirrorState)
-    except (FileNotFoundError, DamagedError):
-        return {}
-    return {"complete": None, "logged": {}} | state.to_json()
+    state = read_if_sound(file, MirrorState)
+    return {} if state is None else {"complete": None, "logged": {}} | state.to_json()

@@ -24,9 +24,10 @@ from gsbench.claims.switches import (
 from gsbench.errors import InputError
 from gsbench.launch.plan import describe_plan
 from gsbench.launch.trial import Trial
+from gsbench.runs.layout import SEED
 from gsbench.settings import Switch
 from gsbench.verbs.arguments import ArgumentParser, names
-from gsbench.words import counted
+from gsbench.words import counted, listed
 
 DEFAULT_METRIC = "psnr"
 
@@ -52,6 +53,10 @@ def main(argv: Sequence[str], runs: Path) -> int:
         f"{densify}: {counted(len(switches), 'part')} ({', '.join(switches)}), {len(trials)} runs, "
         f"{counted(len(flat), 'trial')}"
     )
+    for run, group in trials.items():
+        left_out = [name for name in switches if name not in run]
+        hashes = ", ".join(dict.fromkeys(trial.folder.name.partition(SEED)[0] for trial in group))
+        print(f"  {hashes}: {f'without {listed(left_out)}' if left_out else 'with all of them'}")
     if options.dry_run:
         print("\n".join(describe_plan(flat, flat[0].values["launch"]["parallel"])))
         return 0

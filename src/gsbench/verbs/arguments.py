@@ -34,6 +34,25 @@ def path(text: str) -> Path:
     return Path(text).expanduser()
 
 
+def add_where(parser: argparse.ArgumentParser) -> None:
+    """Add ``--where KEY=VALUE``, whose values `gsbench.analysis.cells.select_trials` takes as a dict."""
+    parser.add_argument(
+        "--where",
+        type=_condition,
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="only such trials (repeatable)",
+    )
+
+
+def _condition(text: str) -> tuple[str, str]:
+    key, sign, value = text.partition("=")
+    if not sign:
+        raise argparse.ArgumentTypeError(f"{text!r} is not KEY=VALUE, such as iterations=30000")
+    return key, value
+
+
 def names(text: str) -> tuple[str, ...]:
     """Different names with commas between them; an argument's ``type``."""
     words = tuple(word.strip() for word in text.split(","))

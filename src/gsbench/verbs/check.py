@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.claims.file import direction_is_odd, read_claims
+from gsbench.claims.file import ClaimsFile, direction_is_odd, read_claims
 from gsbench.claims.here import Here
 from gsbench.claims.sweep import Check, prepare, run_looks
 from gsbench.config.trust import PERMISSIONS
@@ -38,13 +39,33 @@ def main(argv: Sequence[str], runs: Path) -> int:
         help="what the claims' arms may run beside gsbench; a file of claims cannot allow it",
     )
     parser.add_argument("--dry-run", action="store_true", help="show trials, time and what is not testable here")
+    parser.add_argument(
+        "--from",
+        dest="archive",
+        type=path,
+        metavar="ARCHIVE",
+        help="make the verdicts again from what gsbench export --results wrote; runs nothing, needs no photographs",
+    )
     options = parser.parse_args(argv)
     file = read_claims(options.claims)
+    if options.archive is not None:
+        return _recheck(file, options.archive)
     check = prepare(file, runs, Here(missing_folders, download=not options.dry_run), _permissions(options.permissions))
     if options.dry_run:
         print("\n".join(describe(check)))
         return 0
     _run(check)
+    return 0
+
+
+def _recheck(file: ClaimsFile, archive: Path) -> int:
+    """Print the page in Markdown that the archive's trials make; 0 whatever the verdicts are."""
+    from gsbench.claims.page import make_page, to_markdown
+    from gsbench.claims.recheck import recheck
+
+    with tempfile.TemporaryDirectory() as folder:
+        found = recheck(file, archive, Path(folder))
+        print(to_markdown(make_page(file, found.verdicts, found.declared, found.plans)), end="")
     return 0
 
 
@@ -85,7 +106,7 @@ def _run(check: Check) -> None:
     from gsbench.launch.batch import run_batch
 
     make_runs_folder(check.runs)
-    declared = declare_plan(check.home, check.plan, check.plan_hash)
+    declared = declare_plan(check.home, check.plan, check.plan_hash, check.missing)
     verdicts = run_looks(
         check,
         declared,

@@ -13,10 +13,8 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from gsbench.analysis.results import list_experiments
-from gsbench.datasets.catalog import read_catalog
-from gsbench.eval.facts import known_keys
-from gsbench.runs.layout import TRIAL_GLOB
+from gsbench.runs.experiments import list_experiments
+from gsbench.runs.layout import SEED, TRIAL_GLOB
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.verbs.table import VERBS
 
@@ -107,12 +105,16 @@ def _cell(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
     if len(rest) == 1:
         return [f"{name}:{scene}:" for scene in scenes]
     if len(rest) == 2:
+        from gsbench.eval.facts import known_keys
+
         return [f"{name}:{rest[0]}:{metric}:" for metric in known_keys()]
     arms = {folder.parent.name for folder in _trials(runs, name) if folder.parents[1].name == rest[0]}
     return [f"{name}:{rest[0]}:{rest[1]}:{arm}" for arm in arms]
 
 
 def _dataset(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
+    from gsbench.datasets.catalog import read_catalog
+
     catalog = read_catalog()
     return catalog if not arguments else catalog[arguments[0]].scenes if arguments[0] in catalog else []
 
@@ -145,7 +147,7 @@ def _addresses(runs: Path, word: str, whole: bool) -> list[str]:
             found.add(f"{name}:")
             continue
         for folder in _trials(runs, name) if whole else []:
-            scene, arm, seed = folder.parents[1].name, folder.parent.name, folder.name.rpartition("-seed")[2]
+            scene, arm, seed = folder.parents[1].name, folder.parent.name, folder.name.rpartition(SEED)[2]
             parts = [name, scene, arm, seed][: depth + 1]
             found.add(":".join(parts) + (":" if len(parts) < 4 else ""))
     return sorted(found)

@@ -35,6 +35,7 @@ OPTIONAL = {  # package -> what needs it, and the extra that brings it
     "submitit": ("launch=local and launch=slurm", "slurm"),
     "tensorboard": ("tracking=tensorboard", "tensorboard"),
     "viser": ("gsbench view", "view"),
+    "cv2": ("gsbench video to .mp4", "video"),
     "wandb": ("tracking=wandb", "wandb"),
 }
 
@@ -238,6 +239,7 @@ def check_tracking(runs: Path) -> Iterator[Finding]:
 
 def check_weights() -> Iterator[Finding]:
     """Weights that are at hand; nothing is downloaded."""
+    from gsbench.eval.dists import ALPHA_BETA
     from gsbench.eval.lpips import BACKBONES
     from gsbench.init.networks.weights import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
     from gsbench.weights import WEIGHTS_VARIABLE, MissingWeights, WeightsFile, find_weights, hub_cache
@@ -245,6 +247,7 @@ def check_weights() -> Iterator[Finding]:
     wanted: list[tuple[str, tuple[WeightsFile, ...]]] = []
     for name, backbone in BACKBONES.items():
         wanted += [(f"LPIPS {name}", backbone.features), (f"LPIPS {name} heads", (backbone.heads,))]
+    wanted.append(("DISTS, with LPIPS vgg", (ALPHA_BETA,)))
     wanted += [(f"init=dim {name}", (spec,)) for name, spec in EXTRACTOR_WEIGHTS.items()]
     wanted += [(f"LightGlue for {name}", (spec,)) for name, spec in LIGHTGLUE_WEIGHTS.items()]
     for purpose, specs in wanted:

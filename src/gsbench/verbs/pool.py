@@ -5,19 +5,18 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from html import escape
-from importlib.resources import files
 from pathlib import Path
 
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import metric_quantity
+from gsbench.analysis.report.page import write_page
 from gsbench.claims.pooling import Pooled, describe, pool, pooled_forest
 from gsbench.claims.studies import Wanted, read_source
 from gsbench.errors import InputError
-from gsbench.files import write_text
 from gsbench.verbs.arguments import ArgumentParser, names, path
 
 DONE, LEFT_OUT = 0, 1
+BETTER = {1: ", more is better", -1: ", less is better", 0: ""}
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -43,10 +42,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         print(f"gsbench: {fault}", file=sys.stderr)
     if options.out is not None:
         title = f"{options.arm[0]} against {options.baseline[0]}: {options.metric}"
-        try:
-            write_text(options.out, _page(title, pooled, options.metric, [*describe(pooled), *notes, *faults]))
-        except OSError as error:
-            raise InputError(f"cannot write {options.out} ({error.strerror}); give another --out") from None
+        write_page(options.out, title, _forest(title, pooled, options.metric), [*describe(pooled), *notes, *faults])
         print(options.out)
     return LEFT_OUT if faults else DONE
 
@@ -95,14 +91,6 @@ def _rows(pooled: Pooled) -> list[str]:
     return lines
 
 
-def _page(title: str, pooled: Pooled, metric: str, lines: Sequence[str]) -> str:
-    """One HTML file that needs no other."""
+def _forest(title: str, pooled: Pooled, metric: str) -> str:
     shown = metric_quantity(metric, ())
-    style = files("gsbench.analysis.report").joinpath("style.css").read_text(encoding="utf-8")
-    chart = pooled_forest(pooled, title, f"difference in {shown.name}", shown.direction)
-    listed = "".join(f"<li>{escape(line)}</li>" for line in lines)
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
-        f'<link rel="icon" href="data:,"><style>{style}</style></head>\n'
-        f'<body><main><h1>{escape(title)}</h1><div class="charts">{chart}</div><ul>{listed}</ul></main></body></html>\n'
-    )
+    return pooled_forest(pooled, title, f"difference in {shown.name}{BETTER[shown.direction]}", shown.direction)

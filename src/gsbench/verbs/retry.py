@@ -9,7 +9,6 @@ from pathlib import Path
 
 import yaml
 
-from gsbench.analysis.results import experiment_home
 from gsbench.config.compose import Composed, compose_one
 from gsbench.config.hydra_guard import typed_permissions
 from gsbench.config.trust import PERMISSIONS, check_permissions
@@ -17,10 +16,14 @@ from gsbench.errors import InputError
 from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.launch.trial import Trial
+from gsbench.runs.experiments import experiment_home
 from gsbench.runs.origin import FROM_RENDERS
 from gsbench.runs.trial_files import TrialPaths, label_of, read_config
 from gsbench.system.own_modules import allow_modules
+from gsbench.tracking.address import VARIABLE, untyped_address
 from gsbench.verbs.arguments import ArgumentParser
+
+TRACKER = "tracking.uri"
 
 log = logging.getLogger(__name__)
 
@@ -54,6 +57,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     planned = {trial.folder: trial for trial in read_plan(home)}
     here = os.getcwd()
     trials = [recompose(folder, planned.get(folder), runs, options.changes, here) for folder in unfinished]
+    _check_trackers(trials, options.changes)
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
@@ -63,6 +67,17 @@ def main(argv: Sequence[str], runs: Path) -> int:
     code = run_trials(trials)
     forget(home, [old for old in replaced if old in planned])
     return code
+
+
+def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
+    """Raise InputError where trials would send their results to a tracker that files name and nobody typed."""
+    typed = next((word.partition("=")[2] for word in changes if key_of(word) == TRACKER), None)
+    for trial in trials:
+        if strange := untyped_address(trial.values["tracking"], typed):
+            raise InputError(
+                f"{label_of(trial.folder)} would send its results to {strange}, as a file says: to allow it, type "
+                f"{TRACKER}={strange} (in no plan: set {VARIABLE}={strange}); tracking=none sends nothing"
+            )
 
 
 def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[str], here: str) -> Trial:

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from gsbench.analysis.results import TrialResult, experiment_home, list_experiments, read_experiment
+from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.analysis.superseded import find_superseded
 from gsbench.launch.plan import forget, read_plan, remove
 from gsbench.launch.states import TrialState, states_of_experiment
+from gsbench.runs.experiments import experiment_home, list_experiments
 from gsbench.runs.source import source_on_disk
 from gsbench.runs.trial_files import label_of
 from gsbench.verbs.arguments import ArgumentParser

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.analysis.results import experiment_home, list_experiments
 from gsbench.errors import GsbenchError
+from gsbench.runs.experiments import experiment_home, list_experiments
 from gsbench.tracking import sync
 from gsbench.tracking.process import MirrorError
 from gsbench.verbs.arguments import ArgumentParser
@@ -16,7 +16,10 @@ def main(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if the tracker cannot be reached."""
     parser = ArgumentParser(prog="gsbench sync", description="Mirror ended trials to their tracker, once.")
     parser.add_argument("experiment", nargs="?", help="its name; without one, all")
-    parser.add_argument("--uri", help="the tracker, such as http://127.0.0.1:5000; without it, each trial's own")
+    parser.add_argument(
+        "--uri",
+        help="the tracker, such as http://127.0.0.1:5000 (else $MLFLOW_TRACKING_URI, else the runs folder's own)",
+    )
     parser.add_argument("--rebuild", action="store_true", help="delete what the tracker shows of them, mirror anew")
     options = parser.parse_args(argv)
     homes = (

@@ -15,6 +15,7 @@ VERBS = {
     "report": ("gsbench.verbs.report", "one HTML file with the evidence of an experiment"),
     "check": ("gsbench.verbs.check", "test the claims of a paper, written in a file: supported, refuted or undecided"),
     "plan": ("gsbench.verbs.plan", "how many scenes and seeds resolve a difference, and what the hours at hand do"),
+    "trend": ("gsbench.verbs.trend", "whether a difference holds from small to large, along one setting"),
     "ablate": ("gsbench.verbs.ablate", "which part of a densifier carries its gain: its switches in all combinations"),
     "pool": (
         "gsbench.verbs.pool",
@@ -28,6 +29,10 @@ VERBS = {
     "ui": ("gsbench.verbs.ui", "open the MLflow dashboard on this machine"),
     "export": ("gsbench.verbs.export", "copy a trained model, an initial cloud or an experiment's results for others"),
     "view": ("gsbench.verbs.view", "look at trained models in the browser: one, or two side by side"),
+    "video": (
+        "gsbench.verbs.video",
+        "film a trained model: along its cameras, round the scene, or along a path of nerfstudio's",
+    ),
     "completion": ("gsbench.verbs.completion", "complete verbs, settings, experiments and trials on the Tab key"),
     "doctor": ("gsbench.verbs.doctor", "check this machine and say what is missing"),
 }

@@ -23,7 +23,7 @@ from gsbench.analysis.translations import by_protocol
 from gsbench.errors import InputError
 from gsbench.eval.protocol import ALL
 from gsbench.files import write_text
-from gsbench.verbs.arguments import ArgumentParser, names, path
+from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 
 TRIALS = "trials"
 FAIRNESS = "fairness"
@@ -41,7 +41,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         print(f"left out: {warning}", file=sys.stderr)
     if options.protocol is not None:
         experiment = by_protocol(experiment, options.protocol)
-    trials = select_trials(experiment.trials, _conditions(options.where))
+    trials = select_trials(experiment.trials, dict(options.where))
     texts = _trials(trials, options) if options.format == TRIALS else _tables(experiment, trials, options)
     _write(texts, options.out, experiment.name)
     return 0
@@ -116,9 +116,7 @@ def _parser() -> ArgumentParser:
     parser.add_argument(
         "--metrics", type=names, metavar="A,B", help="such as psnr,ssim,lpips_squeeze,gaussians,train_time"
     )
-    parser.add_argument(
-        "--where", action="append", default=[], metavar="KEY=VALUE", help="only such trials (repeatable)"
-    )
+    add_where(parser)
     parser.add_argument(
         "--paper",
         metavar="NAME",
@@ -142,13 +140,6 @@ def _parser() -> ArgumentParser:
 def _is_plain(options: argparse.Namespace) -> bool:
     """No layout of the user's own was asked for."""
     return options.rows is None and options.columns is None
-
-
-def _conditions(pairs: Sequence[str]) -> dict[str, str]:
-    for pair in pairs:
-        if "=" not in pair:
-            raise InputError(f"--where {pair!r} is not KEY=VALUE, such as iterations=30000")
-    return dict(pair.split("=", 1) for pair in pairs)
 
 
 def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:

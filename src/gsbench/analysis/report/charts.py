@@ -27,6 +27,15 @@ class Series:
 
 
 @dataclass(frozen=True)
+class Bar:
+    """An interval at ``x``, drawn upright."""
+
+    x: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
 class ForestRow:
     """A difference with its interval; ``low`` and ``high`` are None where no interval is known."""
 
@@ -46,11 +55,13 @@ def line_chart(
     marker: tuple[float, str] | None = None,
     x_names: Sequence[str] = (),
     dots: bool = False,
+    bars: Sequence[Bar] = (),
+    x_ticks: Sequence[float] = (),
 ) -> str:
     """Lines over common axes; ``marker`` is a labelled vertical line. What a log axis cannot show is dropped.
 
-    With ``x_names``, x is the place in that list: values side by side at equal distances. With ``dots``, points are
-    marked however many there are.
+    With ``x_names``, x is the place in that list: values side by side at equal distances; ``x_ticks`` are marked in
+    place of round values. With ``dots``, points are marked however many there are. ``bars`` belong to the first line.
     """
     shown = [
         Series(s.name, [p for p in s.points if (p[0] > 0 or not log_x) and (p[1] > 0 or not log_y)]) for s in series
@@ -59,8 +70,8 @@ def line_chart(
     if not shown:
         return ""
     xs = [x for s in shown for x, _ in s.points] + ([marker[0]] if marker else [])
-    ys = [y for s in shown for _, y in s.points]
-    x_axis = _Axis(xs, log_x, LEFT, WIDTH - RIGHT, names=x_names)
+    ys = [y for s in shown for _, y in s.points] + [end for bar in bars for end in (bar.low, bar.high)]
+    x_axis = _Axis(xs, log_x, LEFT, WIDTH - RIGHT, names=x_names, at=x_ticks)
     y_axis = _Axis(ys, log_y, HEIGHT - BOTTOM, TOP)
     parts = [_frame(x_axis, y_axis, x_label, y_label)]
     if marker:
@@ -78,6 +89,11 @@ def line_chart(
                 f'<circle cx="{x_axis.place(x):.1f}" cy="{y_axis.place(y):.1f}" r="3.5" fill="{color}"/>'
                 for x, y in one.points
             ]
+    parts += [
+        f'<line stroke="{COLORS[0]}" stroke-width="1.5" x1="{x_axis.place(bar.x):.1f}" x2="{x_axis.place(bar.x):.1f}" '
+        f'y1="{y_axis.place(bar.low):.1f}" y2="{y_axis.place(bar.high):.1f}"/>'
+        for bar in bars
+    ]
     ends = "; ".join(f"{s.name} {_ends(s.points, x_axis)}" for s in shown)
     return _figure(title, f"{y_label} against {x_label}: {ends}.", parts, HEIGHT, [s.name for s in shown])
 
@@ -153,8 +169,11 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
     return _figure(title, f"{x_label}. {words}.", parts, height, [])
 
 
+ROUND = (1, 2, 2.5, 5, 10)  # steps between ticks, of a power of ten
+
+
 class _Axis:
-    """Maps values to pixels, with round tick values; with ``names``, a tick for each of them at 0, 1, 2, …"""
+    """Maps values to pixels, with ticks ``at`` some, else at round ones; with ``names``, one for each at 0, 1, 2, …"""
 
     def __init__(
         self,
@@ -164,6 +183,7 @@ class _Axis:
         end: float,
         ticks: int = TICKS,
         names: Sequence[str] = (),
+        at: Sequence[float] = (),
     ) -> None:
         self._log, self._start, self._end, self.names = log, start, end, names
         scaled = [self._scale(value) for value in values]
@@ -176,6 +196,8 @@ class _Axis:
         self._low, self._high = (low if zero_based else low - margin), high + margin
         if names:
             self.ticks = [float(place) for place in range(len(names))]
+        elif at:
+            self.ticks = list(at)
         else:
             self.ticks = self._log_ticks() if log else _round_ticks(self._low, self._high, ticks)
 
@@ -208,11 +230,16 @@ class _Axis:
 
 
 def _round_ticks(low: float, high: float, count: int) -> list[float]:
+    """About ``count`` round values between, and two at least: one alone would be no scale."""
     raw = (high - low) / count
     power = 10.0 ** math.floor(math.log10(raw))
-    step = next(factor * power for factor in (1, 2, 2.5, 5, 10) if factor * power >= raw)
-    first = math.ceil(low / step)
-    return [index * step for index in range(first, math.floor(high / step) + 1)]
+    place = next(place for place, factor in enumerate(ROUND) if factor * power >= raw)
+    for factor in (*reversed(ROUND[: place + 1]), 0.5):
+        step = factor * power
+        indices = range(math.ceil(low / step), math.floor(high / step) + 1)
+        if len(indices) > 1:
+            break
+    return [index * step for index in indices]
 
 
 def _frame(x_axis: _Axis, y_axis: _Axis, x_label: str, y_label: str) -> str:

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gsbench.analysis.errors_by_region import absolute_error, read_image, view_names
+from gsbench.analysis.errors_by_region import absolute_error, read_ignored, read_image, view_names
 from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
 from gsbench.runs.layout import GROUND_TRUTH, RENDERS
 
 CROP = 128  # px a side, but at most a third of the image
+STRIPE, STRIPES = 4, (110, 150)  # px, grey levels: how ignored pixels are shown
 SHOWN = 288  # px: crops are enlarged to it without smoothing, so that pixels stay pixels
 
 
@@ -33,6 +34,7 @@ class Crop:
     truth: str
     first_error: float
     second_error: float
+    striped: bool = False  # some of its pixels, which a mask ignores
 
 
 def choose_crops(
@@ -51,7 +53,7 @@ def choose_crops(
         try:
             names = view_names(one)
             for view in names:
-                images = _read(one, other, view)
+                images, _ = _read(one, other, view)
                 places += [(gain, (one, other), view, box) for gain, box in _extremes(*images)]
             seen.add(one.scene)
         except InputError as error:
@@ -68,15 +70,23 @@ def data_uri(image: NDArray[np.uint8]) -> str:
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _read(
-    one: TrialResult, other: TrialResult, view: str
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
+def _read(one: TrialResult, other: TrialResult, view: str) -> tuple[list[NDArray[np.uint8]], NDArray[np.bool_] | None]:
+    """Both renders and the photograph, ignored pixels striped, and which these are (None: all count)."""
     first = read_image(one.path / RENDERS / f"{view}.png")
     second = read_image(other.path / RENDERS / f"{view}.png")
     truth = read_image(one.path / GROUND_TRUTH / f"{view}.png")
     if not first.shape == second.shape == truth.shape:
         raise InputError(f"{one.label} and {other.label}: {view} has different sizes")
-    return first, second, truth
+    ignored = read_ignored(one, view)
+    images = [first, second, truth]
+    return (images if ignored is None else [_hatched(image, ignored) for image in images]), ignored
+
+
+def _hatched(image: NDArray[np.uint8], ignored: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """``image`` with stripes on ignored pixels, which are thus equal in all images."""
+    rows, columns = np.indices(ignored.shape)
+    stripes = np.where((rows + columns) % (2 * STRIPE) < STRIPE, *STRIPES).astype(np.uint8)  # [H, W]
+    return np.where(ignored[..., None], stripes[..., None], image)
 
 
 def _extremes(
@@ -98,10 +108,12 @@ def _extremes(
 
 def _cut(pair: tuple[TrialResult, TrialResult], view: str, box: tuple[int, int, int, int]) -> Crop:
     left, top, right, bottom = box
-    images = [image[top:bottom, left:right] for image in _read(*pair, view)]
+    whole, ignored = _read(*pair, view)
+    images = [image[top:bottom, left:right] for image in whole]
     errors = [float(absolute_error(image, images[2]).mean()) for image in images[:2]]
     uris = [data_uri(_enlarge(image)) for image in images]
-    return Crop(pair[0].scene, view, pair[0].seed, box, uris[0], uris[1], uris[2], errors[0], errors[1])
+    striped = ignored is not None and bool(ignored[top:bottom, left:right].any())
+    return Crop(pair[0].scene, view, pair[0].seed, box, uris[0], uris[1], uris[2], errors[0], errors[1], striped)
 
 
 def _enlarge(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gsbench.analysis.attribution import attribute, attribution_sentence
+from gsbench.analysis.caveats import caveats
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import short_version
 from gsbench.analysis.errors_by_region import MAP_PROPERTIES, RegionErrors, errors_by_region
@@ -46,7 +46,7 @@ class Versus:
     second: Arm
     verdicts: tuple[Verdict, ...]
     headline: str
-    attribution: str  # in which ingredients the arms differ, where these are several
+    caveats: str  # what else than the idea may have made the difference
     fairness: Table
     secondary: str  # what else was found, where a metric was declared
     by_scene: tuple[str, ...]
@@ -103,7 +103,7 @@ def compare_arms(
         second,
         verdicts,
         headline(judged, first, second),
-        attribution_sentence(attribute(trials, first, second), first, second),
+        caveats(trials, first, second),
         fairness_table(trials, first, second),
         secondary(judged),
         tuple(by_scene_lines([verdict for verdict in verdicts if verdict.role in ("one of all", "declared")])),
@@ -168,7 +168,7 @@ def _mean_curves(trials: Sequence[TrialResult], name: str, keys: Sequence[str]) 
 
 
 def _origin_chart(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> str:
-    """What made the Gaussians that are left at the end, as the mean of a trial."""
+    """Chart of the causes of the Gaussians that are left at the end, as the mean of a trial."""
     origins = {arm: [trial.record.causes for trial in trials if trial.arm == arm] for arm in arms}
     causes = list(dict.fromkeys(cause for logged in origins.values() for counts in logged for cause in counts))
     means = {
@@ -258,7 +258,7 @@ def _unequal_counts(change: float, _: Sequence[Sequence[TrialResult]]) -> str:
 
 
 def _unsteady_times(_: float, arms: Sequence[Sequence[TrialResult]]) -> str:
-    """How far the training times of equal trials differ, without which a change of them says little."""
+    """Say how far the training times of equal trials differ, without which a change of them says little."""
     cells = by_key([trial for arm in arms for trial in arm], lambda trial: (trial.arm, trial.scene)).values()
     times = [[t for trial in cell if (t := COST_READERS["seconds"](trial))] for cell in cells]
     spread = max((max(own) / min(own) - 1 for own in times if own), default=0.0)

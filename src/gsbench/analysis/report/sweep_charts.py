@@ -6,11 +6,12 @@ import statistics
 from collections.abc import Mapping, Sequence
 
 from gsbench.analysis.cells import by_key
+from gsbench.analysis.configurations import canonical
 from gsbench.analysis.differences import differing_settings
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.report.charts import Series, line_chart, short_number
-from gsbench.analysis.results import TrialResult, canonical
+from gsbench.analysis.results import TrialResult
 
 NAMES = ("densify.name", "init.name")  # an arm may be named after the value that it has
 FAMILY = ("init.name", "densify._target_")

@@ -2,26 +2,93 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from gsbench.files import file_sha256
+from gsbench.init.point_files import read_points
+from gsbench.init.points import GREY
 from gsbench.logs import progress
 from gsbench.pipeline.steps.code import step_of_code
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.stages import CAPTURE
 from gsbench.runs.step import Step
+from gsbench.scene.colmap import write_frames
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.images import image_size
+from gsbench.scene.images import Behind, image_size
+from gsbench.scene.masks import IMAGES, prepare, prepared_mask
 from gsbench.scene.options import SceneConfig
-from gsbench.scene.readers import read_colmap, read_photos
+from gsbench.scene.readers import (
+    SPARSE_FOLDERS,
+    existing_folder,
+    fingerprint,
+    read_colmap,
+    read_photos,
+    read_transforms,
+)
 from gsbench.scene.sizes import check_final_size
+from gsbench.scene.transforms import Transforms
+from gsbench.scene.transforms import read_transforms as read_transforms_files
 from gsbench.scene.types import Capture
+from gsbench.system.resources import available_threads
 
 
-def capture_step(options: SceneConfig) -> Step | None:
-    """The step that makes the photographs; None for a scene that is read from the user's folder."""
-    if options.kind != "courtyard":
-        return None
+class CaptureSource:
+    """Source of the photographs of a scene: the user's folder, or a step before.
+
+    What is there is looked at once, however many trials ask.
+    """
+
+    def __init__(self, options: SceneConfig) -> None:
+        self.options = options
+        self._captures: dict[Path | None, Capture] = {}
+
+    @cached_property
+    def step(self) -> Step | None:
+        """The step that makes photographs, or a COLMAP model of the cameras in a file.
+
+        None for a scene that is read from the user's folder as it is.
+        """
+        if self.options.kind == "transforms":
+            return _transforms_step(self._transforms)
+        return _courtyard_step(self.options) if self.options.kind == "courtyard" else None
+
+    def read(self, made: Path | None) -> Capture:
+        """The photographs, selected and split; ``made`` is the folder that ``step`` filled."""
+        if made not in self._captures:
+            self._captures[made] = self._read(made)
+        return self._captures[made]
+
+    def _read(self, made: Path | None) -> Capture:
+        options = self.options
+        selection: dict[str, Any] = {"max_images": options.max_images, "split": options.split_rule}
+        if options.kind == "courtyard":
+            assert made is not None
+            return read_colmap(options.name, made, exact_poses=True, **selection)
+        path, selection["masks"] = str(options.path), options.masks
+        if options.kind == "transforms":
+            assert made is not None
+            capture = read_transforms(options.name, path, self._transforms, made / SPARSE_FOLDERS[0], **selection)
+        elif options.kind == "photos":
+            capture = read_photos(options.name, path, images=options.images, **selection)
+        else:
+            capture = read_colmap(options.name, path, images=options.images, sparse=options.sparse, **selection)
+        for name in capture.image_names:
+            file = capture.images / name
+            check_final_size(image_size(file), options.downscale, options.max_size, str(file))
+        return capture
+
+    @cached_property
+    def _transforms(self) -> Transforms:
+        return read_transforms_files(existing_folder(self.options.name, str(self.options.path)))
+
+
+def _courtyard_step(options: SceneConfig) -> Step:
     inputs = {name: getattr(options, name) for name in ("views", "width", "height", "seed")}
 
     def build(folder: Path) -> None:
@@ -31,20 +98,51 @@ def capture_step(options: SceneConfig) -> Step | None:
     return step_of_code(CAPTURE, inputs, build, __name__)
 
 
-def read_capture(options: SceneConfig, made: Path | None) -> Capture:
-    """The photographs of ``options``, selected and split; ``made`` is the folder that ``capture_step`` filled."""
-    selection: dict[str, Any] = {"max_images": options.max_images, "split": options.split_rule}
-    if made is not None:
-        return read_colmap(options.name, made, exact_poses=True, **selection)
-    path = Path(str(options.path)).expanduser()
-    if options.kind == "photos":
-        capture = read_photos(options.name, path, images=options.images, **selection)
-    else:
-        capture = read_colmap(options.name, path, images=options.images, sparse=options.sparse, **selection)
-    for name in capture.image_names:
-        file = capture.images / name
-        check_final_size(image_size(file), options.downscale, options.max_size, str(file))
-    return capture
+def _transforms_step(said: Transforms) -> Step:
+    """The step that writes the cameras and points of ``transforms.json`` as a COLMAP model."""
+    sizes = {name: [frame.camera.width, frame.camera.height] for name, frame in said.frames.items()}
+    inputs = {"transforms": [file_sha256(file) for file in said.sources], "sizes": sizes}
+
+    def build(target: Path) -> None:
+        cloud = None
+        if said.points is not None:
+            points, colors = read_points(said.points)
+            grey = np.full(points.shape, GREY, dtype=np.uint8)
+            cloud = said.undo.points(points), grey if colors is None else colors
+        frames = {name: (frame.camera, frame.rotation, frame.translation) for name, frame in said.frames.items()}
+        write_frames(target / SPARSE_FOLDERS[0], frames, cloud=cloud)
+
+    return step_of_code(CAPTURE, inputs, build, __name__)
+
+
+def masked_step(capture: Capture, behind: Behind) -> Step | None:
+    """The step that replaces what masks ignore and what is transparent, before anything looks at it.
+
+    None for a capture without masks whose transparent pixels are black, as they are read anyway.
+    """
+    if not capture.masks and behind == "black":
+        return None
+    inputs: dict[str, Any] = {
+        "images": fingerprint(capture.images, capture.image_names),
+        "masks": {name: file_sha256(file) for name, file in sorted(capture.masks.items())},
+    }
+    if behind != "black":
+        inputs["behind"] = behind
+
+    def build(folder: Path) -> None:
+        names = capture.image_names
+        with progress("scene") as report, ThreadPoolExecutor(max_workers=available_threads()) as pool:
+            made = pool.map(lambda name: prepare(folder, capture.images, capture.masks, name, behind), names)
+            for done, _ in enumerate(made, 1):
+                report("pixels replaced", done, len(names))
+
+    return step_of_code(CAPTURE, inputs, build, __name__)
+
+
+def masked(capture: Capture, folder: Path) -> Capture:
+    """The capture with what `masked_step` left in ``folder``."""
+    masks = {name: prepared_mask(folder, name) for name in capture.masks}
+    return replace(capture, images=folder / IMAGES, masks=masks)
 
 
 def split_of(capture: Capture) -> str:

@@ -41,6 +41,7 @@ from gsbench.runs.stage_records import Evaluation
 from gsbench.runs.stages import EVALUATE
 from gsbench.runs.step import Step
 from gsbench.runs.trial_record import Earlier
+from gsbench.scene.columns import COUNTED
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
 from gsbench.scene.nearness import nearness
@@ -93,7 +94,7 @@ def evaluate_step(
                 image = quantize(rendered).cpu().numpy()  # [H, W, 3] uint8
                 if renders is not None:
                     Image.fromarray(image).save(renders / png_name(view.name))
-                per_view[view.name] = evaluator.evaluate_view(image, view.image)
+                per_view[view.name] = evaluator.evaluate_view(image, view.image, view.mask)
                 report(phase, done, len(scene.test))
             return per_view
 
@@ -136,7 +137,7 @@ def measure_step(
         with progress("evaluate") as report:
             for done, view in enumerate(scene.test, 1):
                 per_view[view.name] = evaluator.evaluate_view(
-                    read_image(folder / RENDERS / png_name(view.name)), view.image
+                    read_image(folder / RENDERS / png_name(view.name)), view.image, view.mask
                 )
                 report("views", done, len(scene.test))
         unknown = nothing_known(geometry, flicker, "another program's renders are known, not its model")
@@ -153,7 +154,7 @@ def _further_metrics(evaluator: Evaluator) -> dict[str, Any]:
 
 
 def _of_model(geometry: bool, flicker: bool) -> dict[str, bool]:
-    """What is measured of the model as it enters a key; nothing where nothing is."""
+    """Measures of the model as they enter a key; nothing where none are."""
     return {name: True for name, asked in (("geometry", geometry), ("flicker", flicker)) if asked}
 
 
@@ -173,6 +174,8 @@ def _write_metrics(
     cameras, training = ([view.camera for view in views] for views in (scene.test, scene.train))
     near = nearness(cameras, training, scene.extent)
     places = {view.name: place for view, place in zip(scene.test, near, strict=True)}  # no metrics: they are in no mean
+    if any(view.mask is not None for view in [*scene.train, *scene.test]):
+        places = {view.name: places[view.name] | {COUNTED: view.counted} for view in scene.test}
     write_per_view(folder / PER_VIEW, {view: row | places.get(view, {}) for view, row in rows.items()})
     summary = replace(summary_of(evaluator, rows), at=dict(at))
     for found in of_model:

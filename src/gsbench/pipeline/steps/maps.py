@@ -59,7 +59,7 @@ def paint(rasterizer: Rasterizer, gaussians: Gaussians, features: Tensor, camera
 
 
 def _mean_seen(sums: Tensor, alpha: Tensor) -> Tensor:
-    """What was painted, as a mean over the Gaussians of each pixel, [H, W, 3]; NaN where no surface is seen."""
+    """Painted values, as a mean over the Gaussians of each pixel, [H, W, 3]; NaN where no surface is seen."""
     seen = (alpha >= MIN_ALPHA).unsqueeze(-1)
     return torch.where(seen, sums / alpha.clamp_min(MIN_ALPHA).unsqueeze(-1), math.nan)
 

@@ -22,6 +22,7 @@ from gsbench.pipeline.components import options_of, rasterizer_inputs
 from gsbench.pipeline.steps.code import step_of_code
 from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
+from gsbench.runs.hashing import as_before
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
@@ -42,7 +43,8 @@ def train_step(
     snapshot_at: Sequence[int] = (),
 ) -> Step:
     """Train on the training views, from the cloud of the initialiser; keep the model at ``snapshot_at`` too."""
-    of_model = {key: value for key, value in dataclasses.asdict(options).items() if key not in WITHOUT_EFFECT_ON_MODEL}
+    values = as_before("train", dataclasses.asdict(options))
+    of_model = {key: value for key, value in values.items() if key not in WITHOUT_EFFECT_ON_MODEL}
     inputs: dict[str, Any] = {
         "scene": views.inputs,
         "init": views.init.key,

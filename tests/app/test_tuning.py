@@ -1,0 +1,322 @@
+"""Tuning parity with trials that take no time: what is declared, searched and chosen, and that nobody is favoured."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsbench import cli
+from gsbench.analysis.cells import with_variants
+from gsbench.analysis.fairness import fairness_table
+from gsbench.analysis.report.build import build_report
+from gsbench.analysis.results import load_experiment
+from gsbench.analysis.tables import build_table
+from gsbench.errors import GsbenchError
+from gsbench.launch.declare import declare, declared_metrics, planned_trials
+from gsbench.launch.outcome import Outcome, outcome_of_error, outcome_of_results
+from gsbench.launch.plan import add_to_plan
+from gsbench.launch.trial import Trial
+from gsbench.runs.declaration import read_plans
+from gsbench.runs.layout import CONFIG, RESULTS
+from gsbench.runs.trial_record import record_from
+from gsbench.runs.tuning_record import TuningRecord, read_tuning
+from tests.analysis.synthetic import Plan, trial_data, write_trial
+from tests.launch.test_declare import TINY
+
+pytest.importorskip("optuna", reason="needs Optuna (extra search)")
+
+FILE = """\
+# @package _global_
+name: fair
+eval: {primary: psnr}
+hydra:
+  mode: MULTIRUN
+  sweeper:
+    params: {densify: "adc,volumetric", seed: "0,1"}
+    tune:
+      points: 4
+      ranges:
+        adc: {densify.gradient_threshold: "tag(log, interval(1e-4, 4e-4))"}
+        volumetric: {densify.volume_threshold: "tag(log, interval(1e-3, 1e-1))", densify.stop: "range(100, 500, 100)"}
+"""
+WORDS = [*(word for word in TINY if not word.startswith(("densify=", "seed=", "name="))), "+experiment=fair"]
+KEYS = {"adc": "gradient_threshold", "volumetric": "volume_threshold"}
+BEST = {"adc": 3e-4, "volumetric": 0.01}
+
+
+class Fake:
+    """Made-up results in the place of trained ones, best at `BEST`; ``stops`` and ``fails`` are numbers of trials."""
+
+    def __init__(self, stops: int | None = None, fails: Sequence[int] = ()) -> None:
+        self.stops, self.fails = stops, fails
+        self.trained: list[Trial] = []
+        self.batches: list[int] = []
+
+    def __call__(self, trials: Sequence[Trial]) -> list[Outcome]:
+        add_to_plan(trials)
+        declare(declared_metrics(trials), planned_trials(trials))
+        self.batches.append(len(trials))
+        return [self.run(trial) for trial in trials]
+
+    def run(self, trial: Trial) -> Outcome:
+        results = trial.folder / RESULTS
+        if not results.exists():
+            self.trained.append(trial)
+            if len(self.trained) - 1 == self.stops:
+                raise KeyboardInterrupt
+            if len(self.trained) - 1 in self.fails:
+                return outcome_of_error(trial.folder, GsbenchError("no luck"))
+            arm, values = trial.values["densify"]["name"], trial.values
+            error = abs(np.log(values["densify"][KEYS[arm]] / BEST[arm])) if arm in KEYS else 0.0
+            views = {"psnr": 26.0 - error + 0.01 * values["seed"] + np.arange(3.0)}
+            data = trial_data(Plan(experiment=values["name"]), "courtyard", "random", arm, values["seed"], views)
+            write_trial(trial.paths.runs, data, views, trial.folder.name.partition("-")[0])
+            (trial.folder / CONFIG).write_text(trial.yaml)
+        return outcome_of_results(trial.folder, record_from(results.read_bytes(), results))
+
+    def tuning(self, arm: str) -> list[Trial]:
+        return [trial for trial in self.trained if trial.values["name"] == f"fair-tune-random-{arm}"]
+
+    def judged(self) -> list[Trial]:
+        return [trial for trial in self.trained if trial.values["name"] == "fair"]
+
+
+@pytest.fixture
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "conf" / "experiment").mkdir(parents=True)
+    return tmp_path / "runs"
+
+
+Sweep = Callable[..., int]
+
+
+@pytest.fixture
+def sweep(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sweep:
+    def run(fake: Fake, *words: str, file: str = FILE) -> int:
+        (tmp_path / "conf" / "experiment" / "fair.yaml").write_text(file)
+        monkeypatch.setattr("gsbench.app.command.run_batch", fake)
+        return cli.run(["--config-dir", str(tmp_path / "conf"), *WORDS, *words])
+
+    return run
+
+
+def tuning(runs: Path) -> TuningRecord:
+    return read_tuning(runs / "fair")
+
+
+def chosen(runs: Path, arm: str) -> dict[str, Any]:
+    best = tuning(runs).arms[f"random-{arm}"].best
+    assert best is not None
+    return dict(best.settings)
+
+
+def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_the_best(
+    sweep: Sweep, runs: Path
+) -> None:
+    fake = Fake()
+    assert sweep(fake) == 0
+    assert fake.batches == [2, 2, 2, 2, 4]  # a point of both arms at a time, then the sweep as a whole
+    for arm in ("adc", "volumetric"):
+        values = [trial.values for trial in fake.tuning(arm)]
+        assert len(values) == 4
+        assert all(one["scene"]["validation"] and one["eval"]["primary"] is None for one in values)
+        assert {one["seed"] for one in values} == {100}
+        points = [one["densify"][KEYS[arm]] for one in values]
+        closest = min(points, key=lambda value: abs(np.log(value / BEST[arm])))
+        assert chosen(runs, arm)[f"densify.{KEYS[arm]}"] == closest
+        own = [trial.values for trial in fake.judged() if trial.values["densify"]["name"] == arm]
+        assert [one["seed"] for one in own] == [0, 1]
+        assert {one["densify"][KEYS[arm]] for one in own} == {closest}
+        assert not any(one["scene"]["validation"] for one in own)
+    assert fake.tuning("adc")[0].values["densify"]["gradient_threshold"] == 0.0002  # the arm as it is comes first
+    assert tuning(runs).arms["random-adc"].as_it_is
+    assert not tuning(runs).arms["random-volumetric"].as_it_is  # its stop is no multiple of 100
+
+
+def test_the_plan_is_declared_before_anything_is_trained(sweep: Sweep, runs: Path) -> None:
+    assert sweep(Fake(stops=0)) == cli.INTERRUPTED
+    (plan,) = read_plans(runs / "fair")
+    assert plan.kind == "tuning"
+    assert plan.plan["tuning"]["points"] == 4
+    assert plan.plan["tuning"]["arms"]["random-volumetric"]["ranges"]["densify.stop"] == "range(100, 500, 100)"
+
+
+@pytest.mark.parametrize("stops", [3, 9])  # in the search, and in the sweep
+def test_killed_anywhere_it_goes_on_and_chooses_the_same(
+    stops: int, sweep: Sweep, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = Fake()
+    assert sweep(whole) == 0
+    expected = tuning(runs)
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "again"))
+    assert sweep(Fake(stops=stops)) == cli.INTERRUPTED
+    rest = Fake()
+    assert sweep(rest) == 0
+    assert len(rest.trained) == 12 - stops  # nothing is trained twice but the one that was killed
+    assert read_tuning(tmp_path / "again" / "fair").arms == expected.arms
+    assert len(read_plans(tmp_path / "again" / "fair")) == 1
+    again = Fake()
+    assert sweep(again) == 0
+    assert again.batches == [4]  # what is tuned is not even asked for
+
+
+def test_seeds_may_be_added_to_a_tuned_sweep_and_it_may_stop_when_decided(sweep: Sweep, runs: Path) -> None:
+    assert sweep(Fake(), "launch.stop_when_decided=true", "seed=0,1,2") == 0
+    assert sorted(plan.kind for plan in read_plans(runs / "fair")) == ["stopping", "tuning"]
+    more = Fake()
+    assert sweep(more, "launch.stop_when_decided=true", "seed=0,1,2") == 0
+    assert not more.trained
+    assert sorted(plan.kind for plan in read_plans(runs / "fair")) == ["stopping", "tuning"]  # neither ousts the other
+    assert sweep(more, "seed=0,1,2,3") == 0
+    assert {trial.values["name"] for trial in more.trained} == {"fair"}
+
+
+def test_another_launcher_gets_the_points_and_their_trials(sweep: Sweep) -> None:
+    fake = Fake()
+    assert sweep(fake, "hydra/launcher=basic", "launch=serial") == 0
+    assert fake.batches == [1] * 12
+    assert len(fake.tuning("adc")) == len(fake.tuning("volumetric")) == 4
+
+
+def test_a_point_is_judged_on_all_scenes_and_seeds_of_the_tuning(sweep: Sweep, runs: Path) -> None:
+    fake = Fake()
+    words = ["scene.sector=0,1", "scene.split=sector", "hydra.sweeper.tune.seed='7,8'", "hydra.sweeper.tune.points=2"]
+    assert sweep(fake, *words) == 0
+    assert [(one.values["scene"]["sector"], one.values["seed"]) for one in fake.tuning("adc")] == [
+        (sector, seed) for _ in range(2) for sector in (0, 1) for seed in (7, 8)
+    ]
+    point = tuning(runs).arms["random-adc"].search
+    assert point is not None
+    assert point.points[0].value == pytest.approx(26 - np.log(1.5) + 0.075 + 1, abs=1e-4)
+
+
+def test_points_that_fail_are_part_of_the_budget_and_an_arm_without_any_ends_the_sweep(
+    sweep: Sweep, runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert sweep(Fake(fails=[0])) == 1
+    search = tuning(runs).arms["random-adc"].search
+    assert search is not None
+    assert [point.state for point in search.points] == ["failed", "done", "done", "done"]
+    capsys.readouterr()
+    assert sweep(Fake(fails=[0, 2, 4, 6]), "name=none") == 1
+    assert "no point of random-adc has a psnr (gsbench status none-tune-random-adc says why)" in capsys.readouterr().err
+
+
+def test_zero_points_tune_nothing(sweep: Sweep, runs: Path) -> None:
+    fake = Fake()
+    assert sweep(fake, "hydra.sweeper.tune.points=0") == 0
+    assert fake.batches == [4]
+    assert not (runs / "fair" / "tuning.json").exists()
+
+
+def test_a_dry_run_says_what_will_be_tuned_and_trains_nothing(
+    sweep: Sweep, runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    look = ["--dry-run"]
+    assert sweep(Fake(), *look) == 0
+    said = capsys.readouterr().out
+    assert "tunes first: 4 points each for random-adc and random-volumetric, by psnr of validation views" in said
+    assert "8 trainings" in said
+    assert "the arms are listed as they are" in said
+    assert not runs.exists()
+
+
+# --- what is printed
+
+
+def notes(runs: Path, *words: str) -> list[str]:
+    trials = with_variants(load_experiment(runs, "fair").trials)
+    table = fairness_table(trials, ("random", "adc"), ("random", "volumetric"))
+    return [note for note in table.notes if note.startswith("Tuning.")]
+
+
+def test_the_sheet_says_budget_views_points_and_what_was_chosen(sweep: Sweep, runs: Path) -> None:
+    assert sweep(Fake()) == 0
+    adc, volumetric = notes(runs)
+    best = chosen(runs, "volumetric")
+    assert "random-volumetric: " + " and ".join(f"{key}={best[key]}" for key in sorted(best)) in volumetric
+    assert "the best of 4 points by psnr of validation views (courtyard; seed 100), declared " in volumetric
+    assert "before any of these trials" in volumetric
+    assert "densify.stop=range(100, 500, 100)" in volumetric
+    assert "the arm as it is was no point" in volumetric
+    assert "the first point was the arm as it is" in adc
+    assert "Tried: 0.0002 (27.59)" in adc
+    page = build_report(load_experiment(runs, "fair"))
+    assert "tuning was unequal" not in page
+    assert "is the best of 4 points" in page
+
+
+UNEVEN = FILE.replace('{densify.gradient_threshold: "tag(log, interval(1e-4, 4e-4))"}', "{}")
+SENTENCE = "Their tuning was unequal: random-adc none and random-volumetric 4 points of 1 seed on validation views."
+
+
+def test_an_arm_that_was_tuned_more_is_said_in_headline_and_tables(sweep: Sweep, runs: Path) -> None:
+    assert sweep(Fake(), file=UNEVEN) == 0
+    lines = notes(runs)
+    assert f"Tuning. {SENTENCE}" in lines
+    assert "Tuning. random-adc: left as it is by the tuning of its sweep." in lines
+    page = build_report(load_experiment(runs, "fair"))
+    assert page.index("<strong>random-volumetric against") < page.index(SENTENCE) < page.index("<summary>Fairness")
+    assert any(SENTENCE in note for note in build_table(load_experiment(runs, "fair")).notes)
+
+
+def test_trials_from_before_the_tuning_and_with_other_values_are_named(sweep: Sweep, runs: Path) -> None:
+    assert sweep(Fake()) == 0
+    for file in (runs / "fair").glob("*/random-volumetric/*/results.json"):
+        file.write_text(file.read_text().replace('"raster"', '"measured": "2020-01-01T00:00:00Z", "raster"'))
+    (line,) = [note for note in notes(runs) if "random-volumetric: " in note]
+    assert "when 2 of these 2 trials had been measured" in line
+    file = runs / "fair" / "tuning.json"
+    record = json.loads(file.read_text())
+    for point in record["arms"]["random-volumetric"]["search"]["points"]:
+        point["settings"]["densify.volume_threshold"] = 0.5
+    file.write_text(json.dumps(record))
+    lines = notes(runs)
+    assert any("but these trials have other values" in line for line in lines)
+    assert any("random-adc 4 points of 1 seed on validation views and random-volumetric none" in line for line in lines)
+    file.write_text("{")
+    assert notes(runs)  # a record that is damaged takes nothing else with it
+
+
+# --- bad input
+
+MISTAKES = [
+    (FILE, "hydra.sweeper.tune.point=3", "did you mean points?"),
+    (FILE, "hydra.sweeper.tune.metric=psnrr", "did you mean psnr?"),
+    (FILE, "hydra.sweeper.tune.seed='1,2'", "tune.seed: 1 is a seed of the sweep, too"),
+    (FILE, "hydra.sweeper.tune.seed=one", "must list whole numbers"),
+    (FILE, "densify.stop=300", "is tuned and given as well"),
+    (FILE, "densify=adc", "ranges.volumetric is no arm of the sweep"),
+    (FILE, "densify=adc,volumetric,longaxis", "say nothing of longaxis"),
+    (FILE, "scene.validation=true", "leave scene.validation out"),
+    (FILE, "launch.wait=false", "launch.wait must be true"),
+    (FILE, "hydra/sweeper=basic", "hydra.sweeper.tune: gsbench's own sweeper alone tunes arms"),
+    (FILE.replace("points: 4", "points: null"), "", "say how many points"),
+    (FILE[: FILE.index("      ranges")], "", "no ranges to search"),
+    (FILE.replace("densify.stop", "densify.stpo"), "", "did you mean"),
+    (FILE.replace("densify.stop", "scene.max_size"), "", "of what all arms are measured by"),
+    (FILE.replace("densify.stop", "seed"), "", "of what all arms are measured by"),
+    (FILE.replace('"range(100, 500, 100)"', "300"), "", "is one value"),
+    (FILE.replace("interval(1e-3, 1e-1)", "interval(0, 1e-1)"), "", "densify.volume_threshold"),
+    (FILE.replace("interval(1e-3, 1e-1)", "interval(1e-3"), "", "tune.ranges"),
+    (FILE.replace("        adc: {", "        adc: 3 #"), "", "hydra.sweeper.tune.ranges"),
+]
+
+
+@pytest.mark.parametrize(("file", "word", "part"), MISTAKES)
+def test_mistakes_are_one_line_before_any_work(
+    file: str, word: str, part: str, sweep: Sweep, runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fake = Fake()
+    assert sweep(fake, *([word] if word else []), file=file) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert part in line
+    assert not fake.batches
+    assert not runs.exists()
