@@ -13,7 +13,7 @@ def heed_interrupts() -> None:
 
 
 def bytes_written(folder: Path, pattern: str) -> int:
-    """Bytes in the files of ``folder`` that match ``pattern``, any of which its writer may rename or remove just now."""
+    """Bytes in the files of ``folder`` that match ``pattern``, while their writer may rename or remove any of them."""
     total = 0
     for path in folder.glob(pattern):
         with suppress(FileNotFoundError):
