@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import findings_archives as archives
+import findings_trends as trends
 import pandas as pd
 from findings_pairs import difference, facts, pair, row
 from PIL import Image
@@ -194,6 +195,8 @@ def with_tables(page: str) -> str:
 def _table(found: re.Match[str]) -> list[str]:
     name, arms = found["experiment"], found["arms"].split(", ") if found["arms"] else []
     if archives.archive_of(name).is_file():
+        if arms and name == trends.BRIDGE:
+            return trends.trends_table(name, arms, found["against"])
         if arms:
             return archives.TABLES_OF_ARMS[found["table"]](name, arms, found["against"])
         return archives.TABLES[found["table"]](name)
@@ -237,3 +240,5 @@ if __name__ == "__main__":
         for page in PAGES:
             page.write_text(with_tables(page.read_text(encoding="utf-8")), encoding="utf-8")
         draw()
+        if archives.archive_of(trends.BRIDGE).is_file():
+            trends.draw()

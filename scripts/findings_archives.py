@@ -34,6 +34,7 @@ ARCHIVED = (
     "findings_dimension",
     "findings_matched",
     "findings_exponent",
+    "scale_bridge",
     "check_volumetric",
 )
 PICTURES = {"findings_matched": worst_views, "findings_volume": for_and_against}

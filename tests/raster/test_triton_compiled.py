@@ -18,7 +18,7 @@ from gsbench.gaussians.deferred import DeferredHarmonics
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.contract import Case
-from gsbench.raster.triton import composite, executor
+from gsbench.raster.triton import composite, lists
 from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.train.loss_triton import MULTIPROCESSORS, STRIP, TritonLoss, rows_of_program
 from tests.raster.ahead_of_time import TARGETS, Launch, compile_for, recorded, specialization
@@ -47,7 +47,7 @@ class Answer:
 def launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
     """Kernels are recorded instead of run."""
     Answer.asked = 0
-    monkeypatch.setattr(executor, "Readback", Answer)
+    monkeypatch.setattr(lists, "Readback", Answer)
     with recorded(monkeypatch) as record:
         yield record
 
@@ -95,7 +95,7 @@ def test_kernels_compile_without_spills(launches: list[Launch], target: int, mon
     step(CASE, absolute=True, footprint=True)
     deferred_step(CASE, harmonics_of(CASE), TritonRasterizer())
     if target == 90:  # the other variants: the lower degrees, and blocks that are numbered in 32 bits
-        monkeypatch.setattr(executor, "MAX_INT16", 0)
+        monkeypatch.setattr(lists, "MAX_INT16", 0)
         for degree in (0, 1, 2):
             step(replace(CASE, sh_degree=degree))
             if degree > 0:

@@ -21,10 +21,11 @@ from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.raster import staged
 from gsbench.raster.base import Rasterizer, RenderOutput
 from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.raster.triton import composite, executor, layout
+from gsbench.raster.triton import composite, layout, lists
 from gsbench.raster.triton.deferred import Factors, Tables
 from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.raster.triton.memory import BYTES_OF_BORDER, PAIRS_OF_BORDER, workspace_bytes
@@ -78,7 +79,7 @@ def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(monkeypatch:
         output, gradients = render_with_gradients(TritonRasterizer(), case, torch.float32)
         footprint = output.footprint(values)
         frame = output.footprint.args[1].frame
-        skipped.append(int((frame.starts[1:] - frame.past).sum()))
+        skipped.append(int((frame.lists.starts[1:] - frame.past).sum()))
         return bits(output, gradients) + [tensor.numpy().tobytes() for tensor in vars(footprint).values()]
 
     skipped: list[int] = []
@@ -140,9 +141,9 @@ def test_segments_change_nothing_but_the_last_digits(monkeypatch: pytest.MonkeyP
     shorten_segments(monkeypatch)
     errors, output = misses(case, case.gaussians())
     frame = output.footprint.args[1].frame
-    crossed = (frame.past - frame.starts[:-1] - 1) // 8
+    crossed = (frame.past - frame.lists.starts[:-1] - 1) // 8
     assert int(crossed.sum()) > 15
-    assert bool(((frame.starts[1:] - frame.starts[:-1] - 1) // 8 > crossed).any())
+    assert bool(((frame.lists.starts[1:] - frame.lists.starts[:-1] - 1) // 8 > crossed).any())
     assert max(errors.values()) < 1e-5
 
 
@@ -392,7 +393,7 @@ def test_more_rows_than_were_expected() -> None:
 
 def test_many_blocks_are_numbered_in_more_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = bits(*render_with_gradients(TritonRasterizer(), TINY, torch.float32))
-    monkeypatch.setattr(executor, "MAX_INT16", 0)
+    monkeypatch.setattr(lists, "MAX_INT16", 0)
     assert bits(*render_with_gradients(TritonRasterizer(), TINY, torch.float32)) == expected
 
 
@@ -402,7 +403,7 @@ def test_the_memory_that_is_kept_is_counted_from_its_shapes(case: Case) -> None:
     output = rasterizer.render(leaves(case), case.camera(), case.sh_degree, BLACK)
     frame = output.footprint.args[1].frame
     output.image.sum().backward()
-    count, pairs, blocks = case.count, frame.pairs, frame.grid.blocks
+    count, pairs, blocks = case.count, frame.units.pairs, frame.grid.blocks
     del output, frame
     free = [workspace for pool in (rasterizer._frames, rasterizer._scratch) for workspace in pool._free.values()]
     buffers = [tensor for (workspace,) in free for tensor in workspace._buffers.values()]
@@ -417,7 +418,7 @@ def test_the_memory_that_is_kept_is_counted_from_its_shapes(case: Case) -> None:
 
 
 def test_more_pairs_than_can_be_sorted_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(executor, "MAX_INT32", 3)
+    monkeypatch.setattr(lists, "MAX_INT32", 3)
     with pytest.raises(ValueError, match="more than 3"):
         TritonRasterizer().render(leaves(TINY), TINY.camera(), 0, BLACK)
 
@@ -429,7 +430,7 @@ def test_float64_is_refused() -> None:
 
 def test_a_background_that_is_not_finite_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a device it is not looked at before the kernels do."""
-    monkeypatch.setattr(executor, "check_settings", lambda *_: None)
+    monkeypatch.setattr(staged, "check_settings", lambda *_: None)
     with pytest.raises(ValueError, match="background"):
         TritonRasterizer().render(leaves(TINY), TINY.camera(), 0, torch.tensor([0.0, torch.nan, 0.0]))
 

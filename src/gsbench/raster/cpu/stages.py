@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsbench.gaussians.deferred import DeferredHarmonics
 from gsbench.gaussians.model import NUM_SH_REST, Gaussians
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
@@ -32,6 +31,7 @@ from gsbench.raster.cpu.shuffle import REST
 from gsbench.raster.cpu.vector import LANES
 from gsbench.raster.cpu.workspace import HEADROOM, Arena, ShardRunner, TensorPool
 from gsbench.raster.footprint import Footprint, view_depths
+from gsbench.raster.staged import Gradients, Request
 from gsbench.raster.validate import raise_for_values
 from gsbench.scene.camera import Camera
 
@@ -76,10 +76,7 @@ def forward(
     workshop: Workshop,
     arena: Arena,
     gaussians: Gaussians,
-    harmonics: DeferredHarmonics | None,
-    camera: Camera,
-    degree: int,
-    background: NDArray[np.float32],
+    request: Request,
     image: Tensor,
     alpha: Tensor,
     radii: Tensor,
@@ -87,9 +84,9 @@ def forward(
     """Project, sort, bin, composite into ``image``, ``alpha`` and ``radii``."""
     run = workshop.runner.run
     count = len(gaussians)
-    view = at.make_view(camera, CONSTANTS)
+    view = at.make_view(request.camera, CONSTANTS)
     tiles = view.tiles_x * view.tiles_y
-    arrays, pending = _arrays(gaussians), pending_of(harmonics)
+    arrays, pending = _arrays(gaussians), pending_of(request.harmonics)
     records = arena.take("records", (count * at.RECORD,), np.float32)
     record_ints = records.view(np.int32)
     keys = arena.take("keys", (count,), np.uint64)
@@ -105,7 +102,7 @@ def forward(
             end,
             *arrays,
             pending,
-            degree,
+            request.degree,
             view,
             records,
             record_ints,
@@ -155,7 +152,7 @@ def forward(
 
     frame = Frame(
         view,
-        degree,
+        request.degree,
         flags[:, VISIBLE],
         records,
         starts,
@@ -166,7 +163,7 @@ def forward(
         arena.take("last", (tiles * at.TILE_PIXELS,), np.float32),
         np.empty(TILE_SHARDS + 1, np.int64),
         arena.take("tile_shard", (tiles,), np.uint8),
-        background,
+        request.background.numpy(),
     )
     balance_tiles(starts, TILE_SHARDS, frame.bounds, frame.tile_shard)
     image_array, alpha_array = image.numpy().reshape(-1), alpha.numpy().reshape(-1)
@@ -204,18 +201,16 @@ def backward(
     arena: Arena,
     frame: Frame,
     gaussians: Gaussians,
-    harmonics: DeferredHarmonics | None,
+    request: Request,
     g_image: NDArray[np.float32],
     g_alpha: NDArray[np.float32],
-    absolute: Tensor | None,
     want_splitting: bool,
-) -> tuple[list[Tensor | None], Tensor, Tensor | None]:
-    """The gradients of the six tensors, of ``screen_points`` and of the splitting probe; fills ``absolute`` [N, 2] if
-    it is given.
+) -> Gradients:
+    """The gradients, and those in absolute values where ``request`` has room for them; ``g_alpha`` may be empty.
 
-    With ``harmonics`` the gradient of ``sh_rest`` is None, and its factors go there.
+    With harmonics that are put off the factors of their gradient go there.
     """
-    count = len(gaussians)
+    count, harmonics, absolute = len(gaussians), request.harmonics, request.absolute
     rows = arena.take("rows", (TILE_SHARDS, count * at.ROW), np.float32, zero=True)
     want_absolute = None if absolute is None else True
 
@@ -266,11 +261,11 @@ def backward(
 
     workshop.runner.run(GAUSSIAN_SHARDS, backproject)
     if harmonics is None:
-        return [*gradients.values(), g_sh_rest], g_screen, g_splitting
+        return Gradients([*gradients.values(), g_sh_rest], g_screen, g_splitting)
     if frame.degree > 0:
         visible = [int(number) for number in frame.visible]
         harmonics.receive(Factors(workshop.runner, factors, chunks[:-1], visible, frame.degree, count))
-    return [*gradients.values(), None], g_screen, g_splitting
+    return Gradients([*gradients.values(), None], g_screen, g_splitting)
 
 
 def _arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-# Bytes that stay from step to step, in the workspaces of `executor`.
+# Bytes that stay from step to step, in the workspaces of `stages` and `lists`.
 BYTES_OF_GAUSSIAN = (
     64 + 36 + 3 * 4 + 3 * 8
 )  # record; slopes of the colour; depth and key, rows of blocks; their places, the order

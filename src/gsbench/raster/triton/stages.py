@@ -1,0 +1,273 @@
+"""Stages of the Triton rasterizer in order, forward and backward; and the footprint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster.footprint import Footprint, view_depths
+from gsbench.raster.staged import Gradients, Request
+from gsbench.raster.triton.backprojection import backproject, sum_units
+from gsbench.raster.triton.composite import composite, decomposite
+from gsbench.raster.triton.deferred import Factors, Pending
+from gsbench.raster.triton.footprint import cover, sum_cover
+from gsbench.raster.triton.launch import launch, launch_grid
+from gsbench.raster.triton.layout import (
+    BLOCK_PIXELS,
+    BORDER,
+    COLOR_SLOPES,
+    FACTORS,
+    RECORD,
+    ROW,
+    Grid,
+    View,
+    count_borders,
+    make_grid,
+    make_view,
+)
+from gsbench.raster.triton.lists import Lists, Projected, Units, find_all_units, make_lists
+from gsbench.raster.triton.projection import project
+from gsbench.raster.triton.workspace import Workspace
+from gsbench.scene.camera import Camera
+
+
+@dataclass
+class Frame:
+    """Results of the forward pass for the backward pass; the memory belongs to a workspace."""
+
+    grid: Grid
+    view: View
+    pending: Pending
+    projected: Projected
+    units: Units
+    lists: Lists
+    transmittance: Tensor  # [blocks * BLOCK_PIXELS]
+    last: Tensor  # [blocks * BLOCK_PIXELS] int32
+    past: Tensor  # [blocks] int32
+    borders: Tensor  # [count_borders(pairs) * BORDER]
+    last_slots: Tensor  # [blocks] int64
+
+
+def forward(
+    memory: Workspace,
+    scratch: Workspace,
+    gaussians: Gaussians,
+    pending: Pending,
+    request: Request,
+    image: Tensor,
+    alpha: Tensor,
+    radii: Tensor,
+) -> Frame:
+    """Project, sort, bin, composite into ``image``, ``alpha`` and ``radii``. Raises ValueError for bad values."""
+    grid, view = make_grid(request.camera), make_view(request.camera)
+    count, blocks, background = len(gaussians), grid.blocks, request.background
+    flags = scratch.take("flags", 1, torch.int32).zero_()
+    keys = scratch.take("depth_keys", count, torch.int32)
+    projected = _project(memory, gaussians, pending, view, request.degree, keys, radii, flags)
+    units, owners = find_all_units(memory, scratch, gaussians, projected, grid, keys, flags, background)
+    lists = make_lists(memory, scratch, units, owners, blocks)
+    frame = Frame(
+        grid,
+        view,
+        pending,
+        projected,
+        units,
+        lists,
+        memory.take("transmittance", blocks * BLOCK_PIXELS.value, torch.float32),
+        memory.take("last", blocks * BLOCK_PIXELS.value, torch.int32),
+        memory.take("past", blocks, torch.int32),
+        memory.take("borders", count_borders(units.pairs) * BORDER.value, torch.float32),
+        memory.take("last_slots", blocks, torch.int64),
+    )
+    launch_grid(composite, blocks)(
+        lists.order,
+        lists.starts,
+        lists.entries,
+        projected.records,
+        count,
+        background,
+        grid.width,
+        grid.height,
+        grid.blocks_x,
+        image,
+        alpha,
+        frame.transmittance,
+        frame.last,
+        frame.past,
+        frame.borders,
+        lists.slots,
+        frame.last_slots,
+        num_warps=1,
+    )
+    return frame
+
+
+def _project(
+    memory: Workspace,
+    gaussians: Gaussians,
+    pending: Pending,
+    view: View,
+    degree: int,
+    keys: Tensor,
+    radii: Tensor,
+    flags: Tensor,
+) -> Projected:
+    """Project all Gaussians; ``keys`` sort by depth, ``flags`` tell of values that cannot be used."""
+    count = len(gaussians)
+    projected = Projected(
+        memory.take("records", (count + 1) * RECORD.value, torch.float32),
+        memory.take("color_slopes", count * COLOR_SLOPES.value, torch.float32),
+        memory.take("row_counts", count, torch.int32),
+    )
+    parameters = [tensor.detach() for tensor in gaussians.tensors().values()]
+    launch(project, count + 1, 128)(
+        *parameters,
+        *pending.tensors(parameters[-1]),
+        count,
+        view,
+        projected.records,
+        projected.records.view(torch.int32),
+        projected.color_slopes,
+        keys,
+        projected.row_counts,
+        radii,
+        flags,
+        DEGREE=degree,
+        DEFERRED=pending.harmonics is not None,
+    )
+    return projected
+
+
+def backward(
+    scratch: Workspace,
+    frame: Frame,
+    gaussians: Gaussians,
+    request: Request,
+    g_image: Tensor,
+    g_alpha: Tensor | None,
+    want_splitting: bool,
+) -> Gradients:
+    """The gradients, and those in absolute values where ``request`` has room for them.
+
+    With harmonics that are put off the factors of their gradient go there.
+    """
+    grid, units, lists, count = frame.grid, frame.units, frame.lists, len(gaussians)
+    projected, pending, absolute = frame.projected, frame.pending, request.absolute
+    rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)
+    inner = count_borders(units.pairs)
+    launch_grid(decomposite, inner + grid.blocks)(
+        lists.order,
+        lists.starts,
+        grid.blocks,
+        inner,
+        lists.entries,
+        lists.slots,
+        projected.records,
+        count,
+        request.background,
+        grid.width,
+        grid.height,
+        grid.blocks_x,
+        frame.transmittance,
+        frame.last,
+        frame.past,
+        frame.borders,
+        g_image,
+        g_image if g_alpha is None else g_alpha,
+        rows,
+        HAS_ALPHA=g_alpha is not None,
+        ABSOLUTE=absolute is not None,
+        num_warps=1,
+    )
+    _sum_units(frame, rows)
+    means, log_scales, quaternions, logits, *_ = gaussians.tensors().values()
+    deferred = pending.harmonics is not None
+    *gradients, g_sh_rest = (
+        torch.zeros_like(tensor[:0] if deferred and name == "sh_rest" else tensor)
+        for name, tensor in gaussians.tensors().items()
+    )
+    factors = means.new_empty(count if deferred else 0, FACTORS.value)
+    g_screen = torch.zeros_like(means[:, :2])
+    g_splitting = means.new_zeros(count, 3, 3) if want_splitting else None
+    launch(backproject, count, 128)(
+        means,
+        log_scales,
+        quaternions,
+        logits,
+        projected.row_counts if pending.harmonics is None else pending.harmonics.last,
+        count,
+        frame.view,
+        projected.records.view(torch.int32),
+        projected.color_slopes,
+        projected.row_counts,
+        units.first,
+        units.pair_ends,
+        units.widths,
+        rows,
+        *gradients,
+        g_sh_rest,
+        g_screen,
+        g_screen if absolute is None else absolute,
+        g_screen if g_splitting is None else g_splitting,
+        factors,
+        factors.view(torch.int32),
+        DEGREE=request.degree,
+        DEFERRED=deferred,
+        ABSOLUTE=absolute is not None,
+        SPLITTING=want_splitting,
+    )
+    if pending.harmonics is None or pending.tables is None:
+        return Gradients([*gradients, g_sh_rest], g_screen, g_splitting)
+    if request.degree > 0:
+        pending.harmonics.receive(Factors(pending.tables, factors, request.degree))
+    return Gradients([*gradients, None], g_screen, g_splitting)
+
+
+def _sum_units(frame: Frame, rows: Tensor) -> None:
+    """Add up the ``rows`` of each unit's pairs, in place."""
+    units = frame.units
+    launch(sum_units, units.number, 32)(
+        units.pair_ends, units.widths, units.blocks, frame.last_slots, units.number, rows
+    )
+
+
+def footprint(
+    scratch: Workspace, frame: Frame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
+) -> Footprint:
+    """See ``raster.base.RenderOutput``."""
+    units, lists, count, device = frame.units, frame.lists, len(gaussians), gaussians.means.device
+    covered = torch.zeros(count, dtype=torch.int32, device=device)
+    sums, distances = torch.zeros(2, count, device=device)
+    asked = sums if values is None else values.detach().float().contiguous()
+    rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)  # ``cover`` fills three of 16
+    launch_grid(cover, frame.grid.blocks)(
+        lists.starts,
+        lists.entries,
+        lists.slots,
+        frame.projected.records,
+        frame.grid.width,
+        frame.grid.height,
+        frame.grid.blocks_x,
+        frame.last,
+        frame.past,
+        asked,
+        rows,
+        HAS_VALUES=values is not None,
+        num_warps=1,
+    )
+    _sum_units(frame, rows)
+    launch(sum_cover, count, 128)(
+        count,
+        frame.projected.row_counts,
+        units.first,
+        units.pair_ends,
+        units.widths,
+        rows,
+        covered,
+        sums,
+        distances,
+    )
+    return Footprint(covered, view_depths(gaussians, camera), sums, distances)
