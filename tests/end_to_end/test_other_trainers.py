@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import pytest
 import torch
 from PIL import Image
@@ -27,7 +26,7 @@ from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.view.trials import find_trial, load_viewed
 from tests.datasets.server import serve
 from tests.end_to_end.conftest import Run
-from tests.processes import heed_interrupts
+from tests.processes import heed_interrupts, is_running
 
 pytestmark = pytest.mark.end_to_end
 
@@ -260,13 +259,6 @@ def test_one_that_hangs_is_ended(
     pids = [int(word) for line in log.splitlines() if line.startswith("pids ") for word in line.split()[1:]]
     assert len(pids) == 2
     assert not any(map(is_running, pids))
-
-
-def is_running(pid: int) -> bool:
-    try:
-        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ import tracemalloc
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pycolmap
 import pytest
 from PIL import Image
@@ -26,6 +25,7 @@ from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
 from gsbench.system.isolate import telling_tail
 from tests.config.test_schema import composed
+from tests.processes import is_running
 
 PATIENCE = 60.0  # seconds within which what never comes is told from a slow machine
 
@@ -138,9 +138,9 @@ def test_nothing_is_left_running(tmp_path: Path) -> None:
     code = "import subprocess, sys; print(subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)']).pid)"
     run(tmp_path, code)
     left, deadline = int((tmp_path / "log").read_text().split()[-1]), time.monotonic() + PATIENCE
-    while psutil.pid_exists(left) and psutil.Process(left).status() != "zombie" and time.monotonic() < deadline:
+    while is_running(left) and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert not psutil.pid_exists(left) or psutil.Process(left).status() == "zombie"
+    assert not is_running(left)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 
 from gsbench.errors import TrainingError
 from gsbench.external.program import run_program
-from tests.processes import heed_interrupts
+from tests.processes import heed_interrupts, is_running
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="daemons get away where nobody can adopt orphans")
 PATIENCE = 60.0  # seconds within which what never comes is told from a slow machine
@@ -46,10 +46,7 @@ def is_gone(mark: Path) -> bool:
     """Whether the process whose id stands in ``mark`` ends within our patience."""
     pid, deadline = int(mark.read_text()), time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
-        try:
-            if psutil.Process(pid).status() == psutil.STATUS_ZOMBIE:
-                return True
-        except psutil.NoSuchProcess:
+        if not is_running(pid):
             return True
         time.sleep(0.05)
     os.kill(pid, signal.SIGKILL)
@@ -69,8 +66,10 @@ def test_a_daemon_of_a_trainer_ends_with_it(tmp_path: Path, end: str, code: str)
     except TrainingError:
         assert end
     assert is_gone(tmp_path / "mark")
-    names = [process.info["cmdline"] for process in psutil.process_iter(["cmdline"])]
-    assert [sys.executable, "-c", FORKS] not in names
+    deadline = time.monotonic() + PATIENCE
+    while any(process.info["cmdline"] == [sys.executable, "-c", FORKS] for process in psutil.process_iter(["cmdline"])):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
