@@ -171,8 +171,8 @@ def test_a_slow_tracker_is_not_waited_for(tmp_path: Path, caplog: pytest.LogCapt
             write_trial(folder, values)
             mine = threading.active_count() - threads - tracker.threads
     assert [record.getMessage().split(";")[0] for record in caplog.records] == ["tracking: MLflow is slow"] * 2
-    assert mine == 0  # no thread that the end of the interpreter could hit
-    assert psutil.Process().children() == others
+    assert mine <= 0  # no thread that the end of the interpreter could hit; one of before may have ended
+    assert set(psutil.Process().children()) <= set(others)
 
 
 def test_patience_is_short_after_it_was_in_vain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
