@@ -10,8 +10,10 @@ already is left as it is.
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +33,10 @@ def prepare(data: Path, out: Path) -> None:
         model = source / MODEL
         if not model.is_dir():
             model = _estimated(name, source, out)
-        count = thin(model, target / MODEL)
+        shutil.rmtree(target, ignore_errors=True)  # what a killed run left
+        target.mkdir(parents=True)
         (target / "images").symlink_to(source / "images", target_is_directory=True)
+        count = thin(model, target / MODEL)
         print(f"{name}: {count} points")
 
 
@@ -46,8 +50,12 @@ def thin(model: Path, out: Path, most: int = MOST_POINTS) -> int:
     for point in points:
         if point not in kept:
             reconstruction.delete_point3D(point)
-    out.mkdir(parents=True)
-    reconstruction.write(out)
+    out.parent.mkdir(parents=True)
+    with tempfile.TemporaryDirectory(dir=out.parent) as folder:
+        whole = Path(folder) / "model"
+        whole.mkdir()
+        reconstruction.write(whole)
+        whole.rename(out)
     return len(reconstruction.points3D)
 
 

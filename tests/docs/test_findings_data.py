@@ -74,6 +74,25 @@ def test_what_is_there_stays_and_what_is_not_is_said(tmp_path: Path, capsys: pyt
     assert len(lines) == len(findings_data.CAPTURES)
 
 
+def test_a_run_that_was_killed_is_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A capture counts as ready when all of it is there; the photographs behind the link stay in any case."""
+    write_capture(tmp_path / "data" / "fox", points=20)
+
+    def killed(self: pycolmap.Reconstruction, folder: Path) -> None:
+        (Path(folder) / "cameras.bin").touch()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pycolmap.Reconstruction, "write", killed)
+        with pytest.raises(KeyboardInterrupt):
+            findings_data.prepare(tmp_path / "data", tmp_path / "out")
+    assert not (tmp_path / "out" / "fox" / "sparse" / "0").exists()
+    findings_data.prepare(tmp_path / "data", tmp_path / "out")
+    assert len(points_of(tmp_path / "out" / "fox")) == 20
+    assert (tmp_path / "out" / "fox" / "images" / "0.png").is_file()
+    assert (tmp_path / "data" / "fox" / "images" / "0.png").is_file()
+
+
 def test_a_capture_without_a_model_gets_the_estimated_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The two commands are understood by gsbench, and the entry that the second names is where the first writes."""
     write_capture(tmp_path / "data" / "monstree", model=False)

@@ -88,7 +88,7 @@ def _sync_one(folder: Path, values: dict[str, Any], runs: Path, uri: str | None,
         print(f"{label_of(folder)} is being mirrored by another process", file=out, flush=True)
         return False
     except Exception as error:  # whatever the tracker raises
-        raise MissedError(f"{name_of(options)} does not take {label_of(folder)} ({one_line(error)})") from error
+        raise MissedError(f"{name_of(options)} does not take {label_of(folder)} ({kind_and_words(error)})") from error
 
 
 class MissedError(Exception):
@@ -151,7 +151,7 @@ def _serve(work: Callable[[threading.Event, TextIO], object], patience: float) -
     except Exception as error:  # noqa: BLE001 - whatever the tracker raises
         code = TRACKER_FAILED
         traceback.print_exc()
-        print(error if isinstance(error, MissedError) else one_line(error), file=sys.stderr, flush=True)
+        print(error if isinstance(error, MissedError) else kind_and_words(error), file=sys.stderr, flush=True)
     os._exit(code)  # no library is torn down: one might hang or crash in it
 
 
@@ -163,7 +163,7 @@ def _watch_input(ended: threading.Event, patience: float) -> None:
     os._exit(1)  # whatever hangs
 
 
-def one_line(error: Exception) -> str:
+def kind_and_words(error: Exception) -> str:
     """Kind and first words of an error, whatever library it comes from."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0][:200] if lines else ''}"
