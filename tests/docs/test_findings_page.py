@@ -7,6 +7,7 @@ import zipfile
 from types import ModuleType
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 
@@ -190,8 +191,47 @@ def test_what_is_said_of_the_exponent_is_so(scripts: ModuleType, prose: str) -> 
     assert gains["flower"].min() > 1 > 0 > gains["courtyard"].max()
 
 
-@pytest.mark.parametrize("name", ["check_volumetric", "findings_exponent", "findings_matched", "findings_volume"])
+@pytest.mark.parametrize(
+    "name", ["check_volumetric", "findings_exponent", "findings_matched", "findings_volume", "scale_bridge"]
+)
 def test_published_archives_name_no_folder_of_a_machine(scripts: ModuleType, name: str) -> None:
     with zipfile.ZipFile(scripts.archives.archive_of(name)) as archive:
         for member in archive.namelist():
             assert not re.search(rb"/(root|home|work|tmp|Users)/", archive.read(member)), member
+
+
+def test_what_is_said_of_small_and_large_is_so(scripts: ModuleType, prose: str) -> None:
+    """Against the trials themselves, without `gsbench.analysis.trends`."""
+    frame = scripts.archives.read_trials("scale_bridge")
+    assert (len(frame), set(frame.scene)) == (112, {"flower", "kitchen"})
+    assert set(frame.groupby(["scene", "arm", "scene.max_size", "train.iterations"]).size()) == {2}
+    keys = ["arm", "scene", "scene.max_size", "train.iterations", "seed"]
+    values = frame.set_index(keys)[["lpips_squeeze", "psnr"]]
+    rule, split = values.xs("volumetric_once") - values.xs("adc"), values.xs("longaxis") - values.xs("absgrad")
+    flower, kitchen = (
+        {arm: found.xs(scene, level="scene") for arm, found in (("rule", rule), ("split", split))}
+        for scene in ("flower", "kitchen")
+    )
+
+    def by(found: pd.DataFrame, metric: str, *keys: tuple[int, int]) -> list[float]:
+        """Means over seeds at (px, iterations)."""
+        return [float(found[metric].xs(key, level=("scene.max_size", "train.iterations")).mean()) for key in keys]
+
+    sizes = [(size, 5000) for size in (120, 160, 256, 320, 480)]
+    lengths = [(256, length) for length in (2000, 5000, 15000)]
+    one, other = by(flower["rule"], "lpips_squeeze", *sizes), by(flower["rule"], "psnr", *sizes)
+    assert (flower["rule"].lpips_squeeze < 0).all()
+    assert (flower["rule"].psnr > 0).all()
+    assert "LPIPS falls by {}, {}, {}, {} and {}".format(*(said(-v, 3).lstrip("+") for v in one)) in prose
+    assert f"PSNR goes from {said(other[0], 2)} dB at 120 px to {said(other[-1], 2)} dB at 480" in prose
+    share = 100 * one[1] / one[-1]
+    assert f"{share:.0f} % of what is there at 480" in prose
+    far = by(flower["rule"], "lpips_squeeze", *lengths)
+    assert "{}, {} and {} after 2,000, 5,000 and 15,000 iterations".format(*(said(v, 3) for v in far)) in prose
+    turns = [by(kitchen["rule"], "lpips_squeeze", key)[0] for key in [*sizes, lengths[0], lengths[2]]]
+    assert min(turns) < 0 < max(turns)
+    assert f"between {said(min(turns), 3)} and {said(max(turns), 3)}" in prose
+    longer = [np.mean([by(scene["split"], "lpips_squeeze", key)[0] for scene in (flower, kitchen)]) for key in lengths]
+    assert longer == sorted(longer, reverse=True)
+    larger = [np.mean([by(scene["split"], "lpips_squeeze", key)[0] for scene in (flower, kitchen)]) for key in sizes]
+    assert min(larger) == larger[-1]
