@@ -17,7 +17,7 @@ from findings_pictures import for_and_against, worst_views
 
 from gsbench.analysis.frame import to_frame
 from gsbench.analysis.pairing import Paired
-from gsbench.analysis.results import read_experiment
+from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.analysis.statistics import Comparison, compare_family
 from gsbench.claims.archive import unpack_archive, write_archive
 from gsbench.claims.file import read_claims
@@ -65,13 +65,19 @@ def checked(name: str) -> Recheck:
 
 
 @functools.cache
+def trials_of(name: str) -> tuple[TrialResult, ...]:
+    """The trials of an archive. Their files are gone afterwards; what is measured and set was read."""
+    with tempfile.TemporaryDirectory() as folder:
+        trials = unpack_archive(archive_of(name), Path(folder)).trials
+        assert all(trial.config for trial in trials)
+    return trials
+
+
+@functools.cache
 def read_trials(name: str) -> pd.DataFrame:
     """The trials of an archive, one a row, with their ``arm`` (the densifier) and ``question``."""
-    with tempfile.TemporaryDirectory() as folder:
-        experiment = unpack_archive(archive_of(name), Path(folder))
-        frame = to_frame(experiment)
-        questions = [trial.question for trial in experiment.trials]
-    return frame.assign(arm=frame.densify, question=questions)
+    frame = to_frame(trials_of(name))
+    return frame.assign(arm=frame.densify, question=[trial.question for trial in trials_of(name)])
 
 
 def verdicts_table(name: str) -> list[str]:

@@ -5,19 +5,14 @@ The differences at the values of a line are one family of tests (Holm), and so a
 
 from __future__ import annotations
 
-import functools
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 
-from findings_archives import DATA, PRIMARY, archive_of
+from findings_archives import DATA, PRIMARY, trials_of
 from findings_pairs import facts, row
 
 from gsbench.analysis.cells import select_trials
 from gsbench.analysis.quantities import quantity
-from gsbench.analysis.results import TrialResult
 from gsbench.analysis.trends import Answer, Trend, trend
-from gsbench.claims.archive import unpack_archive
 from gsbench.words import signed
 
 BRIDGE = "scale_bridge"
@@ -26,42 +21,31 @@ LINES = {  # what grows: its unit, and what holds the other still
     "scene.max_size": ("px", {"train.iterations": "5000"}),
     "train.iterations": ("iterations", {"scene.max_size": "256"}),
 }
-METRICS = {PRIMARY: 3, "psnr": 2, "ssim": 3, "ms_ssim": 4, "fsim": 4}  # with their digits; the first was declared
-
-
-@functools.cache
-def read_trials(name: str) -> tuple[TrialResult, ...]:
-    """The trials of an archive. Their files are gone afterwards; what is measured and set was read."""
-    with tempfile.TemporaryDirectory() as folder:
-        trials = tuple(unpack_archive(archive_of(name), Path(folder)).trials)
-        for trial in trials:
-            assert trial.record
-            assert trial.config
-    return trials
+DIGITS = 3  # of the declared metric
+OTHERS = {"psnr": 2, "ssim": 3}  # metrics shown beside it, with their digits
 
 
 def found(name: str, arm: str, against: str, along: str, metric: str) -> Trend:
     """Return how ``arm`` minus ``against`` goes along one of `LINES`."""
-    trials = select_trials(read_trials(name), LINES[along][1])
+    trials = select_trials(trials_of(name), LINES[along][1])
     return trend(trials, against, arm, along, quantity(metric, trials))
 
 
 def trends_table(name: str, arms: Sequence[str], against: str) -> list[str]:
     """Table of a value a row, both lines below each other: the declared metric, its change from there, two others."""
     titles = [f"{facts(PRIMARY).label}: {arms[0]} − {against}", "scenes with the sign at the largest"]
-    titles += ["changes to the largest by", facts("psnr").label, facts("ssim").label]
+    titles += ["changes to the largest by", *(facts(metric).label for metric in OTHERS)]
     lines = [row(["", *titles]), row(["---"] * (1 + len(titles)))]
     for along, (unit, _) in LINES.items():
-        primary, *others = (found(name, arms[0], against, along, metric) for metric in (PRIMARY, "psnr", "ssim"))
-        digits = [METRICS[metric] for metric in ("psnr", "ssim")]
+        primary = found(name, arms[0], against, along, PRIMARY)
+        others = [(found(name, arms[0], against, along, metric), digits) for metric, digits in OTHERS.items()]
         for place, step in enumerate(primary.steps):
-            cells = [cell(step.difference, METRICS[PRIMARY]), f"{step.same_sign} of {len(step.by_scene)}"]
-            cells.append("" if step.to_largest is None else cell(step.to_largest, METRICS[PRIMARY]))
-            cells += [cell(other.steps[place].difference, d) for other, d in zip(others, digits, strict=True)]
+            cells = [cell(step.difference, DIGITS), f"{step.same_sign} of {len(step.by_scene)}"]
+            cells.append("" if step.to_largest is None else cell(step.to_largest, DIGITS))
+            cells += [cell(other.steps[place].difference, digits) for other, digits in others]
             lines.append(row([f"{step.value:,.0f} {unit}", *cells]))
-        cells = [cell(primary.doubling, METRICS[PRIMARY]), "", ""]
-        cells += [cell(other.doubling, d) for other, d in zip(others, digits, strict=True)]
-        lines.append(row([f"*twice the {unit}*", *cells]))
+        doublings = [cell(other.doubling, digits) for other, digits in others]
+        lines.append(row([f"*twice the {unit}*", cell(primary.doubling, DIGITS), "", "", *doublings]))
     return lines
 
 

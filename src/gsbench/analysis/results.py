@@ -275,7 +275,7 @@ def _with_known_settings(
 
 
 class _UnusableError(Exception):
-    """Return why a folder is not a usable trial."""
+    """Reason why a folder is not a usable trial."""
 
 
 def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialResult:

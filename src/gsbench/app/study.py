@@ -80,14 +80,15 @@ class Study:
         from optuna.trial import TrialState
 
         study, goal = self._optuna, self.goal
-        known = [trial for trial in study.get_trials(deepcopy=False) if trial.state != TrialState.WAITING]
+        every = study.get_trials(deepcopy=False)
+        known = [trial for trial in every if trial.state != TrialState.WAITING]
         begun = {trial.number: trial.params for trial in known if trial.state == TrialState.RUNNING}
         left = {number: values for number, values in begun.items() if set(values) == set(self.ranges)}
         for number in begun.keys() - left.keys():  # killed between its first value and its last
             study.tell(number, state=TrialState.FAIL)
         if left:
             return left
-        if not known and self.first is not None and not study.get_trials(deepcopy=False):
+        if not every and self.first is not None:
             study.enqueue_trial(self.first)
         points: dict[int, Values] = {}
         while len(known) + len(points) < goal.points and len(points) < goal.at_once:
