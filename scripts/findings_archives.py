@@ -22,6 +22,7 @@ from gsbench.analysis.statistics import Comparison, compare_family
 from gsbench.claims.archive import unpack_archive, write_archive
 from gsbench.claims.file import read_claims
 from gsbench.claims.recheck import Recheck, recheck
+from gsbench.claims.shares import merge
 from gsbench.runs.declaration import EXTRAPOLATION, INTERPOLATION
 from gsbench.runs.experiments import list_experiments
 from gsbench.words import signed
@@ -32,6 +33,7 @@ ARCHIVED = (
     "findings_volume",
     "findings_longaxis",
     "findings_dimension",
+    "findings_full",
     "findings_matched",
     "findings_exponent",
     "scale_bridge",
@@ -61,7 +63,7 @@ def checked(name: str) -> Recheck:
     file = claims_of(name)
     assert file is not None
     with tempfile.TemporaryDirectory() as folder:
-        return recheck(read_claims(file), archive_of(name), Path(folder))
+        return recheck(read_claims(file), [archive_of(name)], Path(folder))
 
 
 @functools.cache
@@ -199,12 +201,15 @@ def _arms(frame: pd.DataFrame) -> list[str]:
 
 
 def collect(runs: Path) -> None:
-    """Write the archives of the experiments in ``runs``, and their `PICTURES`."""
+    """Add the experiments in ``runs`` to their archives, and write their `PICTURES`."""
     for name in ARCHIVED:
         if name in list_experiments(runs):
-            experiment = read_experiment(runs / name)
-            for line in write_archive(experiment, archive_of(name)):
-                print(f"left out: {line}")
+            experiment, archive = read_experiment(runs / name), archive_of(name)
+            with tempfile.TemporaryDirectory() as folder:
+                own = Path(folder) / archive.name
+                for line in write_archive(experiment, own):
+                    print(f"left out: {line}")
+                merge([own, archive] if archive.is_file() else [own], name, archive)
             if name in PICTURES:
                 PICTURES[name](experiment).save(DATA / f"{name}.jpg", quality=85)
 

@@ -69,7 +69,7 @@ def test_the_same_verdicts_where_photographs_lie_elsewhere(tmp_path: Path, monke
     monkeypatch.setenv("GSBENCH_DATA", "/labs/one/data")
     (before,), archive = made(tmp_path)
     monkeypatch.setenv("GSBENCH_DATA", "elsewhere")
-    found = recheck(claims(says="the same in other words"), archive, tmp_path / "unpacked")
+    found = recheck(claims(says="the same in other words"), [archive], tmp_path / "unpacked")
     (after,) = found.verdicts
     assert len(before.trials) >= 8
     assert before.decision is not None
@@ -88,14 +88,14 @@ def test_an_archive_of_a_version_that_kept_no_reasons(tmp_path: Path) -> None:
     del line["missing"]
     (home / DECLARED).write_text(json.dumps(line) + "\n")
     write_archive(read_experiment(home), archive)
-    (verdict,) = recheck(claims(), archive, tmp_path / "unpacked").verdicts
+    (verdict,) = recheck(claims(), [archive], tmp_path / "unpacked").verdicts
     assert "absent: was not tested" in verdict.notes
 
 
 def test_another_plan_than_the_declared_is_refused(tmp_path: Path) -> None:
     _, archive = made(tmp_path)
     with pytest.raises(InputError, match="give the file as it was then"):
-        recheck(claims(least=0.1), archive, tmp_path / "unpacked")
+        recheck(claims(least=0.1), [archive], tmp_path / "unpacked")
 
 
 def test_an_archive_of_a_plain_experiment_is_refused(tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_an_archive_of_a_plain_experiment_is_refused(tmp_path: Path) -> None:
     (home / DECLARED).unlink()
     write_archive(read_experiment(home), tmp_path / "b.zip")
     with pytest.raises(InputError, match="no plan of claims was declared in it"):
-        recheck(claims(), tmp_path / "b.zip", tmp_path / "unpacked")
+        recheck(claims(), [tmp_path / "b.zip"], tmp_path / "unpacked")
 
 
 def test_settings_that_a_later_version_adds_change_nothing(tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_settings_that_a_later_version_adds_change_nothing(tmp_path: Path) -> No
         del values["scene"]["split"], values["init"]["points_from"]
         file.write_text(yaml.safe_dump(values))
     write_archive(read_experiment(home), archive)
-    (verdict,) = recheck(claims(), archive, tmp_path / "unpacked").verdicts
+    (verdict,) = recheck(claims(), [archive], tmp_path / "unpacked").verdicts
     assert len(verdict.trials) >= 8
 
 

@@ -11,6 +11,7 @@ from jinja2 import Environment, StrictUndefined
 from gsbench.analysis.caveats import caveats
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import fairness_table
+from gsbench.analysis.origins import cloud_notes, machine_notes
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.report.crops import Crop, choose_crops
 from gsbench.analysis.results import TrialResult
@@ -49,14 +50,22 @@ class Page:
 
 
 def make_page(
-    file: ClaimsFile, verdicts: Sequence[Verdict], declared: DeclaredPlan, plans: Sequence[DeclaredPlan]
+    file: ClaimsFile,
+    verdicts: Sequence[Verdict],
+    declared: DeclaredPlan,
+    plans: Sequence[DeclaredPlan],
+    shares: Sequence[str] = (),
 ) -> Page:
-    """The content of the page: the plan that was ``declared``, of all ``plans`` under this name, and its verdicts."""
+    """The content of the page: the plan that was ``declared``, of all ``plans`` under this name, and its verdicts.
+
+    ``shares`` are the names of archives whose trials count beside those of this machine.
+    """
     counts = {word: sum(verdict.word == word for verdict in verdicts) for word in SYMBOLS}
     tested = sum(verdict.word != "not testable here" for verdict in verdicts)
     lines = [
         f"{file.paper}. " + ", ".join(f"{count} {word}" for word, count in counts.items() if count) + ".",
         _declared_line(declared, plans),
+        *([f"Trials from {', '.join(shares)} count beside those that were run here."] if shares else []),
     ]
     if tested:
         lines.insert(
@@ -65,8 +74,14 @@ def make_page(
             "which they share equally, each over all its looks at the trials (docs/verdict.md). A verdict is about "
             f"{_scope(verdicts)} at this size.",
         )
-    smaller = _size_line(file, [trial for verdict in verdicts for trial in verdict.trials])
-    return Page(f"{file.name}: claims and verdicts", (*lines, *smaller), tuple(map(_section, verdicts)))
+    judged = list({trial.path: trial for verdict in verdicts for trial in verdict.trials}.values())
+    lines += [*_size_line(file, judged), *_origin_lines(judged)]
+    return Page(f"{file.name}: claims and verdicts", tuple(lines), tuple(map(_section, verdicts)))
+
+
+def _origin_lines(trials: Sequence[TrialResult]) -> list[str]:
+    """Lines on what may differ between pairs of trials: machines, and the clouds of one scene."""
+    return [*machine_notes(trials), *cloud_notes(trials)]
 
 
 def _scope(verdicts: Sequence[Verdict]) -> str:

@@ -25,7 +25,7 @@ from gsbench.runs.declaration import DeclaredPlan
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import FAILED
 from gsbench.runs.trial_files import Failure, TrialPaths, label_of
-from gsbench.words import counted, some_of, without_places
+from gsbench.words import closest, counted, some_of, without_places
 
 log = logging.getLogger(__name__)
 
@@ -54,12 +54,18 @@ class Question:
 
 @dataclass(frozen=True)
 class Check:
-    """A file of claims in a runs folder: its questions, and the first trial of each scene and arm."""
+    """A file of claims in a runs folder: its questions, and the first trial of each scene and arm.
+
+    ``run_here`` are the claims' scenes whose trials are run here, as (claim, scene); ``elsewhere`` finds the trials of
+    others' shares (`gsbench.claims.shares`), of which the pairs that are whole are not run again.
+    """
 
     file: ClaimsFile
     runs: Path
     questions: tuple[Question, ...]
     first: dict[tuple[str, str, str], Composed]  # by claim, scene, arm
+    run_here: frozenset[tuple[str, str]]
+    elsewhere: Find = lambda trial: None
 
     @property
     def home(self) -> Path:
@@ -94,22 +100,25 @@ class Check:
         }
 
     def trials(self, questions: Sequence[Question], seeds: int) -> list[Composed]:
-        """The trials that the questions need for their first ``seeds`` seeds; one that several need stands once."""
+        """The trials to be run here that the questions need for their first ``seeds`` seeds; one that several need
+        stands once.
+        """
         found: dict[Path, Composed] = {}
         for seed in range(seeds):
             for question in questions:
                 for scene in question.scenes if question.testable else ():
-                    for arm in (question.claim.baseline, question.claim.arm):
-                        trial = with_seed(self.first[question.claim.id, scene, arm], seed)
-                        found.setdefault(TrialPaths.of(trial.values).folder, trial)
+                    both = self._both(question, scene, seed)
+                    if (question.claim.id, scene) in self.run_here and not all(map(self.elsewhere, both)):
+                        for trial in both:
+                            found.setdefault(TrialPaths.of(trial.values).folder, trial)
         return list(found.values())
 
-    def verdicts(self, declared: DeclaredPlan, find: Find | None = None) -> list[Verdict]:
-        """The verdicts from the trials that are done: those that ``find`` finds, or those in the runs folder."""
-        find = find or self._in_runs()
+    def verdicts(self, declared: DeclaredPlan) -> list[Verdict]:
+        """The verdicts from the trials that are done, in the runs folder or elsewhere."""
+        find = self._in_runs()
         found = []
         for question in self.questions:
-            pairs = self._pairs(question, find)
+            pairs = self._pairs(question, (find, self.elsewhere))
             verdict = judge_claim(question.claim, self.file, pairs, question.scenes, self.sharing, declared.time)
             if not question.testable:
                 verdict = replace(verdict, reason=question.why_not)
@@ -119,6 +128,15 @@ class Check:
                 verdict = replace(verdict, reason=f"{verdict.reason}; failed: {some_of(failed)}")
             found.append(verdict)
         return found
+
+    def shared_pairs(self) -> int:
+        """The number of pairs of trials that others' shares hold whole."""
+        return sum(
+            all(map(self.elsewhere, self._both(question, scene, seed)))
+            for question in self.questions
+            for scene in (question.scenes if question.testable else ())
+            for seed in range(self.looks[-1])
+        )
 
     def _failed(self, question: Question, find: Find) -> list[str]:
         """The trials of a question that failed, each with the reason; of several with one reason the first."""
@@ -135,24 +153,44 @@ class Check:
         by_folder = {trial.path: trial for trial in trials}
         return lambda trial: by_folder.get(TrialPaths.of(trial.values).folder)
 
-    def _pairs(self, question: Question, find: Find) -> dict[PairKey, Pair]:
+    def _pairs(self, question: Question, sources: Sequence[Find]) -> dict[PairKey, Pair]:
+        """The pairs by scene and seed, each from the first source that has both of its trials.
+
+        Two machines' clouds of one capture differ, so that a trial of one is no partner for that of another.
+        """
         found: dict[PairKey, Pair] = {}
         for scene in question.scenes if question.testable else ():
             for seed in range(self.looks[-1]):
-                arms = (question.claim.baseline, question.claim.arm)
-                both = [find(with_seed(self.first[question.claim.id, scene, arm], seed)) for arm in arms]
-                if both[0] is not None and both[1] is not None:
-                    found[scene, seed] = both[0], both[1]
+                one, other = self._both(question, scene, seed)
+                for find in sources:
+                    baseline, arm = find(one), find(other)
+                    if baseline is not None and arm is not None:
+                        found[scene, seed] = baseline, arm
+                        break
         return found
 
+    def _both(self, question: Question, scene: str, seed: int) -> tuple[Composed, Composed]:
+        """The trials of the baseline and of the arm."""
+        claim = question.claim
+        baseline, arm = (with_seed(self.first[claim.id, scene, arm], seed) for arm in (claim.baseline, claim.arm))
+        return baseline, arm
 
-def prepare(file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequence[str] = ()) -> Check:
+
+def prepare(
+    file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequence[str] = (), only: Sequence[str] = ()
+) -> Check:
     """Compose the first trial of every scene and arm of every claim; ``lacking`` says what cannot be had here.
 
-    ``permissions`` are words such as ``allow_targets=[mine]`` that were typed: a file of claims can give none.
+    ``permissions`` are words such as ``allow_targets=[mine]`` that were typed: a file of claims can give none. Trials
+    of ``only`` these scenes, where some are named, are run here, and nobody asks whether the others could be.
 
-    Raises InputError, naming claim, scene and arm, for settings that do not compose.
+    Raises InputError, naming claim, scene and arm, for settings that do not compose, and for an unknown scene.
     """
+    for scene in only:
+        if scene not in file.scenes:
+            near = closest(scene, file.scenes)
+            raise InputError(f"{file.name} has no scene {scene}{near} (it has {', '.join(file.scenes)})")
+    here: set[tuple[str, str]] = set()
     questions: list[Question] = []
     first: dict[tuple[str, str, str], Composed] = {}
     known: dict[tuple[str, ...], Composed] = {}
@@ -166,15 +204,18 @@ def prepare(file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequenc
                 if words not in known:
                     known[words] = _composed(words, runs, f"claim {claim.id}, scene {scene}, arm {arm}")
                 first[claim.id, scene, arm] = known[words]
-                reason = reason or lacking(known[words], claim.metric)
+                if scene in (only or (scene,)):
+                    reason = reason or lacking(known[words], claim.metric)
             if reason:
                 missing.setdefault(reason, []).append(scene)
-            else:
-                scenes.append(scene)
+                continue
+            scenes.append(scene)
+            if scene in (only or (scene,)):
+                here.add((claim.id, scene))
         _check_different(claim, scenes, first)
         reasons = tuple(f"{some_of(names)}: {reason}" for reason, names in missing.items())
         questions.append(Question(claim, tuple(scenes), reasons))
-    return Check(file, runs, tuple(questions), first)
+    return Check(file, runs, tuple(questions), first, frozenset(here))
 
 
 class Looked(Protocol[T]):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 from collections.abc import Mapping, Sequence
@@ -20,7 +19,9 @@ from gsbench.runs.declaration import (
     kind_of_plan,
     read_declarations,
     read_plans,
+    record_text,
     trial_key,
+    united,
 )
 from gsbench.runs.layout import DECLARED, SEED
 from gsbench.system.locks import hold
@@ -73,7 +74,7 @@ def declare(metrics: Mapping[Path, str | None], planned: Mapping[Path, Planned])
             if given is None and standing is not None:
                 log.info("%s: %s stays declared, since %s", home.name, standing.metric, standing.when)
             before = standing.trials if standing is not None else {}
-            together = None if before is None else _together(before, planned[home])
+            together = None if before is None else united(before, planned[home])
             same = standing is not None and standing.metric == metric
             if same and (together is None or together == before):
                 continue
@@ -91,11 +92,6 @@ def declare(metrics: Mapping[Path, str | None], planned: Mapping[Path, Planned])
                 metric,
                 standing.metric,
             )
-
-
-def _together(one: Planned, other: Planned) -> Planned:
-    """The trials of both."""
-    return {key: tuple(sorted({*one.get(key, ()), *other.get(key, ())})) for key in {**one, **other}}
 
 
 def declare_plan(
@@ -121,7 +117,5 @@ def declare_plan(
 
 
 def _write(home: Path, metrics: Sequence[Declaration], plans: Sequence[DeclaredPlan]) -> None:
-    """The whole record, in the order of time."""
-    both: list[Declaration | DeclaredPlan] = [*metrics, *plans]
-    entries = sorted(both, key=lambda entry: entry.time)
-    write_text(home / DECLARED, "".join(json.dumps(entry.to_record()) + "\n" for entry in entries))
+    """The whole record."""
+    write_text(home / DECLARED, record_text(metrics, plans))

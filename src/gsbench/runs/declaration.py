@@ -8,10 +8,11 @@ own. `gsbench.analysis.declaration` judges by it.
 from __future__ import annotations
 
 import calendar
+import json
 import logging
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -126,6 +127,37 @@ def read_plans(folder: Path) -> list[DeclaredPlan]:
     """Read every plan of claims that was declared for the experiment in ``folder``, the oldest first."""
     found = (line.declared_plan for line in _lines(folder))
     return sorted((plan for plan in found if plan is not None), key=lambda plan: plan.time)
+
+
+def united(one: Planned, other: Planned) -> Planned:
+    """The trials of both."""
+    return {key: tuple(sorted({*one.get(key, ()), *other.get(key, ())})) for key in {**one, **other}}
+
+
+def record_text(metrics: Iterable[Declaration], plans: Iterable[DeclaredPlan]) -> str:
+    """The content of ``declared.jsonl``, in the order of time."""
+    both: list[Declaration | DeclaredPlan] = [*metrics, *plans]
+    entries = sorted(both, key=lambda entry: entry.time)
+    return "".join(json.dumps(entry.to_record()) + "\n" for entry in entries)
+
+
+def merged_record(folders: Iterable[Path]) -> str:
+    """The content of one ``declared.jsonl`` in the place of those in ``folders``, shares of one experiment.
+
+    A plan stands with the earliest of its times. Trials that a later declaration of a metric brought are added to
+    those of before, as they would be in one folder.
+    """
+    folders = list(folders)
+    plans: dict[str, DeclaredPlan] = {}
+    for plan in sorted((plan for folder in folders for plan in read_plans(folder)), key=lambda plan: plan.time):
+        plans.setdefault(plan.hash, plan)
+    metrics: list[Declaration] = []
+    declared = [one for folder in folders for one in read_declarations(folder)]
+    for one in sorted(declared, key=lambda declaration: declaration.time):
+        before: Planned | None = metrics[-1].trials if metrics else {}
+        trials = None if before is None or one.trials is None else united(before, one.trials)
+        metrics.append(replace(one, trials=trials))
+    return record_text(metrics, plans.values())
 
 
 def unix_time(text: object) -> int | None:

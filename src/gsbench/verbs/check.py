@@ -8,6 +8,8 @@ from pathlib import Path
 
 from gsbench.claims.file import ClaimsFile, direction_is_odd, read_claims
 from gsbench.claims.here import Here
+from gsbench.claims.recheck import check_can_go_on, recheck, with_shares
+from gsbench.claims.shares import Shares, read_shares
 from gsbench.claims.sweep import Check, prepare, run_looks
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
@@ -18,7 +20,7 @@ from gsbench.launch.preflight import missing_folders
 from gsbench.launch.trial import Trial
 from gsbench.runs.declaration import read_plans
 from gsbench.runs.finished import Done, find_finished
-from gsbench.verbs.arguments import ArgumentParser, path
+from gsbench.verbs.arguments import ArgumentParser, names, path
 from gsbench.words import counted
 
 MARKDOWN, HTML = "claims.md", "claims.html"
@@ -41,30 +43,55 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("--dry-run", action="store_true", help="show trials, time and what is not testable here")
     parser.add_argument(
         "--from",
-        dest="archive",
+        dest="archives",
         type=path,
+        nargs="+",
         metavar="ARCHIVE",
         help="make the verdicts again from what gsbench export --results wrote; runs nothing, needs no photographs",
     )
+    parser.add_argument(
+        "--with",
+        dest="shares",
+        type=path,
+        nargs="+",
+        default=[],
+        metavar="ARCHIVE",
+        help="archives of the same check, from other machines or of an earlier day: what they hold is not run again",
+    )
+    parser.add_argument(
+        "--scene",
+        dest="scenes",
+        type=names,
+        default=(),
+        metavar="NAME,…",
+        help="run the trials of these scenes alone, where other machines run the others",
+    )
     options = parser.parse_args(argv)
     file = read_claims(options.claims)
-    if options.archive is not None:
-        return _recheck(file, options.archive)
-    check = prepare(file, runs, Here(missing_folders, download=not options.dry_run), _permissions(options.permissions))
-    if options.dry_run:
-        print("\n".join(describe(check)))
-        return 0
-    _run(check)
+    if options.archives is not None:
+        if options.dry_run or options.shares or options.scenes:
+            raise InputError("check --from runs nothing: it goes with neither --dry-run nor --with nor --scene")
+        return _recheck(file, options.archives)
+    here = Here(missing_folders, download=not options.dry_run)
+    check = prepare(file, runs, here, _permissions(options.permissions), options.scenes)
+    with tempfile.TemporaryDirectory() as folder:
+        shares = read_shares(options.shares, Path(folder)) if options.shares else None
+        if shares is not None:
+            check = with_shares(check, shares)
+            check_can_go_on(check, shares, here.fingerprint)
+        if options.dry_run:
+            print("\n".join(describe(check)))
+        else:
+            _run(check, options.shares, shares)
     return 0
 
 
-def _recheck(file: ClaimsFile, archive: Path) -> int:
-    """Print the page in Markdown that the archive's trials make; 0 whatever the verdicts are."""
+def _recheck(file: ClaimsFile, archives: Sequence[Path]) -> int:
+    """Print the page in Markdown that the archives' trials make; 0 whatever the verdicts are."""
     from gsbench.claims.page import make_page, to_markdown
-    from gsbench.claims.recheck import recheck
 
     with tempfile.TemporaryDirectory() as folder:
-        found = recheck(file, archive, Path(folder))
+        found = recheck(file, archives, Path(folder))
         print(to_markdown(make_page(file, found.verdicts, found.declared, found.plans)), end="")
     return 0
 
@@ -90,7 +117,11 @@ def describe(check: Check) -> list[str]:
         looks = ", ".join(map(str, check.looks))
         lines.append(f"to be tested       {claim.id}: {asked}; on {scenes}; looks at {looks} seeds")
         lines += [f"                   without {reason}" for reason in question.missing]
+        if others := [scene for scene in question.scenes if (claim.id, scene) not in check.run_here]:
+            lines.append(f"                   left to others: {', '.join(others)}")
         lines += [f"                   {remark}" for remark in [direction_is_odd(claim)] if remark]
+    if shared := check.shared_pairs():
+        lines.append(f"{counted(shared, 'pair')} of trials come from archives and are not run again")
     first, most = (check.trials(check.questions, seeds) for seeds in (check.looks[0], check.looks[-1]))
     lines.append(
         f"{counted(len(first), 'trial')} until the first look, {len(most)} at most; "
@@ -101,19 +132,21 @@ def describe(check: Check) -> list[str]:
     return lines
 
 
-def _run(check: Check) -> None:
+def _run(check: Check, archives: Sequence[Path], shares: Shares | None) -> None:
     from gsbench.claims.page import make_page, to_html, to_markdown
     from gsbench.launch.batch import run_batch
 
     make_runs_folder(check.runs)
     declared = declare_plan(check.home, check.plan, check.plan_hash, check.missing)
+    if shares is not None:  # the plan is as old as its oldest record
+        declared = min(declared, shares.declared, key=lambda plan: plan.time)
     verdicts = run_looks(
         check,
         declared,
         lambda trials: run_batch([Trial.of(trial) for trial in trials]),
         lambda trial: isinstance(find_finished(trial.values), Done),
     )
-    page = make_page(check.file, verdicts, declared, read_plans(check.home))
+    page = make_page(check.file, verdicts, declared, read_plans(check.home), [file.name for file in archives])
     for name, text in ((MARKDOWN, to_markdown(page)), (HTML, to_html(page))):
         write_text(check.home / name, text)
     for verdict in verdicts:

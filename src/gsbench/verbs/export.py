@@ -6,11 +6,13 @@ import logging
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
 from gsbench.files import atomic
+from gsbench.runs.experiments import list_experiments
 from gsbench.runs.layout import STORE
 from gsbench.runs.stages import INIT
 from gsbench.verbs.arguments import ArgumentParser, path
@@ -50,11 +52,22 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument(
         "--out", type=path, metavar="PATH", help="the file, or for init the folder, to write; needed for a TRIAL"
     )
+    parser.add_argument(
+        "--with",
+        dest="shares",
+        type=path,
+        nargs="+",
+        default=[],
+        metavar="ARCHIVE",
+        help="with --results: also what these archives of the same experiment hold, from other machines or days",
+    )
     options = parser.parse_args(argv)
     if options.results is not None:
         if options.trial or options.to:
-            raise InputError("export --results takes an experiment and --out alone")
-        return export_results(options.results, runs, options.out)
+            raise InputError("export --results takes an experiment, --with and --out alone")
+        return export_results(options.results, runs, options.out, options.shares)
+    if options.shares:
+        raise InputError("--with goes with --results EXPERIMENT")
     if not options.trial or options.out is None:
         raise InputError("export needs a TRIAL and --out PATH, or --results EXPERIMENT (see gsbench export --help)")
     from gsbench.view.trials import find_trial, model_file
@@ -79,19 +92,29 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
-def export_results(name: str, runs: Path, out: Path | None) -> int:
-    """Write the archive of an experiment's results, and say what is not in it; 0."""
-    from gsbench.claims.archive import write_archive
+def export_results(name: str, runs: Path, out: Path | None, shares: Sequence[Path] = ()) -> int:
+    """Write the archive of an experiment's results and of its ``shares``, and say what is not in it; 0.
 
-    experiment = load_experiment(runs, name)
+    Of an experiment that is not in ``runs`` the shares alone make the archive.
+    """
+    from gsbench.claims.archive import write_archive
+    from gsbench.claims.shares import merge
+
     file = Path(f"{name}.zip") if out is None else out
     if file.is_dir():
         file = file / f"{name}.zip"
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        left_out = write_archive(experiment, file)
-    except OSError as error:
-        raise InputError(f"cannot write {file} ({error.strerror or error}); give another --out") from error
+    left_out: list[str] = []
+    with TemporaryDirectory() as folder:
+        own = Path(folder) / f"{name}.zip" if shares else file
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            if not shares or name in list_experiments(runs):
+                left_out = write_archive(load_experiment(runs, name), own)
+                shares = [own, *shares] if shares else ()
+            if shares:
+                merge(shares, name, file)
+        except OSError as error:
+            raise InputError(f"cannot write {file} ({error.strerror or error}); give another --out") from error
     for line in left_out:
         log.warning("left out: %s", line)
     print(file)

@@ -1,0 +1,278 @@
+"""A check that several machines share: the same verdicts as of one, no trial twice, no pair across machines."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gsbench.analysis.results import load_experiment, read_experiment
+from gsbench.claims.archive import unpack_archive, write_archive
+from gsbench.claims.file import ClaimsFile, parse_claims
+from gsbench.claims.recheck import check_can_go_on, recheck, with_shares
+from gsbench.claims.shares import gather, merge, read_shares
+from gsbench.claims.sweep import Check, prepare, run_looks
+from gsbench.claims.verdict import Verdict
+from gsbench.cli import run
+from gsbench.errors import InputError
+from gsbench.launch.declare import declare_plan
+from gsbench.runs.declaration import read_declarations, read_plans
+from gsbench.runs.layout import DECLARED, RESULTS
+from gsbench.verbs.check import describe
+from tests.analysis.synthetic import Plan, write_runs
+from tests.claims.test_archive import members
+from tests.claims.test_recheck import SCENES, Runner
+from tests.claims.test_sweep import content, ready
+
+NOISE = 6.0  # dB: no claim is decided before the last look
+TRIALS = 2 * 2 * 4  # arms, scenes, seeds
+
+
+def two_scenes() -> ClaimsFile:
+    return parse_claims(content() | {"scenes": {name: SCENES[name] for name in ("courtyard", "own")}})
+
+
+def machine(runs: Path, *only: str, lacks: str = "") -> Check:
+    """The check in a runs folder of its own, of ``only`` these scenes; photographs of ``lacks`` are not there."""
+    return prepare(two_scenes(), runs, lambda trial, _: "no data" * (trial.values["scene"]["name"] == lacks), only=only)
+
+
+def go_on(check: Check) -> tuple[list[Verdict], int]:
+    """Run what is to be run; the verdicts, and the number of trials that were run."""
+    runner = Runner(noise=NOISE)
+    declared = declare_plan(check.home, check.plan, check.plan_hash, check.missing)
+    return run_looks(check, declared, runner, ready), sum(runner.batches)
+
+
+def archived(check: Check, file: Path) -> Path:
+    assert write_archive(read_experiment(check.home), file) == []
+    return file
+
+
+def numbers(verdicts: list[Verdict]) -> list[object]:
+    return [(one.word, one.decision, one.by_scene, one.baseline, one.beforehand) for one in verdicts]
+
+
+def test_two_machines_look_by_look_end_as_one_does(tmp_path: Path) -> None:
+    alone, count = go_on(machine(tmp_path / "alone"))
+    assert (alone[0].word, count) == ("undecided", TRIALS)
+    homes = {name: machine(tmp_path / name, name) for name in ("courtyard", "own")}
+    assert {check.plan_hash for check in homes.values()} == {machine(tmp_path / "alone").plan_hash}
+    verdicts, trained, archives = {}, 0, {}
+    for look in range(3):  # at 2, 3 and 4 seeds: each machine does its part, and is given the other's
+        for name, check in homes.items():
+            others = [file for other, file in archives.items() if other != name]
+            shared = check
+            if others:
+                shared = with_shares(check, read_shares(others, tmp_path / f"{name}{look}"))
+            verdicts[name], count = go_on(shared)
+            trained += count
+            archives[name] = archived(check, tmp_path / f"{name}{look}.zip")
+    assert trained == TRIALS
+    assert numbers(verdicts["own"]) == numbers(alone)
+    found = recheck(two_scenes(), list(archives.values()), tmp_path / "both")
+    assert numbers(list(found.verdicts)) == numbers(alone)
+    merge(list(archives.values()), "check_it", tmp_path / "merged.zip")
+    merged = recheck(two_scenes(), [tmp_path / "merged.zip"], tmp_path / "merged")
+    assert numbers(list(merged.verdicts)) == numbers(alone)
+    assert merged.declared == found.declared
+
+
+def test_a_new_machine_goes_on_where_a_lost_one_stood(tmp_path: Path) -> None:
+    alone, _ = go_on(machine(tmp_path / "alone"))
+    first = machine(tmp_path / "first", "courtyard")
+    (waiting,), count = go_on(first)
+    assert (waiting.word, count) == ("undecided", 4)
+    assert "waits for own" in waiting.reason
+    archive = archived(first, tmp_path / "first.zip")
+    second = with_shares(machine(tmp_path / "second"), read_shares([archive], tmp_path / "there"))
+    assert f"{TRIALS - 4} at most" in "\n".join(describe(second))
+    assert "2 pairs of trials come from archives and are not run again" in describe(second)
+    verdicts, count = go_on(second)
+    assert count == TRIALS - 4
+    assert numbers(verdicts) == numbers(alone)
+
+
+def test_a_scene_whose_photographs_only_others_have(tmp_path: Path) -> None:
+    whole = machine(tmp_path / "first")
+    alone, _ = go_on(whole)
+    archive = archived(whole, tmp_path / "a.zip")
+    poor = with_shares(machine(tmp_path / "poor", lacks="own"), read_shares([archive], tmp_path / "there"))
+    verdicts, count = go_on(poor)
+    assert count == 0
+    assert numbers(verdicts) == numbers(alone)
+    other, shares = (
+        prepare(parse_claims(content(least=0.1)), tmp_path, lambda *_: ""),
+        read_shares([archive], tmp_path / "b"),
+    )
+    with pytest.raises(InputError, match="give the file as it was then"):
+        with_shares(other, shares)
+
+
+def test_half_a_pair_is_no_share(tmp_path: Path) -> None:
+    """A lone trial of another machine is no partner: its cloud, of the same photographs, may be another."""
+    first = machine(tmp_path / "first")
+    go_on(first)
+    for results in first.home.glob(f"own/*-volumetric/*/{RESULTS}"):
+        results.unlink()
+    archive = archived_rest(first, tmp_path / "half.zip")
+    second = with_shares(machine(tmp_path / "second"), read_shares([archive], tmp_path / "there"))
+    _, count = go_on(second)
+    assert count == TRIALS // 2  # both arms of the scene
+
+
+def archived_rest(check: Check, file: Path) -> Path:
+    write_archive(read_experiment(check.home), file)
+    return file
+
+
+def test_a_pair_that_is_here_is_judged_before_one_of_others(tmp_path: Path) -> None:
+    there, here = machine(tmp_path / "there"), machine(tmp_path / "here")
+    go_on(there)
+    for results in there.home.glob(f"*/*-volumetric/*/{RESULTS}"):
+        values = json.loads(results.read_text())
+        values["num_gaussians"] += 1
+        results.write_text(json.dumps(values))
+    alone, _ = go_on(here)
+    both = with_shares(here, read_shares([archived_rest(there, tmp_path / "a.zip")], tmp_path / "x"))
+    verdicts, count = go_on(both)
+    assert count == 0
+    assert [trial.path for trial in verdicts[0].trials] == [trial.path for trial in alone[0].trials]
+
+
+def test_a_trial_that_was_trained_twice_is_refused_and_the_same_one_counts_once(tmp_path: Path) -> None:
+    check = machine(tmp_path / "one")
+    go_on(check)
+    one = archived(check, tmp_path / "one.zip")
+    assert len(gather([one, one], tmp_path / "same").trials) == TRIALS
+    results = next(check.home.glob(f"own/*/*/{RESULTS}"))
+    values = json.loads(results.read_text())
+    results.write_text(json.dumps(values | {"seconds": {"train": 12.5}}))
+    two = archived(check, tmp_path / "two.zip")
+    with pytest.raises(InputError, match=r"own/.* stands in .*one\.zip and in .*two\.zip with other results"):
+        gather([one, two], tmp_path / "twice")
+
+
+def edit_results(home: Path, pattern: str, **changes: object) -> None:
+    for results in home.glob(f"{pattern}/{RESULTS}"):
+        results.write_text(json.dumps(json.loads(results.read_text()) | changes))
+
+
+def go_on_from(archive: Path, here: Check, folder: Path) -> None:
+    shares = read_shares([archive], folder)
+    check_can_go_on(with_shares(here, shares), shares, lambda trial: "ours")
+
+
+def test_a_scene_is_gone_on_with_by_the_same_code_and_photographs_alone(tmp_path: Path) -> None:
+    first = machine(tmp_path / "first", "courtyard")
+    go_on(first)
+    edit_results(first.home, "*/*/*", hashes={"data": "theirs"})
+    archive = archived(first, tmp_path / "data.zip")
+    with pytest.raises(InputError, match="courtyard: photographs or their model are not those of"):
+        go_on_from(archive, machine(tmp_path / "x"), tmp_path / "a")
+    for k, here in enumerate((machine(tmp_path / "x", "own"), machine(tmp_path / "x", lacks="courtyard"))):
+        go_on_from(archive, here, tmp_path / f"b{k}")  # another scene has photographs of its own
+    recheck(two_scenes(), [archive], tmp_path / "c")  # where nothing is run, nothing is asked
+    code = {"files": {"raster/base.py": "0123456789abcdef"}, "commit": "c0ffee" * 6}
+    edit_results(first.home, "*/*/*", hashes={"data": "ours"}, code=code)
+    with pytest.raises(InputError, match=r"made by other code \(raster/base\.py, commit c0ffeec0ffee\)"):
+        go_on_from(archived(first, archive), machine(tmp_path / "x"), tmp_path / "d")
+    edit_results(first.home, "*/*/*", code={"sources": {"mine.Own": "0"}})  # of a class that no configuration names
+    go_on_from(archived(first, archive), machine(tmp_path / "x"), tmp_path / "e")
+
+
+def test_shares_by_unlike_code_or_photographs_are_refused(tmp_path: Path) -> None:
+    archives = []
+    for k, scene in enumerate(("courtyard", "own")):
+        check = machine(tmp_path / scene, scene)
+        go_on(check)
+        edit_results(check.home, "*/*/*", code={"files": {"raster/base.py": str(k) * 16}})
+        archives.append(archived(check, tmp_path / f"{scene}.zip"))
+    with pytest.raises(InputError, match=r"trials by unlike code, gsbench.s raster/base\.py: 00000000 \(courtyard"):
+        read_shares(archives, tmp_path / "x")
+    edit_results(tmp_path / "own" / "check_it", "*/*/*-seed1", hashes={"data": "other"})
+    write_archive(read_experiment(tmp_path / "own" / "check_it"), tmp_path / "mixed.zip")
+    with pytest.raises(InputError, match="own: seeds were trained on unlike photographs"):
+        read_shares([tmp_path / "mixed.zip"], tmp_path / "y")
+
+
+def test_the_earliest_of_two_times_of_a_plan_stands(tmp_path: Path) -> None:
+    archives, times = [], []
+    for k, name in enumerate(("courtyard", "own")):
+        check = machine(tmp_path / name, name)
+        go_on(check)
+        line = json.loads((check.home / DECLARED).read_text()) | {"time": f"2026-01-0{2 - k}T00:00:00Z"}
+        (check.home / DECLARED).write_text(json.dumps(line) + "\n")
+        archives.append(archived(check, tmp_path / f"{name}.zip"))
+        times += [plan.time for plan in read_plans(check.home)]
+    (plan,) = read_plans(gather(archives, tmp_path / "x").folder)
+    assert plan.time == min(times) < max(times)
+
+
+def test_declared_trials_of_a_sweep_add_up(tmp_path: Path) -> None:
+    """As in one folder, to which a second command added its trials: with the time of the second."""
+    archives = []
+    for k, scene in enumerate(("garden", "room")):
+        runs = tmp_path / scene
+        write_runs(runs, Plan(scenes=[scene]))
+        line = {"metric": "psnr", "time": f"2026-01-0{1 + k}T00:00:00Z", "trials": {f"{scene}/sfm-adc/aa": [0, 1]}}
+        (runs / "exp" / DECLARED).write_text(json.dumps(line) + "\n")
+        archives.append(tmp_path / f"{scene}.zip")
+        write_archive(load_experiment(runs, "exp"), archives[-1])
+    together = gather(archives[::-1], tmp_path / "x")
+    assert {trial.scene for trial in together.trials} == {"garden", "room"}
+    first, second = read_declarations(together.folder)
+    assert first.trials == {"garden/sfm-adc/aa": (0, 1)}
+    assert second.trials == {"garden/sfm-adc/aa": (0, 1), "room/sfm-adc/aa": (0, 1)}
+
+
+def test_archives_of_other_experiments_are_refused(tmp_path: Path) -> None:
+    archives = []
+    for name in ("one", "other"):
+        write_runs(tmp_path / name, Plan(experiment=name))
+        archives.append(tmp_path / f"{name}.zip")
+        write_archive(load_experiment(tmp_path / name, name), archives[-1])
+    with pytest.raises(InputError, match="is of the experiment other, not of one"):
+        gather(archives, tmp_path / "x")
+    with pytest.raises(InputError, match="no plan of claims was declared in it"):
+        read_shares(archives[:1], tmp_path / "y")
+    with pytest.raises(InputError, match=r"has no scene cortyard; did you mean courtyard\?"):
+        machine(tmp_path, "cortyard")
+
+
+def test_the_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """``export --with`` joins archives with the runs folder, and without it; ``check`` judges what they hold."""
+    archives = {}
+    for name in ("courtyard", "own"):
+        check = machine(tmp_path / name, name)
+        go_on(check)
+        archives[name] = str(archived(check, tmp_path / f"{name}.zip"))
+    claims = tmp_path / "claims.yaml"
+    scenes = {name: SCENES[name] for name in ("courtyard", "own")}
+    claims.write_text(yaml.safe_dump(content() | {"scenes": scenes}))
+    for runs, shares in (("courtyard", ["own"]), ("nothing", ["own", "courtyard"])):
+        monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / runs))
+        out = tmp_path / f"of_{runs}.zip"
+        words = ["--with", *(archives[name] for name in shares), "--out", str(out)]
+        assert run(["export", "--results", "check_it", *words]) == 0
+        assert len(unpack_archive(out, tmp_path / f"un_{runs}").trials) == 8
+    assert capsys.readouterr().out.count(".zip") == 2
+    one, other = (members(tmp_path / f"of_{runs}.zip") for runs in ("courtyard", "nothing"))
+    crate = "ro-crate-metadata.json"  # dates results that do not say when they were measured by their files
+    assert one | {crate: b""} == other | {crate: b""}
+    for given in ([str(out)], list(archives.values())):
+        assert run(["check", str(claims), "--from", *given]) == 0
+    first, second = capsys.readouterr().out.split("# check_it: claims and verdicts")[1:]
+    assert first == second
+    assert "2 scenes, 2 seeds" in first
+    assert run(["check", str(claims), "--dry-run", "--with", str(out), "--scene", "courtyard"]) == 0
+    said = capsys.readouterr().out
+    assert "4 pairs of trials come from archives" in said
+    assert "0 trials until the first look, 4 at most" in said
+    assert "left to others: own" in said
+    for words in (["--from", str(out), "--dry-run"], ["--from", str(out), "--scene", "own"], ["--scene", "nowhere"]):
+        assert run(["check", str(claims), *words]) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1
+    assert run(["export", "exp:a:b:0", "--out", "a.ply", "--with", str(out)]) == 2
