@@ -15,7 +15,7 @@ from gsbench.scene.courtyard.render import render_courtyard
 from tests.claims.test_sweep import content
 from tests.launch.test_declare import TINY
 
-SEEDS, SCENES = 2, ("near", "far")
+SEEDS, SCENES = 3, ("near", "far")
 
 
 def trained(runs: Path) -> set[tuple[str, str]]:
@@ -52,14 +52,17 @@ def test_two_machines_with_photographs_at_places_of_their_own(
     assert run(["check", str(claims), "--scene", "near"]) == 0
     assert "waits for far" in capsys.readouterr().out
     assert trained(first) == {("near", 0), ("near", 1)}
+    assert run(["check", str(claims), "--scene", "near", "--all-seeds"]) == 0
+    assert "waits for far" in capsys.readouterr().out
+    assert trained(first) == {("near", seed) for seed in range(SEEDS)}
     assert run(["export", "--results", "check_it", "--out", str(share)]) == 0
 
     second = on("second")
     assert run(["check", str(claims), "--with", str(share)]) == 0
-    assert trained(second) == {("far", 0), ("far", 1)}
+    assert trained(second) == {("far", seed) for seed in range(SEEDS)}
     said = (second / "check_it" / "claims.md").read_text()
     assert "Trials from share.zip count beside those that were run here" in said
-    assert "2 scenes, 2 seeds" in said
+    assert "2 scenes, 3 seeds" in said
     assert "had been measured before this plan" not in said
     assert run(["export", "--results", "check_it", "--with", str(share), "--out", str(tmp_path / "all.zip")]) == 0
     capsys.readouterr()

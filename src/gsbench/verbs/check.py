@@ -11,6 +11,7 @@ from gsbench.claims.here import Here
 from gsbench.claims.recheck import check_can_go_on, recheck, with_shares
 from gsbench.claims.shares import Shares, read_shares
 from gsbench.claims.sweep import Check, prepare, run_looks
+from gsbench.config.compose import Composed
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, write_text
@@ -66,11 +67,16 @@ def main(argv: Sequence[str], runs: Path) -> int:
         metavar="NAME,…",
         help="run the trials of these scenes alone, where other machines run the others",
     )
+    parser.add_argument(
+        "--all-seeds",
+        action="store_true",
+        help="run all planned seeds at once, where looks at the trials would wait for other machines",
+    )
     options = parser.parse_args(argv)
     file = read_claims(options.claims)
     if options.archives is not None:
-        if options.dry_run or options.shares or options.scenes:
-            raise InputError("check --from runs nothing: it goes with neither --dry-run nor --with nor --scene")
+        if options.dry_run or options.shares or options.scenes or options.all_seeds:
+            raise InputError("check --from runs nothing, so no other option goes with it")
         return _recheck(file, options.archives)
     here = Here(missing_folders, download=not options.dry_run)
     check = prepare(file, runs, here, _permissions(options.permissions), options.scenes)
@@ -82,7 +88,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         if options.dry_run:
             print("\n".join(describe(check)))
         else:
-            _run(check, options.shares, shares)
+            _run(check, options.shares, shares, options.all_seeds)
     return 0
 
 
@@ -132,7 +138,7 @@ def describe(check: Check) -> list[str]:
     return lines
 
 
-def _run(check: Check, archives: Sequence[Path], shares: Shares | None) -> None:
+def _run(check: Check, archives: Sequence[Path], shares: Shares | None, all_seeds: bool) -> None:
     from gsbench.claims.page import make_page, to_html, to_markdown
     from gsbench.launch.batch import run_batch
 
@@ -140,12 +146,16 @@ def _run(check: Check, archives: Sequence[Path], shares: Shares | None) -> None:
     declared = declare_plan(check.home, check.plan, check.plan_hash, check.missing)
     if shares is not None:  # the plan is as old as its oldest record
         declared = min(declared, shares.declared, key=lambda plan: plan.time)
-    verdicts = run_looks(
-        check,
-        declared,
-        lambda trials: run_batch([Trial.of(trial) for trial in trials]),
-        lambda trial: isinstance(find_finished(trial.values), Done),
-    )
+
+    def is_done(trial: Composed) -> bool:
+        return isinstance(find_finished(trial.values), Done)
+
+    def run(trials: Sequence[Composed]) -> None:
+        run_batch([Trial.of(trial) for trial in trials])
+
+    if all_seeds and (left := [one for one in check.trials(check.questions, check.looks[-1]) if not is_done(one)]):
+        run(left)  # what an earlier look sees does not change by them
+    verdicts = run_looks(check, declared, run, is_done)
     page = make_page(check.file, verdicts, declared, read_plans(check.home), [file.name for file in archives])
     for name, text in ((MARKDOWN, to_markdown(page)), (HTML, to_html(page))):
         write_text(check.home / name, text)
