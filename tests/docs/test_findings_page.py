@@ -203,15 +203,16 @@ def test_published_archives_name_no_folder_of_a_machine(scripts: ModuleType, nam
 def test_what_is_said_of_small_and_large_is_so(scripts: ModuleType, prose: str) -> None:
     """Against the trials themselves, without `gsbench.analysis.trends`."""
     frame = scripts.archives.read_trials("scale_bridge")
-    assert (len(frame), set(frame.scene)) == (112, {"flower", "kitchen"})
+    assert (len(frame), set(frame.scene)) == (168, {"courtyard", "flower", "kitchen"})
     assert set(frame.groupby(["scene", "arm", "scene.max_size", "train.iterations"]).size()) == {2}
     keys = ["arm", "scene", "scene.max_size", "train.iterations", "seed"]
     values = frame.set_index(keys)[["lpips_squeeze", "psnr"]]
     rule, split = values.xs("volumetric_once") - values.xs("adc"), values.xs("longaxis") - values.xs("absgrad")
-    flower, kitchen = (
-        {arm: found.xs(scene, level="scene") for arm, found in (("rule", rule), ("split", split))}
-        for scene in ("flower", "kitchen")
-    )
+    scenes = {
+        scene: {arm: found.xs(scene, level="scene") for arm, found in (("rule", rule), ("split", split))}
+        for scene in ("flower", "kitchen", "courtyard")
+    }
+    flower = scenes["flower"]
 
     def by(found: pd.DataFrame, metric: str, *keys: tuple[int, int]) -> list[float]:
         """Means over seeds at (px, iterations)."""
@@ -228,10 +229,34 @@ def test_what_is_said_of_small_and_large_is_so(scripts: ModuleType, prose: str) 
     assert f"{share:.0f} % of what is there at 480" in prose
     far = by(flower["rule"], "lpips_squeeze", *lengths)
     assert "{}, {} and {} after 2,000, 5,000 and 15,000 iterations".format(*(said(v, 3) for v in far)) in prose
-    turns = [by(kitchen["rule"], "lpips_squeeze", key)[0] for key in [*sizes, lengths[0], lengths[2]]]
-    assert min(turns) < 0 < max(turns)
-    assert f"between {said(min(turns), 3)} and {said(max(turns), 3)}" in prose
-    longer = [np.mean([by(scene["split"], "lpips_squeeze", key)[0] for scene in (flower, kitchen)]) for key in lengths]
-    assert longer == sorted(longer, reverse=True)
-    larger = [np.mean([by(scene["split"], "lpips_squeeze", key)[0] for scene in (flower, kitchen)]) for key in sizes]
-    assert min(larger) == larger[-1]
+    shares = scripts.archives.volume_shares(frame)
+    for scene in ("kitchen", "courtyard"):
+        turns = [by(scenes[scene]["rule"], "lpips_squeeze", key)[0] for key in [*sizes, lengths[0], lengths[2]]]
+        assert min(turns) < 0 < max(turns)
+        assert re.search(f"between {said(min(turns), 3)}( LPIPS)? and {re.escape(said(max(turns), 3))}", prose)
+    acts = [f"{100 * shares[scene, 'volumetric_once']:.0f} %" for scene in ("courtyard", "kitchen")]
+    assert f"At {acts[0]} and {acts[1]} of what grows" in prose
+
+    def mean(metric: str, key: tuple[int, int]) -> float:
+        """Of the long axis over scenes."""
+        return float(np.mean([by(scene["split"], metric, key)[0] for scene in scenes.values()]))
+
+    psnr = [mean("psnr", key) for key in sizes]
+    assert all(by(scene["split"], "psnr", key)[0] > 0 for scene in scenes.values() for key in sizes)
+    least, most = (said(value, 2).lstrip("+") for value in (min(psnr), max(psnr)))
+    assert f"PSNR by {least} to {most} dB in the mean of five sizes" in prose
+    assert f"PSNR rises by {least} to {most} dB at five sizes" in prose
+    lpips = [-mean("lpips_squeeze", key) for key in sizes]
+    least, most = (said(value, 3).lstrip("+") for value in (min(lpips), max(lpips)))
+    assert f"LPIPS by {least} to {most}" in prose
+    assert f"LPIPS falls by {least} to {most}" in prose
+    slope = np.polyfit(np.log2([size for size, _ in sizes]), lpips, 1)[0]
+    assert f"by {said(slope, 3).lstrip('+')} more with each doubling" in prose
+    assert abs(mean("lpips_squeeze", lengths[0])) < 0.0005
+    for scene in scenes.values():
+        for metric in ("lpips_squeeze", "psnr"):
+            assert np.ptp(np.sign(by(scene["split"], metric, sizes[1], sizes[-1]))) == 0
+    for metric, sure in (("psnr", 5), ("lpips_squeeze", 3)):  # as the table has it in bold
+        steps = scripts.trends.found("scale_bridge", "longaxis", "absgrad", "scene.max_size", metric).steps
+        assert sum(step.difference.interval.low * step.difference.interval.high > 0 for step in steps) == sure
+    assert "the intervals of PSNR leave zero at all five, those of LPIPS at three" in prose
