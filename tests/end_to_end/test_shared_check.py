@@ -18,7 +18,7 @@ from tests.launch.test_declare import TINY
 SEEDS, SCENES = 3, ("near", "far")
 
 
-def trained(runs: Path) -> set[tuple[str, str]]:
+def trained(runs: Path) -> set[tuple[str, int]]:
     """The scene and seed of each trial that is done."""
     found = [json.loads(file.read_text()) for file in runs.glob("check_it/*/*/*/results.json")]
     return {(one["scene"], one["seed"]) for one in found}
@@ -59,10 +59,10 @@ def test_two_machines_with_photographs_at_places_of_their_own(
 
     second = on("second")
     assert run(["check", str(claims), "--with", str(share)]) == 0
-    assert trained(second) == {("far", seed) for seed in range(SEEDS)}
+    assert trained(second) == {("far", 0), ("far", 1)}  # .1 dB apart: refuted at the first look, where .3 dB matter
     said = (second / "check_it" / "claims.md").read_text()
     assert "Trials from share.zip count beside those that were run here" in said
-    assert "2 scenes, 3 seeds" in said
+    assert "2 scenes, 2 seeds" in said
     assert "had been measured before this plan" not in said
     assert run(["export", "--results", "check_it", "--with", str(share), "--out", str(tmp_path / "all.zip")]) == 0
     capsys.readouterr()
