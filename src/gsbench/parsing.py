@@ -100,19 +100,23 @@ def read_json(path: Path) -> Any:
     return value
 
 
-def read_yaml(path: Path) -> Any:
-    """The plain value in a YAML file; raises as `read_json` does."""
-    return parse_yaml(read_bytes(path, MOST_YAML_BYTES), path)
+def read_yaml(path: Path, unique: bool = False) -> Any:
+    """The plain value in a YAML file; raises as `read_json` does.
+
+    With ``unique``, also for a key that stands twice in a mapping, of which the first would be lost without a word.
+    """
+    return parse_yaml(read_bytes(path, MOST_YAML_BYTES), path, unique)
 
 
-def parse_yaml(content: bytes, path: Path) -> Any:
+def parse_yaml(content: bytes, path: Path, unique: bool = False) -> Any:
     """Parse YAML; raises DamagedError for what is none, or has values that `fault_of` names.
 
-    Numbers need not be finite: YAML is what users set, and a class may have an infinite default.
+    Numbers need not be finite: YAML is what users set, and a class may have an infinite default. ``unique`` is as
+    for `read_yaml`.
     """
     try:
         text = content.decode("utf-8")
-        fault = _danger_in_yaml(text)
+        fault = _danger_in_yaml(text) or (_key_that_stands_twice(text) if unique else "")
         value = None if fault else yaml.load(text, Loader=LOADER)
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError) as error:
         reason = getattr(error, "problem", None) or error  # PyYAML's own text has several lines
@@ -140,6 +144,27 @@ def _danger_in_yaml(text: str) -> str:
                 return "it has a merge key"
             if len(event.value) > MOST_WORD:
                 return f"it has a word of {len(event.value):,} characters without quotes"
+    return ""
+
+
+def _key_that_stands_twice(text: str) -> str:
+    """Name the first key of a mapping that stands there again, with its line; "" where there is none."""
+    waiting, seen = [yaml.compose(text, Loader=LOADER)], set()
+    while waiting:
+        node = waiting.pop()
+        if id(node) in seen:  # an alias
+            continue
+        seen.add(id(node))
+        if isinstance(node, yaml.MappingNode):
+            keys = set()
+            for key, value in node.value:
+                if isinstance(key, yaml.ScalarNode):
+                    if key.value in keys:
+                        return f"{key.value!r} stands twice in it (line {key.start_mark.line + 1})"
+                    keys.add(key.value)
+                waiting.append(value)
+        elif isinstance(node, yaml.SequenceNode):
+            waiting += node.value
     return ""
 
 

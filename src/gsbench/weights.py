@@ -87,6 +87,16 @@ def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, d
     return [path for spec in specs if (path := found[spec]) is not None]
 
 
+def digests_of_unpinned(specs: Sequence[WeightsFile], folder: Path | None = None) -> list[str]:
+    """The sha256 of those files of ``specs`` that have no published checksum and were put into a folder by hand.
+
+    Any file of the right shapes may lie there; what is in the torch hub cache was downloaded from the address.
+    """
+    hand_made = [(place, below) for place, below in _search_folders(folder) if place != hub_cache()]
+    found = [_find_local(spec, hand_made) for spec in specs if spec.sha256 is None]
+    return [file_sha256(path) for path in found if path is not None]
+
+
 def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path | None:
     """The first file with the right checksum; raises ``MissingWeights`` where all that are there have a wrong one."""
     faults = []

@@ -216,7 +216,17 @@ def test_files_that_cannot_be_read_say_so(tmp_path: Path) -> None:
         read_claims(tmp_path / "none.yaml")
     with pytest.raises(InputError, match="cannot be read"):
         read_claims(tmp_path)
-    for text, message in (("a: [", "not YAML"), ("name: a\nname: b\n", "stands twice"), ("", "mapping")):
+    for text, message in (
+        ("a: [", "not YAML"),
+        ("name: a\nname: b\n", "stands twice"),
+        ("a: {b: [{c: 1, c: 2}]}", r"'c' stands twice in it \(line 1\)"),
+        ("", "mapping"),
+        ("name: 2001-99-99", "not YAML"),
+        ("name: 2001-01-01", "of type date"),
+        ("[" * 20_000, "levels"),
+        ("a: &a {b: 1}\nc: {<<: *a}", "merge key"),
+        ("a: !!python/name:os.system x", "tag"),
+    ):
         path = tmp_path / "bad.yaml"
         path.write_text(text)
         with pytest.raises(InputError, match=message) as caught:

@@ -116,6 +116,24 @@ def test_a_plan_allows_nothing_and_names_no_folder_of_modules(
     assert not (place / "exploded").exists()
 
 
+def test_a_plan_names_no_folder_of_packages_of_settings(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hydra imports ``pkg://conf_of_mine`` while it composes: the user's own, not one in the folder of the plan."""
+    theirs = place / "theirs"
+    for folder, line in (("theirs", f"open({str(place / 'exploded')!r}, 'w')\n"), (".", "")):
+        (place / folder / "conf_of_mine").mkdir(parents=True)
+        (place / folder / "conf_of_mine" / "__init__.py").write_text(line)
+    monkeypatch.chdir(place)
+    add_to_plan(compose_trials(["name=x", "seed=0,1"], multirun=True))
+    plan = place / "runs" / "x" / "plan.json"
+    content = json.loads(plan.read_text())
+    for planned in content["trials"].values():
+        planned |= {"cwd": str(theirs), "overrides": [*planned["overrides"], "hydra.searchpath=[pkg://conf_of_mine]"]}
+    plan.write_text(json.dumps(content))
+    assert cli.run(["retry", "x", "allow_targets=[conf_of_mine]", "--dry-run"]) == 0
+    assert sys.modules.pop("conf_of_mine").__file__ == str(place / "conf_of_mine" / "__init__.py")
+    assert not (place / "exploded").exists()
+
+
 # ---- programs
 
 PROGRAM = ["densify=external", "densify.command=[python,'{data}']", "densify.result=x.ply", "densify.version='1'"]

@@ -25,6 +25,7 @@ from tests.strange import place as place
 
 pytestmark = pytest.mark.usefixtures("place")
 MKDIR = {"_target_": "os.mkdir", "path": "exploded"}
+BASIC_LAUNCHER = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
 LOG_CALLBACK = "hydra.experimental.callbacks.LogJobReturnCallback"
 
 
@@ -59,6 +60,12 @@ STRANGE: dict[str, tuple[dict[str, Any], str]] = {  # settings of a file, and a 
     "beside the sweeper's settings": ({"hydra": {"sweeper": {"grids": [MKDIR]}}}, "hydra.sweeper.grids.0"),
     "a sweeper": ({"hydra": {"sweeper": {"_target_": "hydra_plugins.bomb.Bomb"}}}, "no sweeper that is installed"),
     "a launcher": ({"hydra": {"launcher": {"_target_": "hydra_plugins.gsbench.os.mkdir"}}}, "no launcher that is"),
+    "a launcher's lines for a shell": (
+        {"hydra": {"launcher": {"_target_": BASIC_LAUNCHER, "setup": ["touch exploded"]}}}, "allow_targets=[bash]"
+    ),
+    "what a launcher does not list": (
+        {"hydra": {"launcher": {"_target_": BASIC_LAUNCHER, "teardown": ["touch exploded"]}}}, "launcher.teardown="
+    ),
     "a launcher in a copy": (
         calls(inner="${hydra.launcher}"), "copies others"
     ),

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.runs.source import source_of, source_on_disk, unseen_imports
-from gsbench.system.own_modules import allow_modules, allowed_modules
+from gsbench.runs.source import _installed_names, source_of, source_on_disk, unseen_imports
+from gsbench.system.own_modules import PATH_AT_START, allow_modules, allowed_modules
 
 CLASS = "\nclass Mine: ...\n"
 CASES = {  # the file of the class, the file that it needs, and how; what else lies there does not count
@@ -27,6 +27,10 @@ CASES = {  # the file of the class, the file that it needs, and how; what else l
     "by its full name": ("pack/mine.py", "pack/inner/helper.py", "import pack.inner.helper"),
     "from the package": ("pack/mine.py", "pack/helper.py", "from pack import helper"),
     "a package's own file": ("pack/mine.py", "pack/__init__.py", ""),
+    "by an attribute of the package": ("mine.py", "pack/helper.py", "import pack\nx = lambda: pack.helper.value"),
+    "by an attribute of another name": (
+        "mine.py", "pack/inner/helper.py", "from pack import inner as i\ndef late():\n    return i.helper.value",
+    ),
     "all of a package": ("pack/mine.py", "pack/inner/helper.py", "from .inner import *"),
     "a package": ("mine.py", "helper/__init__.py", "import helper"),
     "a module of a package": ("mine.py", "helper/deep.py", "import helper.deep"),
@@ -137,6 +141,41 @@ def test_installed_packages_and_pythons_own_do_not_count(home: Path) -> None:
     for name in ("json.py", "numpy.py"):  # they lie in the folder, but Python finds others first
         (home / name).touch()
     assert source_of(write(home, "mine.py", "helper.py", "import json\nimport numpy\nimport pytest")) == with_them
+
+
+def test_what_was_installed_into_the_folder_does_not_count_and_what_lies_beside_it_does(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`pip install --target .` leaves its packages and their records among the user's files."""
+    monkeypatch.setattr("gsbench.runs.source.PATH_AT_START", (*PATH_AT_START, str(home)))  # as PYTHONPATH=. would
+    target = write(home, "mine.py", "helper.py", "import helper, between\nimport spaced.deep")
+    (home / "spaced").mkdir()
+    (home / "spaced" / "deep.py").write_text("value = 1\n")
+    before = source_of(target)
+    info = home / "spaced-1.0.dist-info"
+    info.mkdir()
+    (info / "RECORD").write_text("spaced/deep.py,,\n")
+    _installed_names.cache_clear()
+    for name in ("spaced", "helper", "between"):
+        allowed_modules().pop(name)
+    without = source_of(target)
+    assert without != before
+    (home / "spaced" / "deep.py").write_text("value = 2\n")
+    assert source_of(target) == without
+    (home / "helper.py").write_text("value = 2\n")
+    assert source_of(target) != without
+    _installed_names.cache_clear()
+
+
+def test_a_class_passed_on_by_another_module_has_the_files_of_both(home: Path) -> None:
+    write(home, "mine.py", "helper.py", "")
+    (home / "between.py").write_text("from mine import Mine\nMine.value = 1\n")
+    one, other, both = source_of("mine.Mine"), source_of("between.Mine"), source_of("between.Mine", "mine.Mine")
+    assert len({one["source"], other["source"]}) == 2
+    assert both == other  # it imports the other
+    (home / "between.py").write_text("from mine import Mine\nMine.value = 2\n")
+    assert source_of("mine.Mine") == one
+    assert source_of("between.Mine", "mine.Mine") != both
 
 
 def test_a_circle_of_imports_ends_and_a_broken_file_is_hashed(home: Path) -> None:

@@ -112,6 +112,9 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     assert not list((tmp_path / "cache").glob(".*"))  # no work folder is left behind
     load_scene(capture, capture.model, tmp_path / "cache", downscale=4)
     assert len(list((tmp_path / "cache").iterdir())) == 2
+    load_scene(capture, capture.model, tmp_path / "cache", made_by={"scene/images.py": "edited"}, **options)
+    assert done == [("views", 6, 6)] * 3  # what other code has prepared is not taken
+    assert len(list((tmp_path / "cache").iterdir())) == 3
 
 
 def test_centred_moves_the_principal_point_only(make_scene, tmp_path: Path):

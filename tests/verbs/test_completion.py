@@ -71,6 +71,8 @@ def test_offers(line: str, offered: list[str], runs: Path) -> None:
 
 
 def test_the_first_word_is_a_verb_or_a_setting(runs: Path) -> None:
+    (runs / "x$(touch${IFS}exploded)").mkdir()
+    assert not any("$" in word for word in complete("gsbench tables ", runs))  # a shell would run it
     offered = complete("gsbench ", runs)
     assert set(VERBS) <= set(offered)
     assert {"scene=", "init=", "densify.", "seed=", "+experiment="} <= set(offered)

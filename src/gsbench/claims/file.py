@@ -29,7 +29,6 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from annotated_types import Ge, Interval, MinLen, Predicate, doc
 
 from gsbench.analysis.statistics import ALPHA
@@ -38,6 +37,7 @@ from gsbench.claims.sequential import FIRST_LOOK, MOST_ALPHA, Design, plan_looks
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.eval.facts import find
+from gsbench.parsing import read_yaml
 from gsbench.runs.hashing import sha256_of
 from gsbench.settings import checked
 from gsbench.words import closest
@@ -155,12 +155,11 @@ class ClaimsFile:
 def read_claims(path: Path) -> ClaimsFile:
     """Read and check a file of claims; raises InputError, one line that names the place and the mend."""
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeys)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8"
-        raise InputError(f"{path} cannot be read ({reason}): give a file of claims (docs/claims.md)") from None
-    except yaml.YAMLError as error:
-        raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
+        content = read_yaml(path, unique=True)
+    except FileNotFoundError:
+        raise InputError(
+            f"{path} cannot be read (there is no such file): give a file of claims (docs/claims.md)"
+        ) from None
     try:
         return parse_claims(content)
     except InputError as error:
@@ -199,17 +198,6 @@ def read_least(value: float | str, where: str) -> Least:
     if not math.isfinite(size) or size <= 0:
         raise InputError(f"{where}: least must be a number above 0, got {value!r}: {NO_SIZE}")
     return Least(size, relative)
-
-
-class _UniqueKeys(yaml.SafeLoader):
-    """Refuses a key that stands twice in one mapping, of which the first would be lost without a word."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise yaml.constructor.ConstructorError(None, None, f"{key!r} stands twice", node.start_mark)
-        return super().construct_mapping(node, deep)
 
 
 def _claim(entry: object, place: int) -> Claim:

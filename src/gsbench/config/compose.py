@@ -63,35 +63,42 @@ def composing() -> Iterator[Hydra]:
             hydra = GlobalHydra.instance().hydra
             assert hydra is not None
             know_old_names(hydra.config_loader)
-            _guard(hydra)
+            _guard(hydra, (), os.getcwd())
             yield hydra
     finally:
         HydraConfig.instance().cfg = None
 
 
-def compose_master(hydra: Hydra, words: Sequence[str], mode: RunMode = RunMode.RUN) -> DictConfig:
+def compose_master(
+    hydra: Hydra, words: Sequence[str], mode: RunMode = RunMode.RUN, modules: str | None = None
+) -> DictConfig:
     """Compose the configuration of ``words``, with Hydra's settings in the node ``hydra``; raises InputError, one line.
 
-    From here on the modules are found that ``words`` allow: they are what somebody has typed.
+    From here on the modules are found that ``words`` allow: they are what somebody has typed, in the folder
+    ``modules`` (default: the current one).
     """
-    _guard(hydra, words)
-    allow_modules(typed_permissions(words))
+    folder = os.getcwd() if modules is None else modules
+    _guard(hydra, words, folder)
+    allow_modules(typed_permissions(words), folder)
     with explained(words), warnings.catch_warnings():
         warnings.filterwarnings("error", message=r".* is not available\.", module="hydra")  # a folder to search in
         return hydra.compose_config(CONFIG_NAME, list(words), run_mode=mode)
 
 
-def _guard(hydra: Hydra, words: Sequence[str] = ()) -> None:
-    """Let ``hydra`` compose only what cannot make anything run that ``words`` do not allow."""
+def _guard(hydra: Hydra, words: Sequence[str], folder: str) -> None:
+    """Let ``hydra`` compose only what cannot make anything run that ``words`` do not allow, typed in ``folder``."""
     path = hydra.config_loader.get_search_path()
-    hydra.config_loader = GuardedLoader(path, typed_permissions(words), os.getcwd())
+    hydra.config_loader = GuardedLoader(path, typed_permissions(words), folder)
 
 
-def compose_one(overrides: Sequence[str]) -> Composed:
-    """The configuration of the single trial that ``overrides`` describe, as ``Composed.overrides`` has them."""
+def compose_one(overrides: Sequence[str], modules: str | None = None) -> Composed:
+    """The configuration of the single trial that ``overrides`` describe, as ``Composed.overrides`` has them.
+
+    The user's own modules are looked for in the folder ``modules`` (default: the current one).
+    """
     check_single(overrides, "choose one")
     with composing() as hydra:
-        return ready_trial(compose_master(hydra, overrides), overrides)
+        return ready_trial(compose_master(hydra, overrides, modules=modules), overrides)
 
 
 def compose_values(overrides: Sequence[str]) -> DictConfig:

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigNode, ConfigStore
 from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
 from hydra.experimental.callback import Callback
@@ -259,11 +260,32 @@ def _check_hydra(hydra: Any, allowed: Sequence[str]) -> None:
     for place, key, value in _entries(launcher, ("hydra", "launcher")):
         if isinstance(value, str) and not value.isprintable():
             raise InputError(f"{'.'.join((*place, key))} must be one line, got {value!r}")
-    for key in SHELL_SETTINGS:
-        if launcher.get(key) and SHELL not in allowed:
-            raise InputError(
-                f"hydra.launcher.{key}={launcher[key]!r} runs in a shell; if you trust it, {to_type([SHELL], allowed)}"
-            )
+    _check_launcher(launcher, allowed)
+
+
+def _check_launcher(launcher: dict[str, Any], allowed: Sequence[str]) -> None:
+    """Refuse of a launcher's settings those that reach a shell, and those that its plug-in does not know.
+
+    submitit's hand the latter on to Slurm's script under their names, lines for a shell among them (``teardown``).
+    """
+    known = _settings_of_launcher(launcher.get(TARGET))
+    for key, value in launcher.items():
+        if SHELL in allowed or not value or key == TARGET:
+            continue
+        if key in SHELL_SETTINGS:
+            why = "runs in a shell"
+        elif key not in known:
+            why = "is no setting that this launcher lists, and may run in a shell"
+        else:
+            continue
+        raise InputError(f"hydra.launcher.{key}={value!r} {why}; if you trust it, {to_type([SHELL], allowed)}")
+
+
+def _settings_of_launcher(target: Any) -> set[str]:
+    """Return the names of all settings that installed plug-ins have registered for the launcher ``target``."""
+    group = ConfigStore.instance().repo.get("hydra", {}).get("launcher", {})
+    nodes = [entry.node for entry in group.values() if isinstance(entry, ConfigNode)]
+    return {str(key) for node in nodes if node.get(TARGET) == target for key in node}
 
 
 def _check_copies(config: DictConfig, hydra: dict[str, Any]) -> None:

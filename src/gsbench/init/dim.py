@@ -22,7 +22,7 @@ from gsbench.init.networks.weights import ALIKED_WEIGHTS, EXTRACTOR_WEIGHTS, LIG
 from gsbench.logs import Progress
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath, Fraction
-from gsbench.weights import find_all_weights
+from gsbench.weights import WeightsFile, digests_of_unpinned, find_all_weights
 
 logger = logging.getLogger(__name__)
 
@@ -126,12 +126,19 @@ class Dim(FeatureInitializer):
         )
 
     def find_weights(self) -> tuple[Path | None, Path | None]:
-        folder = None if self.weights is None else Path(self.weights).expanduser()
-        specs = [ALIKED_WEIGHTS[self.aliked_model] if self.extractor == "aliked" else EXTRACTOR_WEIGHTS[self.extractor]]
-        if self.matcher == "lightglue":
-            specs.append(LIGHTGLUE_WEIGHTS[self.extractor])
-        paths = find_all_weights(specs, folder, self.download)
+        paths = find_all_weights(self._weights_files(), self._weights_folder(), self.download)
         return paths[0], paths[1] if len(paths) > 1 else None
+
+    def content(self) -> str | None:
+        digests = digests_of_unpinned(self._weights_files(), self._weights_folder())
+        return " ".join(digests) or None
+
+    def _weights_files(self) -> list[WeightsFile]:
+        files = [ALIKED_WEIGHTS[self.aliked_model] if self.extractor == "aliked" else EXTRACTOR_WEIGHTS[self.extractor]]
+        return [*files, LIGHTGLUE_WEIGHTS[self.extractor]] if self.matcher == "lightglue" else files
+
+    def _weights_folder(self) -> Path | None:
+        return None if self.weights is None else Path(self.weights).expanduser()
 
     def check(self, capture: Capture, reference: Path | None) -> None:
         super().check(capture, reference)

@@ -135,11 +135,11 @@ def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str,
     return metrics
 
 
-def rasterizer_inputs(rasterizer: Rasterizer) -> str | dict[str, Any]:
+def rasterizer_inputs(rasterizer: Rasterizer, target: str | None = None) -> str | dict[str, Any]:
     """The rasterizer as it enters a stage's key: gsbench's own by name, a user's by class, source and options."""
-    if f"{type(rasterizer).__module__}.".startswith(OWN):
+    if not own_names(rasterizer, target):
         return rasterizer.name
-    return {"name": rasterizer.name} | options_of("raster", rasterizer)
+    return {"name": rasterizer.name} | options_of("raster", rasterizer, target)
 
 
 def _check_names(cls: Any, options: dict[str, Any], group: str) -> None:
@@ -160,6 +160,8 @@ def locate(target: str, group: str, allow_targets: list[str]) -> type:
     if not isinstance(found, type) or lacking:
         without = f": it has no {', '.join(lacking)}()" if lacking else ""
         raise InputError(f"{group}._target_={target} is not a class for {group}{without}")
+    if not target.startswith(OWN) and not source_of(target):
+        log.warning("no file of %s was found: results do not know its version", target)
     if has_changed_since_import(target):  # the first call also notes the file as it is now, while it is what runs
         log.warning("the code of %s has changed since it was imported: this process goes on with what it was", target)
     if not target.startswith(OWN) and (unseen := unseen_imports(target, before)):
@@ -170,17 +172,28 @@ def locate(target: str, group: str, allow_targets: list[str]) -> type:
     return found
 
 
-def options_of(group: str, component: Any) -> dict[str, Any]:
-    """Class and options of a component of ``group``, as they enter a stage's key; those that cannot change a result are
-    left out."""
-    target = f"{type(component).__module__}.{type(component).__qualname__}"
-    values = {"class": target} | source_of(target)
+def options_of(group: str, component: Any, target: str | None = None) -> dict[str, Any]:
+    """Class and options of a component of ``group``, as they enter a stage's key.
+
+    Options of gsbench's own classes that cannot change a result are left out. ``target`` is the import path by which a
+    configuration names the class, which need not be where it is defined.
+    """
+    cls, names = type(component), own_names(component, target)
+    values: dict[str, Any] = {"class": f"{cls.__module__}.{cls.__qualname__}"} | source_of(*names)
     if dataclasses.is_dataclass(component):
-        fields = [
-            field.name for field in dataclasses.fields(component) if field.init and field.name not in WITHOUT_EFFECT
-        ]
+        left_out = () if names else WITHOUT_EFFECT
+        fields = [field.name for field in dataclasses.fields(component) if field.init and field.name not in left_out]
         values |= as_before(group, {name: _plain(getattr(component, name)) for name in fields})
     return values
+
+
+def own_names(component: Any, target: str | None = None) -> list[str]:
+    """Import paths behind a component that are not gsbench's: where it is asked for, where its class is defined.
+
+    The class may be one that a function made, or lie within another: what has files is its module.
+    """
+    named = [target, f"{type(component).__module__}.{type(component).__name__}"]
+    return [name for name in dict.fromkeys(named) if name is not None and not name.startswith(OWN)]
 
 
 def _plain(value: Any) -> Any:

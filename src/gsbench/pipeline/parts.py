@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from gsbench.config.trust import check_permissions
+from gsbench.config.trust import check_permissions, targets_in
 from gsbench.densify import Densifier
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.metric import Metric
@@ -110,6 +110,11 @@ class Parts:
     def evaluator(self) -> Evaluator:
         """The evaluator that measures the renders; looks for the weights of networks."""
         return make_evaluator(self.eval, self.device, self.metrics)
+
+    @cached_property
+    def targets(self) -> dict[str, str]:
+        """The import paths by which the configuration names the parts' classes: ``{"densify": "mine.Mine"}``."""
+        return {".".join(place): target for place, target in targets_in(self.values)}
 
     @property
     def measured_earlier(self) -> list[int]:

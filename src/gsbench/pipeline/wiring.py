@@ -59,7 +59,7 @@ class TrialSteps:
         if parts.initializer.needs_reference(self.capture):
             reference = init_step(store, self.capture, Sfm())
             yield reference
-        init = init_step(store, self.capture, parts.initializer, reference)
+        init = init_step(store, self.capture, parts.initializer, reference, parts.targets.get("init"))
         yield init
         self.views = Views(store, self.capture, init, parts.scene)
         trained = self._train_step()
@@ -79,13 +79,22 @@ class TrialSteps:
                 self.views, parts.program, parts.train.iterations, parts.seed, parts.device, parts.threads
             )
         return train_step(
-            self.views, parts.densifier, parts.rasterizer, parts.train, parts.seed, parts.device, parts.measured_earlier
+            self.views,
+            parts.densifier,
+            parts.rasterizer,
+            parts.train,
+            parts.seed,
+            parts.device,
+            parts.measured_earlier,
+            parts.targets,
         )
 
     def _evaluate_step(self, trained: Step) -> Step:
         parts = self.parts
         if parts.program is not None and not parts.program.leaves_model:
-            return measure_step(self.views, trained, parts.evaluator, parts.eval.geometry, parts.eval.flicker)
+            return measure_step(
+                self.views, trained, parts.evaluator, parts.eval.geometry, parts.eval.flicker, parts.targets
+            )
         return evaluate_step(
             self.views,
             trained,
@@ -98,6 +107,7 @@ class TrialSteps:
             made_by_program=parts.program is not None,
             geometry=parts.eval.geometry,
             flicker=parts.eval.flicker,
+            targets=parts.targets,
         )
 
 

@@ -24,6 +24,7 @@ from gsbench.gaussians.model import MAX_SH_DEGREE
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.parts import Parts
+from gsbench.pipeline.steps.views import makers_of_views
 from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs.layout import GROUND_TRUTH, MASKS, POINT_CLOUD, PROTOCOLS, RENDERS, STORE, VIEWS
 from gsbench.runs.store import Store
@@ -217,6 +218,7 @@ def resampled(steps: TrialSteps, protocol: Protocol, photographs: Pictures) -> P
         max_size=longest,
         resample=protocol.shrinking,
         principal_point=options.principal_point,
+        made_by=makers_of_views(),
     )
     return _same_views(scene, photographs, protocol)
 

@@ -28,14 +28,16 @@ PACKAGE = Path(__file__).resolve().parents[1]
 RELEASED = "released.json"  # in the package: the digests of all files as they were released
 AS_RELEASED = "released"  # the state of a file that is
 DIGEST_CHARACTERS = 16
-# Parts that make no number: what is said and shown, how processes run, where files lie. What `config` and `settings`
-# make of the user's words is in the keys as it is.
-WITHOUT_PART = frozenset(
+# Parts that make no number: what is said, how processes run, where files lie. What `config` and `settings` make of the
+# user's words is in the keys as it is.
+WITHOUT_NUMBERS = frozenset(
     """
-    analysis app bench claims cli config datasets errors launch logs parsing records renders runs settings system
-    tracking verbs view words
+    app cli config errors launch logs parsing records runs settings system tracking verbs words
     """.split()  # noqa: SIM905 - words are easier to read than a list of quoted ones
 )
+# Parts that work on results: none in a trial, unless a user's class asks for one. No stage's version stands for them.
+ON_RESULTS = frozenset(("analysis", "bench", "claims", "datasets", "renders", "view"))
+WITHOUT_PART = WITHOUT_NUMBERS | ON_RESULTS
 # Modules that put a trial together: a part in each, and followed no further, since they know parts of every kind.
 WIRING = tuple(f"pipeline/{name}.py" for name in ("components", "parts", "results", "trial", "wiring"))
 
@@ -61,20 +63,22 @@ _sources: dict[str, _Source] = {}  # by the path below the package
 _unkept: set[str] = set()  # those whose digests no other process has left
 
 
-def files_of(roots: Iterable[tuple[str, str | None]]) -> dict[str, str]:
+def files_of(roots: Iterable[tuple[str, str | None]], asked: Iterable[tuple[str, str | None]] = ()) -> dict[str, str]:
     """``{"eval/ssim.py": state}`` for each file that the ``roots``, modules or names in them, reach by their imports.
 
     A name that a package only passes on counts as what defines it, so that an arm does not depend on its neighbours.
+    ``asked`` are those that a user's class imports, which may be of parts that otherwise have none in a trial.
     The state is a digest, or ``released``.
     """
     found: dict[str, str] = {}
-    waiting = list(roots)
+    waiting = [(root, False) for root in roots] + [(root, True) for root in asked]
     while waiting:
-        file = _file(*waiting.pop())
-        if file is not None and file not in found and _part(file):
+        name, is_asked = waiting.pop()
+        file = _file(*name)
+        if file is not None and file not in found and (_part(file) or (is_asked and _top(file) in ON_RESULTS)):
             found[file] = state_of(file)
             if file not in WIRING:
-                waiting += _read(file).names
+                waiting += [(imported, not _part(file)) for imported in _read(file).names]
     _keep_digests()
     return dict(sorted(found.items()))
 
@@ -146,7 +150,12 @@ def _is_text(node: ast.AST | None) -> bool:
 
 
 def _part(file: str) -> bool:
-    return file.partition("/")[0].removesuffix(".py") not in WITHOUT_PART
+    return _top(file) not in WITHOUT_PART
+
+
+def _top(file: str) -> str:
+    """The part of gsbench that a file belongs to."""
+    return file.partition("/")[0].removesuffix(".py")
 
 
 def _module(file: str) -> str:

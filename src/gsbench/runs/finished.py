@@ -17,6 +17,7 @@ from gsbench.runs.inputs import (
     Stamp,
     read_inputs,
     read_results,
+    source_stamp_of,
     stamp_of,
     version_of,
 )
@@ -51,7 +52,7 @@ def find_finished(
 ) -> Done | NotDone:
     """Tell whether the trial with the resolved configuration ``values`` is done and nothing it was made of has changed.
 
-    Quick, since files are compared by size and time of change. A trial that lacks a metric for want of weights is done
+    Quick, since files are compared by size and times of change. A trial that lacks a metric for want of weights is done
     only if ``unavailable_now``, called with the ``eval`` settings, says that it would lack it again.
     """
     folder = TrialPaths.of(values).folder
@@ -88,12 +89,12 @@ def _objections(folder: Path, values: dict[str, Any], results: TrialRecord, inpu
     if inputs.pycolmap != (installed := version_of(PYCOLMAP)):
         yield NotDone("package", f"it was made with {PYCOLMAP} {inputs.pycolmap}, and {installed} is installed")
     for path, stamp in inputs.sources.items():
-        yield from _file_objections(Path(path), stamp)
+        yield from _file_objections(Path(path), stamp, source_stamp_of)
     for path, changed in inputs.folders.items():
         if _changed(Path(path)) != changed:
             yield NotDone("file", f"files have come to {path}, or gone from there")
     for name, stamp in inputs.published.items():
-        yield from _file_objections(folder / name, stamp)
+        yield from _file_objections(folder / name, stamp, stamp_of)
     for name, path in inputs.entries.items():
         try:
             read_manifest(Path(path))
@@ -101,9 +102,9 @@ def _objections(folder: Path, values: dict[str, Any], results: TrialRecord, inpu
             yield NotDone("store", f"the result of its stage {name} in the store is damaged or gone ({error})")
 
 
-def _file_objections(path: Path, stamp: Stamp) -> Iterator[NotDone]:
+def _file_objections(path: Path, stamp: Stamp, stamp_now: Callable[[Path], Stamp]) -> Iterator[NotDone]:
     try:
-        if stamp_of(path) != stamp:
+        if stamp_now(path) != stamp:
             yield NotDone("file", f"{path} has changed")
     except (OSError, ValueError) as error:
         yield NotDone("file", f"{path} cannot be read ({getattr(error, 'strerror', error)})")

@@ -7,9 +7,10 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from gsbench.runs.source import source_of
+from gsbench.runs.source import OWN, source_of
 
-WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")  # options that cannot change a result
+# Options of gsbench's own classes that cannot change a result; what they mean in a user's class, nobody knows.
+WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
 # Settings of a group that say how results will be read, or what may be varied, whatever they are.
 DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",)}
 # Settings that are younger than results that people keep, with the value at which all is as it was before them: at
@@ -41,7 +42,8 @@ def determining(values: Mapping[str, Any]) -> dict[str, Any]:
     kept = {key: value for key, value in values.items() if key not in NOT_HASHED}
     for key, group in kept.items():
         if isinstance(group, dict):
-            dropped = (*WITHOUT_EFFECT, *DECLARED.get(key, ()))
+            without_effect = WITHOUT_EFFECT if str(group.get("_target_") or OWN).startswith(OWN) else ()
+            dropped = (*without_effect, *DECLARED.get(key, ()))
             kept[key] = {name: value for name, value in as_before(key, group).items() if name not in dropped}
     return kept
 

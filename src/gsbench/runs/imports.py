@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 BY_NAME = frozenset({"import_module", "__import__"})  # called with the name of a module
@@ -22,7 +22,8 @@ MAX_PLACE = 200  # characters of a text that may name a folder
 class Imports:
     """The imports of a file.
 
-    ``names`` has pairs of a module and what is taken of it: a name, ``*``, or None for the module itself.
+    ``names`` has pairs of a module and what is taken of it: a name, ``*``, or None for the module itself. What a text
+    takes of a module later counts too: ``pack.helper.value`` is (``pack``, ``helper``), (``pack.helper``, ``value``).
     ``computed`` says that modules are imported whose names the text does not give. ``places`` are the texts that may
     be folders to look in, where the file changes ``sys.path``, else None.
     """
@@ -52,6 +53,10 @@ def read_imports(tree: ast.Module, module: str, is_package: bool) -> Imports:
         if isinstance(node, ast.Call) and _word(node.func) in by_name and (found := _named(node, package)):
             understood.add(node.func)
             names[(found, None)] = None
+    bound = _bound(nodes, package)
+    for node in nodes:
+        if isinstance(node, ast.Attribute):
+            names |= dict.fromkeys(_taken(node, bound))
     for node in nodes:
         word = _word(node)
         if isinstance(node, ast.Attribute) and word in SEARCHED:
@@ -71,6 +76,33 @@ def _nodes(tree: ast.AST) -> Iterator[ast.AST]:
             continue
         yield node
         pending += ast.iter_child_nodes(node)
+
+
+def _bound(nodes: Sequence[ast.AST], package: str) -> dict[str, str]:
+    """Full names of what import statements give names to."""
+    bound: dict[str, str] = {}
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                top = alias.name.split(".")[0]
+                bound[alias.asname or top] = alias.name if alias.asname else top
+        elif isinstance(node, ast.ImportFrom):
+            source = _absolute("." * node.level + (node.module or ""), package)
+            bound |= {alias.asname or alias.name: f"{source}.{alias.name}" for alias in node.names}
+    return bound
+
+
+def _taken(node: ast.Attribute, bound: Mapping[str, str]) -> list[tuple[str, str]]:
+    """What ``a.b.c`` takes of modules, if ``a`` is ``bound``: ``b`` of it, and ``c`` of that."""
+    words: list[str] = []
+    at: ast.AST = node
+    while isinstance(at, ast.Attribute):
+        words.append(at.attr)
+        at = at.value
+    if not isinstance(at, ast.Name) or at.id not in bound:
+        return []
+    full = [bound[at.id], *reversed(words)]
+    return [(".".join(full[:depth]), full[depth]) for depth in range(1, len(full))]
 
 
 def _word(node: ast.AST) -> str | None:

@@ -20,11 +20,11 @@ from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS, INPUTS, PER_VIEW, RE
 from gsbench.runs.stages import STAGES
 from gsbench.runs.trial_record import TrialRecord, record_from, results_text
 
-INPUTS_VERSION = 1
+INPUTS_VERSION = 2
 PYCOLMAP = "pycolmap"  # the package whose version has a part in every cloud
 READ_LATER = (PER_VIEW, CURVES, EVENTS, HISTOGRAMS)  # beside the results, by tables and reports
 
-Stamp = tuple[int, int]  # size in bytes, time of change in ns
+Stamp = tuple[int, ...]  # size in bytes, times of change in ns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +89,7 @@ def write_finished(
         "digests": digests,
         "stages": {stage.name: stage.version for stage in STAGES},
         "pycolmap": version_of(PYCOLMAP),
-        "sources": {str(path): stamp_of(path) for path in sources},
+        "sources": {str(path): source_stamp_of(path) for path in sources},
         "folders": {str(path): path.stat().st_mtime_ns for path in places},
         "entries": {name: str(path) for name, path in (entries or {}).items()},
         "published": {path.relative_to(folder).as_posix(): stamp_of(path) for path in published},
@@ -163,6 +163,16 @@ def stamp_of(path: Path) -> Stamp:
     """Size and time of change; raises OSError."""
     state = os.stat(path)
     return state.st_size, state.st_mtime_ns
+
+
+def source_stamp_of(path: Path) -> Stamp:
+    """Size and time of change, and when the system saw a change, which nobody can set back; raises OSError.
+
+    For what is the user's, which a program may have replaced and given the time of before. Our own files are links,
+    whose state changes with each further one.
+    """
+    state = os.stat(path)
+    return state.st_size, state.st_mtime_ns, state.st_ctime_ns
 
 
 def version_of(package: str) -> str | None:

@@ -1,21 +1,22 @@
 """Version of a user's own code behind a result: the hash of the files that a class needs. Loads no torch.
 
-These are the file that defines the class, the packages it is in, and what they import of the user's own, at any
-remove: what lies in their package or beside it, what ``allow_targets`` names, and what Python finds outside its own
-folders and those of installed packages. They are read, never run, so that the answer is the same before the code is
-imported and after.
+These are the file where the configuration finds the class, that which defines it, the packages that these are in, and
+what they import of the user's own, at any remove: what lies in their package or beside it, what ``allow_targets``
+names, and what Python finds outside its own folders and those of installed packages. They are read, never run, so that
+the answer is the same before the code is imported and after.
 """
 
 from __future__ import annotations
 
 import ast
+import csv
 import hashlib
 import importlib
 import importlib.util
 import os
 import sys
 import sysconfig
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.machinery import ModuleSpec, PathFinder
@@ -43,27 +44,29 @@ _as_imported: dict[str, tuple[ModuleSpec, _File]] = {}  # what a module's file h
 _as_read: dict[tuple[str, Path], tuple[list[int], _File]] = {}  # files by module and path, each with its state then
 
 
-def source_of(target: str) -> dict[str, str]:
+def source_of(*targets: str) -> dict[str, str]:
     """``{"source": sha256}`` of the files that a user's own class needs, which have no version that we could bump.
 
-    Of one file it is the sha256 of what it holds, of several that of a list as ``sha256sum`` prints it, with the names
-    of modules. A module that this process has imported counts as it was then: that is the code that runs, whatever has
-    become of the file since. Empty for gsbench's own classes, and where there is no such file (importing it will say
-    what is wrong).
+    ``targets`` are import paths, ``package.module.Class``: where a module passes on a class of another, both are its
+    names. Of one file it is the sha256 of what it holds, of several that of a list as ``sha256sum`` prints it, with the
+    names of modules. A module that this process has imported counts as it was then: that is the code that runs,
+    whatever has become of the file since. Empty for gsbench's own classes, and where there is no such file (importing
+    it will say what is wrong).
     """
-    digest = None if target.startswith(OWN) else _Reach(target).digest()
+    own = [target for target in targets if not target.startswith(OWN)]
+    digest = _Reach(own).digest() if own else None
     return {} if digest is None else {"source": digest}
 
 
 def has_changed_since_import(target: str) -> bool:
     """Return whether the files of a class are no longer those that this process has imported, and therefore runs."""
     source = source_of(target)
-    return bool(source) and _Reach(target, as_imported=False).digest() != source["source"]
+    return bool(source) and _Reach([target], as_imported=False).digest() != source["source"]
 
 
-def gsbench_imports(target: str) -> list[tuple[str, str | None]]:
+def gsbench_imports(*targets: str) -> list[tuple[str, str | None]]:
     """The imports of gsbench in the files of a user's class: modules, and what is taken of each."""
-    return sorted(_Reach(target).of_gsbench, key=str)
+    return sorted(_Reach(targets).of_gsbench, key=str)
 
 
 def unseen_imports(target: str, before: Collection[str]) -> list[str]:
@@ -71,7 +74,7 @@ def unseen_imports(target: str, before: Collection[str]) -> list[str]:
 
     Their names were computed, or the folder where they lie was: an edit there would go unnoticed.
     """
-    known, found = _Reach(target).paths, []
+    known, found = _Reach([target]).paths, []
     for name in sorted(sys.modules.keys() - set(before)):
         spec = getattr(sys.modules.get(name), "__spec__", None)
         if spec is None or f"{name}.".startswith(OWN) or _file_of(spec) is None or _is_installed(spec):
@@ -87,7 +90,7 @@ def source_on_disk(target: str, folder: str) -> str | None:
     What this process has imported under these names, perhaps from elsewhere, does not count.
     """
     importlib.invalidate_caches()  # the files may be younger than what a finder remembers of their folder
-    return _Reach(target, folder, as_imported=False).digest()
+    return _Reach([target], folder, as_imported=False).digest()
 
 
 def sources_of(values: Mapping[str, Any]) -> dict[str, str]:
@@ -113,17 +116,18 @@ class _Reach:
     process has imported counts as it was then.
     """
 
-    def __init__(self, target: str, folder: str | None = None, as_imported: bool = True) -> None:
+    def __init__(self, targets: Iterable[str], folder: str | None = None, as_imported: bool = True) -> None:
         self.files: dict[str, str] = {}
         self.paths: set[str] = set()
         self.of_gsbench: set[tuple[str, str | None]] = set()
         self._visited: set[tuple[str, Path]] = set()
         self._folder, self._as_imported = folder, as_imported
-        module = target.rpartition(".")[0]
-        self._top = module.split(".")[0]
-        self._own = self._find_own()
-        if any(name == module and _file_of(spec) for name, spec in _descend(module, [self._own])):
-            self._add(module, [self._own])
+        modules = list(dict.fromkeys(target.rpartition(".")[0] for target in targets))
+        self._own = {top: self._find_own(top) for top in dict.fromkeys(name.split(".")[0] for name in modules)}
+        for module in modules:
+            own = [self._own[module.split(".")[0]]]
+            if any(name == module and _file_of(spec) for name, spec in _descend(module, own)):
+                self._add(module, own)
 
     def digest(self) -> str | None:
         """One hash for all the files; None where there are none."""
@@ -132,12 +136,12 @@ class _Reach:
         listed = "".join(f"{digest}  {name}\n" for name, digest in sorted(self.files.items()))
         return hashlib.sha256(listed.encode()).hexdigest()
 
-    def _find_own(self) -> ModuleSpec | None:
-        """Find the package of the class: as it was imported, or as Python would find it."""
+    def _find_own(self, top: str) -> ModuleSpec | None:
+        """Find the package ``top`` of a class: as it was imported, or as Python would find it."""
         if self._folder is not None:
-            return _find_top(self._top, [*sys.path, self._folder])
-        loaded = sys.modules.get(self._top)
-        return _find_top(self._top) if loaded is None else loaded.__spec__
+            return _find_top(top, [*sys.path, self._folder])
+        loaded = sys.modules.get(top)
+        return _find_top(top) if loaded is None else loaded.__spec__
 
     def _add(self, module: str, tops: Sequence[ModuleSpec | None]) -> None:
         """Add a module, the packages that it is in, and what they import; ``tops`` are what its first name may be."""
@@ -150,11 +154,15 @@ class _Reach:
             self._keep(name, file, content.digest)
             if content.imports.computed:
                 self._add_folder(name, spec, file)
+            places: dict[str, list[ModuleSpec | None]] = {}
             for imported, taken in content.imports.names:
                 if f"{imported}.".startswith(OWN):
                     self.of_gsbench.add((imported, taken))
                     continue
-                found = self._find_imported(imported.split(".")[0], name, file, content.imports)
+                top = imported.split(".")[0]
+                if top not in places:
+                    places[top] = self._find_imported(top, name, file, content.imports)
+                found = places[top]
                 self._add(imported if taken in (None, "*") else f"{imported}.{taken}", found)
                 if taken == "*":  # which of its modules that takes, a package may say anywhere
                     for inner, package in _descend(imported, found):
@@ -190,8 +198,8 @@ class _Reach:
         What this process has imported does not count, nor what it has added to ``sys.path``: both may be the doing of
         the code in question, and the answer must be the same before it runs.
         """
-        if top == self._top:
-            return [self._own]
+        if top in self._own:
+            return [self._own[top]]
         known = _find_top(top, [*PATH_AT_START, *([] if self._folder is None else [self._folder])])
         if known is None and top in allowed_modules():
             known = PathFinder.find_spec(top, [allowed_modules()[top]])
@@ -240,18 +248,31 @@ def _file_of(spec: ModuleSpec) -> Path | None:
 
 def _is_installed(spec: ModuleSpec) -> bool:
     """Return whether a module is Python's own or of an installed package, which its version stands for."""
+    if spec.name.split(".")[0] in allowed_modules():
+        return False
     places = [spec.origin] if spec.has_location else list(spec.submodule_search_locations or [])
-    return all(place is None or _is_installed_in(os.path.dirname(place)) for place in places)
+    return all(place is None or _is_installed_at(Path(place)) for place in places)
+
+
+def _is_installed_at(place: Path) -> bool:
+    folder = place.parent
+    if INSTALLED & set(folder.parts) or any(
+        folder.is_relative_to(sysconfig.get_path(key)) for key in ("stdlib", "platstdlib")
+    ):
+        return True
+    for above in (folder, folder.parent):  # as of `pip install --target`, which leaves the user's files beside its own
+        inside = place.relative_to(above).as_posix()
+        if any(name == inside or name.startswith(f"{inside}/") for name in _installed_names(above)):
+            return True
+    return False
 
 
 @cache
-def _is_installed_in(folder: str) -> bool:
-    place = Path(folder)
-    if INSTALLED & set(place.parts) or any(
-        place.is_relative_to(sysconfig.get_path(key)) for key in ("stdlib", "platstdlib")
-    ):
-        return True
-    return any(next(above.glob("*.dist-info"), None) for above in (place, place.parent))  # as of `pip install --target`
+def _installed_names(folder: Path) -> frozenset[str]:
+    """List the files that the installed packages in ``folder`` say are theirs, by their paths below it."""
+    records = [file for info in folder.glob("*.dist-info") if (file := info / "RECORD").is_file()]
+    texts = [file.read_text(encoding="utf-8", errors="replace") for file in records]
+    return frozenset(row[0] for text in texts for row in csv.reader(text.splitlines()) if row)
 
 
 def _read(module: str, path: Path) -> _File:

@@ -12,9 +12,11 @@ import logging
 import os
 import secrets
 import shutil
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -48,18 +50,20 @@ def load_scene(
     principal_point: PrincipalPoint = "used",
     threads: int = 2,
     progress: Progress = no_progress,
+    made_by: Mapping[str, str | None] = MappingProxyType({}),
 ) -> Scene:
     """Load the views of a capture with the cameras of the COLMAP model in ``model_dir``.
 
     Images of a distorted camera are undistorted, then all are shrunk by ``downscale`` and to a longest side of
     ``max_size`` px (see `downscaled_size`). ``centred`` moves principal points to the image centre, as 3DGS assumes.
-    Views without a pose in the model are left out with a warning. ``progress`` counts images.
+    Views without a pose in the model are left out with a warning. ``progress`` counts images. ``made_by`` names the
+    versions of code and packages that prepare images, so that those of others are not taken from the cache.
 
     Raises `InputError` if fewer than three views or no training view have a pose, or an image does not fit its camera.
     """
     if principal_point not in ("used", "centred"):
         raise InputError(f"scene.principal_point must be used or centred, got {principal_point!r}")
-    folder = Path(cache_dir) / _cache_key(capture, Path(model_dir), downscale, max_size, resample)
+    folder = Path(cache_dir) / _cache_key(capture, Path(model_dir), downscale, max_size, resample, made_by)
     if not (folder / CAMERAS_FILE).is_file():
         _build(folder, capture, Path(model_dir), downscale, max_size, resample, threads, progress)
     entries = json.loads((folder / CAMERAS_FILE).read_text(encoding="utf-8"))["views"]
@@ -184,12 +188,20 @@ def _camera(entry: dict[str, object]) -> Camera:
     return Camera(**asdict(intrinsics), rotation=pose[:, :3], translation=pose[:, 3])
 
 
-def _cache_key(capture: Capture, model_dir: Path, downscale: int, max_size: int | None, resample: Resample) -> str:
-    """A digest of the images, the model's cameras and poses, and the options."""
+def _cache_key(
+    capture: Capture,
+    model_dir: Path,
+    downscale: int,
+    max_size: int | None,
+    resample: Resample,
+    made_by: Mapping[str, str | None],
+) -> str:
+    """A digest of the images, the model's cameras and poses, the options, and what prepares the images."""
     digest = hashlib.sha256()
     for file in sorted(model_files(model_dir)):
         if file.stem != "points3D":
             digest.update(f"{file.name}\0{hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
     options = [CACHE_VERSION, capture.fingerprint, capture.image_names, downscale, max_size, resample]
+    options += [sorted(made_by.items())]
     digest.update(json.dumps(options).encode())
     return digest.hexdigest()[:32]

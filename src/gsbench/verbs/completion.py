@@ -20,6 +20,7 @@ from gsbench.verbs.table import VERBS
 
 QUERY = "query"
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
+PLAIN_WORD = re.compile(r"[\w.,:=+/@\[\]{}~-]+")  # what no shell reads as anything but itself: folders have any names
 CHOICES = r"(?<![\w-]){option}[ =]\{{([^}}]*)\}}"  # as argparse shows them: --format {{md,csv}}
 
 
@@ -50,7 +51,7 @@ def complete(line: str, runs: Path) -> list[str]:
         found = list(OPTIONS)
     else:
         found = [*([] if words else VERBS), *_settings(words, word)]
-    return sorted({candidate for candidate in found if candidate.startswith(word)})
+    return sorted({candidate for candidate in found if candidate.startswith(word) and PLAIN_WORD.fullmatch(candidate)})
 
 
 def _of_verb(verb: str, words: Sequence[str], word: str, runs: Path) -> Iterable[str]:

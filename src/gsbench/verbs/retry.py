@@ -95,9 +95,9 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
         if any(change.startswith("launch=") and change not in planned.overrides for change in changes):
             own = [word for word in own if not word.startswith("launch.")]  # they were meant for the other launcher
         permissions = [change for change in changes if key_of(change) == PERMISSIONS]
-        as_planned = compose_one([*words, *permissions]) if changes else None
-        trial = compose_one([*own, *changes])
-        allow_modules(allowed, here)  # but not the modules: a stranger's plan would name a folder of the stranger's
+        # but not the modules: a stranger's plan would name a folder of the stranger's
+        as_planned = compose_one([*words, *permissions], modules=here) if changes else None
+        trial = compose_one([*own, *changes], modules=here)
         if as_planned is not None and _identity(trial) != _identity(as_planned):
             raise InputError(
                 f"{' '.join(changes)} would make other trials than those of the plan: give the sweep's own command"

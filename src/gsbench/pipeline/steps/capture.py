@@ -15,7 +15,6 @@ from gsbench.init.point_files import read_points
 from gsbench.init.points import GREY
 from gsbench.logs import progress
 from gsbench.pipeline.steps.code import step_of_code
-from gsbench.runs.hashing import sha256_of
 from gsbench.runs.stages import CAPTURE
 from gsbench.runs.step import Step
 from gsbench.scene.colmap import write_frames
@@ -143,8 +142,3 @@ def masked(capture: Capture, folder: Path) -> Capture:
     """The capture with what `masked_step` left in ``folder``."""
     masks = {name: prepared_mask(folder, name) for name in capture.masks}
     return replace(capture, images=folder / IMAGES, masks=masks)
-
-
-def split_of(capture: Capture) -> str:
-    """A hash of which views are held out."""
-    return sha256_of(list(capture.test_names))

@@ -48,6 +48,8 @@ from gsbench.scene.nearness import nearness
 from gsbench.scene.types import Scene
 from gsbench.train.trainer import snapshot_file
 
+EXTRA = "eval.extra"  # where a configuration has the user's own metrics
+
 
 def evaluate_step(
     views: Views,
@@ -61,11 +63,13 @@ def evaluate_step(
     made_by_program: bool = False,
     geometry: bool = False,
     flicker: bool = False,
+    targets: Mapping[str, str] = MappingProxyType({}),
 ) -> Step:
     """Render and measure the model of ``trained``, and its snapshots of the iterations ``earlier``.
 
     ``maps`` also keeps what the report needs to say where an arm helps; ``geometry`` and ``flicker`` also measure the
-    model itself (`gsbench.pipeline.steps.model_metrics`). The key of a training by another program
+    model itself (`gsbench.pipeline.steps.model_metrics`). ``targets`` has the import paths by which the configuration
+    names classes, by their places in it. The key of a training by another program
     (``made_by_program``) knows nothing of the rendering, so it is in this step's.
     """
     inputs: dict[str, Any] = {
@@ -77,8 +81,8 @@ def evaluate_step(
     if earlier:
         inputs["earlier"] = list(earlier)
     if made_by_program:
-        inputs |= {"raster": rasterizer_inputs(rasterizer), "background": list(background)}
-    inputs |= _further_metrics(evaluator) | _of_model(geometry, flicker)
+        inputs |= {"raster": rasterizer_inputs(rasterizer, targets.get("raster")), "background": list(background)}
+    inputs |= _further_metrics(evaluator, targets) | _of_model(geometry, flicker)
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
@@ -116,19 +120,25 @@ def evaluate_step(
             found.append(measure_flicker(rasterizer, gaussians, scene, color))
         _write_metrics(folder, evaluator, per_view, found, scene, at)
 
-    return step_of_code(EVALUATE, inputs, build, __name__, (rasterizer, *evaluator.extra.values()))
+    components = ((rasterizer, targets.get("raster")), *_named(evaluator, targets))
+    return step_of_code(EVALUATE, inputs, build, __name__, components)
 
 
 def measure_step(
-    views: Views, trained: Step, evaluator: Evaluator, geometry: bool = False, flicker: bool = False
+    views: Views,
+    trained: Step,
+    evaluator: Evaluator,
+    geometry: bool = False,
+    flicker: bool = False,
+    targets: Mapping[str, str] = MappingProxyType({}),
 ) -> Step:
-    """Measure the renders that another program left in ``trained``, as they are."""
+    """Measure the renders that another program left in ``trained``, as they are; ``targets`` as for `evaluate_step`."""
     inputs: dict[str, Any] = {
         "renders": trained.key,
         "protocol": evaluator.protocol.id,
         "unavailable": sorted(evaluator.unavailable),
     }
-    inputs |= _further_metrics(evaluator) | _of_model(geometry, flicker)
+    inputs |= _further_metrics(evaluator, targets) | _of_model(geometry, flicker)
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
@@ -143,12 +153,17 @@ def measure_step(
         unknown = nothing_known(geometry, flicker, "another program's renders are known, not its model")
         _write_metrics(folder, evaluator, per_view, [unknown], scene)
 
-    return step_of_code(EVALUATE, inputs, build, __name__, tuple(evaluator.extra.values()))
+    return step_of_code(EVALUATE, inputs, build, __name__, _named(evaluator, targets))
 
 
-def _further_metrics(evaluator: Evaluator) -> dict[str, Any]:
+def _named(evaluator: Evaluator, targets: Mapping[str, str]) -> list[tuple[Any, str | None]]:
+    """The user's own metrics, each with the import path by which the configuration names its class."""
+    return [(metric, targets.get(f"{EXTRA}.{name}")) for name, metric in evaluator.extra.items()]
+
+
+def _further_metrics(evaluator: Evaluator, targets: Mapping[str, str]) -> dict[str, Any]:
     """The user's own metrics and those of ``eval.more`` as they enter a key; nothing where there are none."""
-    own = {name: options_of("eval", metric) for name, metric in evaluator.extra.items()}
+    own = {name: options_of("eval", metric, targets.get(f"{EXTRA}.{name}")) for name, metric in evaluator.extra.items()}
     further: dict[str, Any] = {"extra": own, "more": list(evaluator.more)}
     return {name: value for name, value in further.items() if value}
 

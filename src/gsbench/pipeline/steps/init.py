@@ -9,8 +9,8 @@ from pathlib import Path
 from gsbench.init.base import MODEL_FOLDER, Initializer
 from gsbench.logs import Progress, progress
 from gsbench.pipeline.components import options_of
-from gsbench.pipeline.steps.capture import split_of
 from gsbench.pipeline.steps.code import step_of_code
+from gsbench.pipeline.steps.held_out import split_of
 from gsbench.runs.stages import INIT
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
@@ -19,13 +19,22 @@ from gsbench.scene.types import Capture
 from gsbench.system.resources import available_threads
 
 
-def init_step(store: Store, capture: Capture, initializer: Initializer, reference: Step | None = None) -> Step:
-    """The initialiser's step; ``reference`` is the one whose cameras stand in for those that did not come."""
+def init_step(
+    store: Store,
+    capture: Capture,
+    initializer: Initializer,
+    reference: Step | None = None,
+    target: str | None = None,
+) -> Step:
+    """The initialiser's step; ``reference`` is the one whose cameras stand in for those that did not come.
+
+    ``target`` is the import path by which the configuration names the initialiser's class.
+    """
     inputs = {
         "capture": capture.fingerprint,
         "test": split_of(capture),
         "exact_poses": capture.exact_poses,
-        "options": options_of("init", initializer),
+        "options": options_of("init", initializer, target),
         "content": initializer.content(),
         "reference": None if reference is None else reference.key,
         "pycolmap": version("pycolmap"),
@@ -37,7 +46,7 @@ def init_step(store: Store, capture: Capture, initializer: Initializer, referenc
             cameras = None if reference is None else store.path(reference) / MODEL_FOLDER
             initializer.run(capture, folder, report, reference=cameras)
 
-    return step_of_code(INIT, inputs, build, __name__, (initializer,), in_processes=True)
+    return step_of_code(INIT, inputs, build, __name__, ((initializer, target),), in_processes=True)
 
 
 def check_readable(capture: Capture, report: Progress) -> None:

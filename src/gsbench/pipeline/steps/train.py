@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -41,15 +42,20 @@ def train_step(
     seed: int,
     device: torch.device,
     snapshot_at: Sequence[int] = (),
+    targets: Mapping[str, str] = MappingProxyType({}),
 ) -> Step:
-    """Train on the training views, from the cloud of the initialiser; keep the model at ``snapshot_at`` too."""
+    """Train on the training views, from the cloud of the initialiser; keep the model at ``snapshot_at`` too.
+
+    ``targets`` has the import paths by which the configuration names classes, by their places in it.
+    """
+    by_densifier, by_rasterizer = targets.get("densify"), targets.get("raster")
     values = as_before("train", dataclasses.asdict(options))
     of_model = {key: value for key, value in values.items() if key not in WITHOUT_EFFECT_ON_MODEL}
     inputs: dict[str, Any] = {
         "scene": views.inputs,
         "init": views.init.key,
-        "densify": options_of("densify", densifier),
-        "raster": rasterizer_inputs(rasterizer),
+        "densify": options_of("densify", densifier, by_densifier),
+        "raster": rasterizer_inputs(rasterizer, by_rasterizer),
         "train": of_model,
         "seed": seed,
     }
@@ -85,7 +91,8 @@ def train_step(
         }
         write_json(folder / TRAINING, summary)
 
-    return step_of_code(TRAIN, inputs, build, __name__, (densifier, rasterizer))
+    components = ((densifier, by_densifier), (rasterizer, by_rasterizer))
+    return step_of_code(TRAIN, inputs, build, __name__, components)
 
 
 def initial_gaussians(init: Path, device: torch.device) -> Gaussians:

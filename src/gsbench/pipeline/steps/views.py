@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.logs import progress
-from gsbench.pipeline.steps.capture import split_of
+from gsbench.pipeline.steps.held_out import split_of
+from gsbench.runs.code import edited, files_of
+from gsbench.runs.inputs import PYCOLMAP, version_of
 from gsbench.runs.layout import VIEWS
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
@@ -47,4 +49,15 @@ class Views:
                 resample=self.options.resample,
                 principal_point=self.options.principal_point,
                 progress=report,
+                made_by=makers_of_views(),
             )
+
+
+@cache
+def makers_of_views() -> dict[str, str | None]:
+    """What makes pixels of photographs, each with its version: gsbench's files that are not as released, and packages.
+
+    Pillow reads and shrinks images, pycolmap undistorts them.
+    """
+    code = edited(files_of([(load_scene.__module__, None)]))
+    return {**code, **{package: version_of(package) for package in (PYCOLMAP, "pillow")}}

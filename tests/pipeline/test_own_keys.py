@@ -1,0 +1,129 @@
+"""Keys of trials with classes of the user's: whatever makes them compute something else, moves them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gsbench.config.compose import compose_one
+from gsbench.pipeline.parts import Parts
+from gsbench.pipeline.steps.views import makers_of_views
+from gsbench.pipeline.wiring import TrialSteps
+from gsbench.runs.code import ON_RESULTS, files_of
+from gsbench.runs.hashing import config_hash
+from gsbench.runs.source import gsbench_imports
+from gsbench.runs.store import Store
+from gsbench.system.own_modules import allowed_modules
+from tests.pipeline.test_keys import WORDS, BareSource
+
+MODULES = ("mine", "variant")
+METRIC = (
+    "class M:\n    direction = 1\n    value = {}\n    def measure(self, image, truth):\n        return self.value\n"
+)
+FROM_A_FUNCTION = "def metric_of(x):\n{}    return M\nM = metric_of({{}})\n".format(
+    "".join(f"    {line}\n" for line in METRIC.format("x").splitlines())
+)
+WITHIN = "class Outer:\n{}M = Outer.M\n".format("".join(f"    {line}\n" for line in METRIC.splitlines()))
+WRAPPED = f"import functools\ndef same(cls):\n    return type(cls.__name__, (cls,), {{{{}}}})\n@same\n{METRIC}"
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The folder in which somebody types."""
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    _forget()
+    for name in MODULES:
+        allowed_modules().pop(name, None)
+
+
+def _forget() -> None:
+    """As in another process."""
+    for name in MODULES:
+        sys.modules.pop(name, None)
+
+
+def keys_of(home: Path, *words: str) -> dict[str, str]:
+    """The keys of a trial as a new process would find them, by stage, and the hash of its configuration."""
+    _forget()
+    values = compose_one([*WORDS, f"allow_targets=[{','.join(MODULES)}]", *words]).values
+    steps = list(TrialSteps(Parts(values), Store(home / "store"), BareSource).steps())
+    return {"config": config_hash(values)} | {step.stage.name: step.key for step in steps}
+
+
+def moved(one: dict[str, str], other: dict[str, str]) -> set[str]:
+    return {name for name in one if one[name] != other[name]}
+
+
+@pytest.mark.parametrize(
+    "text", [METRIC, FROM_A_FUNCTION, WITHIN, WRAPPED], ids=["plain", "made by a function", "in a class", "wrapped"]
+)
+def test_an_edited_metric_is_computed_anew_however_its_class_is_made(home: Path, text: str) -> None:
+    words = ["+eval.extra.m._target_=mine.M"]
+    found = []
+    for value in ("1.0", "2.0", "1.0"):
+        (home / "mine.py").write_text(text.format(value))
+        found.append(keys_of(home, *words))
+    assert moved(found[0], found[1]) == {"config", "evaluate"}
+    assert found[0] == found[2]
+
+
+def test_what_passes_a_class_on_counts_as_well(home: Path) -> None:
+    (home / "mine.py").write_text(METRIC.format("1.0"))
+    found = []
+    for value in ("3.0", "4.0"):
+        (home / "variant.py").write_text(f"from mine import M\nM.value = {value}\n")
+        found.append(keys_of(home, "+eval.extra.m._target_=variant.M"))
+    assert moved(*found) == {"config", "evaluate"}
+    found = []
+    for value in ("3.0", "4.0"):  # one of gsbench's own classes
+        (home / "variant.py").write_text(f"from gsbench.densify import Volumetric\nVolumetric.extra = {value}\n")
+        found.append(keys_of(home, "densify._target_=variant.Volumetric"))
+    from gsbench.densify import Volumetric
+
+    del Volumetric.extra
+    assert moved(*found) == {"config", "train", "evaluate"}
+
+
+def test_options_of_ones_own_class_have_an_effect_whatever_they_are_called(home: Path) -> None:
+    text = (
+        "from dataclasses import dataclass\nfrom gsbench.densify import Volumetric\n"
+        "@dataclass(kw_only=True)\nclass Mine(Volumetric):\n    weights: float = 1.0\n    threads: int = 1\n"
+    )
+    (home / "mine.py").write_text(text)
+    own = ["densify._target_=mine.Mine", "+densify.weights=1.0"]
+    for change in ("densify.weights=9.0", "+densify.threads=2"):
+        assert moved(keys_of(home, *own), keys_of(home, *own, change)) == {"config", "train", "evaluate"}
+    (home / "mine.py").write_text(
+        f"from dataclasses import dataclass\n@dataclass\n{METRIC.format(1)}    weights: int = 1\n"
+    )
+    words = ["+eval.extra.m._target_=mine.M", "+eval.extra.m.weights=1"]
+    assert moved(keys_of(home, *words), keys_of(home, *words, "eval.extra.m.weights=3")) == {"config", "evaluate"}
+
+
+def test_a_part_that_no_trial_has_counts_where_ones_own_class_asks_for_it(home: Path) -> None:
+    for text in (
+        "from gsbench.analysis.statistics import holm",
+        "import gsbench.analysis\ndef f():\n    return gsbench.analysis.statistics.holm",
+        "from gsbench import analysis as a\nf = lambda: a.statistics.holm",
+    ):
+        (home / "mine.py").write_text(f"{text}\n{METRIC.format(1)}")
+        _forget()
+        compose_one([*WORDS, "allow_targets=[mine]"])
+        asked = gsbench_imports("mine.M")
+        assert "analysis/statistics.py" in files_of([], asked), text
+    assert not any(file.startswith(tuple(ON_RESULTS)) for file in files_of([("gsbench.pipeline.steps.train", None)]))
+
+
+def test_the_cache_of_prepared_photographs_knows_the_code_that_prepared_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    reached = files_of([("gsbench.scene.load", None)])
+    assert {"scene/images.py", "scene/prepare.py", "scene/masks.py", "scene/colmap.py"} <= reached.keys()
+    monkeypatch.setattr("gsbench.pipeline.steps.views.edited", lambda files: dict.fromkeys(files, "edited"))
+    makers_of_views.cache_clear()
+    found = makers_of_views()
+    makers_of_views.cache_clear()
+    assert found["scene/images.py"] == "edited"
+    assert {"pycolmap", "pillow"} <= found.keys()
