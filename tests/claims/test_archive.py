@@ -165,14 +165,10 @@ def flip_a_bit(file: Path) -> None:
         (resigned("results.jsonl", b'"folder":"courtyard/', b'"folder":"../../../tmp/'), "no folder of a trial"),
         (resigned("results.jsonl", b'"folder":"courtyard/', b'"folder":"room/'), "foreign"),
         (resigned("results.jsonl", b'"status":"complete"', b'"status":"well"'), "unfinished"),
-        (
-            resigned(
-                "results.jsonl",
-                b"{",
-                b"[",
-            ),
-            "not that of an archive",
-        ),
+        (resigned("results.jsonl", b"{", b"["), "not that of an archive"),
+        (resigned("results.jsonl", b"{", b"[" * 200_000), "not that of an archive"),
+        (resigned("results.jsonl", b"-seed1", b"-seed0"), "stands twice"),
+        (edit("archive.json", b"{", b"[" * 200_000), "not JSON"),
         (edit("archive.json", b'"experiment": "exp"', b'"experiment": "../up"'), "no name of an experiment"),
     ],
 )

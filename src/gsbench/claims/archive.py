@@ -120,7 +120,7 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
         _unpack(home, trials, contents)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
-    except (KeyError, TypeError, ValueError, AttributeError, csv.Error) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError, csv.Error) as error:
         raise InputError(f"{file}: its content is not that of an archive ({error!r}): export it again") from None
     experiment = read_experiment(home)
     if not experiment.trials or experiment.warnings:
@@ -146,12 +146,12 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
         raise InputError("no such file") from None
     except IsADirectoryError:
         raise InputError("it is a folder: give an archive, or a folder of nerfbaselines' result files") from None
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"its {MANIFEST} is not JSON ({error})") from None
     except (OSError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise InputError(f"it is no whole zip archive ({error}): fetch or export it again") from None
     except UnicodeDecodeError:
         raise InputError(f"its {MANIFEST} is not UTF-8") from None
-    except json.JSONDecodeError as error:
-        raise InputError(f"its {MANIFEST} is not JSON ({error})") from None
     for name, content in contents.items():
         if hashlib.sha256(content).hexdigest() != manifest["sha256"][name]:
             raise InputError(f"{name} was changed after the export (its sha256 is another): export it again")
@@ -172,6 +172,8 @@ def _member(archive: zipfile.ZipFile, name: str) -> bytes:
 def _unpack(home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: Mapping[str, bytes]) -> None:
     """Write the files of every trial as gsbench has them."""
     for folder, results in trials:
+        if (home / folder).exists():
+            raise InputError(f"the trial {folder} stands twice in it")
         (home / folder).mkdir(parents=True)
         (home / folder / RESULTS).write_text(json.dumps(results), encoding="utf-8")
     known = {folder for folder, _ in trials}
