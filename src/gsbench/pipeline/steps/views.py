@@ -55,7 +55,7 @@ class Views:
 
 @cache
 def makers_of_views() -> dict[str, str | None]:
-    """What makes pixels of photographs, each with its version: gsbench's files that are not as released, and packages.
+    """Versions of what makes pixels of photographs: gsbench's files that are not as released, and packages.
 
     Pillow reads and shrinks images, pycolmap undistorts them.
     """
