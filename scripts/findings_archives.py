@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import functools
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pandas as pd
 from findings_pairs import difference, facts, pair, row
 from findings_pictures import for_and_against, worst_views
+from PIL import Image
 
 from gsbench.analysis.frame import to_frame
 from gsbench.analysis.pairing import Paired
-from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.analysis.results import Experiment, TrialResult, read_experiment
 from gsbench.analysis.statistics import Comparison, compare_family
 from gsbench.claims.archive import unpack_archive, write_archive
 from gsbench.claims.file import read_claims
@@ -39,7 +40,11 @@ ARCHIVED = (
     "scale_bridge",
     "check_volumetric",
 )
-PICTURES = {"findings_matched": worst_views, "findings_volume": for_and_against}
+PICTURES: dict[str, Callable[[Experiment], Image.Image]] = {
+    "findings_matched": worst_views,
+    "findings_volume": for_and_against,
+    "findings_dimension": functools.partial(for_and_against, rule="volumetric-1"),
+}
 QUESTIONS = (INTERPOLATION, EXTRAPOLATION)
 PRIMARY = "lpips_squeeze"
 GROWTH = ("event_split_volume", "event_split_gradient", "event_cloned")

@@ -11,8 +11,8 @@ from gsbench.analysis.per_view import read_views
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.runs.declaration import EXTRAPOLATION, INTERPOLATION
 
-ARMS = ("adc", "volumetric", "volumetric_once", "longaxis")  # in this order, where they are there
-RULE, CONTROL = "volumetric", "adc"
+ARMS = ("adc", "volumetric", "volumetric-1", "volumetric_once", "volumetric_once-1", "longaxis")  # in this order
+CONTROL = "adc"
 JUDGED = "lpips_squeeze"  # less is better
 GAP = 4  # px between pictures
 
@@ -28,8 +28,8 @@ def worst_views(experiment: Experiment) -> Image.Image:
     return _joined(rows)
 
 
-def for_and_against(experiment: Experiment) -> Image.Image:
-    """Draw, of all scenes, the view at which `RULE` gains most over `CONTROL` and that at which it loses most.
+def for_and_against(experiment: Experiment, rule: str = "volumetric") -> Image.Image:
+    """Draw, of all scenes, the view at which ``rule`` gains most over `CONTROL` and that at which it loses most.
 
     One pair of rows between the cameras, one where no camera went.
     """
@@ -39,7 +39,7 @@ def for_and_against(experiment: Experiment) -> Image.Image:
         for scene in dict.fromkeys(trial.scene for trial in experiment.trials):
             own = _first_seeds(experiment, scene, question)
             views = {trial.densify: read_views(trial) for trial in own}
-            found += [(views[RULE][v][JUDGED] - views[CONTROL][v][JUDGED], v, own) for v in views[RULE]]
+            found += [(views[rule][v][JUDGED] - views[CONTROL][v][JUDGED], v, own) for v in views[rule]]
         found.sort(key=lambda entry: entry[:2])
         rows += [_pictures(own, view) for _, view, own in (found[0], found[-1])]
     return _joined(rows)
