@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from gsbench.analysis.results import TrialResult
-from gsbench.claims.page import _scope, make_page
+from gsbench.claims.page import _scope, make_page, to_html, to_markdown
 from gsbench.claims.verdict import NOT_TESTABLE, judge_claim
 from tests.claims.test_sweep import DECLARED
 from tests.claims.test_verdict import MakePairs, claim_with
@@ -46,3 +46,23 @@ def test_the_page_says_where_machines_and_clouds_of_its_trials_differ(make_pairs
     for words in ("Trials from share.zip count", "on 2 kinds of machine", "from 2 different clouds"):
         assert any(words in line for line in mixed), words
     assert not any(words in line for line in plain for words in ("count beside", "machine", "clouds"))
+
+
+def test_where_scenes_differ_in_the_initialiser_a_sheet_stands_for_each(make_pairs: MakePairs) -> None:
+    claim, file = claim_with()
+    pairs = make_pairs(scenes=("courtyard", "room", "yard"), seeds=range(2))
+    other = {
+        key: tuple(
+            replace(trial, record=replace(trial.record, init="dataset" if key[0] != "courtyard" else trial.init))
+            for trial in pair
+        )
+        for key, pair in pairs.items()
+    }
+    page = make_page(file, [judge_claim(claim, file, other, ("courtyard", "room", "yard"))], DECLARED, [DECLARED])
+    (section,) = page.sections
+    counts = [line for sheet in section.fairness for line in sheet.notes if line.startswith("Compared")]
+    assert [line.split()[1] for line in counts] == ["2", "4"]
+    assert len(section.trials) == 12
+    for text in (to_markdown(page), to_html(page)):
+        assert "dataset-volumetric against dataset-adc" in text
+        assert "sfm-volumetric against sfm-adc" in text

@@ -172,27 +172,82 @@ def test_the_verdicts_of_the_papers_claims_are_made_again(scripts: ModuleType, p
     assert {100 * (1 - verdict.design.alpha) for verdict in verdicts if verdict.design} == {99.0}
 
 
-def test_what_is_said_of_the_exponent_is_so(scripts: ModuleType, prose: str) -> None:
+def test_what_is_said_of_the_exponent_alone_is_so(scripts: ModuleType, prose: str) -> None:
     archives = scripts.archives
     c = archives.compared("findings_exponent", ("volumetric-1",), "volumetric")[BETWEEN, "volumetric-1", "psnr"]
     low, high = said(c.interval.low, 2), said(c.interval.high, 2)
     cost = said(-c.mean, 2).lstrip("+")
     assert f"That costs {cost} dB [{low}, {high}], p {c.p_family:.3f}".replace("p 0.", "p .") in prose
     assert c.family == 6
-    frame = archives.read_trials("findings_exponent")
-    counts = frame.groupby(["scene", "arm"])[["event_split_volume", "event_split_gradient", "event_cloned"]].sum()
-    share = counts.event_split_volume / counts.sum(axis=1)
+    share = archives.volume_shares(archives.read_trials("findings_exponent"))
     one, three = (share.xs(arm, level="arm") for arm in ("volumetric-1", "volumetric"))
     texts = [f"{value:.2f}".lstrip("0") for scene in ("courtyard", "flower") for value in (one[scene], three[scene])]
-    sentence = "on the courtyard {} of what it clones or splits is split by volume (with 3: {}), on flower {} ({})"
+    sentence = "takes {} of what it clones or splits on the courtyard (with 3: {}), on flower {} ({})"
     assert sentence.format(*texts) in prose
-    near = archives.paired(frame, "volumetric-1", "psnr", "adc", BETWEEN)
-    gains = dict(zip(near.scenes, (matrix.ravel() for matrix in near.differences), strict=True))
-    assert gains["flower"].min() > 1 > 0 > gains["courtyard"].max()
+
+
+def test_what_is_said_of_more_of_the_rule_is_so(scripts: ModuleType, prose: str) -> None:
+    archives = scripts.archives
+    name, arms = "findings_dimension", ("volumetric-1", "volumetric_once-1")
+    verdicts = archives.checked(name).verdicts
+    assert {(verdict.word, verdict.design.by_scene, verdict.beforehand) for verdict in verdicts} == {
+        ("undecided", True, True)
+    }
+    frame = archives.read_trials(name)
+    assert len(frame) == 192
+    assert set(frame.groupby(["scene", "arm", "question"]).size()) == {4}
+    found = {
+        (arm, question): dict(zip(pair.scenes, (matrix.ravel() for matrix in pair.differences), strict=True))
+        for arm in arms
+        for question in (BETWEEN, BEYOND)
+        for pair in [archives.paired(frame, arm, "lpips_squeeze", "adc", question)]
+    }
+    assert all(values["flower"].max() < 0 for values in found.values())
+    falls = [-found[arm, question]["flower"].mean() for arm in arms for question in (BETWEEN, BEYOND)]
+    texts = [said(value, 3).lstrip("+") for value in falls]
+    sentence = "falls by {} between the cameras and by {} where none went (volumetric_once: {} and {}), in each of four"
+    assert sentence.format(*texts) in prose
+    near = found[arms[0], BETWEEN]
+    one, three = (
+        archives.volume_shares(archives.read_trials(experiment)).xs(arm, level="arm")
+        for experiment, arm in ((name, arms[0]), ("findings_volume", "volumetric"))
+    )
+    shares = [f"{own[scene]:.2f}".lstrip("0") for scene in ("bonsai", "courtyard", "caliterra") for own in (one, three)]
+    rises = [said(near[scene].mean(), 3).lstrip("+") for scene in ("bonsai", "courtyard", "caliterra")]
+    assert (
+        "{} of what grows on bonsai (with 3: {}), {} on the courtyard ({}) and {} on caliterra ({})".format(*shares)
+        in prose
+    )
+    assert "LPIPS is higher by {}, {} and {}; on bonsai, courtyard and kitchen in each of four".format(*rises) in prose
+    assert all(near[scene].min() > 0 for scene in ("bonsai", "courtyard", "kitchen"))
+    rest = [values.mean() for scene, values in near.items() if scene != "flower"]
+    assert f"nobody declared: {_with_interval(rest)}" in prose
+    kitchen = [found[arm, BETWEEN]["kitchen"].mean() for arm in arms]
+    assert f"On kitchen only {one['kitchen']:.2f}".replace("0.", ".") in prose
+    assert "LPIPS rises by {} and {}".format(*(said(value, 3).lstrip("+") for value in kitchen)) in prose
+    texts = []
+    for experiment, (rule, once) in ((name, arms), ("findings_volume", ("volumetric", "volumetric_once"))):
+        pair = archives.paired(archives.read_trials(experiment), once, "lpips_squeeze", rule, BETWEEN)
+        texts.append(_with_interval([matrix.mean() for matrix in pair.differences]))
+    assert f"between the cameras here: {texts[0]}; with the exponent 3 it is not: {texts[1]}" in prose
+
+
+def _with_interval(values: list[float]) -> str:
+    """Write the mean of scenes with the plain t interval of 95 %."""
+    interval = stats.ttest_1samp(values, 0).confidence_interval()
+    return f"{said(float(np.mean(values)), 3)} [{said(interval.low, 3)}, {said(interval.high, 3)}]"
 
 
 @pytest.mark.parametrize(
-    "name", ["check_volumetric", "findings_exponent", "findings_matched", "findings_volume", "scale_bridge"]
+    "name",
+    [
+        "check_volumetric",
+        "findings_dimension",
+        "findings_exponent",
+        "findings_matched",
+        "findings_volume",
+        "scale_bridge",
+    ],
 )
 def test_published_archives_name_no_folder_of_a_machine(scripts: ModuleType, name: str) -> None:
     with zipfile.ZipFile(scripts.archives.archive_of(name)) as archive:

@@ -36,7 +36,7 @@ class Section:
     headline: str
     evidence: tuple[str, ...]
     scenes: tuple[tuple[str, str], ...]
-    fairness: Table | None  # None where no trial was compared
+    fairness: tuple[Table, ...]  # one for each two arms that are paired: scenes may differ in the initialiser
     trials: tuple[str, ...]
 
 
@@ -104,8 +104,7 @@ def to_markdown(page: Page) -> str:
         claim = section.verdict.claim
         parts += ["", f"## {claim.id}: {section.verdict.word}", "", f"> {claim.says}", ">", f"> {claim.where}", ""]
         parts += [section.headline + "\n"]
-        if section.fairness is not None:
-            parts.append(table_to_markdown(section.fairness))
+        parts += map(table_to_markdown, section.fairness)
         parts += [f"- {line}" for line in section.evidence]
         if section.scenes:
             parts += ["", "| scene | difference |", "|---|---|"]
@@ -120,7 +119,7 @@ def to_html(page: Page) -> str:
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(_resource("gsbench.claims", "page.html.j2"))
     shown = [
-        (section, _sheet(section.fairness), _chart(section.verdict), *_crops(section.verdict))
+        (section, tuple(map(table_to_html, section.fairness)), _chart(section.verdict), *_crops(section.verdict))
         for section in page.sections
     ]
     style = _resource("gsbench.analysis.report", "style.css")
@@ -169,17 +168,13 @@ def _plan_words(verdict: Verdict) -> str:
     return f"gsbench plan {name} --metric {verdict.claim.metric} --difference {difference:.3g}"
 
 
-def _sheet(fairness: Table | None) -> str:
-    return "" if fairness is None else table_to_html(fairness)
-
-
-def _fairness(verdict: Verdict) -> tuple[Table | None, str]:
-    """The fairness sheet of a claim's arms, and what else than the idea may have made a difference (`caveats`)."""
+def _fairness(verdict: Verdict) -> tuple[tuple[Table, ...], str]:
+    """The fairness sheets of a claim's arms, and what else than the idea may have made a difference (`caveats`)."""
     trials = with_variants(verdict.trials)
-    arms = [trial.arm for trial in trials[:2]]
-    if len(set(arms)) < 2:
-        return None, ""
-    return fairness_table(trials, *arms), caveats(trials, *arms)
+    both = dict.fromkeys((one.arm, other.arm) for one, other in _pairs(trials))
+    arms = [(one, other) for one, other in both if one != other]
+    sentences = dict.fromkeys(caveats(trials, *two) for two in arms)
+    return tuple(fairness_table(trials, *two) for two in arms), " ".join(filter(None, sentences))
 
 
 def _declared_line(declared: DeclaredPlan, plans: Sequence[DeclaredPlan]) -> str:
@@ -218,11 +213,16 @@ def _chart(verdict: Verdict) -> str:
 
 def _crops(verdict: Verdict) -> tuple[list[Crop], list[Crop]]:
     """Places where the arm is closer to the photographs, and where the baseline is."""
-    pairs = list(zip(verdict.trials[::2], verdict.trials[1::2], strict=True))
+    pairs = _pairs(verdict.trials)
     if not pairs or verdict.measure.cost:
         return [], []
     gained, lost, _ = choose_crops(pairs, CROPS)
     return gained, lost
+
+
+def _pairs(trials: Sequence[TrialResult]) -> list[tuple[TrialResult, TrialResult]]:
+    """Pairs of a verdict's trials, which stand baseline and arm in turn."""
+    return list(zip(trials[::2], trials[1::2], strict=True))
 
 
 def _number(value: float | None) -> str:
