@@ -8,18 +8,22 @@ from __future__ import annotations
 
 import functools
 import tempfile
+import zipfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from findings_pairs import difference, facts, pair, row
 from findings_pictures import for_and_against, worst_views
+from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.analysis.frame import to_frame
 from gsbench.analysis.pairing import Paired
 from gsbench.analysis.results import Experiment, TrialResult, read_experiment
-from gsbench.analysis.statistics import Comparison, compare_family
+from gsbench.analysis.statistics import MIN_SCENES, Comparison, compare_family, t_interval
 from gsbench.claims.archive import unpack_archive, write_archive
 from gsbench.claims.file import read_claims
 from gsbench.claims.recheck import Recheck, recheck
@@ -45,7 +49,7 @@ PICTURES: dict[str, Callable[[Experiment], Image.Image]] = {
     "findings_volume": for_and_against,
     "findings_dimension": functools.partial(for_and_against, rule="volumetric-1"),
 }
-QUESTIONS = (INTERPOLATION, EXTRAPOLATION)
+QUESTIONS = {INTERPOLATION: "between", EXTRAPOLATION: "sector"}  # as the page calls them
 PRIMARY = "lpips_squeeze"
 GROWTH = ("event_split_volume", "event_split_gradient", "event_cloned")
 OTHERS = {"psnr": 2, "ssim": 3, "ms_ssim": 4, "fsim": 4, "flip": 3}  # metrics that were not declared, and their digits
@@ -104,7 +108,7 @@ def gaps_table(name: str) -> list[str]:
     """An arm a row: its means over scenes at both questions, and the fall from one to the other."""
     frame = read_trials(name)
     cells = {"psnr": ("PSNR, dB", 2), PRIMARY: ("LPIPS (squeeze)", 3)}
-    titles = [f"{title}, {word}" for title, _ in cells.values() for word in ("between", "where none went", "change")]
+    titles = [f"{title}, {word}" for title, _ in cells.values() for word in (*QUESTIONS.values(), "change")]
     lines = [row(["arm", *titles]), row(["---"] + ["--:"] * len(titles))]
     for arm in _arms(frame):
         means = [arm]
@@ -116,18 +120,65 @@ def gaps_table(name: str) -> list[str]:
 
 
 def scenes_table(name: str, arms: Sequence[str], against: str) -> list[str]:
-    """A scene a row: differences in the declared metric by question and arm, the mean over seeds."""
+    """A scene a row: differences in the declared metric by question and arm, with 95 % over the seeds of this scene.
+
+    From `MIN_SCENES` scenes on their mean stands below, with 95 % over the scenes. No interval is adjusted.
+    """
     frame = read_trials(name)
     columns = [(question, arm) for question in asked(frame) for arm in arms]
-    titles = [f"{arm}, {question}" for question, arm in columns]
+    titles = [f"{arm}, {QUESTIONS[question]}" for question, arm in columns]
     lines = [row(["scene", *titles]), row(["---"] + ["--:"] * len(columns))]
-    found = {column: paired(frame, column[1], PRIMARY, against, column[0]) for column in columns}
+    found = {column: by_scene(frame, column[1], PRIMARY, against, column[0]) for column in columns}
     for scene in dict.fromkeys(frame.scene):
-        cells = [scene]
-        for column in columns:
-            by_scene = dict(zip(found[column].scenes, found[column].differences, strict=True))
-            cells.append(signed(float(by_scene[scene].mean()), ".3f") if scene in by_scene else "")
-        lines.append(row(cells))
+        lines.append(row([scene, *(_plain(found[column][scene]) for column in columns)]))
+    if len(found[columns[0]]) >= MIN_SCENES:
+        means = [np.array([own.mean() for own in found[column].values()]) for column in columns]
+        lines.append(row(["*mean*", *map(_plain, means)]))
+    return lines
+
+
+def _plain(values: NDArray[np.float64]) -> str:
+    """Write a mean with Student's interval of 95 %."""
+    interval = t_interval(values)
+    assert interval is not None
+    mean, low, high = (signed(value, ".3f") for value in (float(values.mean()), interval.low, interval.high))
+    return f"{mean} ({low} to {high})"
+
+
+def views_table(name: str) -> list[str]:
+    """A scene a row: its held-out views under both splits, how far the nearest training view is, and adc's PSNR."""
+    with zipfile.ZipFile(archive_of(name)) as archive, archive.open("per_view.csv") as file:
+        views = pd.read_csv(file)
+    labels = [trial.label.partition("/")[2] for trial in trials_of(name)]  # below the experiment
+    frame = read_trials(name).assign(trial=labels)
+    frame = frame[frame.arm == "adc"].merge(views, on="trial", suffixes=("", "_of_view"))
+    titles = [
+        f"{title}, {word}" for title in ("views", "angle", "distance", "adc's PSNR") for word in QUESTIONS.values()
+    ]
+    lines = [row(["scene", *titles]), row(["---"] + ["--:"] * len(titles))]
+    for scene, own in frame.groupby("scene"):
+        groups = [own[own.question == question] for question in QUESTIONS]
+        cells = [str(group.view.nunique()) for group in groups]
+        cells += [f"{group.angle_to_nearest.median():.1f}°" for group in groups]
+        cells += [f"{group.distance_to_nearest.median():.2f}" for group in groups]
+        cells += [f"{group.groupby('seed').psnr.first().mean():.2f}" for group in groups]
+        lines.append(row([str(scene), *cells]))
+    return lines
+
+
+def growth_table(name: str, arms: Sequence[str], against: str) -> list[str]:
+    """A scene a row, an arm after the other: LPIPS, how many Gaussians both arms have, and what the cap held back."""
+    frame = read_trials(name)
+    titles = [f"{arm}: {what}" for arm in arms for what in ("LPIPS", "Gaussians", "held back by the cap")]
+    lines = [row(["scene", *titles]), row(["---"] + ["--:"] * len(titles))]
+    means = frame.groupby(["scene", "arm"])[["num_gaussians", "event_blocked_by_cap"]].mean()
+    found = {arm: by_scene(frame, arm, PRIMARY, against, INTERPOLATION) for arm in arms}
+    for scene in dict.fromkeys(frame.scene):
+        cells = []
+        for arm in arms:
+            pairs = zip(means.loc[scene, against], means.loc[scene, arm], strict=True)
+            cells += [_plain(found[arm][scene]), *(f"{before:,.0f} → {after:,.0f}" for before, after in pairs)]
+        lines.append(row([scene, *cells]))
     return lines
 
 
@@ -155,8 +206,28 @@ def volume_shares(frame: pd.DataFrame) -> pd.Series:
 
 def gains_between(frame: pd.DataFrame, arm: str, metric: str, against: str) -> pd.Series:
     """Return by scene the difference of two arms between the cameras, the mean over seeds."""
-    found = paired(frame, arm, metric, against, INTERPOLATION)
-    return pd.Series({scene: float(own.mean()) for scene, own in zip(found.scenes, found.differences, strict=True)})
+    return pd.Series({s: float(own.mean()) for s, own in by_scene(frame, arm, metric, against, INTERPOLATION).items()})
+
+
+def by_scene(frame: pd.DataFrame, arm: str, metric: str, against: str, question: str) -> dict[str, NDArray[np.float64]]:
+    """Return ``arm`` minus ``against`` at a question by scene, a value for each seed."""
+    found = paired(frame, arm, metric, against, question)
+    return {scene: own.ravel() for scene, own in zip(found.scenes, found.differences, strict=True)}
+
+
+def budgets_table(name: str) -> list[str]:
+    """An arm of a scene at a budget a row: count, quality and time, the mean over seeds and their deviation."""
+    frame = read_trials(name).assign(minutes=lambda own: own.seconds_train / 60)
+    columns = {"num_gaussians": ("Gaussians", 0), "psnr": ("PSNR, dB", 2), "ssim": ("SSIM", 3)}
+    columns |= {PRIMARY: ("LPIPS (squeeze)", 3), "minutes": ("training, min", 1)}
+    lines = [row(["scene", "budget", "arm", "seeds", *(title for title, _ in columns.values())])]
+    lines.append(row(["---"] * 3 + ["--:"] * (1 + len(columns))))
+    for (scene, cap, most, arm), own in frame.groupby(["scene", "densify.cap", "densify.max_gaussians", "arm"]):
+        cells = [
+            f"{own[key].mean():,.{digits}f} ± {own[key].std():,.{digits}f}" for key, (_, digits) in columns.items()
+        ]
+        lines.append(row([scene, f"{most:,} ({cap})", arm, str(len(own)), *cells]))
+    return lines
 
 
 def metrics_table(name: str, arms: Sequence[str], against: str) -> list[str]:
@@ -166,7 +237,7 @@ def metrics_table(name: str, arms: Sequence[str], against: str) -> list[str]:
     for question in asked(read_trials(name)):
         for arm in arms:
             cells = [difference(found[question, arm, metric], digits) for metric, digits in shown.items()]
-            lines.append(row([f"{arm} − {against}, {question}", *cells]))
+            lines.append(row([f"{arm} − {against}, {QUESTIONS[question]}", *cells]))
     return lines
 
 
@@ -176,11 +247,15 @@ def metrics_of(name: str) -> dict[str, int]:
 
 
 def compared(name: str, arms: Sequence[str], against: str) -> dict[tuple[str, str, str], Comparison]:
-    """Compare arms in `metrics_of` the experiment, by question, arm and metric: one family of tests."""
+    """Compare arms in `metrics_of` the experiment, by question, arm and metric: one family of tests.
+
+    Units are the pairs of trials, from `MIN_SCENES` scenes on the scenes.
+    """
     frame = read_trials(name)
     keys = [(question, arm, metric) for question in asked(frame) for arm in arms for metric in metrics_of(name)]
     members = [
-        (paired(frame, arm, metric, against, question), facts(metric).direction) for question, arm, metric in keys
+        (_units(paired(frame, arm, metric, against, question)), facts(metric).direction)
+        for question, arm, metric in keys
     ]
     return dict(zip(keys, compare_family(members), strict=True))
 
@@ -188,6 +263,13 @@ def compared(name: str, arms: Sequence[str], against: str) -> dict[tuple[str, st
 def paired(frame: pd.DataFrame, arm: str, metric: str, against: str, question: str) -> Paired:
     """``arm`` minus ``against`` at a question, by scene and seed."""
     return pair(frame[frame.question == question], arm, metric, against)
+
+
+def _units(found: Paired) -> Paired:
+    """The pairs, or one value for each scene where there are `MIN_SCENES` of them."""
+    if len(found.scenes) < MIN_SCENES:
+        return found
+    return replace(found, differences=tuple(own.mean(keepdims=True) for own in found.differences))
 
 
 def asked(frame: pd.DataFrame) -> list[str]:
@@ -219,5 +301,5 @@ def collect(runs: Path) -> None:
                 PICTURES[name](experiment).save(DATA / f"{name}.jpg", quality=85)
 
 
-TABLES = {"verdicts": verdicts_table, "gaps": gaps_table}
-TABLES_OF_ARMS = {"scenes": scenes_table, "metrics": metrics_table, "shares": shares_table}
+TABLES = {"verdicts": verdicts_table, "gaps": gaps_table, "views": views_table, "budgets": budgets_table}
+TABLES_OF_ARMS = {"scenes": scenes_table, "growth": growth_table, "metrics": metrics_table, "shares": shares_table}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,35 @@ def test_an_archive_is_a_study_of_its_pairs(tmp_path: Path) -> None:
     assert study.error == pytest.approx(pairs.std(ddof=1) / np.sqrt(6))
     assert study.conditions == {"protocol": "paper-1", "metric": "psnr"}
     assert study.name == "lab"
+
+
+def test_where_each_scene_has_one_initialiser_they_are_one_study(tmp_path: Path) -> None:
+    both = archive(tmp_path, "both", inits=("sfm", "dataset"))
+    assert [study.name for study in read_source(both, WANTED).studies] == ["both (dataset)", "both (sfm)"]
+    trials = load_experiment(tmp_path / "runs_both_0", "exp")
+    kept = [trial for trial in trials.trials if (trial.init == "sfm") == (trial.scene == "garden")]
+    write_archive(replace(trials, trials=tuple(kept)), tmp_path / "one.zip")
+    found = read_source(tmp_path / "one.zip", WANTED)
+    (study,) = found.studies
+    by_arm = {(trial.densify, trial.scene, trial.seed): trial.metrics["psnr"] for trial in kept}
+    pairs = np.array([by_arm["volumetric", *key[1:]] - value for key, value in by_arm.items() if key[0] == "adc"])
+    assert study.effect == pytest.approx(pairs.mean())
+    assert study.error == pytest.approx(pairs.std(ddof=1) / np.sqrt(len(pairs)))
+    assert [("sfm" in note, "dataset" in note) for note in found.notes] == [(False, True), (True, False)]
+
+
+def test_trials_of_archives_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As where one archive holds two initialisers, or two splits, under one name."""
+    files = [str(archive(tmp_path, name, seed, inits=("sfm", "random"))) for seed, name in enumerate("ab")]
+    assert run(["pool", *files, "--arm", "volumetric", "--where", "init=sfm"]) == 0
+    out = capsys.readouterr().out
+    assert "of 2 studies" in out
+    assert "| a |" in out
+    (tmp_path / "nb").mkdir()
+    command = ["pool", *files, str(tmp_path / "nb"), "--arm", "volumetric", "--where", "init=sfm"]
+    assert run(command) == 1
+    assert "hold no settings to choose by" in capsys.readouterr().err
+    assert run(["pool", *files, "--arm", "volumetric", "--where", "init=none"]) == 2
 
 
 def test_from_six_scenes_on_scenes_are_the_units() -> None:

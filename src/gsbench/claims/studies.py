@@ -14,13 +14,13 @@ import json
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.analysis.cells import with_variants
+from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.pairing import ViewCache, arm_name, pair_arms
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import MIN_SCENES
@@ -38,11 +38,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Wanted:
-    """The pooled question: names that ``arm`` and ``baseline`` go by in the sources, and our key of the metric."""
+    """The pooled question: names that ``arm`` and ``baseline`` go by in the sources, and our key of the metric.
+
+    ``where``: only trials of archives with these values of settings count.
+    """
 
     arm: tuple[str, ...]
     baseline: tuple[str, ...]
     metric: str
+    where: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -75,26 +79,35 @@ def standard_error(differences: Sequence[Array]) -> tuple[float, float]:
 
 def _read_archive(path: Path, wanted: Wanted, name: str) -> Found:
     with tempfile.TemporaryDirectory() as folder:
-        trials = with_variants(unpack_archive(path, Path(folder)).trials)
+        every = unpack_archive(path, Path(folder)).trials
+        trials = with_variants(select_trials(every, wanted.where))
         views = ViewCache()
         studies, notes = [], []
         protocols = sorted({trial.record.protocol for trial in trials})
         for protocol in protocols:
             own = [trial for trial in trials if trial.record.protocol == protocol]
-            pairs = _pairs(own, wanted, path)
-            for first, second in pairs:
-                told_apart = [protocol] * (len(protocols) > 1) + [first[0]] * (len(pairs) > 1)
+            groups = _groups(own, _pairs(own, wanted, path))
+            for pairs in groups:
+                told_apart = [protocol] * (len(protocols) > 1) + [pairs[0][0][0]] * (len(groups) > 1)
                 label = f"{name} ({', '.join(told_apart)})" if told_apart else name
-                paired = pair_arms(own, first, second, wanted.metric, views)
-                effect = standard_error([matrix.mean(axis=1) for matrix in paired.differences])
+                found = [pair_arms(own, first, second, wanted.metric, views) for first, second in pairs]
+                effect = standard_error([matrix.mean(axis=1) for paired in found for matrix in paired.differences])
                 studies.append(Study(label, *effect, _conditions(protocol, wanted.metric)))
-                count = sum(len(matrix) for matrix in paired.differences)
-                notes.append(
-                    f"{label}: {arm_name(second)} against {arm_name(first)}, {count} pairs of trials on "
-                    f"{', '.join(paired.scenes)}; {_size(own)}"
-                )
-                notes += [f"{label}: left out, {line}" for line in paired.left_out]
+                for (first, second), paired in zip(pairs, found, strict=True):
+                    count = sum(len(matrix) for matrix in paired.differences)
+                    notes.append(
+                        f"{label}: {arm_name(second)} against {arm_name(first)}, {count} pairs of trials on "
+                        f"{', '.join(paired.scenes)}; {_size(own)}"
+                    )
+                    notes += [f"{label}: left out, {line}" for line in paired.left_out]
         return Found(tuple(studies), tuple(notes), frozenset(map(_mark, trials)))
+
+
+def _groups(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> list[list[tuple[Arm, Arm]]]:
+    """What is one study: all pairs where each scene has one initialiser, else each pair by itself."""
+    scenes = [{trial.scene for trial in trials if trial.arm in pair} for pair in pairs]
+    disjoint = sum(map(len, scenes)) == len(set().union(*scenes))
+    return [list(pairs)] if disjoint else [[pair] for pair in pairs]
 
 
 def _pairs(trials: Sequence[TrialResult], wanted: Wanted, path: Path) -> list[tuple[Arm, Arm]]:
@@ -110,7 +123,8 @@ def _pairs(trials: Sequence[TrialResult], wanted: Wanted, path: Path) -> list[tu
         if len(ones) > 1 or len(others) > 1:
             several = ones if len(ones) > 1 else others
             raise InputError(
-                f"{path}: {' and '.join(arm_name(arm) for arm in several)} go by one name: give the whole name of one"
+                f"{path}: {' and '.join(arm_name(arm) for arm in several)} go by one name: choose trials with --where "
+                "KEY=VALUE, or give the whole name of one"
             )
         if ones and others:
             found.append((ones[0], others[0]))
@@ -154,6 +168,8 @@ class _Result:
 
 def _read_nerfbaselines(folder: Path, wanted: Wanted, name: str) -> Found:
     """The files anywhere below ``folder``: one study for each protocol and data set, whose pairs are its scenes."""
+    if wanted.where:
+        raise InputError(f"{folder}: result files of nerfbaselines hold no settings to choose by (--where)")
     key = NERFBASELINES_METRICS.get(wanted.metric)
     if key is None:
         raise InputError(f"{folder}: nerfbaselines measures {', '.join(NERFBASELINES_METRICS)}, not {wanted.metric}")

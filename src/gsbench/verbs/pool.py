@@ -13,7 +13,7 @@ from gsbench.analysis.report.page import write_page
 from gsbench.claims.pooling import Pooled, describe, pool, pooled_forest
 from gsbench.claims.studies import Wanted, read_source
 from gsbench.errors import InputError
-from gsbench.verbs.arguments import ArgumentParser, names, path
+from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 
 DONE, LEFT_OUT = 0, 1
 BETTER = {1: ", more is better", -1: ", less is better", 0: ""}
@@ -30,12 +30,12 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("--arm", type=names, required=True, help="a densifier; names it goes by, comma between")
     parser.add_argument("--baseline", type=names, default=(BASELINE,), help=f"what it is held against ({BASELINE})")
     parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_vgg")
+    add_where(parser)
     parser.add_argument("--protocol", help="only studies by this one, such as paper-1")
     parser.add_argument("--out", type=path, metavar="FILE", help="also write this HTML file, with the forest plot")
     options = parser.parse_args(argv)
-    pooled, notes, faults = pool_sources(
-        options.sources, Wanted(options.arm, options.baseline, options.metric), options.protocol
-    )
+    wanted = Wanted(options.arm, options.baseline, options.metric, dict(options.where))
+    pooled, notes, faults = pool_sources(options.sources, wanted, options.protocol)
     lines = [*_rows(pooled), "", *describe(pooled), *notes, *faults]
     print("\n".join(lines))
     for fault in faults:
