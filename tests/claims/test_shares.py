@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,14 +14,14 @@ from gsbench.analysis.results import load_experiment, read_experiment
 from gsbench.claims.archive import unpack_archive, write_archive
 from gsbench.claims.file import ClaimsFile, parse_claims
 from gsbench.claims.recheck import check_can_go_on, recheck, with_shares
-from gsbench.claims.shares import Shares, gather, merge, read_shares
-from gsbench.claims.sweep import Check, prepare, run_looks
-from gsbench.claims.verdict import Verdict
+from gsbench.claims.shares import Shares, check_plan_keeps, gather, merge, read_shares
+from gsbench.claims.sweep import Check, Find, prepare, run_looks
+from gsbench.claims.verdict import Pair, Verdict
 from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.launch.declare import declare_plan
-from gsbench.runs.declaration import read_declarations, read_plans
-from gsbench.runs.layout import DECLARED, RESULTS
+from gsbench.runs.declaration import DeclaredPlan, read_declarations, read_plans, standing_plan
+from gsbench.runs.layout import DECLARED, FROM_PIXELS, RESULTS
 from gsbench.verbs.check import describe
 from tests.analysis.synthetic import Plan, write_runs
 from tests.claims.test_archive import members
@@ -66,7 +68,7 @@ def test_two_machines_look_by_look_end_as_one_does(tmp_path: Path) -> None:
     for look in range(3):  # at 2, 3 and 4 seeds: each machine does its part, and is given the other's
         for name, check in homes.items():
             others = [file for other, file in archives.items() if other != name]
-            shares = read_shares(others, tmp_path / f"{name}{look}") if others else None
+            shares = read_shares(others, tmp_path / f"{name}{look}", "check_it") if others else None
             verdicts[name], count = go_on(check if shares is None else with_shares(check, shares), shares)
             trained += count
             archives[name] = archived(check, tmp_path / f"{name}{look}.zip")
@@ -87,7 +89,7 @@ def test_a_new_machine_goes_on_where_a_lost_one_stood(tmp_path: Path) -> None:
     assert (waiting.word, count) == ("undecided", 4)
     assert "waits for own" in waiting.reason
     archive = archived(first, tmp_path / "first.zip")
-    shares = read_shares([archive], tmp_path / "there")
+    shares = read_shares([archive], tmp_path / "there", "check_it")
     second = with_shares(machine(tmp_path / "second"), shares)
     assert f"{TRIALS - 4} at most" in "\n".join(describe(second))
     assert "2 pairs of trials come from archives and are not run again" in describe(second)
@@ -100,17 +102,21 @@ def test_a_scene_whose_photographs_only_others_have(tmp_path: Path) -> None:
     whole = machine(tmp_path / "first")
     alone, _ = go_on(whole)
     archive = archived(whole, tmp_path / "a.zip")
-    shares = read_shares([archive], tmp_path / "there")
+    shares = read_shares([archive], tmp_path / "there", "check_it")
     poor = with_shares(machine(tmp_path / "poor", lacks="own"), shares)
     verdicts, count = go_on(poor, shares)
     assert count == 0
     assert numbers(verdicts) == numbers(alone)
     other, shares = (
         prepare(parse_claims(content(least=0.1)), tmp_path, lambda *_: ""),
-        read_shares([archive], tmp_path / "b"),
+        read_shares([archive], tmp_path / "b", "check_it"),
     )
     with pytest.raises(InputError, match="give the file as it was then"):
         with_shares(other, shares)
+    edited = read_shares([archive], tmp_path / "c", "check_it")
+    nothing = replace(edited, sources=(("old.zip", lambda values: None),))
+    with pytest.raises(InputError, match=r"old\.zip holds no trial of this plan"):
+        with_shares(machine(tmp_path / "x"), nothing)
 
 
 def test_half_a_pair_is_no_share(tmp_path: Path) -> None:
@@ -120,7 +126,7 @@ def test_half_a_pair_is_no_share(tmp_path: Path) -> None:
     for results in first.home.glob(f"own/*-volumetric/*/{RESULTS}"):
         results.unlink()
     archive = archived_rest(first, tmp_path / "half.zip")
-    second = with_shares(machine(tmp_path / "second"), read_shares([archive], tmp_path / "there"))
+    second = with_shares(machine(tmp_path / "second"), read_shares([archive], tmp_path / "there", "check_it"))
     _, count = go_on(second)
     assert count == TRIALS // 2  # both arms of the scene
 
@@ -130,18 +136,113 @@ def archived_rest(check: Check, file: Path) -> Path:
     return file
 
 
-def test_a_pair_that_is_here_is_judged_before_one_of_others(tmp_path: Path) -> None:
+def test_a_pair_that_was_trained_here_and_there_is_refused_and_half_of_one_is_not(tmp_path: Path) -> None:
     there, here = machine(tmp_path / "there"), machine(tmp_path / "here")
     go_on(there)
+    go_on(here)
+    archive = archived(there, tmp_path / "same.zip")
+    verdicts, count = go_on(with_shares(here, read_shares([archive], tmp_path / "x", "check_it")))
+    assert count == 0
     for results in there.home.glob(f"*/*-volumetric/*/{RESULTS}"):
         values = json.loads(results.read_text())
-        values["num_gaussians"] += 1
-        results.write_text(json.dumps(values))
-    alone, _ = go_on(here)
-    both = with_shares(here, read_shares([archived_rest(there, tmp_path / "a.zip")], tmp_path / "x"))
-    verdicts, count = go_on(both)
-    assert count == 0
-    assert [trial.path for trial in verdicts[0].trials] == [trial.path for trial in alone[0].trials]
+        results.write_text(json.dumps(values | {"num_gaussians": values["num_gaussians"] + 1}))
+    other = read_shares([archived(there, tmp_path / "other.zip")], tmp_path / "y", "check_it")
+    with pytest.raises(InputError, match=r"has other results in .*other\.zip than here: it was trained twice"):
+        go_on(with_shares(here, other))
+    for results in there.home.glob(f"*/*-adc/*/{RESULTS}"):
+        results.unlink()
+    half = read_shares([archived_rest(there, tmp_path / "half.zip")], tmp_path / "z", "check_it")
+    assert numbers(go_on(with_shares(here, half))[0]) == numbers(verdicts)
+
+
+def test_after_a_kill_within_a_pair_both_archives_are_judged(tmp_path: Path) -> None:
+    """The lost machine had one trial of the pair, the next one ran both: no archive can hold all three."""
+    alone, _ = go_on(machine(tmp_path / "alone"))
+    first = machine(tmp_path / "first")
+    go_on(first)
+    for results in first.home.glob(f"own/*-volumetric/*-seed[123]/{RESULTS}"):
+        results.unlink()
+    for results in first.home.glob(f"own/*-adc/*-seed[23]/{RESULTS}"):
+        results.unlink()
+    lost = archived_rest(first, tmp_path / "lost.zip")
+    second = with_shares(machine(tmp_path / "second"), read_shares([lost], tmp_path / "a", "check_it"))
+    verdicts, count = go_on(second)
+    assert count == 6
+    edit_results(second.home, "own/*/*", seconds={"train": 12.5})  # no two trainings take as long
+    rest = archived(second, tmp_path / "rest.zip")
+    assert numbers(verdicts) == numbers(alone)
+    for k, archives in enumerate(([lost, rest], [rest, lost])):
+        found = recheck(two_scenes(), archives, tmp_path / f"b{k}")
+        assert numbers(list(found.verdicts)) == numbers(alone)
+    with pytest.raises(InputError, match="gsbench check --from takes each pair from the one that has it whole"):
+        merge([lost, rest], "check_it", tmp_path / "all.zip")
+
+
+def test_a_pair_is_never_made_of_two_machines_trials(tmp_path: Path) -> None:
+    """Neither of two archives, nor of one in which they were joined."""
+    halves = []
+    for name, kept in (("adc", "theirs"), ("volumetric", "ours")):
+        check = machine(tmp_path / name)
+        go_on(check)
+        edit_results(check.home, "own/*/*", hashes={"init": "one", "cloud": kept, "data": "one"})
+        for results in check.home.glob(f"own/*/*/{RESULTS}"):
+            if results.parents[1].name.rpartition("-")[2] != name:
+                results.unlink()
+        halves.append(archived_rest(check, tmp_path / f"{name}.zip"))
+    merge(halves, "check_it", tmp_path / "joined.zip")
+    for k, archives in enumerate((halves, [tmp_path / "joined.zip"])):
+        (verdict,) = recheck(two_scenes(), archives, tmp_path / f"x{k}").verdicts
+        assert verdict.reason == "trials are missing: the next look waits for own"
+
+
+def test_a_machine_that_lacks_a_scene_cannot_drop_it_from_the_verdict(tmp_path: Path) -> None:
+    first, poor = machine(tmp_path / "first", "courtyard"), machine(tmp_path / "poor", lacks="courtyard")
+    for check in (first, poor):
+        go_on(check)
+    archives = [archived(check, tmp_path / f"{check.runs.name}.zip") for check in (first, poor)]
+    for k, order in enumerate((archives, archives[::-1])):
+        with pytest.raises(InputError, match=r"not one plan was declared: .*first\.zip .* on courtyard, own"):
+            recheck(two_scenes(), order, tmp_path / f"a{k}")
+        with pytest.raises(InputError, match="one that lacks a scene names those that it runs"):
+            merge(order, "check_it", tmp_path / "all.zip")
+    ours = read_plans(first.home)[-1]
+    theirs = read_shares(archives[1:], tmp_path / "b", "check_it")
+    with pytest.raises(InputError, match="not one plan was declared: here"):
+        check_plan_keeps(ours, theirs.declared, "poor.zip")
+    check_plan_keeps(theirs.declared, ours, "first.zip")  # the wider one may be taken up
+    with pytest.raises(InputError, match="cannot be tested here on own, which --scene names: no data"):
+        prepare(two_scenes(), tmp_path, lambda trial, _: "no data", only=["own"])
+    shares = read_shares(archives[:1], tmp_path / "c", "check_it")
+    both, _ = go_on(with_shares(machine(tmp_path / "poor", lacks="courtyard"), shares), shares)
+    assert numbers(both)  # it declared the wider plan, and so both archives are of one now
+    archived(poor, archives[1])
+    found = recheck(two_scenes(), archives, tmp_path / "d")
+    assert found.verdicts[0].word == both[0].word
+    assert {scene for scene, _ in found.verdicts[0].by_scene} == {"courtyard", "own"}
+
+
+def test_measures_of_pictures_do_not_hang_on_the_order(tmp_path: Path) -> None:
+    check = machine(tmp_path / "one")
+    go_on(check)
+
+    def copied(name: str, value: float | None) -> tuple[str, Find]:
+        """The same trials in another place, with what an archive brings of their pictures."""
+        home = shutil.copytree(check.home, tmp_path / name / "check_it")
+        for results in home.glob(f"*/*/*/{RESULTS}") if value is not None else ():
+            (results.parent / FROM_PIXELS).write_text(json.dumps({"error_textured": value}))
+        found = {(trial.scene, trial.densify, trial.seed): trial for trial in read_experiment(home).trials}
+        keys = ("scene", "densify")
+        return name, lambda trial: found[*(trial.values[key]["name"] for key in keys), trial.values["seed"]]
+
+    def pairs(*sources: tuple[str, Find]) -> list[Pair]:
+        return list(replace(check, elsewhere=sources).pairs(check.questions[0], lambda trial: None).values())
+
+    bare, seen, other = copied("bare", None), copied("seen", 3.0), copied("other", 4.0)
+    for found in (pairs(bare, seen), pairs(seen, bare)):
+        assert {trial.path.parents[3].name for pair in found for trial in pair} == {"seen"}
+        assert len(found) == TRIALS // 2
+    with pytest.raises(InputError, match="has other results in other than seen"):
+        pairs(seen, bare, other)
 
 
 def test_a_trial_that_was_trained_twice_is_refused_and_the_same_one_counts_once(tmp_path: Path) -> None:
@@ -155,6 +256,10 @@ def test_a_trial_that_was_trained_twice_is_refused_and_the_same_one_counts_once(
     two = archived(check, tmp_path / "two.zip")
     with pytest.raises(InputError, match=r"own/.* stands in .*one\.zip and in .*two\.zip with other results"):
         gather([one, two], tmp_path / "twice")
+    with pytest.raises(
+        InputError, match=r"own/.* has other results in .*two\.zip than .*one\.zip: it was trained twice"
+    ):
+        recheck(two_scenes(), [one, two], tmp_path / "judged")
 
 
 def edit_results(home: Path, pattern: str, **changes: object) -> None:
@@ -163,8 +268,8 @@ def edit_results(home: Path, pattern: str, **changes: object) -> None:
 
 
 def go_on_from(archive: Path, here: Check, folder: Path) -> None:
-    shares = read_shares([archive], folder)
-    check_can_go_on(with_shares(here, shares), shares, lambda trial: "ours")
+    shares = read_shares([archive], folder, "check_it")
+    check_can_go_on(with_shares(here, shares), lambda trial: "ours")
 
 
 def test_a_scene_is_gone_on_with_by_the_same_code_and_photographs_alone(tmp_path: Path) -> None:
@@ -192,12 +297,30 @@ def test_shares_by_unlike_code_or_photographs_are_refused(tmp_path: Path) -> Non
         go_on(check)
         edit_results(check.home, "*/*/*", code={"files": {"raster/base.py": str(k) * 16}})
         archives.append(archived(check, tmp_path / f"{scene}.zip"))
-    with pytest.raises(InputError, match=r"trials by unlike code, gsbench.s raster/base\.py: 00000000 \(courtyard"):
-        read_shares(archives, tmp_path / "x")
+    with pytest.raises(InputError, match=r"made by unlike code, gsbench.s raster/base\.py: 00000000 \(courtyard"):
+        recheck(two_scenes(), archives, tmp_path / "x")
+    edit_results(tmp_path / "own" / "check_it", "*/*/*", code={})
     edit_results(tmp_path / "own" / "check_it", "*/*/*-seed1", hashes={"data": "other"})
     write_archive(read_experiment(tmp_path / "own" / "check_it"), tmp_path / "mixed.zip")
+    edit_results(tmp_path / "courtyard" / "check_it", "*/*/*", code={})
+    write_archive(read_experiment(tmp_path / "courtyard" / "check_it"), archives[0])
     with pytest.raises(InputError, match="own: seeds were trained on unlike photographs"):
-        read_shares([tmp_path / "mixed.zip"], tmp_path / "y")
+        recheck(two_scenes(), [archives[0], tmp_path / "mixed.zip"], tmp_path / "y")
+
+
+def test_days_by_unlike_code_are_refused_before_they_are_trained(tmp_path: Path) -> None:
+    """One machine, one folder: a scene today, another one after gsbench was edited, or a stage has another version."""
+    first = machine(tmp_path / "runs", "courtyard")
+    go_on(first)
+    second = machine(tmp_path / "runs", "own")
+    check_can_go_on(second, lambda trial: None)
+    for code in ({"files": {"raster/base.py": "0123456789abcdef"}}, {"stages": {"train": 999}}):
+        edit_results(first.home, "courtyard/*/*", code=code)
+        with pytest.raises(InputError, match=r"courtyard/.* was made by other code \((raster/base\.py|stage train)\)"):
+            check_can_go_on(second, lambda trial: None)
+        archive = archived(first, tmp_path / "a.zip")
+        with pytest.raises(InputError, match="was made by other code"):
+            go_on_from(archive, machine(tmp_path / "other", "own"), tmp_path / str(len(code)) / next(iter(code)))
 
 
 def test_the_earliest_of_two_times_of_a_plan_stands(tmp_path: Path) -> None:
@@ -211,6 +334,33 @@ def test_the_earliest_of_two_times_of_a_plan_stands(tmp_path: Path) -> None:
         times += [plan.time for plan in read_plans(check.home)]
     (plan,) = read_plans(gather(archives, tmp_path / "x").folder)
     assert plan.time == min(times) < max(times)
+
+
+@pytest.mark.parametrize(
+    ("lines", "stands"),
+    [
+        (["a1"], "a1"),
+        (["a1", "a2"], "a1"),
+        (["a1", "b2", "a3"], "a3"),
+        (["b1", "a2", "a3"], "a2"),
+        (["a1", "b2"], "b2"),
+    ],
+)
+def test_a_plan_stands_since_the_last_other_one(lines: list[str], stands: str) -> None:
+    plans = [DeclaredPlan(int(line[1]), line[0], {}) for line in lines]
+    assert standing_plan(plans) == DeclaredPlan(int(stands[1]), stands[0], {})
+
+
+def test_a_plan_that_was_left_and_taken_up_again_is_as_old_as_that(tmp_path: Path) -> None:
+    check = machine(tmp_path / "one")
+    go_on(check)
+    line = json.loads((check.home / DECLARED).read_text())
+    days = [line | {"time": f"2026-01-0{day}T00:00:00Z", "hash": name} for day, name in enumerate("aba", 1)]
+    (check.home / DECLARED).write_text("".join(json.dumps(day) + "\n" for day in days))
+    archive = archived(check, tmp_path / "a.zip")
+    (one, other, again) = read_plans(gather([archive], tmp_path / "x").folder)
+    assert [plan.hash for plan in (one, other, again)] == list("aba")
+    assert read_shares([archive], tmp_path / "y", "check_it").declared == again
 
 
 def test_declared_trials_of_a_sweep_add_up(tmp_path: Path) -> None:
@@ -239,7 +389,9 @@ def test_archives_of_other_experiments_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is of the experiment other, not of one"):
         gather(archives, tmp_path / "x")
     with pytest.raises(InputError, match="no plan of claims was declared in it"):
-        read_shares(archives[:1], tmp_path / "y")
+        read_shares(archives[:1], tmp_path / "y", "one")
+    with pytest.raises(InputError, match="is of the experiment one, not of check_it"):
+        read_shares(archives[:1], tmp_path / "z", "check_it")
     with pytest.raises(InputError, match=r"has no scene cortyard; did you mean courtyard\?"):
         machine(tmp_path, "cortyard")
 
@@ -278,3 +430,18 @@ def test_the_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyte
         assert run(["check", str(claims), *words]) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1
     assert run(["export", "exp:a:b:0", "--out", "a.ply", "--with", str(out)]) == 2
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "nothing"))
+    repeated = [word for file in archives.values() for word in ("--with", file)]
+    assert run(["export", "--results", "check_it", *repeated, "--out", str(out)]) == 0
+    assert len(unpack_archive(out, tmp_path / "un_repeated").trials) == 8
+    (tmp_path / "nothing" / "check_it" / "own").mkdir(parents=True)  # where nothing was trained
+    assert run(["export", "--results", "check_it", *repeated, "--out", str(out)]) == 0
+    assert "has no whole trial here" in capsys.readouterr().err
+    for name in ("check_it/", "own/check_it", "/tmp/check_it", "", "x\0y"):
+        assert run(["export", "--results", name, *repeated, "--out", str(out)]) == 2
+        assert "is no name of an experiment" in capsys.readouterr().err
+    both = [word for file in archives.values() for word in ("--from", file)]
+    assert run(["check", str(claims), *both]) == 0
+    assert "2 scenes, 2 seeds" in capsys.readouterr().out
+    assert run(["check", str(claims), "allow_targets=[mine]", *both]) == 0
+    assert run(["check", str(claims), "nonsense=1", *both]) == 2

@@ -49,6 +49,7 @@ MOST_BYTES = 1 << 28  # of a file when unpacked; more than any experiment has
 FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # of the files within: the earliest that zip knows
 PRIVATE = ("runs",)  # settings that say where somebody's files lie, and nothing else
 SEED_KEY = "seed"
+NAMED = ("scene", "init", "densify")  # groups of settings whose names a record repeats
 
 
 def write_archive(experiment: Experiment, out: Path) -> list[str]:
@@ -71,7 +72,7 @@ def write_archive(experiment: Experiment, out: Path) -> list[str]:
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
     declared = experiment.folder / DECLARED
     contents = {
-        TRIALS: _json_lines({"folder": _folder(trial), "results": _results(trial)} for trial in kept),
+        TRIALS: _json_lines({"folder": _folder(trial), "results": published_record(trial)} for trial in kept),
         CONFIGURATIONS: _json_lines(
             {"configuration": json.loads(text), "trials": trials} for text, trials in configurations.items()
         ),
@@ -126,7 +127,23 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
     if not experiment.trials or experiment.warnings:
         reason = experiment.warnings[0] if experiment.warnings else "it has no trial"
         raise InputError(f"{file}: {reason}")
+    for trial in experiment.trials:
+        try:
+            read_views(trial)
+            _check_own(trial, read_configuration(trial))
+        except InputError as error:
+            raise InputError(f"{file}: {trial.label}: {error}") from None
     return experiment
+
+
+def _check_own(trial: TrialResult, values: Mapping[str, Any]) -> None:
+    """Raise InputError where a configuration is not that of the trial that it stands at."""
+    found = {SEED_KEY: values.get(SEED_KEY)}
+    found |= {group: values[group].get("name") for group in NAMED if isinstance(values.get(group), dict)}
+    recorded = {SEED_KEY: trial.seed, "scene": trial.scene, "init": trial.init, "densify": trial.densify}
+    for key, value in found.items():
+        if value != recorded[key]:
+            raise InputError(f"its configuration says {key} {value}, its results {recorded[key]}: export it again")
 
 
 def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
@@ -232,23 +249,23 @@ def read_configuration(trial: TrialResult) -> dict[str, Any]:
 def _configuration(trial: TrialResult) -> str:
     """The trial's configuration as JSON, without what says where files lie; raises InputError where it is damaged."""
     values = read_configuration(trial)
-    return json.dumps(_without_paths({key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}))
+    return json.dumps(without_paths({key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}))
 
 
-def _results(trial: TrialResult) -> dict[str, Any]:
+def published_record(trial: TrialResult) -> dict[str, Any]:
     """The record of the trial without what says where files lie, in its reasons too."""
     record = trial.record.to_json()
     reasons = {metric: without_places(reason) for metric, reason in record["unavailable"].items()}
-    results: dict[str, Any] = _without_paths(record | {"unavailable": reasons})
+    results: dict[str, Any] = without_paths(record | {"unavailable": reasons})
     return results
 
 
-def _without_paths(value: Any) -> Any:
+def without_paths(value: Any) -> Any:
     """Plain values, of whose absolute paths the last names are kept."""
     if isinstance(value, Mapping):
-        return {key: _without_paths(entry) for key, entry in value.items()}
+        return {key: without_paths(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_paths(entry) for entry in value]
+        return [without_paths(entry) for entry in value]
     if isinstance(value, str) and (value.startswith(("/", "~")) or PurePath(value).is_absolute()):
         return PurePath(value).name
     return value

@@ -6,14 +6,21 @@ which scenes could be tested.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from gsbench.claims.file import ClaimsFile
-from gsbench.claims.shares import Shares, check_as_here, read_shares
-from gsbench.claims.sweep import Check, Question, prepare
+from gsbench.claims.shares import (
+    FindTrial,
+    Shares,
+    check_alike,
+    check_code,
+    check_photographs,
+    read_shares,
+    tested,
+)
+from gsbench.claims.sweep import Check, Find, Question, prepare
 from gsbench.claims.verdict import Verdict
 from gsbench.config.compose import Composed
 from gsbench.errors import InputError
@@ -31,20 +38,27 @@ class Recheck:
     plans: tuple[DeclaredPlan, ...]
 
 
-def recheck(file: ClaimsFile, archives: Sequence[Path], folder: Path) -> Recheck:
+def recheck(file: ClaimsFile, archives: Sequence[Path], folder: Path, permissions: Sequence[str] = ()) -> Recheck:
     """Judge the claims of ``file`` by the trials in ``archives`` alone, unpacked into the empty folder ``folder``.
 
-    Raises InputError as `read_shares` and `with_shares` do.
+    ``permissions`` are those of `prepare`. Raises InputError as `read_shares`, `with_shares` and `judged` do.
     """
-    shares = read_shares(archives, folder)
-    check = with_shares(prepare(file, folder, lambda trial, metric: ""), shares)
-    return Recheck(tuple(check.verdicts(shares.declared)), shares.declared, shares.plans)
+    shares = read_shares(archives, folder, file.name)
+    check = with_shares(prepare(file, folder, lambda trial, metric: "", permissions), shares)
+    return Recheck(judged(check.verdicts(shares.declared)), shares.declared, shares.plans)
+
+
+def judged(verdicts: Sequence[Verdict]) -> tuple[Verdict, ...]:
+    """The verdicts, whose trials are all alike. Raises InputError where code or photographs are not."""
+    check_alike(list({trial.path: trial for verdict in verdicts for trial in verdict.trials}.values()))
+    return tuple(verdicts)
 
 
 def with_shares(check: Check, shares: Shares) -> Check:
     """The check as it was planned where the shares were made: their pairs of trials count as if they were here.
 
-    A scene that cannot be run here is left to the shares. Raises InputError where the plan is not that of the file.
+    A scene that cannot be run here is left to the shares. Raises InputError where the plan is not that of the file, and
+    where they hold no trial of it.
     """
     declared = shares.declared
     questions = [_as_planned(one, check.file.scenes_of(one.claim), declared) for one in check.questions]
@@ -54,27 +68,48 @@ def with_shares(check: Check, shares: Shares) -> Check:
             f"the archived trials were run under plan {declared.hash[:12]} ({declared.when}), and the file of claims "
             f"is of plan {planned.plan_hash[:12]}: give the file as it was then"
         )
-    return replace(planned, elsewhere=lambda trial: shares.find(trial.values))
+    sources = tuple((name, _by_values(find)) for name, find in shares.sources)
+    for name, find in sources:
+        if not any(find(trial) is not None for _, _, trial in planned.planned()):
+            raise InputError(
+                f"{name} holds no trial of this plan: its settings are of another version of gsbench; check out the "
+                "commit that made it"
+            )
+    return replace(planned, elsewhere=sources)
 
 
-def check_can_go_on(check: Check, shares: Shares, fingerprint: Fingerprint) -> None:
-    """Raise InputError where a scene of which the shares hold a part would be gone on with otherwise than it began.
+def _by_values(find: FindTrial) -> Find:
+    return lambda trial: find(trial.values)
 
-    That is by other code, or with other photographs: ``fingerprint`` gives that of a trial's photographs here.
+
+def check_can_go_on(check: Check, fingerprint: Fingerprint) -> None:
+    """Raise InputError where a check would be gone on with otherwise than it began.
+
+    That is by other code than that of shares, and of scenes that are not run here now; or, of a scene of which shares
+    hold a part, with other photographs: ``fingerprint`` gives that of a trial's photographs here.
     """
-    for trial in check.trials(check.questions, check.looks[-1]):
-        for seed in range(check.looks[-1]):
-            if (theirs := shares.find(trial.values | {"seed": seed})) is not None:
-                check_as_here(theirs, trial.values, fingerprint(trial))
+    to_run = check.trials(check.questions, check.looks[-1])
+    if not to_run:
+        return
+    scenes = {trial.values["scene"]["name"] for trial in to_run}
+    here = check.find_here()
+    for claim, scene, trial in check.planned():
+        found = [theirs for _, find in check.elsewhere if (theirs := find(trial)) is not None]
+        if trial.values["scene"]["name"] in scenes and (claim, scene) in check.run_here:
+            for theirs in found:
+                check_photographs(theirs, fingerprint(trial))
+        elif (ours := here(trial)) is not None:
+            found.append(ours)
+        for one in found:
+            check_code(one, trial.values)
 
 
 def _as_planned(question: Question, every: Sequence[str], declared: DeclaredPlan) -> Question:
     """The question on those of ``every`` scene that could be tested where the plan was declared, with the reasons
     given there.
     """
-    tested = declared.plan.get("tested")
-    kept: Mapping[str, Any] = tested if isinstance(tested, dict) else {}
-    there = tuple(scene for scene in every if scene in kept.get(question.claim.id, ()))
+    kept = tested(declared)
+    there = tuple(scene for scene in every if (question.claim.id, scene) in kept)
     others = [f"{scene}: was not tested" for scene in every if scene not in there]
     reasons = declared.missing.get(question.claim.id, others) if others else ()
     return replace(question, scenes=there, missing=tuple(reasons))

@@ -7,15 +7,18 @@ it stopped and ends with the same verdicts.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from gsbench.analysis.origins import cloud_of
 from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.claims.file import Claim, ClaimsFile
+from gsbench.claims.measures import is_measurable, same_in_pictures
 from gsbench.claims.sequential import plan_looks
+from gsbench.claims.shares import same_results
 from gsbench.claims.verdict import Pair, PairKey, Verdict, judge_claim
 from gsbench.config.compose import Composed, compose_one
 from gsbench.config.sweep_jobs import with_seed
@@ -24,6 +27,7 @@ from gsbench.records import read_if_sound
 from gsbench.runs.declaration import DeclaredPlan
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import FAILED
+from gsbench.runs.stages import INIT
 from gsbench.runs.trial_files import Failure, TrialPaths, label_of
 from gsbench.words import closest, counted, some_of, without_places
 
@@ -32,6 +36,7 @@ log = logging.getLogger(__name__)
 T = TypeVar("T", bound=Composed)
 Lacking = Callable[[Composed, str], str]  # (trial, metric) -> why it cannot be had here, or ""
 Find = Callable[[Composed], TrialResult | None]  # the trial with these settings and seed, where it is done
+HERE = "here"  # name of the runs folder among the sources of trials
 
 
 @dataclass(frozen=True)
@@ -56,8 +61,8 @@ class Question:
 class Check:
     """A file of claims in a runs folder: its questions, and the first trial of each scene and arm.
 
-    ``run_here`` are the claims' scenes whose trials are run here, as (claim, scene); ``elsewhere`` finds the trials of
-    others' shares (`gsbench.claims.shares`), of which the pairs that are whole are not run again.
+    ``run_here`` are the claims' scenes whose trials are run here, as (claim, scene); ``elsewhere`` are others' shares
+    (`gsbench.claims.shares`) by name, each finding its trials; pairs that one of them holds whole are not run again.
     """
 
     file: ClaimsFile
@@ -65,7 +70,7 @@ class Check:
     questions: tuple[Question, ...]
     first: dict[tuple[str, str, str], Composed]  # by claim, scene, arm
     run_here: frozenset[tuple[str, str]]
-    elsewhere: Find = lambda trial: None
+    elsewhere: tuple[tuple[str, Find], ...] = ()
 
     @property
     def home(self) -> Path:
@@ -108,17 +113,20 @@ class Check:
             for question in questions:
                 for scene in question.scenes if question.testable else ():
                     both = self._both(question, scene, seed)
-                    if (question.claim.id, scene) in self.run_here and not all(map(self.elsewhere, both)):
+                    if (question.claim.id, scene) in self.run_here and not self._shared(both):
                         for trial in both:
                             found.setdefault(TrialPaths.of(trial.values).folder, trial)
         return list(found.values())
 
     def verdicts(self, declared: DeclaredPlan) -> list[Verdict]:
-        """The verdicts from the trials that are done, in the runs folder or elsewhere."""
-        find = self._in_runs()
+        """The verdicts from the trials that are done, in the runs folder or elsewhere.
+
+        Raises InputError for a pair that two sources hold with unlike results.
+        """
+        find = self.find_here()
         found = []
         for question in self.questions:
-            pairs = self._pairs(question, (find, self.elsewhere))
+            pairs = self.pairs(question, find)
             verdict = judge_claim(question.claim, self.file, pairs, question.scenes, self.sharing, declared.time)
             if not question.testable:
                 verdict = replace(verdict, reason=question.why_not)
@@ -132,11 +140,23 @@ class Check:
     def shared_pairs(self) -> int:
         """The number of pairs of trials that others' shares hold whole."""
         return sum(
-            all(map(self.elsewhere, self._both(question, scene, seed)))
+            self._shared(self._both(question, scene, seed))
             for question in self.questions
             for scene in (question.scenes if question.testable else ())
             for seed in range(self.looks[-1])
         )
+
+    def planned(self) -> Iterator[tuple[str, str, Composed]]:
+        """(claim, scene, trial) for all that the plan may come to need, here or elsewhere."""
+        for question in self.questions:
+            for scene in question.scenes if question.testable else ():
+                for seed in range(self.looks[-1]):
+                    for trial in self._both(question, scene, seed):
+                        yield question.claim.id, scene, trial
+
+    def _shared(self, both: Sequence[Composed]) -> bool:
+        """Return whether one share has both trials of a pair."""
+        return any(all(map(find, both)) for _, find in self.elsewhere)
 
     def _failed(self, question: Question, find: Find) -> list[str]:
         """The trials of a question that failed, each with the reason; of several with one reason the first."""
@@ -148,25 +168,31 @@ class Check:
                 found.setdefault(failure.reason, label_of(folder))
         return [f"{label}: {reason}" for reason, label in found.items()]
 
-    def _in_runs(self) -> Find:
+    def find_here(self) -> Find:
+        """Find trials in the runs folder, as it is now."""
         trials = read_experiment(self.home).trials if self.home.is_dir() else ()
         by_folder = {trial.path: trial for trial in trials}
         return lambda trial: by_folder.get(TrialPaths.of(trial.values).folder)
 
-    def _pairs(self, question: Question, sources: Sequence[Find]) -> dict[PairKey, Pair]:
-        """The pairs by scene and seed, each from the first source that has both of its trials.
+    def pairs(self, question: Question, here: Find) -> dict[PairKey, Pair]:
+        """The pairs by scene and seed, each from one source, the first that can still measure in their pictures.
 
-        Two machines' clouds of one capture differ, so that a trial of one is no partner for that of another.
+        ``here`` finds the trials of the runs folder, which come first.
+        Two machines' clouds of one capture differ, so that a trial of one is no partner for that of another. Raises
+        InputError for a pair that two sources hold with unlike results.
         """
+        sources = ((HERE, here), *self.elsewhere)
         found: dict[PairKey, Pair] = {}
         for scene in question.scenes if question.testable else ():
             for seed in range(self.looks[-1]):
                 one, other = self._both(question, scene, seed)
-                for find in sources:
+                places: dict[str, Pair] = {}
+                for name, find in sources:
                     baseline, arm = find(one), find(other)
-                    if baseline is not None and arm is not None:
-                        found[scene, seed] = baseline, arm
-                        break
+                    if baseline is not None and arm is not None and _of_one_cloud(baseline, arm):
+                        places[name] = baseline, arm
+                if places:
+                    found[scene, seed] = _one_of(places)
         return found
 
     def _both(self, question: Question, scene: str, seed: int) -> tuple[Composed, Composed]:
@@ -184,7 +210,8 @@ def prepare(
     ``permissions`` are words such as ``allow_targets=[mine]`` that were typed: a file of claims can give none. Trials
     of ``only`` these scenes, where some are named, are run here, and nobody asks whether the others could be.
 
-    Raises InputError, naming claim, scene and arm, for settings that do not compose, and for an unknown scene.
+    Raises InputError, naming claim, scene and arm, for settings that do not compose, for an unknown scene, and for one
+    of ``only`` that cannot be run here: the plan would be another one than that of the other machines.
     """
     for scene in only:
         if scene not in file.scenes:
@@ -206,6 +233,11 @@ def prepare(
                 first[claim.id, scene, arm] = known[words]
                 if scene in (only or (scene,)):
                     reason = reason or lacking(known[words], claim.metric)
+                if reason and only:
+                    raise InputError(
+                        f"claim {claim.id} cannot be tested here on {scene}, which --scene names: {reason}; mend that, "
+                        "or give the claim the reason on all machines (not_testable)"
+                    )
             if reason:
                 missing.setdefault(reason, []).append(scene)
                 continue
@@ -263,6 +295,29 @@ def run_looks(
             if question in left and not reached and not _is_final(verdict):
                 waiting.add(question.claim.id)
     return verdicts
+
+
+def _of_one_cloud(one: TrialResult, other: TrialResult) -> bool:
+    """Return whether arms with one initialiser began with one cloud, as two machines' trials may not have."""
+    keys, clouds = ({read(trial) for trial in (one, other)} for read in (_init_key, cloud_of))
+    return len(keys) > 1 or len(clouds) == 1 or None in keys | clouds
+
+
+def _init_key(trial: TrialResult) -> str | None:
+    return trial.record.hashes.get(INIT.name)
+
+
+def _one_of(places: Mapping[str, Pair]) -> Pair:
+    """The pair that several sources hold. Raises InputError where they hold unlike results."""
+    (first, pair), *others = places.items()
+    for name, other in others:
+        for one, two in zip(pair, other, strict=True):
+            if not (same_results(one, two) and same_in_pictures(one, two)):
+                raise InputError(
+                    f"{one.label} has other results in {name} than {first}: it was trained twice, and nobody is to "
+                    "choose the better; leave one of the two out"
+                )
+    return next((both for both in places.values() if all(map(is_measurable, both))), pair)
 
 
 def _is_final(verdict: Verdict) -> bool:

@@ -129,6 +129,14 @@ def read_plans(folder: Path) -> list[DeclaredPlan]:
     return sorted((plan for plan in found if plan is not None), key=lambda plan: plan.time)
 
 
+def standing_plan(plans: Sequence[DeclaredPlan]) -> DeclaredPlan:
+    """The latest of ``plans``, which are in the order of time and of one kind, with the time from which on it stood."""
+    first = len(plans) - 1
+    while first > 0 and plans[first - 1].hash == plans[-1].hash:
+        first -= 1
+    return plans[first]
+
+
 def united(one: Planned, other: Planned) -> Planned:
     """The trials of both."""
     return {key: tuple(sorted({*one.get(key, ()), *other.get(key, ())})) for key in {**one, **other}}
@@ -144,20 +152,22 @@ def record_text(metrics: Iterable[Declaration], plans: Iterable[DeclaredPlan]) -
 def merged_record(folders: Iterable[Path]) -> str:
     """The content of one ``declared.jsonl`` in the place of those in ``folders``, shares of one experiment.
 
-    A plan stands with the earliest of its times. Trials that a later declaration of a metric brought are added to
-    those of before, as they would be in one folder.
+    A plan that was declared on several machines, with none between, stands with the earliest of its times. Trials that
+    a later declaration of a metric brought are added to those of before, as they would be in one folder.
     """
     folders = list(folders)
-    plans: dict[str, DeclaredPlan] = {}
+    plans: list[DeclaredPlan] = []
     for plan in sorted((plan for folder in folders for plan in read_plans(folder)), key=lambda plan: plan.time):
-        plans.setdefault(plan.hash, plan)
+        before_it = [one for one in plans if one.kind == plan.kind]
+        if not before_it or before_it[-1].hash != plan.hash:
+            plans.append(plan)
     metrics: list[Declaration] = []
     declared = [one for folder in folders for one in read_declarations(folder)]
     for one in sorted(declared, key=lambda declaration: declaration.time):
         before: Planned | None = metrics[-1].trials if metrics else {}
         trials = None if before is None or one.trials is None else united(before, one.trials)
         metrics.append(replace(one, trials=trials))
-    return record_text(metrics, plans.values())
+    return record_text(metrics, plans)
 
 
 def unix_time(text: object) -> int | None:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from gsbench.claims.file import ClaimsFile, direction_is_odd, read_claims
 from gsbench.claims.here import Here
-from gsbench.claims.recheck import check_can_go_on, recheck, with_shares
-from gsbench.claims.shares import Shares, read_shares
+from gsbench.claims.recheck import check_can_go_on, judged, recheck, with_shares
+from gsbench.claims.shares import Shares, check_plan_keeps, read_shares
 from gsbench.claims.sweep import Check, prepare, run_looks
 from gsbench.config.compose import Composed
 from gsbench.config.trust import PERMISSIONS
@@ -19,7 +19,7 @@ from gsbench.launch.declare import declare_plan
 from gsbench.launch.plan import describe_plan
 from gsbench.launch.preflight import missing_folders
 from gsbench.launch.trial import Trial
-from gsbench.runs.declaration import read_plans
+from gsbench.runs.declaration import DeclaredPlan, read_plans, standing_plan
 from gsbench.runs.finished import Done, find_finished
 from gsbench.verbs.arguments import ArgumentParser, names, path
 from gsbench.words import counted
@@ -47,6 +47,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         dest="archives",
         type=path,
         nargs="+",
+        action="extend",
         metavar="ARCHIVE",
         help="make the verdicts again from what gsbench export --results wrote; runs nothing, needs no photographs",
     )
@@ -55,6 +56,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         dest="shares",
         type=path,
         nargs="+",
+        action="extend",
         default=[],
         metavar="ARCHIVE",
         help="archives of the same check, from other machines or of an earlier day: what they hold is not run again",
@@ -63,7 +65,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
         "--scene",
         dest="scenes",
         type=names,
-        default=(),
+        action="extend",
+        default=[],
         metavar="NAME,…",
         help="run the trials of these scenes alone, where other machines run the others",
     )
@@ -77,14 +80,16 @@ def main(argv: Sequence[str], runs: Path) -> int:
     if options.archives is not None:
         if options.dry_run or options.shares or options.scenes or options.all_seeds:
             raise InputError("check --from runs nothing, so no other option goes with it")
-        return _recheck(file, options.archives)
+        return _recheck(file, options.archives, _permissions(options.permissions))
     here = Here(missing_folders, download=not options.dry_run)
     check = prepare(file, runs, here, _permissions(options.permissions), options.scenes)
     with tempfile.TemporaryDirectory() as folder:
-        shares = read_shares(options.shares, Path(folder)) if options.shares else None
+        shares = read_shares(options.shares, Path(folder), file.name) if options.shares else None
         if shares is not None:
             check = with_shares(check, shares)
-            check_can_go_on(check, shares, here.fingerprint)
+            for plan in _own_plans(check)[-1:]:
+                check_plan_keeps(plan, shares.declared, "the archives")
+        check_can_go_on(check, here.fingerprint)
         if options.dry_run:
             print("\n".join(describe(check)))
         else:
@@ -92,12 +97,17 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
-def _recheck(file: ClaimsFile, archives: Sequence[Path]) -> int:
+def _own_plans(check: Check) -> list[DeclaredPlan]:
+    """The plans of claims that were declared in the runs folder, the oldest first."""
+    return [plan for plan in read_plans(check.home) if not plan.kind]
+
+
+def _recheck(file: ClaimsFile, archives: Sequence[Path], permissions: Sequence[str]) -> int:
     """Print the page in Markdown that the archives' trials make; 0 whatever the verdicts are."""
     from gsbench.claims.page import make_page, to_markdown
 
     with tempfile.TemporaryDirectory() as folder:
-        found = recheck(file, archives, Path(folder))
+        found = recheck(file, archives, Path(folder), permissions)
         print(to_markdown(make_page(file, found.verdicts, found.declared, found.plans)), end="")
     return 0
 
@@ -144,8 +154,10 @@ def _run(check: Check, archives: Sequence[Path], shares: Shares | None, all_seed
 
     make_runs_folder(check.runs)
     declared = declare_plan(check.home, check.plan, check.plan_hash, check.missing)
-    if shares is not None:  # the plan is as old as its oldest record
-        declared = min(declared, shares.declared, key=lambda plan: plan.time)
+    plans = _own_plans(check)
+    if shares is not None:  # the plan is as old as its oldest record, where no other one stood since
+        plans = sorted((*plans, *shares.plans), key=lambda plan: plan.time)
+        declared = standing_plan(plans)
 
     def is_done(trial: Composed) -> bool:
         return isinstance(find_finished(trial.values), Done)
@@ -155,8 +167,8 @@ def _run(check: Check, archives: Sequence[Path], shares: Shares | None, all_seed
 
     if all_seeds and (left := [one for one in check.trials(check.questions, check.looks[-1]) if not is_done(one)]):
         run(left)  # what an earlier look sees does not change by them
-    verdicts = run_looks(check, declared, run, is_done)
-    page = make_page(check.file, verdicts, declared, read_plans(check.home), [file.name for file in archives])
+    verdicts = judged(run_looks(check, declared, run, is_done))
+    page = make_page(check.file, verdicts, declared, plans, [file.name for file in archives])
     for name, text in ((MARKDOWN, to_markdown(page)), (HTML, to_html(page))):
         write_text(check.home / name, text)
     for verdict in verdicts:

@@ -9,12 +9,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from gsbench.analysis.results import load_experiment
+from gsbench.analysis.results import load_experiment, read_experiment
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.layout import STORE
 from gsbench.runs.stages import INIT
+from gsbench.settings import is_folder_name
 from gsbench.verbs.arguments import ArgumentParser, path
 from gsbench.view import ADDRESS
 
@@ -57,6 +58,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         dest="shares",
         type=path,
         nargs="+",
+        action="extend",
         default=[],
         metavar="ARCHIVE",
         help="with --results: also what these archives of the same experiment hold, from other machines or days",
@@ -95,11 +97,13 @@ def main(argv: Sequence[str], runs: Path) -> int:
 def export_results(name: str, runs: Path, out: Path | None, shares: Sequence[Path] = ()) -> int:
     """Write the archive of an experiment's results and of its ``shares``, and say what is not in it; 0.
 
-    Of an experiment that is not in ``runs`` the shares alone make the archive.
+    Of an experiment without a whole trial in ``runs`` the shares alone make the archive.
     """
     from gsbench.claims.archive import write_archive
     from gsbench.claims.shares import merge
 
+    if not is_folder_name(name):
+        raise InputError(f"{name!r} is no name of an experiment: give that of its folder below {runs}")
     file = Path(f"{name}.zip") if out is None else out
     if file.is_dir():
         file = file / f"{name}.zip"
@@ -108,11 +112,13 @@ def export_results(name: str, runs: Path, out: Path | None, shares: Sequence[Pat
         own = Path(folder) / f"{name}.zip" if shares else file
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            if not shares or name in list_experiments(runs):
+            if not shares or (name in list_experiments(runs) and read_experiment(runs / name).trials):
                 left_out = write_archive(load_experiment(runs, name), own)
                 shares = [own, *shares] if shares else ()
+            elif shares:
+                log.warning("%s has no whole trial here: the archive is of what the others hold", name)
             if shares:
-                merge(shares, name, file)
+                left_out += merge(shares, name, file)
         except OSError as error:
             raise InputError(f"cannot write {file} ({error.strerror or error}); give another --out") from error
     for line in left_out:
