@@ -215,21 +215,6 @@ def by_scene(frame: pd.DataFrame, arm: str, metric: str, against: str, question:
     return {scene: own.ravel() for scene, own in zip(found.scenes, found.differences, strict=True)}
 
 
-def budgets_table(name: str) -> list[str]:
-    """An arm of a scene at a budget a row: count, quality and time, the mean over seeds and their deviation."""
-    frame = read_trials(name).assign(minutes=lambda own: own.seconds_train / 60)
-    columns = {"num_gaussians": ("Gaussians", 0), "psnr": ("PSNR, dB", 2), "ssim": ("SSIM", 3)}
-    columns |= {PRIMARY: ("LPIPS (squeeze)", 3), "minutes": ("training, min", 1)}
-    lines = [row(["scene", "budget", "arm", "seeds", *(title for title, _ in columns.values())])]
-    lines.append(row(["---"] * 3 + ["--:"] * (1 + len(columns))))
-    for (scene, cap, most, arm), own in frame.groupby(["scene", "densify.cap", "densify.max_gaussians", "arm"]):
-        cells = [
-            f"{own[key].mean():,.{digits}f} ± {own[key].std():,.{digits}f}" for key, (_, digits) in columns.items()
-        ]
-        lines.append(row([scene, f"{most:,} ({cap})", arm, str(len(own)), *cells]))
-    return lines
-
-
 def metrics_table(name: str, arms: Sequence[str], against: str) -> list[str]:
     """Differences with p of one family, in all metrics where none was declared; bold where p is below 5 %."""
     found, shown = compared(name, arms, against), metrics_of(name)
@@ -301,5 +286,5 @@ def collect(runs: Path) -> None:
                 PICTURES[name](experiment).save(DATA / f"{name}.jpg", quality=85)
 
 
-TABLES = {"verdicts": verdicts_table, "gaps": gaps_table, "views": views_table, "budgets": budgets_table}
+TABLES = {"verdicts": verdicts_table, "gaps": gaps_table, "views": views_table}
 TABLES_OF_ARMS = {"scenes": scenes_table, "growth": growth_table, "metrics": metrics_table, "shares": shares_table}

@@ -221,6 +221,27 @@ def test_a_machine_that_lacks_a_scene_cannot_drop_it_from_the_verdict(tmp_path: 
     assert {scene for scene, _ in found.verdicts[0].by_scene} == {"courtyard", "own"}
 
 
+def test_a_trial_that_was_evaluated_again_is_one_training(tmp_path: Path) -> None:
+    """As when weights of LPIPS had come since the first export: what has more metrics is taken."""
+    check = machine(tmp_path / "one")
+    go_on(check)
+    before = archived(check, tmp_path / "before.zip")
+    for results in check.home.glob(f"*/*/*/{RESULTS}"):
+        values = json.loads(results.read_text())
+        more = {"metrics": values["metrics"] | {"flip": 0.25}, "measured": "2026-11-23T00:00:00Z"}
+        results.write_text(json.dumps(values | more))
+    rows = [file.read_text().splitlines() for file in check.home.glob("*/*/*/per_view.csv")]
+    for file, lines in zip(check.home.glob("*/*/*/per_view.csv"), rows, strict=True):
+        file.write_text("\n".join([f"{lines[0]},flip", *(f"{line},0.25" for line in lines[1:])]) + "\n")
+    after = archived(check, tmp_path / "after.zip")
+    for k, order in enumerate(([before, after], [after, before])):
+        merge(order, "check_it", tmp_path / f"{k}.zip")
+        for trial in unpack_archive(tmp_path / f"{k}.zip", tmp_path / f"u{k}").trials:
+            assert trial.metrics["flip"] == 0.25
+        (verdict,) = recheck(two_scenes(), order, tmp_path / f"r{k}").verdicts
+        assert all("flip" in trial.metrics for trial in verdict.trials)
+
+
 def test_measures_of_pictures_do_not_hang_on_the_order(tmp_path: Path) -> None:
     check = machine(tmp_path / "one")
     go_on(check)

@@ -72,7 +72,7 @@ def write_archive(experiment: Experiment, out: Path) -> list[str]:
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
     declared = experiment.folder / DECLARED
     contents = {
-        TRIALS: _json_lines({"folder": _folder(trial), "results": published_record(trial)} for trial in kept),
+        TRIALS: _json_lines({"folder": _folder(trial), "results": _results(trial)} for trial in kept),
         CONFIGURATIONS: _json_lines(
             {"configuration": json.loads(text), "trials": trials} for text, trials in configurations.items()
         ),
@@ -252,7 +252,7 @@ def _configuration(trial: TrialResult) -> str:
     return json.dumps(without_paths({key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}))
 
 
-def published_record(trial: TrialResult) -> dict[str, Any]:
+def _results(trial: TrialResult) -> dict[str, Any]:
     """The record of the trial without what says where files lie, in its reasons too."""
     record = trial.record.to_json()
     reasons = {metric: without_places(reason) for metric, reason in record["unavailable"].items()}

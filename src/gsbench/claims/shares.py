@@ -15,7 +15,7 @@ from typing import Any
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import describe_code, differing_code
 from gsbench.analysis.results import Experiment, TrialResult, read_experiment
-from gsbench.claims.archive import published_record, read_configuration, unpack_archive, without_paths, write_archive
+from gsbench.claims.archive import read_configuration, unpack_archive, without_paths, write_archive
 from gsbench.errors import InputError
 from gsbench.files import write_text
 from gsbench.runs.code import changed_files
@@ -32,7 +32,7 @@ ONE_PLAN = (
     "give all machines one file; one that lacks a scene names those that it runs (--scene), checks and exports again"
 )
 PATHS = ("scene", "init")  # groups whose ``path`` says where somebody's files lie
-OWN_PLACE = "config"  # hash of a trial's record that knows where photographs lie
+PLACE = 3  # folders of a trial within its experiment
 
 FindTrial = Callable[[Mapping[str, Any]], TrialResult | None]  # by the whole configuration of a trial
 
@@ -82,16 +82,18 @@ def gather(archives: Sequence[Path], folder: Path, name: str = "") -> Experiment
     for file, share in zip(archives, shares, strict=True):
         for key, trial in _by_identity(file, share).items():
             other, where = known.setdefault(key, (trial, file))
-            if other is trial:
-                place = home / trial.path.relative_to(share.folder)
-                place.parent.mkdir(parents=True, exist_ok=True)
-                trial.path.rename(place)
-            elif not same_results(trial, other):
+            if len(trial.metrics) > len(other.metrics):
+                known[key] = trial, file
+            if not same_training(trial, other):
                 raise InputError(
                     f"{trial.label} stands in {where} and in {file} with other results: it was trained twice, as after "
                     "a kill between the two trials of a pair. No one archive can hold both: hand both over, and "
                     "gsbench check --from takes each pair from the one that has it whole"
                 )
+    for trial, _ in known.values():
+        place = home.joinpath(*trial.path.parts[-PLACE:])
+        place.parent.mkdir(parents=True, exist_ok=True)
+        trial.path.rename(place)
     if declared := merged_record(share.folder for share in shares):
         write_text(home / DECLARED, declared)
     return read_experiment(home)
@@ -184,12 +186,14 @@ def check_photographs(trial: TrialResult, data: str | None) -> None:
         raise InputError(f"{trial.scene}: photographs or their model are not those of {trial.label}: {ONE_DATA}")
 
 
-def same_results(one: TrialResult, other: TrialResult) -> bool:
-    """Return whether both are one and the same training, wherever its photographs lay."""
-    records = [published_record(trial) for trial in (one, other)]
-    for record in records:
-        record["hashes"] = {name: value for name, value in record["hashes"].items() if name != OWN_PLACE}
-    return records[0] == records[1]
+def same_training(one: TrialResult, other: TrialResult) -> bool:
+    """Return whether both are of one training, as its seconds tell, and agree in each metric that both have.
+
+    One that was evaluated again, when weights had come, has more metrics; its photographs may lie elsewhere by now.
+    """
+    told = [(trial.record.seconds.get("train"), trial.record.num_gaussians) for trial in (one, other)]
+    shared = one.metrics.keys() & other.metrics.keys()
+    return told[0] == told[1] and all(one.metrics[name] == other.metrics[name] for name in shared)
 
 
 def merge(archives: Sequence[Path], name: str, out: Path) -> list[str]:

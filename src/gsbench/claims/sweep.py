@@ -18,7 +18,7 @@ from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.claims.file import Claim, ClaimsFile
 from gsbench.claims.measures import is_measurable, same_in_pictures
 from gsbench.claims.sequential import plan_looks
-from gsbench.claims.shares import same_results
+from gsbench.claims.shares import same_training
 from gsbench.claims.verdict import Pair, PairKey, Verdict, judge_claim
 from gsbench.config.compose import Composed, compose_one
 from gsbench.config.sweep_jobs import with_seed
@@ -175,9 +175,9 @@ class Check:
         return lambda trial: by_folder.get(TrialPaths.of(trial.values).folder)
 
     def pairs(self, question: Question, here: Find) -> dict[PairKey, Pair]:
-        """The pairs by scene and seed, each from one source, the first that can still measure in their pictures.
+        """The pairs by scene and seed, each from the source with most metrics, then with pictures or their measures.
 
-        ``here`` finds the trials of the runs folder, which come first.
+        ``here`` finds the trials of the runs folder, which of equals is taken.
         Two machines' clouds of one capture differ, so that a trial of one is no partner for that of another. Raises
         InputError for a pair that two sources hold with unlike results.
         """
@@ -312,12 +312,12 @@ def _one_of(places: Mapping[str, Pair]) -> Pair:
     (first, pair), *others = places.items()
     for name, other in others:
         for one, two in zip(pair, other, strict=True):
-            if not (same_results(one, two) and same_in_pictures(one, two)):
+            if not (same_training(one, two) and same_in_pictures(one, two)):
                 raise InputError(
                     f"{one.label} has other results in {name} than {first}: it was trained twice, and nobody is to "
                     "choose the better; leave one of the two out"
                 )
-    return next((both for both in places.values() if all(map(is_measurable, both))), pair)
+    return max(places.values(), key=lambda both: (sum(len(one.metrics) for one in both), all(map(is_measurable, both))))
 
 
 def _is_final(verdict: Verdict) -> bool:
