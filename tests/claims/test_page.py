@@ -62,7 +62,9 @@ def test_where_scenes_differ_in_the_initialiser_a_sheet_stands_for_each(make_pai
     (section,) = page.sections
     counts = [line for sheet in section.fairness for line in sheet.notes if line.startswith("Compared")]
     assert [line.split()[1] for line in counts] == ["2", "4"]
-    assert len(section.trials) == 12
+    assert [seeds for _, seeds in section.trials] == ["seeds 0, 1"] * 6
+    folders = [folder for folder, _ in section.trials]
+    assert {trial.label.rpartition("-seed")[0] for pair in other.values() for trial in pair} == {*folders}
     for text in (to_markdown(page), to_html(page)):
         assert "dataset-volumetric against dataset-adc" in text
         assert "sfm-volumetric against sfm-adc" in text

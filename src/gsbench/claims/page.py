@@ -9,7 +9,7 @@ from importlib.resources import files
 from jinja2 import Environment, StrictUndefined
 
 from gsbench.analysis.caveats import caveats
-from gsbench.analysis.cells import with_variants
+from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.origins import cloud_notes, machine_notes
 from gsbench.analysis.report.charts import ForestRow, forest_plot
@@ -21,6 +21,7 @@ from gsbench.analysis.tables import Table
 from gsbench.claims.file import ClaimsFile
 from gsbench.claims.verdict import NOT_TESTABLE, Verdict, Word
 from gsbench.runs.declaration import DeclaredPlan
+from gsbench.runs.layout import SEED
 from gsbench.words import counted
 
 LARGE = 1000.0  # numbers from here on are counts or seconds, and shown whole
@@ -37,7 +38,7 @@ class Section:
     evidence: tuple[str, ...]
     scenes: tuple[tuple[str, str], ...]
     fairness: tuple[Table, ...]  # one for each two arms that are paired: scenes may differ in the initialiser
-    trials: tuple[str, ...]
+    trials: tuple[tuple[str, str], ...]  # folder without the seed, and its seeds
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def to_markdown(page: Page) -> str:
             parts += ["", "| scene | difference |", "|---|---|"]
             parts += [f"| {scene} | {value} |" for scene, value in section.scenes]
         if section.trials:
-            parts += ["", "Trials: " + ", ".join(f"`{label}`" for label in section.trials)]
+            parts += ["", "Trials:", "", *(f"- `{folder}` {seeds}" for folder, seeds in section.trials)]
     return "\n".join(parts).rstrip() + "\n"
 
 
@@ -156,7 +157,7 @@ def _section(verdict: Verdict) -> Section:
         tuple(evidence),
         tuple((scene, verdict.shown(value)) for scene, value in verdict.by_scene),
         fairness,
-        tuple(trial.label for trial in verdict.trials),
+        _folders(verdict.trials),
     )
 
 
@@ -223,6 +224,15 @@ def _crops(verdict: Verdict) -> tuple[list[Crop], list[Crop]]:
 def _pairs(trials: Sequence[TrialResult]) -> list[tuple[TrialResult, TrialResult]]:
     """Pairs of a verdict's trials, which stand baseline and arm in turn."""
     return list(zip(trials[::2], trials[1::2], strict=True))
+
+
+def _folders(trials: Sequence[TrialResult]) -> tuple[tuple[str, str], ...]:
+    """``("exp/garden/sfm-adc/1a2b3c4d", "seeds 0, 1, 2")`` for each arm of a scene."""
+    groups = by_key(trials, lambda trial: trial.label.rpartition(SEED)[0])
+    return tuple(
+        (folder, f"{'seeds' if len(own) > 1 else 'seed'} {', '.join(str(trial.seed) for trial in own)}")
+        for folder, own in groups.items()
+    )
 
 
 def _number(value: float | None) -> str:
