@@ -18,7 +18,7 @@ GAP = 4  # px between pictures
 
 
 def worst_views(experiment: Experiment) -> Image.Image:
-    """Draw, a scene a row, the view of the least mean PSNR where no camera went."""
+    """Draw, a scene a row, the view of the sector with the least mean PSNR."""
     rows = []
     for scene in dict.fromkeys(trial.scene for trial in experiment.trials):
         own = _first_seeds(experiment, scene, EXTRAPOLATION)
@@ -31,7 +31,7 @@ def worst_views(experiment: Experiment) -> Image.Image:
 def for_and_against(experiment: Experiment, rule: str = "volumetric") -> Image.Image:
     """Draw, of all scenes, the view at which ``rule`` gains most over `CONTROL` and that at which it loses most.
 
-    One pair of rows between the cameras, one where no camera went.
+    One pair of rows between the cameras, one of the sector.
     """
     rows = []
     for question in (INTERPOLATION, EXTRAPOLATION):

@@ -156,11 +156,10 @@ def test_what_is_said_of_scenes_is_so(scripts: ModuleType, prose: str) -> None:
     assert len(frame) == 72
     assert set(frame.groupby(["scene", "arm", "question"]).size()) == {3}
     by_scene = {
-        (arm, metric, question): dict(zip(pair.scenes, (matrix.ravel() for matrix in pair.differences), strict=True))
+        (arm, metric, question): archives.by_scene(frame, arm, metric, "adc", question)
         for arm in ARMS
         for metric in ("psnr", "lpips_squeeze")
         for question in (BETWEEN, BEYOND)
-        for pair in [archives.paired(frame, arm, metric, "adc", question)]
     }
     near, far = (by_scene["volumetric", "psnr", question]["flower"] for question in (BETWEEN, BEYOND))
     ranges = [f"{values.min():.1f} to {values.max():.1f} dB" for values in (near, far)]

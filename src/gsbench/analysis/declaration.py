@@ -132,7 +132,7 @@ def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration |
     else:  # the first record may be lost but for what its trials repeat: all since the next may have been added
         again = next((one.time for one in since if one.trials is not None), math.inf)
         added = tuple(trial for trial in trials if measured(trial) >= again)
-    looks = any(plan.kind == STOPPING for plan in read_plans(folder))
+    looks = bool(read_plans(folder, STOPPING))
     return ActiveDeclaration(named, seen, added, len(trials), tuple(others), looks)
 
 

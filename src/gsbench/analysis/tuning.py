@@ -123,7 +123,7 @@ def _tuned_here(own: Sequence[TrialResult]) -> list[str]:
 
 def _when(own: Sequence[TrialResult], record: TuningRecord) -> str:
     """Say when the tuning was declared, and whether that was before these trials were measured."""
-    plans = [plan for plan in read_plans(_home(own[0])) if plan.kind == TUNED and plan.hash == record.hash]
+    plans = [plan for plan in read_plans(_home(own[0]), TUNED) if plan.hash == record.hash]
     if not plans:
         return "of which no declaration is left"
     before = sum(measured(trial) < plans[0].time for trial in own)

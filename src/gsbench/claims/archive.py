@@ -49,6 +49,7 @@ MOST_BYTES = 1 << 28  # of a file when unpacked; more than any experiment has
 FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # of the files within: the earliest that zip knows
 PRIVATE = ("runs",)  # settings that say where somebody's files lie, and nothing else
 SEED_KEY = "seed"
+NO_CONFIGURATION = f"it has no {CONFIG}"
 NAMED = ("scene", "init", "densify")  # groups of settings whose names a record repeats
 
 
@@ -130,20 +131,22 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
     for trial in experiment.trials:
         try:
             read_views(trial)
-            _check_own(trial, read_configuration(trial))
+            if not (trial.path / CONFIG).is_file():
+                raise InputError(f"{NO_CONFIGURATION}: export it again")
         except InputError as error:
             raise InputError(f"{file}: {trial.label}: {error}") from None
     return experiment
 
 
-def _check_own(trial: TrialResult, values: Mapping[str, Any]) -> None:
-    """Raise InputError where a configuration is not that of the trial that it stands at."""
-    found = {SEED_KEY: values.get(SEED_KEY)}
+def _check_own(folder: str, values: Mapping[str, Any], results: Mapping[str, Any]) -> None:
+    """Raise InputError where ``values`` are not the configuration of the trial in ``folder`` with these results."""
+    found = {SEED_KEY: values[SEED_KEY]}
     found |= {group: values[group].get("name") for group in NAMED if isinstance(values.get(group), dict)}
-    recorded = {SEED_KEY: trial.seed, "scene": trial.scene, "init": trial.init, "densify": trial.densify}
     for key, value in found.items():
-        if value != recorded[key]:
-            raise InputError(f"its configuration says {key} {value}, its results {recorded[key]}: export it again")
+        if value != results[key]:
+            raise InputError(
+                f"{folder}: its configuration says {key} {value}, its results {results[key]}: export it again"
+            )
 
 
 def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
@@ -193,12 +196,13 @@ def _unpack(home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: 
             raise InputError(f"the trial {folder} stands twice in it")
         (home / folder).mkdir(parents=True)
         (home / folder / RESULTS).write_text(json.dumps(results), encoding="utf-8")
-    known = {folder for folder, _ in trials}
+    known = dict(trials)
     for line in _lines(contents[CONFIGURATIONS]):
         for folder, seed in line["trials"]:
             if folder in known:
-                content = yaml.safe_dump(line["configuration"] | {SEED_KEY: seed}, sort_keys=False)
-                (home / folder / CONFIG).write_text(content, encoding="utf-8")
+                configuration = line["configuration"] | {SEED_KEY: seed}
+                _check_own(folder, configuration, known[folder])
+                (home / folder / CONFIG).write_text(yaml.safe_dump(configuration, sort_keys=False), encoding="utf-8")
     reader = csv.DictReader(io.StringIO(contents[PER_VIEW].decode()))
     by_trial: dict[str, list[dict[str, str]]] = {}
     for row in reader:
@@ -240,7 +244,7 @@ def read_configuration(trial: TrialResult) -> dict[str, Any]:
     try:
         values = read_yaml(trial.path / CONFIG)
     except FileNotFoundError:
-        raise InputError(f"it has no {CONFIG}") from None
+        raise InputError(NO_CONFIGURATION) from None
     if not isinstance(values, dict):
         raise InputError(f"its {CONFIG} is no mapping")
     return values

@@ -88,6 +88,8 @@ def check_can_go_on(check: Check, fingerprint: Fingerprint) -> None:
     That is by other code than that of shares, and of scenes that are not run here now; or, of a scene of which shares
     hold a part, with other photographs: ``fingerprint`` gives that of a trial's photographs here.
     """
+    if not check.elsewhere and check.is_all_here:
+        return
     to_run = check.trials(check.questions, check.looks[-1])
     if not to_run:
         return

@@ -19,7 +19,7 @@ from gsbench.claims.archive import read_configuration, unpack_archive, without_p
 from gsbench.errors import InputError
 from gsbench.files import write_text
 from gsbench.runs.code import changed_files
-from gsbench.runs.declaration import DeclaredPlan, merged_record, read_plans, standing_plan
+from gsbench.runs.declaration import CLAIMS, DeclaredPlan, merged_record, read_plans, standing_plan
 from gsbench.runs.hashing import determining, sha256_of
 from gsbench.runs.layout import DECLARED
 from gsbench.runs.source import sources_of
@@ -57,11 +57,11 @@ def read_shares(archives: Sequence[Path], folder: Path, name: str) -> Shares:
     archives were made under several plans.
     """
     shares = _unpacked(archives, folder, name)
-    plans = {str(file): _claims_plans(share) for file, share in zip(archives, shares, strict=True)}
+    plans = {str(file): read_plans(share.folder, CLAIMS) for file, share in zip(archives, shares, strict=True)}
     for file, own in plans.items():
         if not own:
             raise InputError(f"{file}: no plan of claims was declared in it: it is no archive of a gsbench check")
-    check_one_plan({file: standing_plan(own) for file, own in plans.items()})
+    check_one_plan({file: own[-1] for file, own in plans.items()})
     every = tuple(sorted((plan for own in plans.values() for plan in own), key=lambda plan: plan.time))
     sources = tuple((str(file), _finder(file, share)) for file, share in zip(archives, shares, strict=True))
     return Shares(standing_plan(every), every, sources)
@@ -76,8 +76,8 @@ def gather(archives: Sequence[Path], folder: Path, name: str = "") -> Experiment
     shares = _unpacked(archives, folder, name)
     home = folder / "together" / shares[0].name
     home.mkdir(parents=True)
-    standing = {str(f): own[-1] for f, share in zip(archives, shares, strict=True) if (own := _claims_plans(share))}
-    check_one_plan(standing)
+    plans = {str(file): read_plans(share.folder, CLAIMS) for file, share in zip(archives, shares, strict=True)}
+    check_one_plan({file: own[-1] for file, own in plans.items() if own})
     known: dict[str, tuple[TrialResult, Path]] = {}
     for file, share in zip(archives, shares, strict=True):
         for key, trial in _by_identity(file, share).items():
@@ -108,10 +108,6 @@ def _unpacked(archives: Sequence[Path], folder: Path, name: str) -> list[Experim
                 f"{file} is of the experiment {share.name}, not of {name or shares[0].name}: shares are of one"
             )
     return shares
-
-
-def _claims_plans(share: Experiment) -> tuple[DeclaredPlan, ...]:
-    return tuple(plan for plan in read_plans(share.folder) if not plan.kind)
 
 
 def _by_identity(file: Path, share: Experiment) -> dict[str, TrialResult]:

@@ -200,7 +200,7 @@ def standing_verdicts(home: Path) -> list[Verdict]:
 
     Raises InputError where the record of it is damaged.
     """
-    plans = [plan for plan in read_plans(home) if plan.kind == STOPPING]
+    plans = read_plans(home, STOPPING)
     return SweepPlan.from_record(plans[-1].plan).verdicts(home, plans[-1]) if plans else []
 
 

@@ -104,7 +104,7 @@ def _read_archive(path: Path, wanted: Wanted, name: str) -> Found:
 
 
 def _groups(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> list[list[tuple[Arm, Arm]]]:
-    """What is one study: all pairs where each scene has one initialiser, else each pair by itself."""
+    """Group pairs into studies: all are one where each scene has one initialiser, else each is its own."""
     scenes = [{trial.scene for trial in trials if trial.arm in pair} for pair in pairs]
     disjoint = sum(map(len, scenes)) == len(set().union(*scenes))
     return [list(pairs)] if disjoint else [[pair] for pair in pairs]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from gsbench.analysis.origins import cloud_of
 from gsbench.analysis.results import TrialResult, read_experiment
@@ -55,6 +55,15 @@ class Question:
     def why_not(self) -> str:
         """The reason why the question cannot be tested here at all; "" where it can."""
         return "" if self.testable else self.claim.not_testable or "; ".join(self.missing)
+
+
+class PlannedPair(NamedTuple):
+    """The trials of a claim's baseline and arm on a scene with a seed, as they are composed."""
+
+    claim: str
+    scene: str
+    seed: int
+    trials: tuple[Composed, Composed]
 
 
 @dataclass(frozen=True)
@@ -104,18 +113,21 @@ class Check:
             if question.missing
         }
 
+    @property
+    def is_all_here(self) -> bool:
+        """True where every scene of every claim is run here."""
+        asked = {(question.claim.id, scene) for question in self.questions for scene in question.scenes}
+        return asked <= self.run_here
+
     def trials(self, questions: Sequence[Question], seeds: int) -> list[Composed]:
         """The trials to be run here that the questions need for their first ``seeds`` seeds; one that several need
         stands once.
         """
         found: dict[Path, Composed] = {}
-        for seed in range(seeds):
-            for question in questions:
-                for scene in question.scenes if question.testable else ():
-                    both = self._both(question, scene, seed)
-                    if (question.claim.id, scene) in self.run_here and not self._shared(both):
-                        for trial in both:
-                            found.setdefault(TrialPaths.of(trial.values).folder, trial)
+        for pair in sorted(self._planned_pairs(questions, seeds), key=lambda pair: pair.seed):
+            if (pair.claim, pair.scene) in self.run_here and not self._is_shared(pair):
+                for trial in pair.trials:
+                    found.setdefault(TrialPaths.of(trial.values).folder, trial)
         return list(found.values())
 
     def verdicts(self, declared: DeclaredPlan) -> list[Verdict]:
@@ -139,24 +151,26 @@ class Check:
 
     def shared_pairs(self) -> int:
         """The number of pairs of trials that others' shares hold whole."""
-        return sum(
-            self._shared(self._both(question, scene, seed))
-            for question in self.questions
-            for scene in (question.scenes if question.testable else ())
-            for seed in range(self.looks[-1])
-        )
+        return sum(map(self._is_shared, self._planned_pairs(self.questions, self.looks[-1])))
 
     def planned(self) -> Iterator[tuple[str, str, Composed]]:
         """(claim, scene, trial) for all that the plan may come to need, here or elsewhere."""
-        for question in self.questions:
-            for scene in question.scenes if question.testable else ():
-                for seed in range(self.looks[-1]):
-                    for trial in self._both(question, scene, seed):
-                        yield question.claim.id, scene, trial
+        for pair in self._planned_pairs(self.questions, self.looks[-1]):
+            for trial in pair.trials:
+                yield pair.claim, pair.scene, trial
 
-    def _shared(self, both: Sequence[Composed]) -> bool:
+    def _planned_pairs(self, questions: Sequence[Question], seeds: int) -> Iterator[PlannedPair]:
+        """The pairs of trials that the ``questions`` need for their first ``seeds`` seeds, a scene after the other."""
+        for question in questions:
+            claim = question.claim
+            for scene in question.scenes if question.testable else ():
+                baseline, arm = (self.first[claim.id, scene, name] for name in (claim.baseline, claim.arm))
+                for seed in range(seeds):
+                    yield PlannedPair(claim.id, scene, seed, (with_seed(baseline, seed), with_seed(arm, seed)))
+
+    def _is_shared(self, pair: PlannedPair) -> bool:
         """Return whether one share has both trials of a pair."""
-        return any(all(map(find, both)) for _, find in self.elsewhere)
+        return any(all(map(find, pair.trials)) for _, find in self.elsewhere)
 
     def _failed(self, question: Question, find: Find) -> list[str]:
         """The trials of a question that failed, each with the reason; of several with one reason the first."""
@@ -183,23 +197,15 @@ class Check:
         """
         sources = ((HERE, here), *self.elsewhere)
         found: dict[PairKey, Pair] = {}
-        for scene in question.scenes if question.testable else ():
-            for seed in range(self.looks[-1]):
-                one, other = self._both(question, scene, seed)
-                places: dict[str, Pair] = {}
-                for name, find in sources:
-                    baseline, arm = find(one), find(other)
-                    if baseline is not None and arm is not None and _of_one_cloud(baseline, arm):
-                        places[name] = baseline, arm
-                if places:
-                    found[scene, seed] = _one_of(places)
+        for pair in self._planned_pairs([question], self.looks[-1]):
+            places: dict[str, Pair] = {}
+            for name, find in sources:
+                baseline, arm = map(find, pair.trials)
+                if baseline is not None and arm is not None and _of_one_cloud(baseline, arm):
+                    places[name] = baseline, arm
+            if places:
+                found[pair.scene, pair.seed] = _one_of(places)
         return found
-
-    def _both(self, question: Question, scene: str, seed: int) -> tuple[Composed, Composed]:
-        """The trials of the baseline and of the arm."""
-        claim = question.claim
-        baseline, arm = (with_seed(self.first[claim.id, scene, arm], seed) for arm in (claim.baseline, claim.arm))
-        return baseline, arm
 
 
 def prepare(
@@ -225,13 +231,14 @@ def prepare(
         scenes: list[str] = []
         missing: dict[str, list[str]] = {}  # scenes by reason
         for scene in () if claim.not_testable else file.scenes_of(claim):
+            is_run_here = scene in (only or (scene,))
             reason = ""
             for arm in (claim.baseline, claim.arm):
                 words = (*file.words(claim, scene, arm), f"name={file.name}", "seed=0", *permissions)
                 if words not in known:
                     known[words] = _composed(words, runs, f"claim {claim.id}, scene {scene}, arm {arm}")
                 first[claim.id, scene, arm] = known[words]
-                if scene in (only or (scene,)):
+                if is_run_here:
                     reason = reason or lacking(known[words], claim.metric)
                 if reason and only:
                     raise InputError(
@@ -242,7 +249,7 @@ def prepare(
                 missing.setdefault(reason, []).append(scene)
                 continue
             scenes.append(scene)
-            if scene in (only or (scene,)):
+            if is_run_here:
                 here.add((claim.id, scene))
         _check_different(claim, scenes, first)
         reasons = tuple(f"{some_of(names)}: {reason}" for reason, names in missing.items())

@@ -32,7 +32,8 @@ STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
 
 
 TrialKey = Annotated[str, Field(pattern=r"^[^/]*/[^/]*/[^/]*$")]
-STOPPING, TUNED = "stopping", "tuning"  # keys of plans of looks at a sweep, and of tuning, among plans of claims
+STOPPING, TUNED = "stopping", "tuning"  # keys of plans of looks at a sweep, and of tuning
+CLAIMS = ""  # plans of claims, which came first and have no key of their own
 Planned = Mapping[str, tuple[int, ...]]  # seeds by scene, arm and hash of the configuration (`trial_key`)
 
 
@@ -86,7 +87,7 @@ class DeclaredPlan:
 
     @property
     def kind(self) -> str:
-        """The kind of plan: `STOPPING`, `TUNED`, or "" for claims; one does not take the place of another kind's."""
+        """The kind of plan: `STOPPING`, `TUNED` or `CLAIMS`; one does not take the place of another kind's."""
         return kind_of_plan(self.plan)
 
     def to_record(self) -> dict[str, Any]:
@@ -96,7 +97,7 @@ class DeclaredPlan:
 
 def kind_of_plan(plan: Mapping[str, Any]) -> str:
     """The `DeclaredPlan.kind` of a plan."""
-    return next((kind for kind in (STOPPING, TUNED) if kind in plan), "")
+    return next((kind for kind in (STOPPING, TUNED) if kind in plan), CLAIMS)
 
 
 def metric_and_question(primary: str) -> tuple[str, str]:
@@ -123,10 +124,14 @@ def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) ->
     return sorted(last.values(), key=lambda declaration: declaration.time)
 
 
-def read_plans(folder: Path) -> list[DeclaredPlan]:
-    """Read every plan of claims that was declared for the experiment in ``folder``, the oldest first."""
+def read_plans(folder: Path, kind: str | None = None) -> list[DeclaredPlan]:
+    """Read the plans of a `DeclaredPlan.kind`, or of all, that were declared for the experiment in ``folder``.
+
+    The oldest first.
+    """
     found = (line.declared_plan for line in _lines(folder))
-    return sorted((plan for plan in found if plan is not None), key=lambda plan: plan.time)
+    plans = [plan for plan in found if plan is not None and kind in (None, plan.kind)]
+    return sorted(plans, key=lambda plan: plan.time)
 
 
 def standing_plan(plans: Sequence[DeclaredPlan]) -> DeclaredPlan:
@@ -157,10 +162,11 @@ def merged_record(folders: Iterable[Path]) -> str:
     """
     folders = list(folders)
     plans: list[DeclaredPlan] = []
+    latest: dict[str, str] = {}  # hash by kind
     for plan in sorted((plan for folder in folders for plan in read_plans(folder)), key=lambda plan: plan.time):
-        before_it = [one for one in plans if one.kind == plan.kind]
-        if not before_it or before_it[-1].hash != plan.hash:
+        if latest.get(plan.kind) != plan.hash:
             plans.append(plan)
+        latest[plan.kind] = plan.hash
     metrics: list[Declaration] = []
     declared = [one for folder in folders for one in read_declarations(folder)]
     for one in sorted(declared, key=lambda declaration: declaration.time):

@@ -19,7 +19,7 @@ from gsbench.launch.declare import declare_plan
 from gsbench.launch.plan import describe_plan
 from gsbench.launch.preflight import missing_folders
 from gsbench.launch.trial import Trial
-from gsbench.runs.declaration import DeclaredPlan, read_plans, standing_plan
+from gsbench.runs.declaration import CLAIMS, read_plans, standing_plan
 from gsbench.runs.finished import Done, find_finished
 from gsbench.verbs.arguments import ArgumentParser, names, path
 from gsbench.words import counted
@@ -87,19 +87,14 @@ def main(argv: Sequence[str], runs: Path) -> int:
         shares = read_shares(options.shares, Path(folder), file.name) if options.shares else None
         if shares is not None:
             check = with_shares(check, shares)
-            for plan in _own_plans(check)[-1:]:
-                check_plan_keeps(plan, shares.declared, "the archives")
+            if ours := read_plans(check.home, CLAIMS):
+                check_plan_keeps(ours[-1], shares.declared, "the archives")
         check_can_go_on(check, here.fingerprint)
         if options.dry_run:
             print("\n".join(describe(check)))
         else:
             _run(check, options.shares, shares, options.all_seeds)
     return 0
-
-
-def _own_plans(check: Check) -> list[DeclaredPlan]:
-    """The plans of claims that were declared in the runs folder, the oldest first."""
-    return [plan for plan in read_plans(check.home) if not plan.kind]
 
 
 def _recheck(file: ClaimsFile, archives: Sequence[Path], permissions: Sequence[str]) -> int:
@@ -154,7 +149,7 @@ def _run(check: Check, archives: Sequence[Path], shares: Shares | None, all_seed
 
     make_runs_folder(check.runs)
     declared = declare_plan(check.home, check.plan, check.plan_hash, check.missing)
-    plans = _own_plans(check)
+    plans = read_plans(check.home, CLAIMS)
     if shares is not None:  # the plan is as old as its oldest record, where no other one stood since
         plans = sorted((*plans, *shares.plans), key=lambda plan: plan.time)
         declared = standing_plan(plans)

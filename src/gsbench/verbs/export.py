@@ -100,31 +100,38 @@ def export_results(name: str, runs: Path, out: Path | None, shares: Sequence[Pat
     Of an experiment without a whole trial in ``runs`` the shares alone make the archive.
     """
     from gsbench.claims.archive import write_archive
-    from gsbench.claims.shares import merge
 
     if not is_folder_name(name):
         raise InputError(f"{name!r} is no name of an experiment: give that of its folder below {runs}")
     file = Path(f"{name}.zip") if out is None else out
     if file.is_dir():
         file = file / f"{name}.zip"
-    left_out: list[str] = []
-    with TemporaryDirectory() as folder:
-        own = Path(folder) / f"{name}.zip" if shares else file
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            if not shares or (name in list_experiments(runs) and read_experiment(runs / name).trials):
-                left_out = write_archive(load_experiment(runs, name), own)
-                shares = [own, *shares] if shares else ()
-            elif shares:
-                log.warning("%s has no whole trial here: the archive is of what the others hold", name)
-            if shares:
-                left_out += merge(shares, name, file)
-        except OSError as error:
-            raise InputError(f"cannot write {file} ({error.strerror or error}); give another --out") from error
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        if shares:
+            left_out = _export_together(name, runs, shares, file)
+        else:
+            left_out = write_archive(load_experiment(runs, name), file)
+    except OSError as error:
+        raise InputError(f"cannot write {file} ({error.strerror or error}); give another --out") from error
     for line in left_out:
         log.warning("left out: %s", line)
     print(file)
     return 0
+
+
+def _export_together(name: str, runs: Path, shares: Sequence[Path], file: Path) -> list[str]:
+    """Write one archive of the trials here and in ``shares``; returns what is not in it."""
+    from gsbench.claims.archive import write_archive
+    from gsbench.claims.shares import merge
+
+    own = read_experiment(runs / name) if name in list_experiments(runs) else None
+    if own is None or not own.trials:
+        log.warning("%s has no whole trial here: the archive is of what the others hold", name)
+        return merge(shares, name, file)
+    with TemporaryDirectory() as folder:
+        archive = Path(folder) / f"{name}.zip"
+        return write_archive(own, archive) + merge([archive, *shares], name, file)
 
 
 def export_model(ply: Path, form: str, out: Path) -> None:
