@@ -23,13 +23,21 @@ KNOWN_MARK = "0705c835f23f8aeabd8d476f6841da66d2f76384e68e1417f379d2bf067f9248"
 WANTED = Wanted(("volumetric", "new"), ("adc", "gaussian-splatting"), "psnr")
 
 
-def archive(tmp_path: Path, name: str, seed: int = 0, protocol: str = "paper-1", **plan: Any) -> Path:
+def archive(
+    tmp_path: Path,
+    name: str,
+    seed: int = 0,
+    protocol: str = "paper-1",
+    budget: dict[str, Any] | None = None,
+    **plan: Any,
+) -> Path:
     """A lab's archive, in which volumetric gains 1 dB."""
     runs = tmp_path / f"runs_{name}_{seed}"
     paths = write_runs(runs, Plan(effect={"psnr": 1.0}, random_seed=seed, **plan))
     for number, path in enumerate(paths):
         results = json.loads((path / "results.json").read_text())
         results["protocol"] = protocol if protocol != "both" else ("paper-1", "standard-1")["garden" in str(path)]
+        results["budget"] = budget or results["budget"]
         results["seconds"]["train"] += seed + number / 1000  # no two trainings take one and the same time
         (path / "results.json").write_text(json.dumps(results))
     file = tmp_path / f"{name}.zip"
@@ -92,11 +100,22 @@ def test_trials_of_archives_can_be_chosen(tmp_path: Path, capsys: pytest.Capture
     out = capsys.readouterr().out
     assert "of 2 studies" in out
     assert "| a |" in out
+    assert out.startswith("volumetric against adc, difference in PSNR (dB), more is better\n")
+    assert "caution" not in out
     (tmp_path / "nb").mkdir()
     command = ["pool", *files, str(tmp_path / "nb"), "--arm", "volumetric", "--where", "init=sfm"]
     assert run(command) == 1
     assert "hold no settings to choose by" in capsys.readouterr().err
     assert run(["pool", *files, "--arm", "volumetric", "--where", "init=none"]) == 2
+
+
+def test_unlike_budgets_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    steered = archive(tmp_path, "steered", budget={"max_gaussians": 20_000, "cap": "governor"})
+    growing = archive(tmp_path, "growing", seed=1, budget={"max_gaussians": None, "cap": None})
+    assert run(["pool", str(steered), str(growing), "--arm", "volumetric", "--out", str(tmp_path / "p.html")]) == 0
+    sentence = "caution: unlike budgets (steered: 20,000 Gaussians (governor); growing: none)"
+    assert sentence in capsys.readouterr().out
+    assert sentence in (tmp_path / "p.html").read_text(encoding="utf-8")
 
 
 def test_from_six_scenes_on_scenes_are_the_units() -> None:

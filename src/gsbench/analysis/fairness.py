@@ -168,8 +168,8 @@ def _resolution(trial: TrialResult) -> str | None:
     return None if size is None else f"{size[0]}×{size[1]} px"
 
 
-def _budget(trial: TrialResult) -> str | None:
-    """``15,000 Gaussians (governor), 600 s``"""
+def budget_words(trial: TrialResult) -> str | None:
+    """``15,000 Gaussians (governor), 600 s``; "none" without limits, None where nobody knows them."""
     budget = trial.record.budget
     if budget is None:
         return None
@@ -197,7 +197,7 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "iterations": _span(_recorded(lambda record: record.iterations)),
     "rounds of the densifier": _span(_rounds),
     "last round (iteration)": _span(_last_round),
-    "budget": _each(_budget),
+    "budget": _each(budget_words),
     "Gaussians in the end": _span(_recorded(lambda record: record.num_gaussians)),
     "seconds of training": _span(_recorded(lambda record: record.seconds.get("train"))),
     "memory (MB)": _span(_recorded(lambda record: record.peak_memory_mb)),

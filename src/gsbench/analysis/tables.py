@@ -20,10 +20,11 @@ from gsbench.analysis.cells import (
     field_value,
     make_cell,
     swept_settings,
+    with_variants,
 )
 from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.origins import cloud_notes, held_out_notes, machine_notes, points_notes
-from gsbench.analysis.pairing import BASELINE
+from gsbench.analysis.pairing import BASELINE, choose_pairs
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.table_notes import caveat_notes, declared_notes, origin_notes
@@ -262,15 +263,23 @@ def _reading_notes(
 
 
 def _cost_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """For every densifier against the baseline, the change of the costs by both averaging rules, over common scenes."""
+    """For every arm against the baseline's, the change of the costs by both averaging rules, over common scenes.
+
+    Settings that were swept make arms of their own, and arms under unlike conditions have no change to tell of.
+    """
+    arms = by_key(with_variants(trials), lambda trial: trial.arm)
     notes = []
-    for init, group in by_key(trials, lambda trial: trial.init).items():
-        arms = by_key(group, lambda trial: trial.densify)
-        for name in sorted(set(arms) - {BASELINE} if BASELINE in arms else ()):
-            for what, read in _COSTS.items():
-                change = cost_change(arms[BASELINE], arms[name], read)
-                if change is not None:
-                    notes.append(f"{what}, {name} against {BASELINE} (init {init}): {change_words(*change)}.")
+    for first, second in choose_pairs(sorted(arms)):
+        (baseline, _, one), (name, _, other) = (arm[1].partition(" ") for arm in (first, second))
+        together = by_key([*arms[first], *arms[second]], lambda trial: trial.scene).values()
+        if baseline != BASELINE or name == BASELINE or any(map(differing_conditions, together)):
+            continue
+        shared = f", {other}" if other and one == other else ""
+        names = (name, baseline) if one == other else (second[1], first[1])
+        for what, read in _COSTS.items():
+            change = cost_change(arms[first], arms[second], read)
+            if change is not None:
+                notes.append(f"{what}, {' against '.join(names)} (init {second[0]}{shared}): {change_words(*change)}.")
     return notes
 
 

@@ -32,13 +32,14 @@ class Study:
     """One archive's difference of two arms in one metric.
 
     ``conditions`` are what studies must share before a mean of them means anything: protocol, metric, and whatever else
-    the caller holds for such.
+    the caller holds for such. ``budget`` says what limited the growth of its arms; "" where nobody knows.
     """
 
     name: str
     effect: float
     error: float
     conditions: Mapping[str, str] = field(default_factory=dict)
+    budget: str = ""
 
     @property
     def interval(self) -> Interval:
@@ -148,6 +149,12 @@ def describe(pooled: Pooled) -> list[str]:
         f"between studies: deviation {math.sqrt(pooled.tau2):.3g}, {100 * pooled.i2:.0f} % of all variance (Q "
         f"{pooled.q:.1f}, p {pooled.q_p:.3f})",
     ]
+    if len({study.budget for study in pooled.studies}) > 1:
+        budgets = "; ".join(f"{study.name}: {study.budget or 'not known'}" for study in pooled.studies)
+        lines.append(
+            f"caution: unlike budgets ({budgets}): at one count, and where each arm grows as it likes, a difference "
+            "answers two questions, and this mean neither of them"
+        )
     if pooled.prediction is not None:
         lines.append(
             f"a further study would lie between {pooled.prediction.low:+.4g} and {pooled.prediction.high:+.4g}"

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.analysis.cells import select_trials, with_variants
+from gsbench.analysis.fairness import budget_words
 from gsbench.analysis.pairing import ViewCache, arm_name, pair_arms
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import MIN_SCENES
@@ -92,7 +93,7 @@ def _read_archive(path: Path, wanted: Wanted, name: str) -> Found:
                 label = f"{name} ({', '.join(told_apart)})" if told_apart else name
                 found = [pair_arms(own, first, second, wanted.metric, views) for first, second in pairs]
                 effect = standard_error([matrix.mean(axis=1) for paired in found for matrix in paired.differences])
-                studies.append(Study(label, *effect, _conditions(protocol, wanted.metric)))
+                studies.append(Study(label, *effect, _conditions(protocol, wanted.metric), _budgets(own, pairs)))
                 for (first, second), paired in zip(pairs, found, strict=True):
                     count = sum(len(matrix) for matrix in paired.differences)
                     notes.append(
@@ -138,6 +139,12 @@ def _pairs(trials: Sequence[TrialResult], wanted: Wanted, path: Path) -> list[tu
 
 def _conditions(protocol: str, metric: str) -> dict[str, str]:
     return {"protocol": protocol, "metric": metric}
+
+
+def _budgets(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> str:
+    """``20,000 Gaussians (governor)``: what limited the growth in these pairs of arms."""
+    arms = {arm for pair in pairs for arm in pair}
+    return " or ".join(sorted({budget_words(trial) or "not known" for trial in trials if trial.arm in arms}))
 
 
 def _size(trials: Sequence[TrialResult]) -> str:

@@ -36,12 +36,15 @@ def main(argv: Sequence[str], runs: Path) -> int:
     options = parser.parse_args(argv)
     wanted = Wanted(options.arm, options.baseline, options.metric, dict(options.where))
     pooled, notes, faults = pool_sources(options.sources, wanted, options.protocol)
-    lines = [*_rows(pooled), "", *describe(pooled), *notes, *faults]
+    title = f"{options.arm[0]} against {options.baseline[0]}"
+    shown = metric_quantity(options.metric, ())
+    lines = [f"{title}, difference in {shown.name}{BETTER[shown.direction]}", "", *_rows(pooled), ""]
+    lines += [*describe(pooled), *notes, *faults]
     print("\n".join(lines))
     for fault in faults:
         print(f"gsbench: {fault}", file=sys.stderr)
     if options.out is not None:
-        title = f"{options.arm[0]} against {options.baseline[0]}: {options.metric}"
+        title += f": {options.metric}"
         write_page(options.out, title, _forest(title, pooled, options.metric), [*describe(pooled), *notes, *faults])
         print(options.out)
     return LEFT_OUT if faults else DONE
