@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from findings_pairs import difference, facts, pair, row
-from findings_pictures import for_and_against, worst_views
+from findings_pictures import cap_of, for_and_against, worst_views
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -30,7 +30,7 @@ from gsbench.claims.recheck import Recheck, recheck
 from gsbench.claims.shares import merge
 from gsbench.runs.declaration import EXTRAPOLATION, INTERPOLATION
 from gsbench.runs.experiments import list_experiments
-from gsbench.words import signed
+from gsbench.words import counted, signed
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "docs" / "findings"
@@ -39,6 +39,7 @@ ARCHIVED = (
     "findings_longaxis",
     "findings_dimension",
     "findings_full",
+    "findings_full_count",
     "findings_matched",
     "findings_exponent",
     "scale_bridge",
@@ -48,9 +49,11 @@ PICTURES: dict[str, Callable[[Experiment], Image.Image]] = {
     "findings_matched": worst_views,
     "findings_volume": for_and_against,
     "findings_dimension": functools.partial(for_and_against, rule="volumetric-1"),
+    "findings_full": functools.partial(for_and_against, kinds=("governor", "soft"), kind_of=cap_of),
 }
 QUESTIONS = {INTERPOLATION: "between", EXTRAPOLATION: "sector"}  # as the page calls them
 PRIMARY = "lpips_squeeze"
+BUDGET = ("densify.max_gaussians", "densify.cap")
 GROWTH = ("event_split_volume", "event_split_gradient", "event_cloned")
 OTHERS = {"psnr": 2, "ssim": 3, "ms_ssim": 4, "fsim": 4, "flip": 3}  # metrics that were not declared, and their digits
 
@@ -99,7 +102,7 @@ def verdicts_table(name: str) -> list[str]:
         shown, on = "", ""
         if decision is not None and decision.mean is not None and decision.interval is not None:
             shown = f"{verdict.shown(decision.mean)} ({verdict.shown_interval(decision.interval)})"
-            on = f"{len(verdict.by_scene)} scenes, {decision.seeds} seeds"
+            on = f"{counted(len(verdict.by_scene), 'scene')}, {counted(decision.seeds, 'seed')}"
         lines.append(row([f"`{claim.id}`: {claim.arm} − {claim.baseline}", shown, f"**{verdict.word}**", on]))
     return lines
 
@@ -182,6 +185,26 @@ def growth_table(name: str, arms: Sequence[str], against: str) -> list[str]:
     return lines
 
 
+def budgets_table(name: str, arms: Sequence[str], against: str) -> list[str]:
+    """A budget of a scene and an arm a row: means over the seeds, and LPIPS minus that of ``against`` as in a scene.
+
+    The share is of all that grows what is split by volume; held back is what the cap did not let grow.
+    """
+    frame = read_trials(name)
+    frame = frame.assign(share=by_volume(frame))
+    columns = {"num_gaussians": ("Gaussians", 0), "event_blocked_by_cap": ("held back", 0), "share": ("by volume", 2)}
+    columns |= {"psnr": ("PSNR, dB", 2), "ssim": ("SSIM", 3), PRIMARY: ("LPIPS", 3)}
+    titles = ["scene", "budget", "arm", *(title for title, _ in columns.values()), f"LPIPS − {against}"]
+    lines = [row(titles), row(["---"] * 3 + ["--:"] * (len(titles) - 3))]
+    for (scene, most, cap), own in frame.groupby(["scene", *BUDGET]):
+        for arm in (against, *arms):
+            means = own[own.arm == arm][list(columns)].mean()
+            cells = [f"{means[key]:,.{digits}f}" for key, (_, digits) in columns.items()]
+            last = "" if arm == against else _plain(by_scene(own, arm, PRIMARY, against, INTERPOLATION)[scene])
+            lines.append(row([scene, f"{most:,} ({cap})", arm, *cells, last]))
+    return lines
+
+
 def shares_table(name: str, arms: Sequence[str], against: str) -> list[str]:
     """A scene a row: which share of all that grows each arm splits by volume, and its gain over ``against`` in PSNR."""
     frame = read_trials(name)
@@ -200,8 +223,12 @@ def shares_table(name: str, arms: Sequence[str], against: str) -> list[str]:
 
 def volume_shares(frame: pd.DataFrame) -> pd.Series:
     """Return by scene and arm which share of all that grows is split by volume, over all seeds and questions."""
-    counts = frame.groupby(["scene", "arm"])[list(GROWTH)].sum()
-    return counts[GROWTH[0]] / counts.sum(axis=1)
+    return by_volume(frame.groupby(["scene", "arm"])[list(GROWTH)].sum())
+
+
+def by_volume(counts: pd.DataFrame) -> pd.Series:
+    """Return by row which share of all that grows is split by volume."""
+    return counts[GROWTH[0]] / counts[list(GROWTH)].sum(axis=1)
 
 
 def gains_between(frame: pd.DataFrame, arm: str, metric: str, against: str) -> pd.Series:
@@ -287,4 +314,10 @@ def collect(runs: Path) -> None:
 
 
 TABLES = {"verdicts": verdicts_table, "gaps": gaps_table, "views": views_table}
-TABLES_OF_ARMS = {"scenes": scenes_table, "growth": growth_table, "metrics": metrics_table, "shares": shares_table}
+TABLES_OF_ARMS = {
+    "scenes": scenes_table,
+    "growth": growth_table,
+    "metrics": metrics_table,
+    "shares": shares_table,
+    "budgets": budgets_table,
+}

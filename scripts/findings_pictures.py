@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from operator import attrgetter
 from pathlib import Path
 
 from PIL import Image
@@ -16,28 +17,41 @@ CONTROL = "adc"
 JUDGED = "lpips_squeeze"  # less is better
 GAP = 4  # px between pictures
 
+KindOf = Callable[[TrialResult], str]
+_question_of: KindOf = attrgetter("question")
+
 
 def worst_views(experiment: Experiment) -> Image.Image:
     """Draw, a scene a row, the view of the sector with the least mean PSNR."""
     rows = []
     for scene in dict.fromkeys(trial.scene for trial in experiment.trials):
-        own = _first_seeds(experiment, scene, EXTRAPOLATION)
+        own = _first_seeds(experiment, scene, EXTRAPOLATION, _question_of)
         views = [read_views(trial) for trial in own]
         worst = min(views[0], key=lambda view: sum(found[view]["psnr"] for found in views))
         rows.append(_pictures(own, worst))
     return _joined(rows)
 
 
-def for_and_against(experiment: Experiment, rule: str = "volumetric") -> Image.Image:
+def cap_of(trial: TrialResult) -> str:
+    """The trial's setting ``densify.cap``."""
+    return str(trial.config["densify.cap"])
+
+
+def for_and_against(
+    experiment: Experiment,
+    rule: str = "volumetric",
+    kinds: Sequence[str] = (INTERPOLATION, EXTRAPOLATION),
+    kind_of: KindOf = _question_of,
+) -> Image.Image:
     """Draw, of all scenes, the view at which ``rule`` gains most over `CONTROL` and that at which it loses most.
 
-    One pair of rows between the cameras, one of the sector.
+    A pair of rows for each of the ``kinds`` of trials: between the cameras and of the sector, or as ``kind_of`` says.
     """
     rows = []
-    for question in (INTERPOLATION, EXTRAPOLATION):
+    for kind in kinds:
         found: list[tuple[float, str, list[TrialResult]]] = []
         for scene in dict.fromkeys(trial.scene for trial in experiment.trials):
-            own = _first_seeds(experiment, scene, question)
+            own = _first_seeds(experiment, scene, kind, kind_of)
             views = {trial.densify: read_views(trial) for trial in own}
             found += [(views[rule][v][JUDGED] - views[CONTROL][v][JUDGED], v, own) for v in views[rule]]
         found.sort(key=lambda entry: entry[:2])
@@ -45,9 +59,9 @@ def for_and_against(experiment: Experiment, rule: str = "volumetric") -> Image.I
     return _joined(rows)
 
 
-def _first_seeds(experiment: Experiment, scene: str, question: str) -> list[TrialResult]:
-    """The trials of the first seed of a scene at a question, in the order of `ARMS`."""
-    own = [t for t in experiment.trials if (t.scene, t.seed, t.question) == (scene, 0, question)]
+def _first_seeds(experiment: Experiment, scene: str, kind: str, kind_of: KindOf) -> list[TrialResult]:
+    """The trials of a scene's first seed that are of this kind, in the order of `ARMS`."""
+    own = [trial for trial in experiment.trials if (trial.scene, trial.seed, kind_of(trial)) == (scene, 0, kind)]
     return sorted(own, key=lambda trial: ARMS.index(trial.densify))
 
 
