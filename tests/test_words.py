@@ -63,6 +63,8 @@ REFUSED = {  # command line: a part of the line that refuses it
     "densify=null": "choose one by its name",
     "scene=[courtyard]": "choose one by its name",
     "densify=vol": "densify=vol does not exist",
+    "densify=mine": "densify=mine does not exist; a class of your own is named by densify._target_",
+    "train=2k": "train=2k does not exist (choose: ",
     "experiment=demo": "write +experiment=NAME",
     "-m +experiment=demo,threshold": "two experiments are two sweeps",
     "+experiment=[demo,threshold]": "two experiments are two sweeps",
@@ -143,6 +145,9 @@ REFUSED = {  # command line: a part of the line that refuses it
     "--cfg job nosuch=1": "nosuch is not a setting",
     "--cfg job train.iterations=abc": "train.iterations must be",
     "--cfg job -m seed=1": "unrecognized arguments: -m",
+    "tables x --fromat csv": "unrecognized arguments: --fromat csv; did you mean --format?",
+    "tables x --fromat=csv": "did you mean --format?",
+    "tables x --zzz": "unrecognized arguments: --zzz (see",
     "--cfg nosuch": "invalid choice",
     "--resolve": "ask one thing",
 }  # fmt: skip

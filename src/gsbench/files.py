@@ -63,6 +63,19 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+@contextmanager
+def place_of(out: Path) -> Iterator[None]:
+    """Make the folder of what ``--out`` names for the block that writes it.
+
+    Raises InputError for an OSError of the block: the place was asked for, and another mends it.
+    """
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise InputError(f"cannot write {out} ({error.strerror or error}); give another --out") from error
+
+
 def link_or_copy(source: Path, target: Path) -> None:
     """Show ``source`` as ``target`` too, as a hard link where the file system has them; replaces what is there."""
     with atomic(target, sync=False) as temporary:

@@ -439,7 +439,7 @@ def test_the_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyte
     assert one | {crate: b""} == other | {crate: b""}
     for given in ([str(out)], list(archives.values())):
         assert run(["check", str(claims), "--from", *given]) == 0
-    first, second = capsys.readouterr().out.split("# check_it: claims and verdicts")[1:]
+    first, second = capsys.readouterr().out.split("check_it: claims and verdicts")[1:]
     assert first == second
     assert "2 scenes, 2 seeds" in first
     assert run(["check", str(claims), "--dry-run", "--with", str(out), "--scene", "courtyard"]) == 0

@@ -180,8 +180,20 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     assert run(["export", "--results", "check_it", "--out", str(archive)]) == 0
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "elsewhere"))
     capsys.readouterr()
-    assert run(["check", str(path), "--from", str(archive)]) == 0
-    assert capsys.readouterr().out == first[0]
+    recheck = ["check", str(path), "--from", str(archive)]
+    assert run(recheck) == 0
+    printed = capsys.readouterr().out
+    assert len(printed.splitlines()) < 15
+    assert "?  claim" not in printed
+    for end, text in zip((".md", ".html"), first, strict=True):
+        page = tmp_path / "pages" / f"claims{end}"
+        assert run([*recheck, "--out", str(page)]) == 0
+        if end == ".md":
+            assert page.read_text() == text
+        assert page.read_text().count("Fairness sheet: ") == text.count("Fairness sheet: ")
+        assert capsys.readouterr().out.endswith(f"{page}\n")
+    for wrong in ([*recheck, "--out", "claims.txt"], ["check", str(path), "--out", "claims.md"]):
+        assert run(wrong) == 2
     assert not (tmp_path / "elsewhere").exists()
 
 

@@ -279,6 +279,7 @@ def test_what_is_typed_is_allowed_in_files_too(capsys: pytest.CaptureFixture[str
     [
         ("mine.os.mkdir", "cannot be imported"),
         ("mine.os", "is not a class for densify"),
+        ("mine.Mime", r"cannot be imported: mine has no Mime; did you mean Mine\?"),
         ("mine.Popen", r"is subprocess\.Popen.*allow_targets=\[mine,subprocess\]"),
     ],
 )

@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 MAP_PROPERTIES = {
     "depth": "depth, world units",
     "distance": "distance to the nearest initial point, world units",
-    "volume": "volume of the Gaussians seen there, cubed world units",
+    "volume": "volume of the Gaussians seen there, cubed scene units",
 }
 
 

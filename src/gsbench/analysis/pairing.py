@@ -147,8 +147,13 @@ def _common_seeds(
             raise InputError(f"{scene}: the arms differ in {', '.join(differing)}, so they are not compared")
     faults = [f"{scene}: seed {seed} has no partner" for seed in sorted(one.keys() ^ other.keys())]
     seeds = sorted(one.keys() & other.keys())
-    without = [seed for seed in seeds if metric not in one[seed].metrics or metric not in other[seed].metrics]
-    faults += [f"{scene}: seed {seed} has no {metric}" for seed in without]
+    without = {
+        seed: trial.unavailable.get(metric, "")
+        for seed in seeds
+        for trial in (one[seed], other[seed])
+        if metric not in trial.metrics
+    }
+    faults += [f"{scene}: seed {seed} has no {metric}{f' ({why})' if why else ''}" for seed, why in without.items()]
     return [seed for seed in seeds if seed not in without], faults
 
 

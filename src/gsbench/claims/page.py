@@ -94,6 +94,16 @@ def _scope(verdicts: Sequence[Verdict]) -> str:
     return "these scenes" if by_scene == {False} else "these scenes (from six on, scenes like these)"
 
 
+def to_text(page: Page) -> str:
+    """The page's lines and headlines, for a terminal."""
+    verdicts = []
+    for section in page.sections:
+        one = section.verdict
+        verdicts.append(f"{one.word:<17}  {one.claim.id}: {section.headline}")
+        verdicts += [f"{'':<17}  {line}" for line in [_judged_on(one)] if line]
+    return "\n".join([page.title, *page.lines, *verdicts]) + "\n"
+
+
 def to_markdown(page: Page) -> str:
     """The page as GitHub-flavoured Markdown."""
     parts = [f"# {page.title}", "", *(line + "\n" for line in page.lines)]
@@ -138,15 +148,12 @@ def _section(verdict: Verdict) -> Section:
             f"{verdict.measure.name} of {claim.arm} against {claim.baseline}: {verdict.shown(decision.mean)} "
             f"({level} interval {verdict.shown_interval(decision.interval)}); {verdict.reason}"
         )
-        unit = "scenes" if verdict.design.by_scene else "pairs of trials"
-        planned = ", ".join(map(str, verdict.design.looks))
         evidence += [
             f"least effect that matters: {claim.effect}; baseline's mean {_number(verdict.baseline)}",
-            f"judged on {counted(decision.trials, 'trial')}: {counted(len(verdict.by_scene), 'scene')}, "
-            f"{decision.seeds} seeds, two arms; looks planned at {planned} seeds; units are {unit}",
+            _judged_on(verdict),
         ]
     if decision is not None and decision.outcome == "undecided" and not verdict.measure.cost:
-        evidence.append(f"how many seeds and scenes would decide: {_plan_words(verdict)}")
+        evidence.append(f"how many seeds and scenes would decide, where the trials are: {_plan_words(verdict)}")
     evidence += verdict.notes
     fairness, mixed = _fairness(verdict)
     if mixed:
@@ -158,6 +165,19 @@ def _section(verdict: Verdict) -> Section:
         tuple((scene, verdict.shown(value)) for scene, value in verdict.by_scene),
         fairness,
         _folders(verdict.trials),
+    )
+
+
+def _judged_on(verdict: Verdict) -> str:
+    """``judged on 8 trials: 2 scenes, 2 seeds, two arms; ...``; "" where no mean is known."""
+    decision, design = verdict.decision, verdict.design
+    if decision is None or decision.mean is None or decision.interval is None or design is None:
+        return ""
+    unit = "scenes" if design.by_scene else "pairs of trials"
+    planned = ", ".join(map(str, design.looks))
+    return (
+        f"judged on {counted(decision.trials, 'trial')}: {counted(len(verdict.by_scene), 'scene')}, "
+        f"{decision.seeds} seeds, two arms; looks planned at {planned} seeds; units are {unit}"
     )
 
 

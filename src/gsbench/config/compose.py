@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from hydra._internal.hydra import Hydra
 
 MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood
-PLUGIN_HINTS = {  # where a word may name a plug-in of Hydra's that is not installed
+HINTS = {  # where a word may name a class of the user's, or a plug-in of Hydra's that is not installed
+    **{group: f"; a class of your own is named by {group}._target_" for group in ("densify", "init", "raster")},
     "hydra/launcher": "; other launchers are packages of their own, which launch=serial, local or slurm do not need",
     "hydra/sweeper": "; other sweepers are packages of their own",
 }
@@ -209,7 +210,7 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
         wanted, name = missing.group(1), missing.group(2)
         choices = sorted({*options(name), *re.findall(r"[\w.-]+", missing.group(3))})
         word = wanted.rpartition("/")[2]
-        near = closest(word, choices) or PLUGIN_HINTS.get(name, "")
+        near = closest(word, choices) or HINTS.get(name, "")
         return f"{name}={word} does not exist{near} (choose: {', '.join(choices)})"
     absent = re.search(r"[Mm]issing mandatory value: ([\w.]+)", text)
     if absent:

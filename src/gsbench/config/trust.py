@@ -82,11 +82,17 @@ def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
     """
     check_target(target, group, allowed)
     module, _, name = target.rpartition(".")
+    missing = object()
     try:
-        found = getattr(importlib.import_module(module), name)
+        place = importlib.import_module(module)
+        found = getattr(place, name, missing)
     except (Exception, SystemExit) as error:  # importing a user's file runs it: it may raise anything
         reason = f"{type(error).__name__}: {error}{_beside(error)}"
         raise InputError(f"{group}.{TARGET}={target} cannot be imported ({reason})") from error
+    if found is missing:
+        raise InputError(
+            f"{group}.{TARGET}={target} cannot be imported: {module} has no {name}{closest(name, dir(place))}"
+        )
     home = f"{getattr(found, '__module__', None)}.{getattr(found, '__qualname__', name)}"
     if isinstance(found, type) and not is_allowed(home, (PACKAGE, *allowed)):
         advice = to_type([home.split(".")[0]], allowed)

@@ -15,7 +15,7 @@ from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, stor
 from gsbench.launch.declare import declare, declared_metrics, planned_trials
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
-from gsbench.launch.preflight import check_parts, check_trackers, missing_folders, missing_weights
+from gsbench.launch.preflight import borrowed_names, check_parts, check_trackers, missing_folders, missing_weights
 from gsbench.launch.serial import run_serial
 from gsbench.launch.trial import Trial, drop_parts
 from gsbench.runs.finished import Done, NotDone, find_finished
@@ -74,6 +74,8 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
         drop_parts(unfinished)
     if launcher != "slurm":
         check_trackers(unfinished)
+    for line in borrowed_names(unfinished):
+        log.warning("%s", line)
     try:
         make_runs_folder(runs)
     except OSError as error:

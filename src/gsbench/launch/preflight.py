@@ -12,6 +12,7 @@ from gsbench.config.compose import Composed
 from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.launch.trial import Trial
+from gsbench.runs.source import OWN
 from gsbench.system.install import install_command
 
 
@@ -57,6 +58,22 @@ def check_trackers(trials: Sequence[Trial]) -> None:
     for sink in sorted({t.values["tracking"]["sink"] for t in trials if t.values["tracking"]["enabled"]}):
         if importlib.util.find_spec(sink) is None:
             raise InputError(f"tracking.sink={sink} needs a package: {install_command(sink)} (or pip install {sink})")
+
+
+def borrowed_names(trials: Sequence[Composed]) -> list[str]:
+    """A line for each class of the user's that would be shown under the name of one of gsbench's own."""
+    named = {
+        (group, str(part.get("name")), str(part["_target_"]))
+        for trial in trials
+        for group, part in ((group, trial.values[group]) for group in ("densify", "init"))
+        if part.get("_target_") is not None and not str(part["_target_"]).startswith(OWN)
+    }
+    return [
+        f"{target} is shown as {name}, like gsbench's own: "
+        f"give it a name, {group}.name={target.rpartition('.')[2].lower()}"
+        for group, name, target in sorted(named)
+        if name in options(group)
+    ]
 
 
 def need_no_check(trials: Sequence[Trial]) -> bool:

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from gsbench.errors import InputError
-from gsbench.words import is_path
+from gsbench.words import closest, is_path
 
 MAX_PORT = 65535
 
 
 class ArgumentParser(argparse.ArgumentParser):
     """An argparse parser that raises InputError for what it does not understand; ``--help`` prints and exits."""
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        found, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            options = [option for action in self._actions for option in action.option_strings]
+            nears = (closest(word.partition("=")[0], options) for word in unknown if word.startswith("--"))
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{next(filter(None, nears), '')}")
+        return found
 
     def error(self, message: str) -> NoReturn:
         verb = self.prog.removeprefix("gsbench").strip()

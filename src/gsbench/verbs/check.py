@@ -14,7 +14,7 @@ from gsbench.claims.sweep import Check, prepare, run_looks
 from gsbench.config.compose import Composed
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
-from gsbench.files import make_runs_folder, write_text
+from gsbench.files import make_runs_folder, place_of, write_text
 from gsbench.launch.declare import declare_plan
 from gsbench.launch.plan import describe_plan
 from gsbench.launch.preflight import missing_folders
@@ -25,6 +25,7 @@ from gsbench.verbs.arguments import ArgumentParser, names, path
 from gsbench.words import counted
 
 MARKDOWN, HTML = "claims.md", "claims.html"
+PAGE_ENDINGS = (".md", ".html")
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -75,12 +76,15 @@ def main(argv: Sequence[str], runs: Path) -> int:
         action="store_true",
         help="run all planned seeds at once, where looks at the trials would wait for other machines",
     )
+    parser.add_argument("--out", type=path, metavar="PAGE", help="with --from: write the whole page, as .md or .html")
     options = parser.parse_args(argv)
     file = read_claims(options.claims)
     if options.archives is not None:
         if options.dry_run or options.shares or options.scenes or options.all_seeds:
-            raise InputError("check --from runs nothing, so no other option goes with it")
-        return _recheck(file, options.archives, _permissions(options.permissions))
+            raise InputError("check --from runs nothing, so no other option than --out goes with it")
+        return _recheck(file, options.archives, _permissions(options.permissions), options.out)
+    if options.out is not None:
+        raise InputError(f"--out goes with --from; what is run here writes {MARKDOWN} and {HTML} beside its trials")
     here = Here(missing_folders, download=not options.dry_run)
     check = prepare(file, runs, here, _permissions(options.permissions), options.scenes)
     with tempfile.TemporaryDirectory() as folder:
@@ -97,13 +101,25 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
-def _recheck(file: ClaimsFile, archives: Sequence[Path], permissions: Sequence[str]) -> int:
-    """Print the page in Markdown that the archives' trials make; 0 whatever the verdicts are."""
-    from gsbench.claims.page import make_page, to_markdown
+def _recheck(file: ClaimsFile, archives: Sequence[Path], permissions: Sequence[str], out: Path | None) -> int:
+    """Print the verdicts that the archives' trials make, and write their page; 0 whatever the verdicts are.
 
+    Raises InputError for an ``out`` of neither format.
+    """
+    from gsbench.claims.page import make_page, to_html, to_markdown, to_text
+
+    if out is not None and out.suffix not in PAGE_ENDINGS:
+        raise InputError(f"--out {out}: a page ends in {' or '.join(PAGE_ENDINGS)}")
     with tempfile.TemporaryDirectory() as folder:
         found = recheck(file, archives, Path(folder), permissions)
-        print(to_markdown(make_page(file, found.verdicts, found.declared, found.plans)), end="")
+        page = make_page(file, found.verdicts, found.declared, found.plans)
+        print(to_text(page), end="")
+        if out is None:
+            print("What each verdict rests on is on the whole page: --out PAGE.html (or .md)")
+        else:
+            with place_of(out):
+                write_text(out, to_html(page) if out.suffix == ".html" else to_markdown(page))
+            print(out)
     return 0
 
 

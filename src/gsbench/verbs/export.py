@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from gsbench.analysis.results import load_experiment, read_experiment
 from gsbench.errors import InputError
-from gsbench.files import atomic
+from gsbench.files import atomic, place_of
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.layout import STORE
 from gsbench.runs.stages import INIT
@@ -81,14 +81,11 @@ def main(argv: Sequence[str], runs: Path) -> int:
     out = options.out
     if out.is_dir() and not is_init:
         raise InputError(f"--out {out} is a folder: name the file to write")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
+    with place_of(out):
         if is_init:
             export_init(trial.path.parents[3] / STORE / INIT.name / trial.record.hashes[INIT.name], out)
         else:
             export_model(model_file(trial), options.to or _format_of(out), out)
-    except OSError as error:
-        raise InputError(f"cannot write {out} ({error.strerror or error}); give another --out") from error
     log.info("%s", trial.label)
     print(out)
     return 0
@@ -106,14 +103,11 @@ def export_results(name: str, runs: Path, out: Path | None, shares: Sequence[Pat
     file = Path(f"{name}.zip") if out is None else out
     if file.is_dir():
         file = file / f"{name}.zip"
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
+    with place_of(file):
         if shares:
             left_out = _export_together(name, runs, shares, file)
         else:
             left_out = write_archive(load_experiment(runs, name), file)
-    except OSError as error:
-        raise InputError(f"cannot write {file} ({error.strerror or error}); give another --out") from error
     for line in left_out:
         log.warning("left out: %s", line)
     print(file)

@@ -11,7 +11,7 @@ from gsbench.analysis.results import load_experiment
 from gsbench.claims.stopping import headline, standing_verdicts
 from gsbench.claims.switches import ablation_part
 from gsbench.errors import InputError
-from gsbench.files import write_text
+from gsbench.files import place_of, write_text
 from gsbench.verbs.arguments import ArgumentParser, path
 
 REPORT_NAME = "report.html"
@@ -38,11 +38,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
         print(f"left out: {warning}", file=sys.stderr)
     looked = [headline(verdict) for verdict in standing_verdicts(experiment.folder)]
     text = build_report(experiment, options.baseline or BASELINE, looked, ablation_part(experiment.folder))
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
+    with place_of(file):
         write_text(file, text)
-    except OSError as error:
-        raise InputError(f"cannot write {file} ({error.strerror}); give another --out") from None
     print(file)
     return 0
 

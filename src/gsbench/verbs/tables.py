@@ -22,7 +22,7 @@ from gsbench.analysis.tables import DEFAULT_ROWS, build_table
 from gsbench.analysis.translations import by_protocol
 from gsbench.errors import InputError
 from gsbench.eval.protocol import ALL
-from gsbench.files import write_text
+from gsbench.files import place_of, write_text
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 
 TRIALS = "trials"
@@ -147,11 +147,8 @@ def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
     if out is None:
         print("\n".join(texts.values()), end="")
         return
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write into {out} ({error.strerror}); give another --out") from None
     for end, text in texts.items():
         file = out / f"{name}{end}"
-        write_text(file, text)
+        with place_of(file):
+            write_text(file, text)
         print(file)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.files import atomic
+from gsbench.files import atomic, place_of
 from gsbench.system.install import install_command
 
 Picture = NDArray[np.uint8]
@@ -49,20 +49,16 @@ def write_video(file: Path, pictures: Iterable[Picture], fps: float) -> None:
     Raises InputError where the file cannot be written.
     """
     check_file(file)
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with atomic(file, sync=False) as temporary:
-            if file.suffix.lower() == ".mp4":
-                named = temporary.with_suffix(".mp4")  # OpenCV goes by the name
-                try:
-                    _write_mp4(named, pictures, fps)
-                    named.replace(temporary)
-                finally:
-                    named.unlink(missing_ok=True)
-            else:
-                _write_animation(temporary, file.suffix.lower(), pictures, fps)
-    except OSError as error:
-        raise InputError(f"cannot write {file} ({error.strerror or error}): give another --out") from error
+    with place_of(file), atomic(file, sync=False) as temporary:
+        if file.suffix.lower() == ".mp4":
+            named = temporary.with_suffix(".mp4")  # OpenCV goes by the name
+            try:
+                _write_mp4(named, pictures, fps)
+                named.replace(temporary)
+            finally:
+                named.unlink(missing_ok=True)
+        else:
+            _write_animation(temporary, file.suffix.lower(), pictures, fps)
 
 
 def _write_mp4(file: Path, pictures: Iterable[Picture], fps: float) -> None:

@@ -26,7 +26,11 @@ def test_only_the_voluminous_is_outlined() -> None:
     camera = orbit_camera(0.0)
     causes = torch.tensor([int(Cause.SPLIT_VOLUME), int(Cause.CLONE)])
     black = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
-    drawn = np.asarray(draw_ellipsoids(black, gaussians, causes, camera, 0.03))
+    picture = np.asarray(draw_ellipsoids(black, gaussians, causes, camera, 0.03))
+    drawn, legend = np.split(picture, [camera.height])
+    in_legend = {tuple(color) for color in legend.reshape(-1, 3).tolist()}
+    assert Cause.SPLIT_VOLUME.color in in_legend
+    assert Cause.CLONE.color not in in_legend
     rows, columns = np.nonzero(drawn.any(-1))
     assert {tuple(color) for color in drawn[rows, columns].tolist()} == {Cause.SPLIT_VOLUME.color}
     radius = math.sqrt((1.0 * camera.fx / 4) ** 2 + 0.3)  # one standard deviation and the blur, px

@@ -7,8 +7,7 @@ from html import escape
 from importlib.resources import files
 from pathlib import Path
 
-from gsbench.errors import InputError
-from gsbench.files import write_text
+from gsbench.files import place_of, write_text
 
 
 def write_page(out: Path, title: str, chart: str, lines: Sequence[str]) -> None:
@@ -20,7 +19,5 @@ def write_page(out: Path, title: str, chart: str, lines: Sequence[str]) -> None:
         f'<link rel="icon" href="data:,"><style>{style}</style></head>\n'
         f'<body><main><h1>{escape(title)}</h1><div class="charts">{chart}</div><ul>{listed}</ul></main></body></html>\n'
     )
-    try:
+    with place_of(out):
         write_text(out, page)
-    except OSError as error:
-        raise InputError(f"cannot write {out} ({error.strerror}); give another --out") from None
