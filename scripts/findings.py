@@ -19,7 +19,7 @@ from pathlib import Path
 import findings_archives as archives
 import findings_trends as trends
 import pandas as pd
-from findings_pairs import difference, facts, pair, row
+from findings_pairs import difference, facts, pair, row, with_arms
 from PIL import Image
 
 from gsbench.analysis.frame import to_frame
@@ -161,12 +161,7 @@ def events_table(frame: pd.DataFrame) -> list[str]:
 
 def read(name: str) -> pd.DataFrame:
     """The trials of an experiment, with their arms."""
-    return _with_arms(pd.read_csv(DATA / f"{name}.csv"))
-
-
-def _with_arms(frame: pd.DataFrame) -> pd.DataFrame:
-    """With the column ``arm``: the densifier, or the initialiser where those differ."""
-    return frame.assign(arm=frame.init if frame.densify.nunique() == 1 else frame.densify)
+    return with_arms(pd.read_csv(DATA / f"{name}.csv"))
 
 
 def _baseline(frame: pd.DataFrame) -> str:
@@ -214,7 +209,7 @@ def draw() -> None:
     from matplotlib import pyplot as plt
 
     for file in sorted(DATA.glob("*_rounds.csv")):
-        rounds = _with_arms(pd.read_csv(file)).assign(thousands=lambda frame: frame["count"] / 1000)
+        rounds = with_arms(pd.read_csv(file)).assign(thousands=lambda frame: frame["count"] / 1000)
         drawn = {"thousands": "Gaussians (thousands)"}
         if "strictness" in rounds:
             drawn["strictness"] = "thresholds, times their own"

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from findings_pairs import difference, facts, pair, row
+from findings_pairs import difference, facts, pair, row, with_arms
 from findings_pictures import cap_of, for_and_against, worst_views
 from numpy.typing import NDArray
 from PIL import Image
@@ -43,6 +43,7 @@ ARCHIVED = (
     "findings_matched",
     "findings_exponent",
     "scale_bridge",
+    "findings_initialisers",
     "check_volumetric",
 )
 PICTURES: dict[str, Callable[[Experiment], Image.Image]] = {
@@ -50,11 +51,13 @@ PICTURES: dict[str, Callable[[Experiment], Image.Image]] = {
     "findings_volume": for_and_against,
     "findings_dimension": functools.partial(for_and_against, rule="volumetric-1"),
     "findings_full": functools.partial(for_and_against, kinds=("governor", "soft"), kind_of=cap_of),
+    "findings_initialisers": functools.partial(for_and_against, rule="dim", control="sfm", kinds=[INTERPOLATION]),
 }
 QUESTIONS = {INTERPOLATION: "between", EXTRAPOLATION: "sector"}  # as the page calls them
 PRIMARY = "lpips_squeeze"
 BUDGET = ("densify.max_gaussians", "densify.cap")
 GROWTH = ("event_split_volume", "event_split_gradient", "event_cloned")
+BASELINES = ("adc", "absgrad", "sfm")
 OTHERS = {"psnr": 2, "ssim": 3, "ms_ssim": 4, "fsim": 4, "flip": 3}  # metrics that were not declared, and their digits
 
 
@@ -89,9 +92,9 @@ def trials_of(name: str) -> tuple[TrialResult, ...]:
 
 @functools.cache
 def read_trials(name: str) -> pd.DataFrame:
-    """The trials of an archive, one a row, with their ``arm`` (the densifier) and ``question``."""
-    frame = to_frame(trials_of(name))
-    return frame.assign(arm=frame.densify, question=[trial.question for trial in trials_of(name)])
+    """The trials of an archive, one a row, with their ``arm`` and ``question``."""
+    frame = with_arms(to_frame(trials_of(name)))
+    return frame.assign(question=[trial.question for trial in trials_of(name)])
 
 
 def verdicts_table(name: str) -> list[str]:
@@ -166,6 +169,19 @@ def views_table(name: str) -> list[str]:
         cells += [f"{group.distance_to_nearest.median():.2f}" for group in groups]
         cells += [f"{group.groupby('seed').psnr.first().mean():.2f}" for group in groups]
         lines.append(row([str(scene), *cells]))
+    return lines
+
+
+def clouds_table(name: str) -> list[str]:
+    """An initialiser a row: points of its cloud, LPIPS and PSNR in each scene and on average, means over the seeds."""
+    frame = read_trials(name)
+    columns = {"num_init_points": ",.0f", PRIMARY: ".3f", "psnr": ".2f"}
+    by_scene = frame.groupby(["arm", "scene"])[list(columns)].mean()
+    scenes = list(dict.fromkeys(frame.scene))
+    lines = [row(["initial points; LPIPS; PSNR, dB", *scenes, "*mean*"]), row(["---"] + ["--:"] * (len(scenes) + 1))]
+    for arm in _arms(frame):
+        means = [*(by_scene.loc[arm, scene] for scene in scenes), by_scene.loc[arm].mean()]
+        lines.append(row([arm, *("; ".join(f"{own[key]:{form}}" for key, form in columns.items()) for own in means)]))
     return lines
 
 
@@ -296,7 +312,7 @@ def _mean(frame: pd.DataFrame, arm: str, question: str, metric: str) -> float:
 
 def _arms(frame: pd.DataFrame) -> list[str]:
     """The baseline first."""
-    return sorted(dict.fromkeys(frame.arm), key=lambda arm: arm not in ("adc", "absgrad"))
+    return sorted(dict.fromkeys(frame.arm), key=lambda arm: arm not in BASELINES)
 
 
 def collect(runs: Path) -> None:
@@ -313,7 +329,7 @@ def collect(runs: Path) -> None:
                 PICTURES[name](experiment).save(DATA / f"{name}.jpg", quality=85)
 
 
-TABLES = {"verdicts": verdicts_table, "gaps": gaps_table, "views": views_table}
+TABLES = {"verdicts": verdicts_table, "gaps": gaps_table, "views": views_table, "clouds": clouds_table}
 TABLES_OF_ARMS = {
     "scenes": scenes_table,
     "growth": growth_table,

@@ -12,6 +12,11 @@ from gsbench.analysis.statistics import Comparison
 from gsbench.eval.facts import MetricFacts, find
 
 
+def with_arms(frame: pd.DataFrame) -> pd.DataFrame:
+    """Add the column ``arm``: the densifier, or the initialiser where those differ."""
+    return frame.assign(arm=frame.init if frame.densify.nunique() == 1 else frame.densify)
+
+
 def pair(frame: pd.DataFrame, arm: str, metric: str, against: str) -> Paired:
     """Pair two arms as the program does, but for the views: a trial's mean stands for them, so none is drawn anew."""
     one, other = (frame[frame.arm == name].set_index(["scene", "seed"])[metric].sort_index() for name in (against, arm))

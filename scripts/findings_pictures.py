@@ -12,7 +12,9 @@ from gsbench.analysis.per_view import read_views
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.runs.declaration import EXTRAPOLATION, INTERPOLATION
 
-ARMS = ("adc", "volumetric", "volumetric-1", "volumetric_once", "volumetric_once-1", "longaxis")  # in this order
+# Arms that are shown, in this order: densifiers, and initialisers where those differ.
+ARMS = ("adc", "volumetric", "volumetric-1", "volumetric_once", "volumetric_once-1", "longaxis")
+CLOUDS = ("sfm", "sfm_dense", "dim", "random")
 CONTROL = "adc"
 JUDGED = "lpips_squeeze"  # less is better
 GAP = 4  # px between pictures
@@ -25,7 +27,7 @@ def worst_views(experiment: Experiment) -> Image.Image:
     """Draw, a scene a row, the view of the sector with the least mean PSNR."""
     rows = []
     for scene in dict.fromkeys(trial.scene for trial in experiment.trials):
-        own = _first_seeds(experiment, scene, EXTRAPOLATION, _question_of)
+        own = list(_first_seeds(experiment, scene, EXTRAPOLATION, _question_of).values())
         views = [read_views(trial) for trial in own]
         worst = min(views[0], key=lambda view: sum(found[view]["psnr"] for found in views))
         rows.append(_pictures(own, worst))
@@ -40,29 +42,34 @@ def cap_of(trial: TrialResult) -> str:
 def for_and_against(
     experiment: Experiment,
     rule: str = "volumetric",
+    control: str = CONTROL,
     kinds: Sequence[str] = (INTERPOLATION, EXTRAPOLATION),
     kind_of: KindOf = _question_of,
 ) -> Image.Image:
-    """Draw, of all scenes, the view at which ``rule`` gains most over `CONTROL` and that at which it loses most.
+    """Draw, of all scenes, the view at which ``rule`` gains most over ``control`` and that at which it loses most.
 
     A pair of rows for each of the ``kinds`` of trials: between the cameras and of the sector, or as ``kind_of`` says.
     """
     rows = []
     for kind in kinds:
-        found: list[tuple[float, str, list[TrialResult]]] = []
+        found: list[tuple[float, str, Sequence[TrialResult]]] = []
         for scene in dict.fromkeys(trial.scene for trial in experiment.trials):
             own = _first_seeds(experiment, scene, kind, kind_of)
-            views = {trial.densify: read_views(trial) for trial in own}
-            found += [(views[rule][v][JUDGED] - views[CONTROL][v][JUDGED], v, own) for v in views[rule]]
+            one, other = read_views(own[control]), read_views(own[rule])
+            found += [(other[view][JUDGED] - one[view][JUDGED], view, list(own.values())) for view in other]
         found.sort(key=lambda entry: entry[:2])
         rows += [_pictures(own, view) for _, view, own in (found[0], found[-1])]
     return _joined(rows)
 
 
-def _first_seeds(experiment: Experiment, scene: str, kind: str, kind_of: KindOf) -> list[TrialResult]:
-    """The trials of a scene's first seed that are of this kind, in the order of `ARMS`."""
+def _first_seeds(experiment: Experiment, scene: str, kind: str, kind_of: KindOf) -> dict[str, TrialResult]:
+    """The trials of a scene's first seed that are of this kind, by `ARMS`, or by `CLOUDS` where one densifier is."""
     own = [trial for trial in experiment.trials if (trial.scene, trial.seed, kind_of(trial)) == (scene, 0, kind)]
-    return sorted(own, key=lambda trial: ARMS.index(trial.densify))
+    if len({trial.densify for trial in own}) > 1:
+        found, shown = {trial.densify: trial for trial in own}, ARMS
+    else:
+        found, shown = {trial.init: trial for trial in own}, CLOUDS
+    return {name: found[name] for name in shown if name in found}
 
 
 def _pictures(trials: Sequence[TrialResult], view: str) -> list[Image.Image]:

@@ -63,7 +63,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "densify=null": "choose one by its name",
     "scene=[courtyard]": "choose one by its name",
     "densify=vol": "densify=vol does not exist",
-    "densify=mine": "densify=mine does not exist; a class of your own is named by densify._target_",
+    "densify=calm": "densify=calm does not exist; a class of your own is named by densify._target_",
     "train=2k": "train=2k does not exist (choose: ",
     "experiment=demo": "write +experiment=NAME",
     "-m +experiment=demo,threshold": "two experiments are two sweeps",
