@@ -334,6 +334,49 @@ def test_what_is_said_of_the_papers_schedule_is_so(scripts: ModuleType, page: st
     assert f"PSNR from {kitchen.min():.1f} to {kitchen.max():.1f} dB" in prose
 
 
+def test_what_is_said_of_initial_clouds_is_so(scripts: ModuleType, prose: str) -> None:
+    archives = scripts.archives
+    verdicts = {verdict.claim.id: verdict for verdict in archives.checked("findings_initialisers").verdicts}
+    facts = {(verdict.word, verdict.beforehand, verdict.decision.seeds) for verdict in verdicts.values()}
+    assert facts == {("undecided", True, 2)}
+    assert {len(verdict.by_scene) for verdict in verdicts.values()} == {6}
+    frame = archives.read_trials("findings_initialisers")
+    assert len(frame) == 84
+    assert set(frame.num_gaussians.round(-3)) == {20_000}
+    trials = frame.set_index(["arm", "scene", "seed"]).sort_index()
+    lpips, psnr = (trials.loc["sfm", key] - trials.loc["random", key] for key in ("lpips_squeeze", "psnr"))
+    assert (lpips < 0).all()
+    gains = [-lpips.groupby("scene").mean(), psnr.groupby("scene").mean()]
+    least, most = (f"{gains[0].agg(end):.3f}".lstrip("0") for end in ("min", "max"))
+    assert prose.count(f"by {least} to {most}") == 2
+    assert f"{gains[1].min():.1f} to {gains[1].max():.1f} dB more PSNR" in prose
+
+    def of(claim: str) -> dict[str, str]:
+        by_scene = dict(verdicts[claim].by_scene)
+        return {scene: said(value, 3) for scene, value in by_scene.items()} | {
+            "mean": said(verdicts[claim].decision.mean, 3)
+        }
+
+    found = of("sfm_against_dim")
+    assert f"SfM's LPIPS is higher by {found['mean'].lstrip('+')} on average" in prose
+    higher = sorted(found[scene] for scene in ("kitchen", "monstree", "herz_jesus"))
+    assert f"higher by {higher[0].lstrip('+')} to {higher[-1].lstrip('+')} on kitchen" in prose
+    assert f"lower by {found['courtyard'].lstrip('−')} on the courtyard" in prose
+    others = dict(verdicts["sfm_against_dim"].by_scene)
+    assert max(abs(others["flower"]), abs(others["fox"])) < 0.003
+    points = frame.groupby("arm").num_init_points.mean()
+    assert f"with {100 * points['dim'] / points['sfm']:.0f} % of SfM's points" in prose
+    assert f"move the mean by {of('dense')['mean']} and {of('jittered')['mean']}" in prose
+    leaked = of("test_photographs")
+    assert f"are worth {leaked['mean']} on average" in prose
+    assert f"on the courtyard and on kitchen {leaked['courtyard']} and {leaked['kitchen']}" in prose
+    carved = of("carved")
+    left = frame[(frame.arm == "carved") & (frame.scene == "flower")].num_init_points.mean()
+    assert f"On flower it leaves {left:,.0f} points, and LPIPS rises by {carved['flower'].lstrip('+')}" in prose
+    falls = [carved[scene].lstrip("−") for scene in ("monstree", "courtyard")]
+    assert f"on monstree it falls by {falls[0]}, on the courtyard by {falls[1]}" in prose
+
+
 def _with_interval(values: list[float]) -> str:
     """Write the mean of scenes with the plain t interval of 95 %."""
     interval = stats.ttest_1samp(values, 0).confidence_interval()
@@ -348,6 +391,7 @@ def _with_interval(values: list[float]) -> str:
         "findings_exponent",
         "findings_full",
         "findings_full_count",
+        "findings_initialisers",
         "findings_matched",
         "findings_volume",
         "scale_bridge",
