@@ -19,7 +19,7 @@ from pathlib import Path
 import findings_archives as archives
 import findings_trends as trends
 import pandas as pd
-from findings_pairs import difference, facts, pair, row, with_arms
+from findings_pairs import arms_of, baseline, difference, facts, pair, row, with_arms
 from PIL import Image
 
 from gsbench.analysis.frame import to_frame
@@ -32,7 +32,6 @@ DOCS = Path(__file__).parents[1] / "docs"
 PAGES = (DOCS / "findings.md", DOCS / "first_findings.md")
 DATA = DOCS / "findings"
 EXPERIMENTS = ("bonsai_growth", "fair_governor", "fair_hard", "initialisers")
-BASELINES = ("adc", "sfm")  # what the others are held against: among densifiers, among initialisers
 METRICS = {"lpips_squeeze": ("LPIPS (squeeze)", 3), "psnr": ("PSNR, dB", 2), "ssim": ("SSIM", 3), "flip": ("FLIP", 3)}
 WHICH = ["scene", "init", "densify", "seed", "iterations", "width", "height"]
 CAUSES = ["cloned", "split_gradient", "split_volume", "isotropic_resplit", "blocked_by_cap", "pruned_opacity"]
@@ -95,7 +94,7 @@ def arms_table(frame: pd.DataFrame) -> list[str]:
     """An arm a row: mean over scenes of the mean over seeds, and the deviation of that mean's trials over seeds."""
     columns = {"num_gaussians": ("Gaussians", 0), **METRICS, "seconds_train": ("training, s", 0)}
     lines = [row(["arm", *(title for title, _ in columns.values())]), row(["---"] + ["--:"] * len(columns))]
-    for arm in _arms(frame):
+    for arm in arms_of(frame):
         own = frame[frame.arm == arm]
         by_seed = own.groupby("seed")[list(columns)].mean()
         cells = [f"{by_seed[k].mean():,.{d}f} ± {by_seed[k].std():,.{d}f}" for k, (_, d) in columns.items()]
@@ -116,7 +115,7 @@ def scenes_table(frame: pd.DataFrame) -> list[str]:
 def _by_scene(frame: pd.DataFrame, title: str, cell: Callable[[pd.DataFrame], str]) -> list[str]:
     scenes = list(dict.fromkeys(frame.scene))
     lines = [row([title, *scenes]), row(["---"] + ["--:"] * len(scenes))]
-    for arm in _arms(frame):
+    for arm in arms_of(frame):
         groups = [frame[(frame.arm == arm) & (frame.scene == scene)] for scene in scenes]
         lines.append(row([arm, *("" if own.empty else cell(own) for own in groups)]))
     return lines
@@ -127,7 +126,7 @@ def differences_table(frame: pd.DataFrame, against: str | None = None, arms: Seq
 
     Bold is what the program would decide. Nothing is called better or worse, since no metric was declared.
     """
-    against = against or _baseline(frame)
+    against = against or baseline(frame)
     found = compared(frame, against, arms)
     lines = [
         row([f"minus {against}", *(title for title, _ in METRICS.values())]),
@@ -142,8 +141,8 @@ def compared(
     frame: pd.DataFrame, against: str | None = None, arms: Sequence[str] | None = None
 ) -> dict[tuple[str, str], Comparison]:
     """Compare each of ``arms`` (default: all others) with ``against`` in each metric, as one family of tests."""
-    against = against or _baseline(frame)
-    keys = [(arm, metric) for arm in arms or _arms(frame) if arm != against for metric in METRICS]
+    against = against or baseline(frame)
+    keys = [(arm, metric) for arm in arms or arms_of(frame) if arm != against for metric in METRICS]
     members = [(pair(frame, arm, metric, against), facts(metric).direction) for arm, metric in keys]
     return dict(zip(keys, compare_family(members), strict=True))
 
@@ -153,7 +152,7 @@ def events_table(frame: pd.DataFrame) -> list[str]:
     causes = [c for c in frame.columns if c.startswith("event_")]
     lines = [row(["arm", *(c.removeprefix("event_").replace("_", " ") for c in causes)])]
     lines.append(row(["---"] + ["--:"] * len(causes)))
-    for arm in _arms(frame):
+    for arm in arms_of(frame):
         means = frame[frame.arm == arm][causes].mean()
         lines.append(row([arm, *(f"{value / 1000:,.1f}" for value in means)]))
     return lines
@@ -162,15 +161,6 @@ def events_table(frame: pd.DataFrame) -> list[str]:
 def read(name: str) -> pd.DataFrame:
     """The trials of an experiment, with their arms."""
     return with_arms(pd.read_csv(DATA / f"{name}.csv"))
-
-
-def _baseline(frame: pd.DataFrame) -> str:
-    return next(arm for arm in BASELINES if arm in set(frame.arm))
-
-
-def _arms(frame: pd.DataFrame) -> list[str]:
-    """The baseline first, then the others as they stand in the file."""
-    return sorted(dict.fromkeys(frame.arm), key=lambda arm: arm != _baseline(frame))
 
 
 TABLES = {

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from findings_pairs import difference, facts, pair, row, with_arms
+from findings_pairs import arms_of, difference, facts, pair, row, with_arms
 from findings_pictures import cap_of, for_and_against, worst_views
 from numpy.typing import NDArray
 from PIL import Image
@@ -57,7 +57,6 @@ QUESTIONS = {INTERPOLATION: "between", EXTRAPOLATION: "sector"}  # as the page c
 PRIMARY = "lpips_squeeze"
 BUDGET = ("densify.max_gaussians", "densify.cap")
 GROWTH = ("event_split_volume", "event_split_gradient", "event_cloned")
-BASELINES = ("adc", "absgrad", "sfm")
 OTHERS = {"psnr": 2, "ssim": 3, "ms_ssim": 4, "fsim": 4, "flip": 3}  # metrics that were not declared, and their digits
 
 
@@ -116,7 +115,7 @@ def gaps_table(name: str) -> list[str]:
     cells = {"psnr": ("PSNR, dB", 2), PRIMARY: ("LPIPS (squeeze)", 3)}
     titles = [f"{title}, {word}" for title, _ in cells.values() for word in (*QUESTIONS.values(), "change")]
     lines = [row(["arm", *titles]), row(["---"] + ["--:"] * len(titles))]
-    for arm in _arms(frame):
+    for arm in arms_of(frame):
         means = [arm]
         for metric, (_, digits) in cells.items():
             one, other = (_mean(frame, arm, question, metric) for question in QUESTIONS)
@@ -179,7 +178,7 @@ def clouds_table(name: str) -> list[str]:
     by_scene = frame.groupby(["arm", "scene"])[list(columns)].mean()
     scenes = list(dict.fromkeys(frame.scene))
     lines = [row(["initial points; LPIPS; PSNR, dB", *scenes, "*mean*"]), row(["---"] + ["--:"] * (len(scenes) + 1))]
-    for arm in _arms(frame):
+    for arm in arms_of(frame):
         means = [*(by_scene.loc[arm, scene] for scene in scenes), by_scene.loc[arm].mean()]
         lines.append(row([arm, *("; ".join(f"{own[key]:{form}}" for key, form in columns.items()) for own in means)]))
     return lines
@@ -308,11 +307,6 @@ def asked(frame: pd.DataFrame) -> list[str]:
 def _mean(frame: pd.DataFrame, arm: str, question: str, metric: str) -> float:
     own = frame[(frame.arm == arm) & (frame.question == question)]
     return float(own.groupby("scene")[metric].mean().mean())
-
-
-def _arms(frame: pd.DataFrame) -> list[str]:
-    """The baseline first."""
-    return sorted(dict.fromkeys(frame.arm), key=lambda arm: arm not in BASELINES)
 
 
 def collect(runs: Path) -> None:

@@ -11,10 +11,23 @@ from gsbench.analysis.pairing import Paired
 from gsbench.analysis.statistics import Comparison
 from gsbench.eval.facts import MetricFacts, find
 
+BASELINES = ("adc", "absgrad", "sfm")  # what others are held against: among densifiers, among initialisers
+
 
 def with_arms(frame: pd.DataFrame) -> pd.DataFrame:
     """Add the column ``arm``: the densifier, or the initialiser where those differ."""
     return frame.assign(arm=frame.init if frame.densify.nunique() == 1 else frame.densify)
+
+
+def baseline(frame: pd.DataFrame) -> str:
+    """Return the first of `BASELINES` that is among the arms."""
+    return next(arm for arm in BASELINES if arm in set(frame.arm))
+
+
+def arms_of(frame: pd.DataFrame) -> list[str]:
+    """The baseline first, then the others as they stand in the table."""
+    first = baseline(frame)
+    return sorted(dict.fromkeys(frame.arm), key=lambda arm: arm != first)
 
 
 def pair(frame: pd.DataFrame, arm: str, metric: str, against: str) -> Paired:

@@ -52,7 +52,7 @@ def tables() -> dict[tuple[str, str], dict[tuple[str, str], Comparison]]:
     for m in script().SECTION.finditer((script().DOCS / "first_findings.md").read_text(encoding="utf-8")):
         if m["table"] == "differences":
             frame, arms = script().read(m["experiment"]), m["arms"].split(", ") if m["arms"] else None
-            against = m["against"] or next(arm for arm in script().BASELINES if arm in set(frame.arm))
+            against = m["against"] or script().baseline(frame)
             found[m["experiment"], against] = script().compared(frame, against, arms)
     return found
 
