@@ -85,6 +85,63 @@ def link_or_copy(source: Path, target: Path) -> None:
             shutil.copyfile(source, temporary)
 
 
+def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
+    """A descriptor of the regular file ``path``, whose last part is no link.
+
+    Raises InputError for a link, and for a pipe or a device, whose reading need not end; OSError as `os.open` does.
+    """
+    flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    try:
+        descriptor = os.open(path, flags, 0o666)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO):  # a link; a pipe that nobody reads
+            raise _no_plain_file(path) from None
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise _no_plain_file(path)
+    return descriptor
+
+
+def require_own(runs: Path, place: Path, below: bool = False) -> None:
+    """Raise InputError where a part of the way from the folder ``runs`` to ``place`` is a link, a pipe or a device.
+
+    With ``below``, also where something in the folder ``place`` is. What is not there is let pass.
+    """
+    # A runs folder that somebody sends may hold links: what we write to `log.txt` would come into the file behind it,
+    # and what we pack or publish would come from there.
+    way = runs
+    for part in place.relative_to(runs).parts:
+        way /= part
+        with suppress(FileNotFoundError, NotADirectoryError):
+            _require_plain(way, os.lstat(way).st_mode)
+    waiting = [place] if below else []
+    while waiting:
+        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(waiting.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    waiting.append(Path(entry.path))
+                elif not entry.is_file(follow_symlinks=False):
+                    raise _no_plain_file(Path(entry.path))
+
+
+def remove_strange(folder: Path) -> None:
+    """Remove the links, pipes and devices below ``folder``; what they lead to stays."""
+    for path in sorted(folder.rglob("*")):
+        mode = os.lstat(path).st_mode
+        if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
+            path.unlink()
+
+
+def _require_plain(path: Path, mode: int) -> None:
+    if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
+        raise _no_plain_file(path)
+
+
+def _no_plain_file(path: Path) -> InputError:
+    return InputError(f"{path} is a link or no regular file, which gsbench does not follow in a runs folder: remove it")
+
+
 def require_regular(path: Path) -> None:
     """Raise InputError for a pipe, a device or a socket, whose reading need not end; what is not there is let pass."""
     with suppress(OSError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -14,6 +15,7 @@ from rich import progress as bars
 from rich.console import Console
 from rich.markup import escape
 
+from gsbench.files import open_plain
 from gsbench.words import printable
 
 LOGGER = logging.getLogger("gsbench")
@@ -95,7 +97,7 @@ def show_details(loggers: bool | str | Sequence[str]) -> None:
 @contextmanager
 def log_to(path: Path) -> Iterator[None]:
     """Write everything that gsbench logs within the block, tracebacks included, to ``path`` as well."""
-    handler = _QuietFileHandler(path, encoding="utf-8")
+    handler = _QuietHandler(os.fdopen(open_plain(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "a", encoding="utf-8"))
     handler.setLevel(logging.DEBUG)
     handler.setFormatter(_Printable("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     LOGGER.addHandler(handler)
@@ -104,10 +106,10 @@ def log_to(path: Path) -> Iterator[None]:
     finally:
         LOGGER.removeHandler(handler)
         with suppress(OSError):
-            handler.close()
+            handler.stream.close()
 
 
-class _QuietFileHandler(logging.FileHandler):
+class _QuietHandler(logging.StreamHandler[TextIO]):
     """Keeps silent where it cannot write: on a full disk the trial's own error says so."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name

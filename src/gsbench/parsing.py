@@ -1,7 +1,8 @@
 """Reading the small files that gsbench writes, whoever wrote or broke them since: bounded, and plain values alone.
 
 A file is read if it is a regular one of at most `MOST_BYTES`; nothing else is opened, so that a FIFO or a device holds
-nobody up. What it holds is JSON or YAML of at most `MOST_DEPTH` levels, whose numbers are finite.
+nobody up, and no link is followed: a user's own file is read by its `resolved` path. What it holds is JSON or YAML of
+at most `MOST_DEPTH` levels, whose numbers are finite.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import yaml
 from pydantic_core import from_json
 
 from gsbench.errors import InputError
+from gsbench.files import open_plain
 
 MOST_BYTES = 64 << 20  # the plan of 80,000 trials; a training that logs each of 300,000 iterations
 SPARE = 1 << 16  # bytes that are read at once beyond a file's size
@@ -60,13 +62,18 @@ def read_tail(path: Path, count: int) -> bytes:
         return os.read(descriptor, count)
 
 
+def resolved(path: Path) -> Path:
+    """The place that a user's own ``path`` leads to, by whatever links."""
+    return Path(os.path.realpath(path))
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[int]:
     """A descriptor of a regular file, closed afterwards; what goes wrong meanwhile is said of the file."""
     try:
-        if not stat.S_ISREG(os.stat(path).st_mode):
+        if not stat.S_ISREG(os.lstat(path).st_mode):  # a link is none: see `gsbench.files.require_own`
             raise DamagedError(path, "cannot be read: it is no regular file")
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+        descriptor = open_plain(path)
         try:
             yield descriptor
         finally:

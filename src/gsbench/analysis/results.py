@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -17,9 +17,10 @@ from typing import Any
 
 from gsbench.analysis.configurations import Configurations, Kind, canonical, load_flat_config
 from gsbench.errors import InputError
+from gsbench.files import require_own
 from gsbench.parsing import DamagedError, one_line
 from gsbench.runs.declaration import QUESTIONS
-from gsbench.runs.experiments import experiment_home, is_folder
+from gsbench.runs.experiments import experiment_home, places_of_trials
 from gsbench.runs.inputs import read_results
 from gsbench.runs.layout import CONFIG, FAILED, RESULTS, SEED
 from gsbench.runs.origin import FROM_RENDERS
@@ -246,7 +247,7 @@ def read_experiment(folder: Path) -> Experiment:
     trials: list[TrialResult] = []
     warnings: list[str] = []
     settings = Configurations()
-    for place in _trial_folders(folder):
+    for place in places_of_trials(folder):
         try:
             trials.append(read_trial(Path(place), runs_dir, settings))
         except _UnusableError as reason:
@@ -281,6 +282,7 @@ class _UnusableError(Exception):
 def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialResult:
     """Read and check one trial folder."""
     try:
+        require_own(runs_dir, path, below=True)
         record, digests = read_results(path)
     except FileNotFoundError:
         raise _UnusableError(_why_unfinished(path)) from None
@@ -288,6 +290,8 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
         raise _UnusableError(f"unfinished, {error.path.name} {error.reason}") from None
     except DamagedError as error:
         raise _UnusableError(f"damaged, {error.path.name} {error.reason}") from None
+    except InputError as error:
+        raise _UnusableError(f"strange, {error}") from None
     match = TRIAL_FOLDER.fullmatch(path.name)
     if match is None:
         raise _UnusableError("foreign, the folder is not named <hash8>-seed<k>")
@@ -299,22 +303,6 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
     if str(record.seed) != match["seed"]:
         raise _UnusableError(f"foreign, its {RESULTS} is of seed {record.seed}")
     return TrialResult(path, match["hash"], record, digests=digests, settings=settings)
-
-
-def _trial_folders(folder: Path) -> Iterator[str]:
-    """Every folder three levels below the experiment, in no particular order."""
-    for scene in _folders(folder):
-        for arm in _folders(scene):
-            yield from _folders(arm)
-
-
-def _folders(place: str | Path) -> list[str]:
-    try:
-        with os.scandir(place) as entries:
-            return [entry.path for entry in entries if is_folder(entry) and not entry.name.startswith(".")]
-    except OSError as error:
-        log.warning("left out: %s cannot be read (%s)", place, error.strerror)
-        return []
 
 
 def _why_unfinished(path: Path) -> str:

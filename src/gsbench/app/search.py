@@ -25,6 +25,7 @@ from gsbench.errors import InputError
 from gsbench.eval.facts import find
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.trial import Trial
+from gsbench.runs.experiments import make_home
 from gsbench.runs.hashing import config_hash, sha256_of
 from gsbench.runs.layout import SEARCH
 from gsbench.settings import check_settings
@@ -116,7 +117,7 @@ def search(
         task.launch(first)
     make_runs_folder(checked_runs_folder(first[0].values["runs"]))
     home = first[0].paths.home
-    home.mkdir(exist_ok=True)
+    make_home(home)
     study = Study(
         home,
         _identity(first[0], wanted, space),

@@ -20,7 +20,7 @@ from gsbench.app.task import grid
 from gsbench.config.command_words import check_makes_trials
 from gsbench.errors import InputError
 from gsbench.eval.facts import find, known_keys
-from gsbench.files import write_json
+from gsbench.files import require_own, write_json
 from gsbench.launch.trial import Trial
 from gsbench.runs.inputs import sound_results
 from gsbench.runs.layout import SEARCH, SEARCH_JOURNAL
@@ -155,6 +155,7 @@ class Study:
         from optuna.storages.journal import JournalFileBackend
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
+        require_own(self.home.parent, self.home / SEARCH_JOURNAL)
         storage = JournalStorage(JournalFileBackend(str(self.home / SEARCH_JOURNAL)))
         direction = DIRECTIONS[1 if self.goal.sign > 0 else -1]
         return optuna.create_study(study_name=self.name, storage=storage, direction=direction, load_if_exists=True)

@@ -21,6 +21,7 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.launch.declare import declare_plan
 from gsbench.parsing import DamagedError
+from gsbench.runs.experiments import make_home
 from gsbench.runs.layout import TUNING
 from gsbench.runs.search_record import SearchRecord
 from gsbench.runs.tuning_record import TunedArm, TuningRecord, read_tuning
@@ -82,7 +83,7 @@ def _search(
     studies = {arm.name: plan.study(arm) for arm in plan.tuned}
     by_name = {arm.name: arm for arm in plan.arms}
     for study in studies.values():
-        study.home.mkdir(exist_ok=True)
+        make_home(study.home)
     with hold(plan.home / f".{TUNING}.lock", "the tuning"):
         while batch := {name: points for name, study in studies.items() if (points := study.next_points())}:
             asked = [(name, number, values) for name, points in batch.items() for number, values in points.items()]

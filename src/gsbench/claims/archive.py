@@ -35,7 +35,7 @@ from gsbench.claims.crate import crate_metadata
 from gsbench.claims.measures import REGIONS, FromPixels, textured_error
 from gsbench.errors import InputError
 from gsbench.files import atomic
-from gsbench.parsing import read_yaml
+from gsbench.parsing import read_bytes, read_yaml
 from gsbench.runs.declaration import DeclaredPlan, read_plans
 from gsbench.runs.layout import CONFIG, DECLARED, FROM_PIXELS, PER_VIEW, RESULTS
 from gsbench.settings import is_folder_name
@@ -78,7 +78,7 @@ def write_archive(experiment: Experiment, out: Path) -> list[str]:
             {"configuration": json.loads(text), "trials": trials} for text, trials in configurations.items()
         ),
         PER_VIEW: _table(rows),
-    } | ({DECLARED: declared.read_bytes()} if declared.is_file() else {})
+    } | ({DECLARED: read_bytes(declared)} if declared.is_file() else {})
     if any(claim.get("metric") in REGIONS for plan in read_plans(experiment.folder) for claim in _claims(plan)):
         contents[PIXELS] = _json_lines(_measured_in_pictures(kept))
     manifest = {

@@ -37,7 +37,7 @@ from gsbench.claims.sequential import FIRST_LOOK, MOST_ALPHA, Design, plan_looks
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.eval.facts import find
-from gsbench.parsing import read_yaml
+from gsbench.parsing import read_yaml, resolved
 from gsbench.runs.hashing import sha256_of
 from gsbench.settings import checked
 from gsbench.words import closest
@@ -155,7 +155,7 @@ class ClaimsFile:
 def read_claims(path: Path) -> ClaimsFile:
     """Read and check a file of claims; raises InputError, one line that names the place and the mend."""
     try:
-        content = read_yaml(path, unique=True)
+        content = read_yaml(resolved(path), unique=True)
     except FileNotFoundError:
         raise InputError(
             f"{path} cannot be read (there is no such file): give a file of claims (docs/claims.md)"

@@ -23,6 +23,7 @@ from gsbench.runs.declaration import (
     trial_key,
     united,
 )
+from gsbench.runs.experiments import make_home
 from gsbench.runs.layout import DECLARED, SEED
 from gsbench.system.locks import hold
 
@@ -64,7 +65,7 @@ def declare(metrics: Mapping[Path, str | None], planned: Mapping[Path, Planned])
     not taken back by a command without one: the trials that such a command adds are added to it, with their time.
     """
     for home, given in metrics.items():
-        home.mkdir(parents=True, exist_ok=True)
+        make_home(home)
         with hold(home / f".{DECLARED}.lock", "the declarations"):
             known = read_declarations(home)
             standing = known[-1] if known else None
@@ -101,7 +102,7 @@ def declare_plan(
 
     One that is the latest of its kind there already stands with its time. ``missing`` is that of a `DeclaredPlan`.
     """
-    home.mkdir(parents=True, exist_ok=True)
+    make_home(home)
     with hold(home / f".{DECLARED}.lock", "the declarations"):
         every = read_plans(home)
         known = [one for one in every if one.kind == kind_of_plan(plan)]

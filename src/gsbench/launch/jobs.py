@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsbench.config.hydra_job import HydraJob
 from gsbench.errors import InputError
+from gsbench.files import require_own
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.queue import forget_submission
 from gsbench.launch.trial import Trial
@@ -105,7 +106,9 @@ def need_submitit(launcher: str) -> None:
 
 def job_folder(values: dict[str, Any]) -> Path:
     """The folder in which the jobs of an experiment write what they print; made if it is not there."""
-    folder = TrialPaths.of(values).runs / JOBS / values["name"]
+    runs = TrialPaths.of(values).runs
+    folder = runs / JOBS / values["name"]
+    require_own(runs, folder, below=True)
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 

@@ -14,9 +14,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsbench.errors import GsbenchError, InputError
+from gsbench.files import require_own
 from gsbench.launch.experience import Experience
 from gsbench.launch.queue import ask_queue, state_in_queue
 from gsbench.launch.trial import Trial
+from gsbench.runs.experiments import make_home
 from gsbench.runs.finished import NotDone, find_finished
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import PLAN, RESULTS, STORE
@@ -49,7 +51,7 @@ def add_to_plan(trials: Sequence[Trial]) -> None:
         if len(entries) > 1:  # the same command is the same sweep, whenever it is given
             sweep = Sweep(id=sha256_of(sorted(entries))[:8], count=len(entries))
             entries = {name: replace(entry, sweep=sweep) for name, entry in entries.items()}
-        home.mkdir(parents=True, exist_ok=True)
+        make_home(home)
         with hold(home / f".{PLAN}.lock", "the plan"):
             write_entries(home, read_entries(home) | entries)
 
@@ -68,6 +70,7 @@ def remove(home: Path, folders: Iterable[Path]) -> None:
     """
     folders = list(folders)
     for folder in folders:
+        require_own(home.parent, folder)
         (folder / RESULTS).unlink(missing_ok=True)  # first, so that no part of a trial is ever taken for all of it
         shutil.rmtree(folder)
     forget(home, folders)

@@ -14,9 +14,10 @@ from gsbench.errors import InputError
 from gsbench.launch.plan import read_plan
 from gsbench.launch.queue import Queue, ask_queue, read_submission, state_in_queue
 from gsbench.parsing import DamagedError
+from gsbench.runs.experiments import places_of_trials
 from gsbench.runs.hashing import determining
 from gsbench.runs.inputs import read_results
-from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, TRIAL_GLOB
+from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED
 from gsbench.runs.trial_files import State, failure_of, read_config, stage_and_step, state_of
 from gsbench.system.locks import read_holder
 
@@ -38,7 +39,7 @@ class TrialState:
 def states_of_experiment(home: Path) -> list[TrialState]:
     """The state of every trial of the experiment in ``home``, planned or found there."""
     planned = {trial.folder: trial.time for trial in read_plan(home)}
-    found = {path for path in home.glob(TRIAL_GLOB) if path.is_dir() and (path / CONFIG).exists()}
+    found = {path for path in map(Path, places_of_trials(home)) if SEED in path.name and (path / CONFIG).exists()}
     folders = sorted({*planned, *found})
     queue = ask_queue(folders)
     return _without_mended([_state(folder, planned.get(folder), queue) for folder in folders])

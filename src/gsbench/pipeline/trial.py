@@ -15,7 +15,7 @@ import pycolmap  # noqa: F401 - here, so that what its import does to signals ca
 import torch
 
 from gsbench.errors import GsbenchError, TrainingError
-from gsbench.files import link_or_copy, remove_temporaries, storage_errors, write_json, write_text
+from gsbench.files import link_or_copy, remove_temporaries, require_own, storage_errors, write_json, write_text
 from gsbench.init.base import PICTURE_FILE, REPORT_FILE
 from gsbench.logs import log_to
 from gsbench.pipeline.parts import Parts
@@ -53,6 +53,8 @@ def run_trial(parts: Parts, config_yaml: str, wait: bool = True) -> TrialRecord:
     take_signals_back()
     paths = TrialPaths.of(parts.values)
     with storage_errors(paths.runs):
+        require_own(paths.runs, paths.folder, below=True)
+        require_own(paths.runs, paths.runs / layout.STORE / layout.VIEWS)
         paths.folder.mkdir(parents=True, exist_ok=True)
         with hold(paths.lock, paths.label, wait), log_to(paths.folder / LOG):
             finished = find_finished(parts.values)

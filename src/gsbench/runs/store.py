@@ -19,7 +19,16 @@ from pathlib import Path
 from typing import Any
 
 from gsbench import __version__
-from gsbench.files import file_sha256, remove_temporaries, storage_errors, sync_to_disk, write_json
+from gsbench.errors import InputError
+from gsbench.files import (
+    file_sha256,
+    remove_strange,
+    remove_temporaries,
+    require_own,
+    storage_errors,
+    sync_to_disk,
+    write_json,
+)
 from gsbench.parsing import DamagedError, fault_of
 from gsbench.records import Amount, Count, Part, read_typed
 from gsbench.runs.hashing import sha256_of
@@ -104,9 +113,10 @@ class Store:
             return found
         final = self.path(step)
         with storage_errors(self.root.parent):
+            require_own(self.root.parent, self.partial(step.stage, step.key))
             final.parent.mkdir(parents=True, exist_ok=True)
             with hold(final.parent / f".{step.key}.lock", f"{step.stage.name} {step.key[:8]}"):
-                if final.exists():
+                if os.path.lexists(final):
                     try:
                         return self._read(final)
                     except ValueError as error:
@@ -115,6 +125,8 @@ class Store:
                 return self._build(step)
 
     def _read(self, path: Path) -> Entry:
+        if path.is_symlink():
+            raise ValueError("it is a link")
         return Entry(path, path.name, read_manifest(path).seconds, cached=True)
 
     def _build(self, step: Step) -> Entry:
@@ -126,6 +138,7 @@ class Store:
                 _remove(partial)
             partial.mkdir(exist_ok=True)
             remove_temporaries(partial)
+            remove_strange(partial)
             (partial / MANIFEST).unlink(missing_ok=True)
             self.on_build(stage, partial)
             started = time.perf_counter()
@@ -193,20 +206,22 @@ def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) 
     if manifest.key != sha256_of({"stage": manifest.stage, "version": manifest.version, "inputs": manifest.inputs}):
         raise ValueError(f"{MANIFEST} does not match its key")
     for name, recorded in manifest.outputs.items():
-        if not _is_sound(folder / name, recorded, thorough):
+        if not _is_sound(folder, name, recorded, thorough):
             raise ValueError(f"{name} differs from what was written")
     return manifest
 
 
-def _is_sound(path: Path, recorded: Output, thorough: bool) -> bool:
+def _is_sound(folder: Path, name: str, recorded: Output, thorough: bool) -> bool:
+    path = folder / name
     try:
+        require_own(folder, path)
         state = path.stat()
         if not stat.S_ISREG(state.st_mode) or state.st_size != recorded.size:
             return False
         if not thorough and state.st_mtime_ns == recorded.mtime_ns:
             return True
         return file_sha256(path) == recorded.sha256
-    except (OSError, ValueError):  # ValueError: a NUL in the name
+    except (OSError, ValueError, InputError):  # ValueError: a NUL in the name, or another folder
         return False
 
 

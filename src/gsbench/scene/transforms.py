@@ -21,6 +21,7 @@ from annotated_types import Len
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
+from gsbench.parsing import resolved
 from gsbench.records import Number, Part, Text, read_typed
 from gsbench.scene.images import IMAGE_SUFFIXES, image_size
 from gsbench.scene.prepare import CameraModel
@@ -150,7 +151,7 @@ def read_transforms(folder: Path) -> Transforms:
     by_part: dict[str, list[str]] = {}
     split, points, undo = None, None, Undo()
     for part, path in files.items():
-        record = read_typed(path, TransformsRecord)
+        record = read_typed(resolved(path), TransformsRecord)
         undo = _undo(path, record)
         found = {frame.name: frame for frame in _frames(folder, path, record, undo)}
         if twice := sorted(found.keys() & frames.keys()):

@@ -15,6 +15,8 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from gsbench.errors import InputError
+from gsbench.files import open_plain
 from gsbench.records import Amount, Part, read_if_sound
 
 try:
@@ -48,7 +50,9 @@ def hold(path: Path, what: str, wait: bool = True) -> Iterator[None]:
         lock.acquire(poll_interval=SECONDS_BETWEEN_TRIES)
     holder = _holder_file(path)
     with suppress(OSError):  # it only informs
-        holder.write_text(json.dumps(this_process() | {"what": what}))
+        holder.unlink(missing_ok=True)  # by another process it may be a link to anywhere
+        with os.fdopen(open_plain(holder, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "w") as stream:
+            stream.write(json.dumps(this_process() | {"what": what}))
     try:
         yield
     finally:
@@ -68,8 +72,8 @@ def is_held(path: Path) -> bool:
         lock.release()
         return False
     try:
-        descriptor = os.open(path, os.O_RDONLY)
-    except OSError:
+        descriptor = open_plain(path)
+    except (OSError, InputError):
         return False
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
 
-from gsbench.files import atomic
+from gsbench.files import atomic, require_own
 from gsbench.runs.layout import ARTIFACTS, DATABASE
 from gsbench.tracking.source import user_tags
 
@@ -54,6 +54,8 @@ def connect(uri: str | None, runs: Path) -> MlflowClient:
     for logger in ("mlflow", "alembic"):  # importing mlflow has set their levels
         logging.getLogger(logger).setLevel(logging.WARNING)
     address = tracker_uri(uri, runs)
+    for name in (DATABASE, ARTIFACTS):
+        require_own(runs, runs / name)
     with _set_up_lock(address, runs):
         _create_sqlite(address)
         if address == default_uri(runs):

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
 from gsbench.errors import InputError
-from gsbench.runs.layout import TRIAL_GLOB
+from gsbench.runs.experiments import places_of_trials
 from gsbench.runs.trial_files import label_of, read_config, state_of
 from gsbench.system.locks import BusyError, hold
 from gsbench.tracking.address import untyped_address
@@ -54,7 +54,7 @@ def sync() -> NoReturn:
 
     def work(ended: threading.Event, out: TextIO) -> None:
         new = known = 0
-        for folder in (folder for home in homes for folder in sorted(Path(home).glob(TRIAL_GLOB))):
+        for folder in (folder for home in homes for folder in sorted(map(Path, places_of_trials(Path(home))))):
             state = state_of(folder)
             if state == "damaged":
                 print(f"left out: {label_of(folder)}: damaged, see gsbench status", file=out, flush=True)

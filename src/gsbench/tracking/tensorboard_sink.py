@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from gsbench.files import require_own
 from gsbench.runs.layout import TENSORBOARD
 from gsbench.tracking.record import TrackedFiles
 from gsbench.tracking.sink import Point, Summary
@@ -29,6 +30,7 @@ class TensorBoardSink:
             return state
         from torch.utils.tensorboard import SummaryWriter
 
+        require_own(self._record.runs, self._folder)
         self.remove()
         self._writer = SummaryWriter(str(self._folder))
         for name, values in (("settings", self._record.params()), ("trial", self._record.tags())):

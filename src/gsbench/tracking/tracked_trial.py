@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from gsbench.files import write_json
+from gsbench.files import require_own, write_json
 from gsbench.runs import layout
 from gsbench.runs.trial_files import failure_of
 from gsbench.system.locks import hold
@@ -78,6 +78,7 @@ def mirror_trial(options: dict[str, Any], runs: Path, folder: Path, values: dict
 
     With ``anew``, the run that mirrors it so far is deleted, and another made from the files alone.
     """
+    require_own(runs, folder, below=True)
     with hold(folder / LOCK, "mirroring", wait=False):
         run = TrackedTrial(options, runs, folder, values)
         if anew:

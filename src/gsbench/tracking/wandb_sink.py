@@ -7,6 +7,7 @@ import uuid
 from collections.abc import Sequence
 from typing import Any
 
+from gsbench.files import require_own
 from gsbench.runs.layout import WANDB
 from gsbench.tracking.record import TrackedFiles
 from gsbench.tracking.sink import Point, Summary
@@ -36,6 +37,7 @@ class WandbSink:
 
         record = self._record
         folder = record.runs / WANDB
+        require_own(record.runs, folder)
         folder.mkdir(exist_ok=True)
         self._run = wandb.init(
             project=record.values["name"],

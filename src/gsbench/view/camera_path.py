@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from gsbench.errors import InputError
+from gsbench.parsing import resolved
 from gsbench.records import Number, Part, read_typed
 from gsbench.scene.camera import Camera
 from gsbench.scene.sectors import arrange, looked_at, scene_up
@@ -154,7 +155,7 @@ def _undo(path: Path) -> Undo:
 
 def _read(path: Path, kind: type[T]) -> T:
     try:
-        return read_typed(path, kind)
+        return read_typed(resolved(path), kind)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
 

@@ -1,0 +1,161 @@
+"""A runs folder of a stranger's: no link of it is followed, and nothing of it holds anybody up."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from gsbench.analysis.results import read_experiment
+from gsbench.errors import InputError
+from gsbench.files import remove_strange, require_own
+from gsbench.launch.declare import declare
+from gsbench.launch.plan import forget, remove
+from gsbench.launch.states import states_of_experiment
+from gsbench.logs import log_to
+from gsbench.parsing import DamagedError, read_bytes
+from gsbench.runs.experiments import list_experiments
+from gsbench.runs.step import Step
+from gsbench.runs.store import Store
+from gsbench.system.locks import describe_holder, hold, is_held
+from tests.finished import write_results
+from tests.runs.toy import TOY, build, toy_inputs
+
+SECRET = "what nobody else may read or change"
+
+
+@pytest.fixture
+def outside(tmp_path: Path) -> Path:
+    """A private folder beside the runs folder."""
+    folder = tmp_path / "outside"
+    folder.mkdir()
+    (folder / "private").write_text(SECRET)
+    return folder
+
+
+@pytest.fixture
+def trial(tmp_path: Path) -> Path:
+    """A finished trial in the runs folder, by its results alone."""
+    folder = tmp_path / "runs" / "x" / "s" / "a-b" / "01234567-seed0"
+    named = {group: {"name": name} for group, name in {"scene": "s", "init": "a", "densify": "b"}.items()}
+    write_results(folder, {"name": "x", "seed": 0, **named})
+    return folder
+
+
+def _log(folder: Path) -> None:
+    with log_to(folder / "log.txt"):
+        pass
+
+
+def _hold(folder: Path) -> None:
+    with hold(folder / ".lock", "work"):
+        pass
+
+
+def _forget(folder: Path) -> None:
+    forget(folder.parents[2], [])
+
+
+def _declare(folder: Path) -> None:
+    declare({folder.parents[2]: "psnr"}, {folder.parents[2]: {}})
+
+
+# What is a link in a trial's folder, and what then runs.
+WRITERS: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "the log": ("log.txt", _log),
+    "a lock": (".lock", _hold),
+    "a lock's holder": (".lock.holder", _hold),
+    "the plan's holder": ("../../../.plan.json.lock.holder", _forget),
+    "the plan": ("../../../plan.json", _forget),
+    "the declarations": ("../../../declared.jsonl", _declare),
+}
+
+
+@pytest.mark.parametrize("case", WRITERS)
+def test_no_link_is_written_through(case: str, trial: Path, outside: Path) -> None:
+    name, write = WRITERS[case]
+    (trial / name).symlink_to(outside / "private")
+    with suppress(InputError, OSError):
+        write(trial)
+    assert (outside / "private").read_text() == SECRET
+
+
+@pytest.mark.parametrize("level", range(3))
+def test_a_linked_folder_is_no_place_of_trials(level: int, trial: Path, outside: Path) -> None:
+    doomed = [trial.parents[2], trial.parents[1], trial.parent][level]
+    doomed.rename(outside / "moved")
+    doomed.symlink_to(outside / "moved")
+    home = trial.parents[2]
+    assert read_experiment(home).trials == () or level == 0  # a folder that is typed may be a link
+    assert states_of_experiment(home) == [] or level == 0
+    assert (list_experiments(home.parent) == []) == (level == 0)
+    with pytest.raises(InputError, match="does not follow"):
+        remove(home, [trial])
+    assert trial.is_dir()
+
+
+def _link(path: Path, outside: Path) -> None:
+    path.symlink_to(outside / "private")
+
+
+def _folder_link(path: Path, outside: Path) -> None:
+    path.symlink_to(outside)
+
+
+def _pipe(path: Path, outside: Path) -> None:
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize("make", [_link, _folder_link, _pipe])
+@pytest.mark.parametrize("name", ["per_view.csv", "renders", "ground_truth/v.png", "log.txt"])
+def test_a_trial_that_holds_something_strange_is_left_out(
+    name: str, make: Callable[[Path, Path], None], trial: Path, outside: Path
+) -> None:
+    assert len(read_experiment(trial.parents[2]).trials) == 1
+    (trial / name).parent.mkdir(exist_ok=True)
+    make(trial / name, outside)
+    found = read_experiment(trial.parents[2])
+    assert not found.trials
+    assert name in found.warnings[0]
+    with pytest.raises(InputError, match="no regular file"):
+        require_own(trial.parents[3], trial, below=True)
+
+
+@pytest.mark.parametrize("make", [_link, _pipe])
+def test_no_link_and_no_pipe_is_read(make: Callable[[Path, Path], None], trial: Path, outside: Path) -> None:
+    for name in ("declared.jsonl", ".lock", ".lock.holder"):
+        make(trial / name, outside)
+    with pytest.raises(DamagedError):
+        read_bytes(trial / "declared.jsonl")
+    assert not is_held(trial / ".lock")
+    assert describe_holder(trial / ".lock") == "another process"
+
+
+def test_a_store_builds_in_no_linked_folder(tmp_path: Path, outside: Path) -> None:
+    store, step = Store(tmp_path / "runs" / "store"), Step(TOY, toy_inputs(1), lambda folder: build(folder, 1, 0.0))
+    partial = store.partial(step.stage, step.key)
+    partial.parent.mkdir(parents=True)
+    partial.symlink_to(outside)
+    with pytest.raises(InputError, match="does not follow"):
+        store.get(step)
+    assert [path.name for path in outside.iterdir()] == ["private"]
+    partial.unlink()
+    made = store.get(step).path
+    made.rename(outside / "moved")
+    made.symlink_to(outside / "moved")
+    assert not store.get(step).path.is_symlink()
+    assert (outside / "moved").is_dir()
+
+
+def test_what_a_killed_build_linked_is_removed_and_what_it_led_to_stays(tmp_path: Path, outside: Path) -> None:
+    partial = tmp_path / "partial"
+    (partial / "work").mkdir(parents=True)
+    (partial / "work" / "images").symlink_to(outside)
+    (partial / "kept").write_text("")
+    remove_strange(partial)
+    assert sorted(path.name for path in partial.iterdir()) == ["kept", "work"]
+    assert not list((partial / "work").iterdir())
+    assert (outside / "private").read_text() == SECRET
