@@ -8,6 +8,7 @@ import os
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +151,24 @@ def test_retry_of_a_trial_without_a_plan_takes_its_own_configuration(runs: Path)
     again = retry.recompose(folders[1], None, runs, [], str(runs.parent))
     assert TrialPaths.of(again.values).folder == folders[1]
     assert again.values == compose_one(["name=x", "densify=adc", "seed=1"]).values
+
+
+@pytest.mark.parametrize("old_plan", [False, True])
+def test_a_second_retry_without_a_plan_runs_the_same_trial(
+    old_plan: bool, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = make_experiment(runs)
+    (runs / "x" / "plan.json").unlink()
+    ran: list[Path] = []
+
+    def killed(trials: list[Any]) -> int:
+        add_to_plan([replace(trial, recorded=False) for trial in trials] if old_plan else trials)
+        ran.extend(trial.folder for trial in trials)
+        return 1
+
+    monkeypatch.setattr("gsbench.app.command.run_trials", killed)
+    assert [cli.run(["retry", "x"]), cli.run(["retry", "x"])] == [1, 1]
+    assert ran == [folders[1], folders[1]]
 
 
 # ---- export

@@ -45,13 +45,15 @@ ASKED = re.compile(r"\$\{hydra:\s*([\w.]+)\s*\}")
 class Composed:
     """The configuration of one trial: resolved values, the same as YAML, and the overrides that give it.
 
-    ``job`` is what Hydra knows of the trial where it runs as a job of Hydra's.
+    ``job`` is what Hydra knows of the trial where it runs as a job of Hydra's. One that was ``recorded`` is read from
+    its own ``config.yaml``, and no overrides give it.
     """
 
     values: dict[str, Any]
     yaml: str
     overrides: tuple[str, ...]
     job: HydraJob | None = field(default=None, compare=False, repr=False)
+    recorded: bool = False
 
 
 @contextmanager

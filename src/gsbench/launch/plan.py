@@ -41,9 +41,14 @@ class Planned:
 
 
 def add_to_plan(trials: Sequence[Trial]) -> None:
-    """Write the trials into the plans of their experiments; those that were there stay."""
+    """Write the trials into the plans of their experiments; those that were there stay.
+
+    A trial that was read from its own record stays out: its plan would hold no words, which describe the defaults.
+    """
     by_plan: dict[Path, dict[str, Entry]] = {}
     for trial in trials:
+        if trial.recorded:
+            continue
         paths = trial.paths
         entry = Entry(overrides=tuple(trial.overrides), cwd=os.getcwd(), time=time.time())
         by_plan.setdefault(paths.home, {})[paths.folder.relative_to(paths.home).as_posix()] = entry

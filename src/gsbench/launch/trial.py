@@ -23,7 +23,7 @@ class Trial(Composed):
     @classmethod
     def of(cls, composed: Composed) -> Trial:
         """The trial of a composition."""
-        return cls(composed.values, composed.yaml, composed.overrides, composed.job)
+        return cls(composed.values, composed.yaml, composed.overrides, composed.job, composed.recorded)
 
     @cached_property
     def paths(self) -> TrialPaths:

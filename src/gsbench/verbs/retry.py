@@ -17,6 +17,7 @@ from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.launch.trial import Trial
 from gsbench.runs.experiments import experiment_home
+from gsbench.runs.layout import CONFIG
 from gsbench.runs.origin import FROM_RENDERS
 from gsbench.runs.trial_files import TrialPaths, label_of, read_config
 from gsbench.system.own_modules import allow_modules
@@ -102,7 +103,10 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
             raise InputError(
                 f"{' '.join(changes)} would make other trials than those of the plan: give the sweep's own command"
             )
-        return Trial(trial.values | {"runs": str(runs)}, trial.yaml, trial.overrides)
+        found = Trial(trial.values | {"runs": str(runs)}, trial.yaml, trial.overrides)
+        # A plan without words may be of a trial that was read from its record, whose settings are not the defaults.
+        if planned.overrides or found.folder == folder or not (folder / CONFIG).exists():
+            return found
     if any(key_of(change) != PERMISSIONS for change in changes):
         raise InputError(
             f"{label_of(folder)} is in no plan, so no setting of it can be changed: run it by its own command"
@@ -112,7 +116,7 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
     if values["densify"].get("evaluated_from") == FROM_RENDERS:
         raise InputError(f"{label_of(folder)} was entered from renders: give the command of `gsbench evaluate` again")
     check_permissions(values)
-    return Trial(values, yaml.safe_dump(values, sort_keys=False), ())
+    return Trial(values, yaml.safe_dump(values, sort_keys=False), (), recorded=True)
 
 
 def key_of(word: str) -> str:
