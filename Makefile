@@ -1,9 +1,8 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-# Two files of tests at a time, each in a process of its own, in the order of their names (else those with few tests, which
-# run the whole program, come last): half the time, and no test that needs another to have run.
-PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+# Two tests at a time, each worker in a process of its own; one that has nothing left takes tests of the other.
+PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 # Each library that chooses its instructions by the processor, told to choose the plainest. Compiled kernels keep a cache
@@ -18,7 +17,7 @@ NEXT_HYDRA := 'hydra-core>=1.4.0rc1,<1.5' 'omegaconf>=2.4.1rc1,<2.5'
 NEXT_HYDRA_TESTS := tests/app tests/config tests/end_to_end/test_hydra.py
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow test-generic next-hydra test-next-hydra lint docs lock
+.PHONY: help install demo test test-slow test-all test-generic next-hydra test-next-hydra lint docs lock
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -30,14 +29,16 @@ demo: $(VENV)/.stamp-run ## baseline against volumetric densification on the cou
 	$(BIN)/gsbench tables demo
 	$(BIN)/gsbench report demo
 
-test: $(VENV)/.stamp-dev ## run the tests, but for the slow ones
+test: $(VENV)/.stamp-dev ## run the quick tests: every unit, every contract, the program as a user runs it
 	$(PYTEST) -m 'not slow'
 
-test-slow: $(VENV)/.stamp-dev ## run the tests that take long and rarely tell anything new
+test-slow: $(VENV)/.stamp-dev
 	$(PYTEST) -m slow
 
+test-all: test test-slow ## run the quick tests and all others, which start processes, train or compile for long
+
 test-generic: $(VENV)/.stamp-dev ## run core tests as on the plainest processor of this architecture
-	$(GENERIC) $(PYTEST) $(CORE_TESTS)
+	$(GENERIC) $(PYTEST) -m 'not slow' $(CORE_TESTS)
 
 next-hydra: $(VENV)/.stamp-dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --pre --no-deps --upgrade --target $(VENV)/next-hydra $(NEXT_HYDRA)

@@ -224,6 +224,7 @@ def test_splat_is_what_gsplat_writes(gaussians: Gaussians) -> None:
     assert weights[0] >= weights[len(weights) // 2] >= weights[-1]
 
 
+@pytest.mark.slow
 def test_spz_is_read_by_another_library(gaussians: Gaussians, tmp_path: Path) -> None:
     """To half a step of each quantity; the file's axes are those of OpenGL."""
     gsply = pytest.importorskip("gsply", reason="needs gsply (extra dev)")

@@ -100,7 +100,8 @@ def test_every_target_for_tests_is_called_by_a_workflow_and_by_ci() -> None:
     wanted |= {"lint", "docs"}
     text = "".join(step.get("run", "") + "\n" for workflow in WORKFLOWS for step in steps(workflow))
     assert wanted <= set(re.findall(r"\bmake ([a-z-]+)", text))
-    assert wanted <= set(re.findall(r"^ *make ([a-z-]+)", (ROOT / ".ci" / "run").read_text(), re.MULTILINE))
+    calls = re.findall(r"^ *make ([a-z -]+)", (ROOT / ".ci" / "run").read_text(), re.MULTILINE)
+    assert wanted <= set(" ".join(calls).split())
 
 
 def test_linux_is_tested_from_the_oldest_python_that_is_promised() -> None:

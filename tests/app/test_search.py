@@ -80,6 +80,7 @@ def points(runs: Path) -> list[dict[str, Any]]:
     return list(json.loads((runs / "x" / "search.json").read_text())["points"])
 
 
+@pytest.mark.slow
 def test_search_finds_the_best_judges_points_by_their_mean_and_goes_on_after_a_kill(runs: Path, trials: Trials) -> None:
     trials.stops = {7}  # in the fourth point, after its first seed
     assert cli.run(COMMAND) == 130
@@ -104,6 +105,7 @@ def test_search_finds_the_best_judges_points_by_their_mean_and_goes_on_after_a_k
     assert all(chart.count("<circle") >= 13 for chart in part.charts)
 
 
+@pytest.mark.slow
 def test_what_is_proposed_does_not_depend_on_when_the_search_was_killed(runs: Path, trials: Trials) -> None:
     assert cli.run([*COMMAND, "hydra.sweeper.trials=4", "name=whole"]) == 0
     whole = list(trials.trained)

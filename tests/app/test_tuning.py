@@ -117,6 +117,7 @@ def chosen(runs: Path, arm: str) -> dict[str, Any]:
     return dict(best.settings)
 
 
+@pytest.mark.slow
 def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_the_best(
     sweep: Sweep, runs: Path
 ) -> None:
@@ -149,6 +150,7 @@ def test_the_plan_is_declared_before_anything_is_trained(sweep: Sweep, runs: Pat
 
 
 @pytest.mark.parametrize("stops", [3, 9])  # in the search, and in the sweep
+@pytest.mark.slow
 def test_killed_anywhere_it_goes_on_and_chooses_the_same(
     stops: int, sweep: Sweep, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -167,6 +169,7 @@ def test_killed_anywhere_it_goes_on_and_chooses_the_same(
     assert again.batches == [4]  # what is tuned is not even asked for
 
 
+@pytest.mark.slow
 def test_seeds_may_be_added_to_a_tuned_sweep_and_it_may_stop_when_decided(sweep: Sweep, runs: Path) -> None:
     assert sweep(Fake(), "launch.stop_when_decided=true", "seed=0,1,2") == 0
     assert sorted(plan.kind for plan in read_plans(runs / "fair")) == ["stopping", "tuning"]
@@ -178,6 +181,7 @@ def test_seeds_may_be_added_to_a_tuned_sweep_and_it_may_stop_when_decided(sweep:
     assert {trial.values["name"] for trial in more.trained} == {"fair"}
 
 
+@pytest.mark.slow
 def test_another_launcher_gets_the_points_and_their_trials(sweep: Sweep) -> None:
     fake = Fake()
     assert sweep(fake, "hydra/launcher=basic", "launch=serial") == 0
@@ -197,6 +201,7 @@ def test_a_point_is_judged_on_all_scenes_and_seeds_of_the_tuning(sweep: Sweep, r
     assert point.points[0].value == pytest.approx(26 - np.log(1.5) + 0.075 + 1, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_points_that_fail_are_part_of_the_budget_and_an_arm_without_any_ends_the_sweep(
     sweep: Sweep, runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -237,6 +242,7 @@ def notes(runs: Path, *words: str) -> list[str]:
     return [note for note in table.notes if note.startswith("Tuning.")]
 
 
+@pytest.mark.slow
 def test_the_sheet_says_budget_views_points_and_what_was_chosen(sweep: Sweep, runs: Path) -> None:
     assert sweep(Fake()) == 0
     adc, volumetric = notes(runs)
@@ -267,6 +273,7 @@ def test_an_arm_that_was_tuned_more_is_said_in_headline_and_tables(sweep: Sweep,
     assert any(SENTENCE in note for note in build_table(load_experiment(runs, "fair")).notes)
 
 
+@pytest.mark.slow
 def test_trials_from_before_the_tuning_and_with_other_values_are_named(sweep: Sweep, runs: Path) -> None:
     assert sweep(Fake()) == 0
     for file in (runs / "fair").glob("*/random-volumetric/*/results.json"):

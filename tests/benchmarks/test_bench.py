@@ -30,6 +30,8 @@ from gsbench.raster.cpu import stages as cpu_stages
 from gsbench.raster.reference import project
 from gsbench.verbs.bench import main, parser
 
+pytestmark = pytest.mark.slow
+
 KEYS = {"raster", "size", "count", "forward_ms", "backward_ms", "step_ms", "peak_memory_mb"}
 
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
 from tests.benchmarks.scale import NAME, timed, write_all
+
+pytestmark = pytest.mark.slow
 
 
 def test_many_trials_are_read_and_averaged(tmp_path: Path) -> None:

@@ -14,6 +14,8 @@ from gsbench.bench.waits import counting_waits
 from gsbench.raster.readback import Readback
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 ONE = torch.ones(4)
 WAITING = {
     "a value": (lambda: ONE.sum().item(), {"_local_scalar_dense": 1}),

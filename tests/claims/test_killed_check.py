@@ -16,6 +16,8 @@ import yaml
 from tests.claims.test_sweep import content
 from tests.launch.test_declare import TINY
 
+pytestmark = pytest.mark.slow
+
 PATIENCE = 240.0  # seconds for a trial of two iterations, on a machine that is busy with other things
 
 
@@ -36,8 +38,6 @@ def done(runs: Path) -> int:
     return len(list(runs.glob("check_it/*/*/*/results.json")))
 
 
-@pytest.mark.slow
-@pytest.mark.end_to_end
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 def test_a_killed_check_goes_on_and_ends_with_the_same_page(tmp_path: Path) -> None:
     words = dict(word.split("=", 1) for word in TINY)

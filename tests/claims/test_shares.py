@@ -28,6 +28,8 @@ from tests.claims.test_archive import members
 from tests.claims.test_recheck import SCENES, Runner
 from tests.claims.test_sweep import content, ready
 
+pytestmark = pytest.mark.slow
+
 NOISE = 6.0  # dB: no claim is decided before the last look
 TRIALS = 2 * 2 * 4  # arms, scenes, seeds
 

@@ -142,7 +142,7 @@ def test_the_page_says_all_in_both_formats(tmp_path: Path) -> None:
     assert "http" not in to_html(page).replace("http://www.w3.org", "")  # one file, no network
 
 
-@pytest.mark.end_to_end
+@pytest.mark.slow
 def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -192,7 +192,6 @@ def test_bad_words_are_refused_in_a_line(
 
 
 @pytest.mark.slow
-@pytest.mark.end_to_end
 def test_the_verb_trains_each_run_once_and_the_report_draws_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -55,6 +55,7 @@ def test_in_a_sweep_and_in_a_file_of_ones_own(tmp_path: Path) -> None:
     assert trials[0].values == trials[1].values
 
 
+@pytest.mark.slow
 def test_a_glob_takes_own_arms_alone() -> None:
     trials = compose_trials(["densify=glob(*)", "train=paper"], True)
     names = [trial.values["densify"]["name"] for trial in trials]

@@ -174,6 +174,7 @@ def test_wrong_type_in_a_component_names_the_key() -> None:
         build("densify", composed("densify.cap=squishy")["densify"], [])
 
 
+@pytest.mark.slow
 def test_every_component_of_gsbench_checks_its_own_options() -> None:
     """`build` leaves it to them; what is wrong in every kind of option is a list of lists."""
     for group, option in [(name, option) for name in ("init", "densify") for option in options(name)]:

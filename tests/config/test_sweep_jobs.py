@@ -42,6 +42,7 @@ def compositions(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("name", list(SWEEPS))
+@pytest.mark.slow
 def test_every_job_is_what_its_words_say(name: str, compositions: list[list[str]]) -> None:
     words, count = SWEEPS[name]
     trials = compose_trials(words, multirun=True)

@@ -19,6 +19,8 @@ from PIL import Image
 from gsbench.cli import run
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 FILE = re.compile(r"# (\w+\.py)\n")  # a block that starts so is a file of that name
 
@@ -56,7 +58,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
             del sys.modules[name]
 
 
-@pytest.mark.end_to_end
 def test_library(folder: Path) -> None:
     found = run_blocks(ROOT / "docs" / "library.md", folder)
     assert sum(found["losses"][-10:]) < 0.9 * sum(found["losses"][:10])
@@ -65,7 +66,6 @@ def test_library(folder: Path) -> None:
         torch.testing.assert_close(found["again"].tensors()[name], tensor, rtol=0, atol=0)
 
 
-@pytest.mark.end_to_end
 def test_densifier(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = run_blocks(ROOT / "docs" / "densifier.md", folder)
     assert found["status"] == 0, capsys.readouterr().err
@@ -74,14 +74,12 @@ def test_densifier(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert len(results) == 1
 
 
-@pytest.mark.end_to_end
 def test_rasterizer(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = run_blocks(ROOT / "docs" / "rasterizer.md", folder)
     assert found["status"] == 0, capsys.readouterr().err
     assert len(list(Path("runs").glob("untiled/courtyard/*/*/results.json"))) == 1
 
 
-@pytest.mark.end_to_end
 def test_metric(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = run_blocks(ROOT / "docs" / "metric.md", folder)
     shown = capsys.readouterr()
@@ -106,7 +104,6 @@ def test_metric(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "gradient error: left of zero is better" in report.replace("gradient error (levels)", "gradient error")
 
 
-@pytest.mark.end_to_end
 def test_initialiser(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """An initialiser from one file outside gsbench, through the real program."""
     found = run_blocks(ROOT / "docs" / "initialiser.md", folder)

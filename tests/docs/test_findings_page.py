@@ -14,6 +14,8 @@ from scipy import stats
 from tests.conftest import ROOT
 from tests.docs import findings_said
 
+pytestmark = pytest.mark.slow
+
 NAME = "findings_matched"
 ARMS = ("volumetric", "volumetric_once", "longaxis")
 BETWEEN, BEYOND = "interpolation", "extrapolation"

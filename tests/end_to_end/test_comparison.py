@@ -9,7 +9,7 @@ import pytest
 from gsbench.cli import run
 from tests.end_to_end.conftest import SMALL
 
-pytestmark = pytest.mark.end_to_end
+pytestmark = pytest.mark.slow
 
 PATIENT = """
 from dataclasses import dataclass

@@ -13,7 +13,7 @@ from gsbench.runs.code import PACKAGE
 from gsbench.system.install import conf_dir
 from tests.end_to_end.conftest import SMALL, Run
 
-pytestmark = [pytest.mark.end_to_end, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 QUICK = [
     *SMALL,

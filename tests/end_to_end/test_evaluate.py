@@ -19,7 +19,7 @@ from gsbench.cli import run
 from gsbench.scene.columns import ANGLE, DISTANCE
 from tests.end_to_end.conftest import SMALL, Run
 
-pytestmark = pytest.mark.end_to_end
+pytestmark = pytest.mark.slow
 EVAL = ["eval.lpips=[squeeze]", "eval.download=false"]
 SCENE = ["scene.views=12", "scene.width=96", "scene.height=72"]
 
@@ -190,7 +190,6 @@ def test_bad_requests_are_one_line(
     assert error.count("gsbench: ") == 1
 
 
-@pytest.mark.slow
 def test_somebodys_model(gsbench: Run, runs: Path, tmp_path: Path) -> None:
     """train=none init=ply: a PLY from anywhere, rendered here; our own gives our own numbers back."""
     model = tmp_path / "theirs.ply"

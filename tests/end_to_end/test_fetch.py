@@ -17,7 +17,7 @@ from tests.datasets.conftest import archive_content, write_archive
 from tests.datasets.server import Manners, Server, serve
 from tests.end_to_end.conftest import Run
 
-pytestmark = pytest.mark.end_to_end
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
@@ -34,7 +34,6 @@ def server(tmp_path: Path) -> Iterator[Server]:
         yield running
 
 
-@pytest.mark.slow
 def test_fetch_then_table1_misses_nothing(gsbench: Run, server: Server, tmp_path: Path) -> None:
     one = gsbench("scene=garden")
     assert one.returncode == 2

@@ -10,7 +10,7 @@ import pytest
 
 from tests.end_to_end.conftest import Run
 
-pytestmark = pytest.mark.end_to_end
+pytestmark = pytest.mark.slow
 SECONDS = 900  # a trial of three iterations on a machine that has much else to do
 
 TINY = [
@@ -67,7 +67,7 @@ def results_below(folder: Path) -> list[dict[str, float]]:
     return [json.loads(path.read_text()) for path in sorted(folder.rglob("results.json"))]
 
 
-@pytest.mark.parametrize("launch", ["serial", pytest.param("local", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("launch", ["serial", "local"])
 def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path, launch: str) -> None:
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     (tmp_path / "conf" / "experiment" / "own.yaml").write_text(EXPERIMENT)
@@ -95,7 +95,7 @@ def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path, launc
 
 @pytest.mark.parametrize(
     "launcher",
-    ["basic", *(pytest.param(name, marks=pytest.mark.slow) for name in ("joblib", "submitit_local"))],
+    ["basic", *(name for name in ("joblib", "submitit_local"))],
 )
 def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, launcher: str) -> None:
     package = f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher"
@@ -112,7 +112,6 @@ def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, launc
     assert [path.stat().st_mtime_ns for path in results] == written  # nothing is done twice
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_a_callback_of_yours_is_found_in_the_processes_of_another_launcher(
     gsbench: Run, tmp_path: Path, launcher: str
@@ -129,7 +128,6 @@ def test_a_callback_of_yours_is_found_in_the_processes_of_another_launcher(
     assert {"sweep begins", "0 begins with seed 0", "1 begins with seed 1", "sweep ends"} <= set(notes)
 
 
-@pytest.mark.slow
 def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(gsbench: Run, tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(
         "from gsbench.densify import NoDensifier\n"

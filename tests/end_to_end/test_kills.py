@@ -20,7 +20,7 @@ import pytest
 from tests.end_to_end.conftest import SMALL, Run
 from tests.processes import bytes_written
 
-pytestmark = pytest.mark.end_to_end
+pytestmark = pytest.mark.slow
 
 SWEEP = ["-m", *SMALL, "name=attacked", "densify=adc,volumetric", "tracking=none", "train.checkpoint_every=40"]
 TRIALS = 2
@@ -74,7 +74,6 @@ def training_log_size(runs: Path) -> int:
     return bytes_written(runs, "store/train/.*.partial/metrics.jsonl")
 
 
-@pytest.mark.slow
 def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
     environment: dict[str, str], undisturbed: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -120,7 +119,6 @@ def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
     assert results_of(runs) == undisturbed
 
 
-@pytest.mark.slow
 def test_two_sweeps_at_once_share_the_work(
     environment: dict[str, str], undisturbed: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -148,7 +146,6 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", str(disk)], check=True)
 
 
-@pytest.mark.slow
 def test_full_disk_ends_the_sweep_in_one_line_and_more_space_mends_it(
     gsbench: Run, undisturbed: dict[str, Any], small_disk: Path
 ) -> None:
@@ -178,7 +175,6 @@ def test_read_only_runs_folder_is_bad_input(gsbench: Run, small_disk: Path) -> N
     assert os.listdir(small_disk) == []
 
 
-@pytest.mark.slow
 def test_a_failed_trial_does_not_stop_the_others_and_retry_mends_it(gsbench: Run, tmp_path: Path) -> None:
     """One densifier is the user's own and fails while a file is absent."""
     (tmp_path / "mine.py").write_text(

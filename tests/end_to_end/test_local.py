@@ -14,7 +14,7 @@ from gsbench.system.resources import assign_gpu, available_threads, take_slot
 from tests.end_to_end.conftest import SMALL
 from tests.end_to_end.test_kills import results_of, start
 
-pytestmark = pytest.mark.end_to_end
+pytestmark = pytest.mark.slow
 
 SWEEP = ["-m", *SMALL, "name=local", "densify=adc", "launch=local", "launch.parallel=2", "tracking=none"]
 
@@ -29,7 +29,6 @@ def holders(runs: Path) -> dict[str, int]:
     return found
 
 
-@pytest.mark.slow
 def test_one_killed_trial_harms_no_other_and_the_next_command_mends_it(
     environment: dict[str, str], tmp_path: Path
 ) -> None:

@@ -24,6 +24,8 @@ from gsbench.scene.masks import read_mask
 from gsbench.scene.readers import read_colmap
 from tests.end_to_end.conftest import trial_of
 
+pytestmark = pytest.mark.slow
+
 SIZE = 192, 144
 QUICK = [
     "scene=colmap", "densify=adc", "train.iterations=80", "train.densify_start=20", "train.densify_interval=20",
@@ -68,13 +70,11 @@ def bits(folder: Path) -> dict[str, str]:
     "words",
     [
         SIFT,
-        pytest.param(["init=sift_kornia"], marks=pytest.mark.slow),
-        pytest.param([*SIFT, "scene.max_size=96"], marks=pytest.mark.slow),
-        pytest.param(
-            ["init=random", "densify=taming", "init.count=3000", "densify.max_gaussians=6000"], marks=pytest.mark.slow
-        ),
-        pytest.param(["init=random", "densify=fastgs"], marks=pytest.mark.slow),
-        pytest.param(["init=random", "train.resolution_schedule=pictures"], marks=pytest.mark.slow),
+        ["init=sift_kornia"],
+        [*SIFT, "scene.max_size=96"],
+        ["init=random", "densify=taming", "init.count=3000", "densify.max_gaussians=6000"],
+        ["init=random", "densify=fastgs"],
+        ["init=random", "train.resolution_schedule=pictures"],
     ],
     ids=["sfm", "kornia", "smaller", "taming", "fastgs", "schedule"],
 )
@@ -99,7 +99,6 @@ def _points(folder: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in model.iterdir()}
 
 
-@pytest.mark.slow
 def test_without_masks_the_noise_is_seen(captures: tuple[Path, Path], tmp_path: Path) -> None:
     """So the test above can fail."""
     clean, noisy = (trial(tmp_path, capture, *SIFT, "scene.masks=null") for capture in captures)

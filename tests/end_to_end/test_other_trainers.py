@@ -28,7 +28,7 @@ from tests.datasets.server import serve
 from tests.end_to_end.conftest import Run
 from tests.processes import heed_interrupts, is_running
 
-pytestmark = pytest.mark.end_to_end
+pytestmark = pytest.mark.slow
 
 TRAINER = Path(__file__).with_name("trainer.py")
 CLOUD = f"""
@@ -245,7 +245,6 @@ def test_bad_programs_end_in_a_line_each_and_lose_nothing_else(
         assert "observations 0" in Path(log[1]).read_text()
 
 
-@pytest.mark.slow
 def test_one_that_hangs_is_ended(
     trainers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -286,7 +285,7 @@ def hanging(
 
 @pytest.mark.parametrize(
     "signum",
-    [signal.SIGINT, *(pytest.param(signum, marks=pytest.mark.slow) for signum in (signal.SIGTERM, signal.SIGKILL))],
+    [signal.SIGINT, *(signum for signum in (signal.SIGTERM, signal.SIGKILL))],
 )
 def test_it_ends_with_gsbench(hanging: tuple[subprocess.Popen[str], list[int]], signum: int) -> None:
     process, pids = hanging

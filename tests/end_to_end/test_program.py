@@ -16,7 +16,7 @@ from PIL import Image
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import SMALL, Run
 
-pytestmark = pytest.mark.end_to_end
+pytestmark = pytest.mark.slow
 
 
 def test_sweep_leaves_complete_trials_and_a_table(gsbench: Run, tmp_path: Path) -> None:
@@ -98,7 +98,6 @@ def test_bad_input_is_one_line_and_exit_code_2(
         assert word in lines[-1]
 
 
-@pytest.mark.slow
 def test_truncated_photo_is_named(gsbench: Run, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()

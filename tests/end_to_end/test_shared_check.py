@@ -15,6 +15,8 @@ from gsbench.scene.courtyard.render import render_courtyard
 from tests.claims.test_sweep import content
 from tests.launch.test_declare import TINY
 
+pytestmark = pytest.mark.slow
+
 SEEDS, SCENES = 3, ("near", "far")
 
 
@@ -24,7 +26,6 @@ def trained(runs: Path) -> set[tuple[str, int]]:
     return {(one["scene"], one["seed"]) for one in found}
 
 
-@pytest.mark.end_to_end
 def test_two_machines_with_photographs_at_places_of_their_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,6 +20,8 @@ from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.readers import read_colmap
 from tests.end_to_end.conftest import trial_of
 
+pytestmark = pytest.mark.slow
+
 QUICK = [
     "scene=colmap", "densify=adc", "train.iterations=120", "train.densify_start=20", "train.densify_interval=20",
     "train.densify_stop=100", "eval.lpips=[]", "eval.flip=false", "tracking=none", "device=cpu",
@@ -52,12 +54,7 @@ def bits(folder: Path) -> dict[str, str]:
 
 @pytest.mark.parametrize(
     ("init", "choice"),
-    [
-        ("sfm", "train"),
-        ("dataset", "train"),
-        pytest.param("dataset", "retriangulated", marks=pytest.mark.slow),
-        pytest.param("sift_kornia", "train", marks=pytest.mark.slow),
-    ],
+    [("sfm", "train"), ("dataset", "train"), ("dataset", "retriangulated"), ("sift_kornia", "train")],
 )
 def test_not_one_bit_of_a_test_photograph_enters_a_trial(
     captures: tuple[Path, Path], tmp_path: Path, init: str, choice: str
@@ -74,7 +71,6 @@ def test_not_one_bit_of_a_test_photograph_enters_a_trial(
         np.testing.assert_array_equal(Image.open(render), Image.open(folders[1] / "renders" / render.name))
 
 
-@pytest.mark.slow
 def test_with_points_from_all_the_noise_is_seen(captures: tuple[Path, Path], tmp_path: Path) -> None:
     """So the test above can fail."""
     words = ["init=sfm", "init.first_octave=0", "init.max_num_features=1500", "init.two_view_tracks=true"]

@@ -11,7 +11,7 @@ import pytest
 from gsbench.cli import run
 from tests.end_to_end.conftest import SMALL, Run
 
-pytestmark = pytest.mark.end_to_end
+pytestmark = pytest.mark.slow
 
 MINE = """
 from dataclasses import dataclass
@@ -29,7 +29,6 @@ QUICK = ["train.iterations=20", "eval.lpips=[]", "eval.flip=false", "tracking=no
 OWN = ["densify=adc", "densify._target_=mine.Mine", "allow_targets=[mine,helper]", "densify.name=mine", "name=edited"]
 
 
-@pytest.mark.slow
 def test_an_edited_densifier_is_never_averaged_with_what_it_was(
     gsbench: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

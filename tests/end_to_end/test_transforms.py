@@ -24,6 +24,8 @@ from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_colmap
 from gsbench.scene.types import Scene
 
+pytestmark = pytest.mark.slow
+
 # What `ns-process-data` does to COLMAP's coordinates: x and y exchanged, z turned round.
 APPLIED = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
 QUICK = [

@@ -13,7 +13,7 @@ import pytest
 
 from tests.end_to_end.test_hydra import TINY
 
-pytestmark = pytest.mark.end_to_end
+pytestmark = pytest.mark.slow
 SECONDS = 900
 BOMB = "with open({mark!r}, 'a') as stream:\n    stream.write(__name__ + '\\n')\n"
 
@@ -80,7 +80,6 @@ def test_nor_by_python_m_but_for_what_python_imports_before_it_comes_to_gsbench(
     assert not (capture.parent / "exploded").exists(), (capture.parent / "exploded").read_text()
 
 
-@pytest.mark.slow
 def test_nor_by_another_trainer_that_tells_its_version(capture: Path) -> None:
     """``python -c`` imports from where it runs, so its version is asked for in an empty folder."""
     (capture.parent / "train.py").write_text("import beside, sys; sys.exit('Error: trained ' + beside.WHAT)")

@@ -12,6 +12,8 @@ import pytest
 
 from tests.end_to_end.conftest import SMALL, Run
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("optuna", reason="needs Optuna (extra search)")
 
 TUNED = [

@@ -24,6 +24,8 @@ from gsbench.densify import Volumetric
 from gsbench.gaussians.trainable import TrainableGaussians
 from tests.end_to_end.conftest import SMALL
 
+pytestmark = pytest.mark.slow
+
 PACKAGE = Path(gsbench.__file__).parent
 MAX_CROSSINGS = 18
 KEY = "densify.volume_threshold"
@@ -62,7 +64,6 @@ def test_a_way_is_counted_by_its_folders() -> None:
     assert crossings(way([outer, inner])) == 3  # conf, config, app, launch
 
 
-@pytest.mark.end_to_end
 def test_from_the_yaml_to_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stacks: list[list[Frame]] = []
     calls: Counter[str] = Counter()

@@ -151,6 +151,7 @@ def test_nothing_is_left_running(tmp_path: Path) -> None:
         ("import time; print('working', flush=True); time.sleep(600)", 3.0, "still ran after 3 s"),
     ],
 )
+@pytest.mark.slow
 def test_bad_ends_are_one_line_with_the_log(tmp_path: Path, code: str, limit: float | None, said: str) -> None:
     with pytest.raises(TrainingError, match=said) as caught:
         run(tmp_path, code, limit)

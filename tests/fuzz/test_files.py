@@ -14,6 +14,8 @@ from PIL import Image
 from gsbench import cli
 from tests.fuzz.models import write_originals
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 CASES = 240  # in CI; `python -m tests.fuzz.models FOLDER 0 10000` tries more
 

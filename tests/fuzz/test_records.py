@@ -14,6 +14,8 @@ import gsbench
 from gsbench import cli
 from tests.fuzz.records import EXPERIMENT, NAMES, write_original
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 CASES = 15 * 20  # in CI; `python -m tests.fuzz.records FOLDER 0 10000` tries more
 DEEP = b"[" * 100_000

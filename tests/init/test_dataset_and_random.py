@@ -55,6 +55,7 @@ def test_dataset_without_points_or_model(courtyard: Capture, bare_photos: Captur
         Dataset().run(bare_photos, tmp_path)
 
 
+@pytest.mark.slow
 def test_random_fills_the_box_around_the_training_cameras(courtyard: Capture, tmp_path: Path):
     report = Random(count=5000, size=2.0, seed=3).run(courtyard, tmp_path / "a")
     cloud = read_cloud(tmp_path / "a" / MODEL_FOLDER)

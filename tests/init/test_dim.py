@@ -58,6 +58,7 @@ class TestUntrained:
         init = superpoint(untrained_weights, matcher="mutual_nearest")
         return init, init.run(courtyard, output / "out", work_dir=output / "work"), output
 
+    @pytest.mark.slow
     def test_cloud_lies_on_the_surfaces(self, run):
         _, report, output = run
         assert (report.init, report.poses, report.num_registered) == ("dim", "shared", 8)
@@ -109,6 +110,7 @@ class TestStore:
         init.run(few, output / "out", work_dir=output / "work")
         return init, output
 
+    @pytest.mark.slow
     def test_only_what_is_missing_or_damaged_is_computed(self, run, few: Capture):
         init, output = run
         features = sorted((output / "work" / "features").iterdir())
@@ -122,6 +124,7 @@ class TestStore:
         assert {path: path.stat().st_mtime_ns for path in times} == times
         assert digest(output / "again" / MODEL_FOLDER) == digest(output / "out" / MODEL_FOLDER)
 
+    @pytest.mark.slow
     def test_two_runs_are_equal_to_the_bit(self, run, few: Capture, tmp_path: Path):
         init, output = run
         init.run(few, tmp_path)
@@ -258,6 +261,7 @@ class TestErrors:
         with pytest.raises(MissingWeights, match="other shapes"):
             build_matcher(superpoint(tmp_path).feature_settings(), tmp_path / "bad.pth", CPU)
 
+    @pytest.mark.slow
     def test_images_without_keypoints(self, few: Capture, tmp_path: Path):
         """A blank photograph is named and left out; only blank ones are an error."""
         images = tmp_path / "images"
@@ -349,6 +353,7 @@ def test_mutual_nearest_by_brute_force():
 
 
 @pytest.mark.shared
+@pytest.mark.slow
 def test_aliked_with_real_weights(courtyard: Capture, shared_weights: Path, tmp_path: Path):
     init = Dim(extractor="aliked", matcher="mutual_nearest", weights=shared_weights, download=False)
     report = init.run(courtyard, tmp_path)

@@ -47,6 +47,7 @@ def shared(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) -> tupl
     return Sfm().run(courtyard, output), output
 
 
+@pytest.mark.slow
 def test_own_poses_agree_with_the_exact_ones(own: tuple[InitReport, Path]):
     report, _ = own
     assert report.num_registered == report.num_images == 8
@@ -59,6 +60,7 @@ def test_own_poses_agree_with_the_exact_ones(own: tuple[InitReport, Path]):
     assert report.warnings == ()
 
 
+@pytest.mark.slow
 def test_jittered_is_sfm_with_copies_nearby(
     shared: tuple[InitReport, Path], courtyard: Capture, tmp_path: Path
 ) -> None:
@@ -132,6 +134,7 @@ def test_output_is_complete_and_the_work_folder_is_gone(shared: tuple[InitReport
     assert not (output / WORK_FOLDER).exists()
 
 
+@pytest.mark.slow
 def test_two_runs_are_equal_to_the_bit_on_any_number_of_threads(
     own: tuple[InitReport, Path], courtyard: Capture, tmp_path: Path
 ):
@@ -140,6 +143,7 @@ def test_two_runs_are_equal_to_the_bit_on_any_number_of_threads(
     assert digest(tmp_path / MODEL_FOLDER) == digest(first / MODEL_FOLDER)
 
 
+@pytest.mark.slow
 def test_bare_photos_get_poses_of_their_own_and_serve_as_reference(bare_photos: Capture, tmp_path: Path):
     assert not Sfm().needs_reference(bare_photos)
     report = Sfm().run(bare_photos, tmp_path / "sfm")
@@ -155,6 +159,7 @@ def test_bare_photos_get_poses_of_their_own_and_serve_as_reference(bare_photos: 
         SfmDense().run(bare_photos, tmp_path / "without")
 
 
+@pytest.mark.slow
 def test_names_with_spaces_and_photos_of_two_sizes(courtyard: Capture, tmp_path: Path):
     images = tmp_path / "my photos"
     images.mkdir()
@@ -191,6 +196,7 @@ def test_detection_at_a_smaller_size_comes_back_at_the_files_size(courtyard: Cap
     assert np.median(surface_distance(read_cloud(tmp_path / MODEL_FOLDER).points)) < 0.06
 
 
+@pytest.mark.slow
 def test_wrong_reference_is_noticed(courtyard: Capture, tmp_path: Path):
     """Poses that are placed but wrong must not pass silently."""
     model = pycolmap.Reconstruction(courtyard.model)
@@ -222,6 +228,7 @@ def test_photos_without_overlap(tmp_path: Path):
         Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
 
 
+@pytest.mark.slow
 def test_photos_from_one_place(courtyard: Capture, tmp_path: Path):
     """Copies of one photograph match perfectly and have no depth."""
     for index in range(4):

@@ -60,6 +60,7 @@ def poses(folder: Path) -> dict[str, bytes]:
     return {image.name: image.cam_from_world().matrix().tobytes() for image in model.images.values()}
 
 
+@pytest.mark.slow
 def test_dataset_keeps_what_two_training_views_see(with_points: Capture, tmp_path: Path) -> None:
     before = read_model(with_points.model)  # type: ignore[arg-type]
     train, test = set(with_points.train_names), set(with_points.test_names)
@@ -158,10 +159,8 @@ MAKERS: dict[str, Callable[[PointsFrom], Initializer]] = {
 
 
 @pytest.mark.parametrize("choice", ["train", "retriangulated"])
-@pytest.mark.parametrize(
-    "name",
-    ["sfm", "dataset", pytest.param("sift_kornia", marks=pytest.mark.slow)],  # the path of dim, without weights
-)
+@pytest.mark.parametrize("name", ["sfm", "dataset", "sift_kornia"])  # the last: the path of dim, without weights
+@pytest.mark.slow
 def test_not_one_bit_of_a_test_photograph_is_in_the_cloud(
     with_points: Capture, tmp_path: Path, name: str, choice: PointsFrom
 ) -> None:
@@ -174,6 +173,7 @@ def test_not_one_bit_of_a_test_photograph_is_in_the_cloud(
     assert clouds[0] == clouds[1]
 
 
+@pytest.mark.slow
 def test_noise_would_be_seen_in_points_from_all(with_points: Capture, tmp_path: Path) -> None:
     clouds = []
     for capture, place in ((with_points, "a"), (with_noise(with_points, tmp_path / "noise"), "b")):

@@ -93,7 +93,7 @@ def test_a_plan_of_claims_is_kept_beside_declared_metrics(tmp_path: Path, caplog
     assert next(plan for plan in read_plans(home) if plan.hash == "bbbb").plan == {"claims": [1]}
 
 
-@pytest.mark.end_to_end
+@pytest.mark.slow
 def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path: Path) -> None:
     words = [*TINY, f"runs={tmp_path}", "name=exp"]
     assert run([*words, "eval.primary=psnr"]) == 0

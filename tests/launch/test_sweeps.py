@@ -111,6 +111,7 @@ NEEDED = {  # what a YAML leaves to its user
 
 
 @pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.slow
 def test_every_yaml_composes(group: str) -> None:
     assert options(group)
     for name in options(group):

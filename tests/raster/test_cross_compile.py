@@ -17,6 +17,8 @@ from gsbench.raster.cpu import CpuRasterizer, backprojection, binning, composite
 from gsbench.train import loss_cpu
 from gsbench.train.loss import photometric_loss
 
+pytestmark = pytest.mark.slow
+
 MODULES = (backprojection, binning, composite, deferred, footprint, projection, loss_cpu)
 TARGETS = {  # triple, processor
     "neon": ("aarch64-unknown-linux-gnu", "neoverse-n1"),
@@ -79,7 +81,6 @@ def test_the_costliest_kernel_compiles_for_arm(target: str) -> None:
     check(target, "decomposite_tiles")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS)
 def test_kernels_compile_for_arm(target: str) -> None:
     assert len(kernels()) >= 13

@@ -52,7 +52,6 @@ def gsbench(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.end_to_end
 def test_the_real_program_trains_with_it_and_knows_its_source(folder: Path) -> None:
     first = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own")
     assert first.returncode == 0, first.stderr

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,57 +16,34 @@ import triton
 
 from tests.raster.conftest import interpreter_fault
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 CONTRACT = "tests/raster/test_contract.py"
 INTERPRETED = "tests/raster/test_triton_interpreted.py"
 EVERY = "match_the_reference"
 ONE_SCENE = "33x49"  # more than one tile each way, the last of one pixel, harmonics of every degree
-PARTS = {  # those that are asked for run side by side
-    "contract": [CONTRACT, INTERPRETED, "-m", "not slow", "-k", f"triton and (not {EVERY} or {ONE_SCENE})"],
+PARTS = {
+    "contract": [CONTRACT, "-k", f"triton and (not {EVERY} or {ONE_SCENE})"],
     "every scene": [CONTRACT, "-k", f"triton and {EVERY} and not {ONE_SCENE}"],
-    "training": [INTERPRETED, "-m", "slow"],
+    "kernels and training": [INTERPRETED],
 }
-SLOW = ("every scene", "training")
 LIMIT = 1700  # s, for one that hangs: below the limit of a test in pyproject.toml; minutes on a quiet machine
 
 
-@pytest.fixture(scope="module")
-def interpreted(request: pytest.FixtureRequest) -> Iterator[dict[str, subprocess.Popen[str]]]:
-    """The parts that this session runs, started together."""
+@pytest.mark.parametrize("part", PARTS)
+def test_in_the_interpreter(part: str) -> None:
     if fault := interpreter_fault(triton.__version__, np.__version__):
         pytest.skip(fault)
-    here = [item for item in request.session.items if item.path == request.path]
-    calls = [item.callspec.params for item in here if hasattr(item, "callspec")]
-    chosen = [params["part"] for params in calls if "part" in params]
     environment = os.environ | {
         "TRITON_INTERPRET": "1",
         "OMP_NUM_THREADS": "1",
         "PYTHONPATH": os.pathsep.join(path for path in [str(ROOT), *sys.path] if path),
     }
-    processes = {
-        part: subprocess.Popen(
-            [sys.executable, "-m", "pytest", "-q", "-x", "--no-header", "-p", "no:cacheprovider", *arguments],
-            cwd=ROOT,
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for part, arguments in PARTS.items()
-        if part in chosen
-    }
-    yield processes
-    for process in processes.values():
-        process.kill()
-        process.wait()
-
-
-@pytest.mark.parametrize("part", [pytest.param(p, marks=[pytest.mark.slow] if p in SLOW else []) for p in PARTS])
-def test_in_the_interpreter(interpreted: dict[str, subprocess.Popen[str]], part: str) -> None:
-    output, _ = interpreted[part].communicate(timeout=LIMIT)
-    print(output)
-    assert interpreted[part].returncode == 0, output
-    assert " passed" in output
+    words = [sys.executable, "-m", "pytest", "-q", "-x", "--no-header", "-p", "no:cacheprovider", *PARTS[part]]
+    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=LIMIT, check=False)
+    assert done.returncode == 0, done.stdout
+    assert " passed" in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -85,7 +61,6 @@ def test_which_interpreter_works_with_which_numpy(versions: tuple[str, str], wor
     assert (interpreter_fault(*versions) is None) == works
 
 
-@pytest.mark.slow
 def test_no_test_is_in_two_parts_or_in_none() -> None:
     environment = os.environ | {"TRITON_INTERPRET": "1"}
 

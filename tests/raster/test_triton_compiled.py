@@ -23,6 +23,8 @@ from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.train.loss_triton import MULTIPROCESSORS, STRIP, TritonLoss, rows_of_program
 from tests.raster.ahead_of_time import TARGETS, Launch, compile_for, recorded, specialization
 
+pytestmark = pytest.mark.slow
+
 CASE = Case(33, 49, 50, sh_degree=3)
 # Bounds on the instructions of the loops that take most of the time, a third above what Triton 3.7 makes of them: a
 # slip by which values leave their registers, or are summed across lanes too early, costs more. An entry is 128 pixels.
@@ -88,7 +90,8 @@ def step(
 
 @pytest.mark.parametrize(
     "target",
-    [pytest.param(number, id=f"sm_{number}", marks=[] if number == 90 else [pytest.mark.slow]) for number in TARGETS],
+    TARGETS,
+    ids="sm_{}".format,
 )
 def test_kernels_compile_without_spills(launches: list[Launch], target: int, monkeypatch: pytest.MonkeyPatch) -> None:
     step(CASE)

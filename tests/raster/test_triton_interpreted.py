@@ -38,6 +38,8 @@ from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer
 from tests.gaussians.helpers import random_gaussians
 
+pytestmark = pytest.mark.slow
+
 BLACK = torch.zeros(3)
 TINY = Case(7, 5, 20, sh_degree=3)
 SMALL = Case(33, 49, 50, sh_degree=3)
@@ -65,7 +67,6 @@ def test_the_same_bits_on_every_run() -> None:
     assert bits(*render_with_gradients(TritonRasterizer(), SMALL, torch.float32)) == expected
 
 
-@pytest.mark.slow
 def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Programs in any order, memory full of NaN and of places far outside: nothing is read before it is written.
 
@@ -452,7 +453,6 @@ def tiny_scene(truth: Gaussians) -> Scene:
     return Scene("tiny", tuple(views), tuple(views[:1]))
 
 
-@pytest.mark.slow
 def test_a_training_equals_the_references(tmp_path: Path) -> None:
     """Thirty iterations, of which the twentieth refines.
 

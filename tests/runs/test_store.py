@@ -177,6 +177,7 @@ def toy(store: Store, number: int, *options: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_killed_at_random_moments_the_work_is_finished_and_right(store: Store) -> None:
     """SIGKILL a process that builds three results, again and again; nothing torn is ever published."""
     rng = random.Random(1)
@@ -206,6 +207,7 @@ def test_killed_at_random_moments_the_work_is_finished_and_right(store: Store) -
     assert left == {TOY.key(toy_inputs(number)) for number in range(3)}
 
 
+@pytest.mark.slow
 def test_rivals_do_the_work_once_and_say_what_they_wait_for(store: Store) -> None:
     processes = [toy(store, 1, "--slow") for _ in range(4)]
     results = [process.communicate(timeout=300) for process in processes]

@@ -19,7 +19,7 @@ import pytest
 
 from tests.end_to_end.conftest import SMALL
 
-pytestmark = [pytest.mark.slurm, pytest.mark.end_to_end]
+pytestmark = [pytest.mark.slurm, pytest.mark.slow]
 
 SLOW = """
 import os, time

@@ -26,6 +26,7 @@ def test_an_address_counts_where_it_is_typed_or_of_the_environment(monkeypatch: 
 
 
 @pytest.mark.parametrize("kind", ["sqlite", "http"])
+@pytest.mark.slow
 def test_sync_leaves_a_strange_tracker_alone(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -35,7 +35,7 @@ from tests.tracking.helpers import (
 )
 from tests.tracking.servers import Gate, Listener
 
-pytestmark = pytest.mark.end_to_end
+pytestmark = pytest.mark.slow
 # Not measured, only the limit within which a program that hangs for good is told from a slow machine.
 SECONDS = 240
 PATIENCE = 4.0
@@ -83,10 +83,7 @@ def check_complete(runs: Path, name: str, code: int, errors: str) -> None:
     "kind",
     [
         "refuses",
-        *(
-            pytest.param(kind, marks=pytest.mark.slow)
-            for kind in ("never answers", "answers after a minute", "hangs up", "postgresql")
-        ),
+        *(kind for kind in ("never answers", "answers after a minute", "hangs up", "postgresql")),
     ],
 )
 def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
@@ -106,7 +103,7 @@ def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
 
 @pytest.mark.parametrize(
     "signum",
-    [signal.SIGINT, *(pytest.param(signum, marks=pytest.mark.slow) for signum in (signal.SIGTERM, signal.SIGKILL))],
+    [signal.SIGINT, *(signum for signum in (signal.SIGTERM, signal.SIGKILL))],
 )
 def test_nothing_is_left_of_a_trial_that_is_ended_while_its_tracker_hangs(signum: int, runs: Path) -> None:
     name = f"ended_by_{signum}"
@@ -173,7 +170,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.1)
 
 
-@pytest.fixture(params=[pytest.param("http", marks=pytest.mark.slow), "postgresql"])
+@pytest.fixture(params=["http", "postgresql"])
 def tracker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Gate, str]]:
     """A tracker that works, behind a gate, and its address there."""
     with ExitStack() as stack:

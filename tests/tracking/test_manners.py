@@ -20,6 +20,8 @@ from gsbench.tracking.source import source_tags
 from gsbench.verbs.ui import address_of
 from tests.tracking.helpers import RECORDS, begin_trial, found_runs, history, options, trial_values, write_trial
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 240  # within which what never comes is told from a slow machine
 
 

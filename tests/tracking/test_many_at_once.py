@@ -13,6 +13,8 @@ from gsbench.runs.trial_files import TrialPaths
 from gsbench.tracking import connect, mirror_trial
 from tests.tracking.helpers import RECORDS, child_environment, found_runs, history, options, trial_values
 
+pytestmark = pytest.mark.slow
+
 JOBS = 8
 CHILD = """
 import json, sys
@@ -56,21 +58,16 @@ def check_jobs(client: Any) -> None:
     assert found_runs(client, "Default") == []
 
 
-@pytest.mark.slow
-@pytest.mark.end_to_end
 def test_eight_jobs_at_once_on_a_new_sqlite_database(tmp_path: Path) -> None:
     run_jobs(tmp_path, None)
     check_jobs(connect(None, tmp_path))
 
 
-@pytest.mark.end_to_end
 def test_eight_jobs_at_once_on_a_new_postgresql_database(tmp_path: Path, postgresql: str) -> None:
     run_jobs(tmp_path, postgresql)
     check_jobs(connect(postgresql, tmp_path))
 
 
-@pytest.mark.end_to_end
-@pytest.mark.slow
 def test_machines_that_share_no_folder_create_one_experiment(tmp_path: Path, postgresql: str) -> None:
     """No file lock is shared: the database itself has to keep them apart."""
     code = (

@@ -48,6 +48,7 @@ def _fresh_patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Mirror, "in_vain", False)
 
 
+@pytest.mark.slow
 def test_all_that_the_files_say_is_mirrored_once(runs: Path) -> None:
     values = trial_values(runs, seed=1)
     folder = begin_trial(values)
@@ -103,6 +104,7 @@ def wait_for_run(folder: Path) -> None:
         time.sleep(0.1)
 
 
+@pytest.mark.slow
 def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs: Path) -> None:
     values = trial_values(runs, seed=4)
     folder = begin_trial(values)
@@ -138,9 +140,8 @@ def test_curves_of_a_training_in_progress_are_followed(runs: Path, tmp_path: Pat
     assert seen == 1
 
 
-@pytest.mark.parametrize(
-    "uri", [pytest.param("down", marks=pytest.mark.slow), "not a database", "no such place", "nonsense"]
-)
+@pytest.mark.parametrize("uri", ["down", "not a database", "no such place", "nonsense"])
+@pytest.mark.slow
 def test_a_broken_tracker_harms_no_trial(uri: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "broken.db").write_text("this is no database" * 100)
     address = {

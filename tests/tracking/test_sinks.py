@@ -49,6 +49,7 @@ def run_of(client: Any, seed: int) -> Any:
     return run
 
 
+@pytest.mark.slow
 def test_measurements_on_the_way_are_steps_of_the_final_metrics_curve(runs: Path) -> None:
     folder, values = finished_trial(runs, seed=1)
     mirror_trial(options(), runs, folder, values)

@@ -168,7 +168,7 @@ def shell(request: pytest.FixtureRequest, tmp_path: Path, runs: Path) -> Iterato
     shell.close()
 
 
-@pytest.mark.end_to_end
+@pytest.mark.slow
 def test_tab_completes(shell: Shell) -> None:
     (shell.log.parent / "photos").mkdir()
     assert shell.call("gsbench tab\tde\t\n") == "tables demo"

@@ -24,7 +24,7 @@ from gsbench.view.server import Viewer, check_port, free_port
 from gsbench.view.trials import find_trial, load_viewed, read_causes
 from tests.view.browser import Browser
 
-pytestmark = pytest.mark.end_to_end
+pytestmark = pytest.mark.slow
 CPU = torch.device("cpu")
 
 

@@ -65,6 +65,7 @@ def mapped(database: Path, mapper: Mapper) -> Mapped:
     return map_images(database, images, database.parent / "out", SETTINGS, VERIFICATION, mapper, no_progress)
 
 
+@pytest.mark.slow
 def test_a_small_baseline_without_a_focal_length_is_placed_by_another_way(tmp_path: Path) -> None:
     database, truth = small_baseline(tmp_path)
     with pytest.raises(InputError, match="found no pair of images to start from"):

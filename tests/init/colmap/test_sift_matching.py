@@ -76,6 +76,7 @@ def read_matches(database: Path) -> tuple[dict[int, bytes], dict[int, tuple[byte
 
 
 @pytest.mark.parametrize("processes", [1, 3])
+@pytest.mark.slow
 def test_matches_are_those_of_colmap_on_one_thread(
     features: tuple[Path, list[tuple[str, str]]], tmp_path: Path, processes: int
 ):
@@ -127,6 +128,7 @@ def test_colmaps_matcher_never_gets_a_second_thread(
     assert set(threads) == {1}
 
 
+@pytest.mark.slow
 def test_auto_leaves_out_what_a_preview_does_not_propose(
     features: tuple[Path, list[tuple[str, str]]], bare_photos: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
