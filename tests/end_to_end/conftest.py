@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
+from filelock import FileLock
 
 from gsbench.cli import run
 
@@ -29,10 +34,47 @@ SMALL = [
     "train.densify_interval=50",
     "train.densify_stop=250",
     "train.opacity_reset_interval=1000",
-    "train.checkpoint_every=100",
+    "train.checkpoint_every=40",
     "eval.download=false",
     "eval.lpips=[squeeze]",
 ]
+FINISHED = "finished"  # the name of the experiment that all tests may copy
+
+
+def common_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The temporary folder of this run of the tests, which is the same for all of its workers."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+@pytest.fixture(scope="session")
+def finished_runs(environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A runs folder with an experiment of four trials, trained once for all workers of the tests: not to be changed."""
+    runs = common_folder(tmp_path_factory) / "finished-runs"
+    with FileLock(f"{runs}.lock"):
+        if not (runs / "complete").exists():
+            sweep = ["-m", *SMALL, f"name={FINISHED}", "densify=adc,volumetric", "seed=0,1", "tracking=none"]
+            done = subprocess.run(
+                [sys.executable, "-m", "gsbench.cli", *sweep],
+                env=environment | {"GSBENCH_RUNS": str(runs)},
+                capture_output=True,
+                text=True,
+                timeout=600,
+                check=False,
+            )
+            assert done.returncode == 0, done.stderr
+            (runs / "complete").touch()
+    return runs
+
+
+# The finished experiment's trials of seed 0, for tests that disturb them.
+SWEEP = ["-m", *SMALL, "name=attacked", "densify=adc,volumetric", "tracking=none"]
+
+
+@pytest.fixture
+def runs(finished_runs: Path, tmp_path: Path) -> Path:
+    """A copy of the finished experiment's runs folder, with its scene and initial cloud."""
+    return shutil.copytree(finished_runs, tmp_path / "runs", symlinks=True)
 
 
 @pytest.fixture(scope="session")
@@ -41,7 +83,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     kept = {key: value for key, value in os.environ.items() if not key.startswith(("GSBENCH_", "MLFLOW_"))}
     return kept | {
         "GSBENCH_RUNS": str(tmp_path_factory.mktemp("runs")),
-        "TORCH_HOME": str(tmp_path_factory.mktemp("hub")),
+        "TORCH_HOME": str(common_folder(tmp_path_factory) / "hub"),  # its name is in results
     }
 
 
@@ -68,3 +110,37 @@ def trial_of(settings: Sequence[str], runs: Path, capture: Path, *words: str) ->
     assert run([*settings, f"scene.path={capture}", f"runs={runs}", f"name={capture.name}", *words]) == 0
     (folder,) = {path.parent for path in (runs / capture.name).glob("*/*/*/results.json")}
     return folder
+
+
+CLOCKED = ("seconds", "peak_memory_mb", "measured")  # what differs between two runs of the same trial
+
+
+def start(environment: dict[str, str], cwd: Path, runs: Path, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "gsbench.cli", *arguments],
+        cwd=cwd,
+        env=environment | {"GSBENCH_RUNS": str(runs)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def results_of(runs: Path, name: str) -> dict[str, Any]:
+    """Everything that a sweep found out: results without times, and checksums of models, pictures and tables."""
+    found: dict[str, Any] = {}
+    for path in sorted(runs.glob(f"{name}/*/*/*/results.json")):
+        results = {key: value for key, value in json.loads(path.read_text()).items() if key not in CLOCKED}
+        results["init_report"].pop("seconds", None)
+        results.pop("experiment")
+        files = [path.parent / "point_cloud.ply", path.parent / "per_view.csv", path.parent / "events.jsonl"]
+        files += sorted(path.parent.glob("renders/*.png"))
+        results["files"] = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+        found[f"{path.parent.parent.name}/{path.parent.name}"] = results
+    return found
+
+
+@pytest.fixture
+def undisturbed(finished_runs: Path) -> dict[str, Any]:
+    """The finished trials of ``SWEEP``, which nobody disturbed."""
+    return {trial: found for trial, found in results_of(finished_runs, FINISHED).items() if trial.endswith("seed0")}

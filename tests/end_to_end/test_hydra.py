@@ -93,13 +93,10 @@ def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path, launc
     assert (tmp_path / "notes.txt").read_text().splitlines()[len(notes) :] == ["sweep begins", "sweep ends"]
 
 
-@pytest.mark.parametrize(
-    "launcher",
-    ["basic", *(name for name in ("joblib", "submitit_local"))],
-)
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, launcher: str) -> None:
     package = f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher"
-    if launcher != "basic" and find_spec(package) is None:
+    if find_spec(package) is None:
         pytest.skip(f"needs {package} (extra dev)")
     words = ["-m", *TINY, f"hydra/launcher={launcher}", "name=x", "seed=0,1"]
     done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)

@@ -1,8 +1,7 @@
-"""The program under attack: kills, rivals, a full disk, a read-only folder, damaged files, signals."""
+"""The program killed by signals, or run twice at once: it goes on, and ends as if nothing had happened."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import random
@@ -11,56 +10,21 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
-from tests.end_to_end.conftest import SMALL, Run
+from tests.claims.test_sweep import content
+from tests.end_to_end.conftest import SMALL, SWEEP, Run, results_of, start
+from tests.launch.test_declare import TINY
 from tests.processes import bytes_written
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")]
 
-SWEEP = ["-m", *SMALL, "name=attacked", "densify=adc,volumetric", "tracking=none", "train.checkpoint_every=40"]
 TRIALS = 2
-CLOCKED = ("seconds", "peak_memory_mb", "measured")  # what differs between two runs of the same trial
-
-
-def start(environment: dict[str, str], cwd: Path, runs: Path, *arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "gsbench.cli", *arguments],
-        cwd=cwd,
-        env=environment | {"GSBENCH_RUNS": str(runs)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-def results_of(runs: Path, name: str = "attacked") -> dict[str, Any]:
-    """Everything that a sweep found out: results without times, and checksums of models, pictures and tables."""
-    found: dict[str, Any] = {}
-    for path in sorted(runs.glob(f"{name}/*/*/*/results.json")):
-        results = {key: value for key, value in json.loads(path.read_text()).items() if key not in CLOCKED}
-        results["init_report"].pop("seconds", None)
-        results.pop("experiment")
-        files = [path.parent / "point_cloud.ply", path.parent / "per_view.csv", path.parent / "events.jsonl"]
-        files += sorted(path.parent.glob("renders/*.png"))
-        results["files"] = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
-        found[f"{path.parent.parent.name}/{path.parent.name}"] = results
-    return found
-
-
-@pytest.fixture(scope="module")
-def undisturbed(environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    folder = tmp_path_factory.mktemp("undisturbed")
-    process = start(environment, folder, folder / "runs", *SWEEP)
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
-    results = results_of(folder / "runs")
-    assert len(results) == TRIALS
-    return results
+PATIENCE = 240.0  # seconds for a trial of two iterations, on a machine that is busy with other things
 
 
 def wait_for(runs: Path, pattern: str, process: subprocess.Popen[str], seconds: float = 120) -> None:
@@ -86,7 +50,7 @@ def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
         time.sleep(rng.uniform(0, 0.8))
         process.send_signal(signal.SIGKILL)
         process.communicate()
-    if len(results_of(runs)) < TRIALS:  # the last kill may have come after the end
+    if len(results_of(runs, "attacked")) < TRIALS:  # the last kill may have come after the end
         written = training_log_size(runs)
         process = start(environment, tmp_path, runs, *SWEEP)
         while training_log_size(runs) == written and process.poll() is None:
@@ -100,7 +64,7 @@ def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
     process = start(environment, tmp_path, runs, *SWEEP)
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 0, output
-    assert results_of(runs) == undisturbed
+    assert results_of(runs, "attacked") == undisturbed
     left = [path for path in runs.rglob("*") if ".tmp" in path.name or path.name.endswith((".partial", ".removed"))]
     assert left == []
 
@@ -111,12 +75,12 @@ def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
     model.write_bytes(content)
     psnr = json.loads(other.read_text())["metrics"]["psnr"]
     other.write_text(other.read_text().replace(f'"psnr": {psnr}', '"psnr": 99.0'))
-    assert results_of(runs) != undisturbed
+    assert results_of(runs, "attacked") != undisturbed
     process = start(environment, tmp_path, runs, *SWEEP)
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 0, output
     assert "point_cloud.ply differs" in output
-    assert results_of(runs) == undisturbed
+    assert results_of(runs, "attacked") == undisturbed
 
 
 def test_two_sweeps_at_once_share_the_work(
@@ -126,94 +90,132 @@ def test_two_sweeps_at_once_share_the_work(
     both = [start(environment, tmp_path, runs, *SWEEP) for _ in range(2)]
     outputs = [process.communicate(timeout=300)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], outputs
-    assert results_of(runs) == undisturbed
+    assert results_of(runs, "attacked") == undisturbed
     trained = [len(re.findall(r"train: iteration (\d+)/\1 ", output)) for output in outputs]  # said once, at the end
     assert sum(trained) == TRIALS, outputs
     assert min(trained) >= 1
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of three MiB; the test is skipped where this user may not mount one."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(disk)], capture_output=True, check=False
-    )
-    if mounted.returncode != 0:
-        pytest.skip("needs the right to mount a small tmpfs (root)")
-    yield disk
-    subprocess.run(["umount", "-l", str(disk)], check=True)
+LOCAL = ["-m", *SMALL, "name=local", "densify=adc", "launch=local", "launch.parallel=2", "tracking=none"]
 
 
-def test_full_disk_ends_the_sweep_in_one_line_and_more_space_mends_it(
-    gsbench: Run, undisturbed: dict[str, Any], small_disk: Path
+def holders(runs: Path) -> dict[str, int]:
+    found = {}
+    for path in runs.glob("local/*/*/*/.lock.holder"):
+        try:
+            found[path.parent.name] = json.loads(path.read_text())["pid"]
+        except (OSError, ValueError):
+            continue
+    return found
+
+
+def test_one_killed_trial_harms_no_other_and_the_next_command_mends_it(
+    environment: dict[str, str], tmp_path: Path
 ) -> None:
-    sweep = [word for word in SWEEP if word not in ("-m", "densify=adc,volumetric")]
-    done = gsbench("-m", *sweep, "densify=adc", "seed=0,1", GSBENCH_RUNS=str(small_disk))
-    assert done.returncode == 1, done.stderr
-    assert "Traceback" not in done.stderr
-    lines = [line for line in done.stderr.strip().splitlines() if line.startswith("gsbench:")]
-    assert lines == [
-        f"gsbench: the disk of {small_disk} is full: free some space, and the same command goes on from here"
-    ]
-    subprocess.run(["mount", "-o", "remount,size=200m", str(small_disk)], check=True)
-    done = gsbench(*sweep, "densify=adc", GSBENCH_RUNS=str(small_disk))
+    pytest.importorskip("submitit", reason="needs the extra slurm")
+    runs = tmp_path / "runs"
+    process = start(environment, tmp_path, runs, *LOCAL, "seed=0,1,2")
+    deadline = time.monotonic() + 120
+    killed, most = "", 0
+    while process.poll() is None and time.monotonic() < deadline:
+        running = {trial: pid for trial, pid in holders(runs).items() if trial != killed}  # its file outlives it
+        most = max(most, len(running))
+        training = list(runs.glob("store/train/.*.partial/metrics.jsonl"))
+        if not killed and training and running:
+            killed, pid = next(iter(running.items()))
+            os.kill(pid, signal.SIGKILL)
+        time.sleep(0.05)
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 1, output
+    assert most == 2
+    assert "2 of 3 trials done" in output
+    assert "ended without a result" in output
+    assert len(results_of(runs, "local")) == 2
+    process = start(environment, tmp_path, runs, *LOCAL, "seed=0,1,2")
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 0, output
+    assert len(results_of(runs, "local")) == 3
+    assert output.count("was done") == 2
+
+
+TUNED = [
+    *("+experiment=tuned", "densify=adc,volumetric", "seed=0", *SMALL, "train.iterations=120", "eval.lpips=[]"),
+    *("tracking=none", "hydra.sweeper.tune.points=2", "name=small"),
+]
+
+
+def views(arm: Path) -> set[str]:
+    """The views that judge the trials of an arm."""
+    return {line.split(",")[0] for file in arm.glob("*/per_view.csv") for line in file.read_text().splitlines()[1:]}
+
+
+def test_a_killed_tuning_goes_on_and_its_values_are_trained(
+    gsbench: Run, environment: dict[str, str], tmp_path: Path
+) -> None:
+    program = [sys.executable, "-m", "gsbench.cli", *TUNED]
+    with subprocess.Popen(program, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True) as first:
+        assert first.stderr is not None
+        for line in first.stderr:
+            if "point 1 of 2" in line:
+                first.send_signal(signal.SIGKILL)
+                break
+        first.stderr.read()
+    home = Path(environment["GSBENCH_RUNS"]) / "small"
+    assert not (home / "tuning.json").exists()
+
+    done = gsbench(*TUNED, "launch=local", "launch.parallel=2")  # by another launcher, too
     assert done.returncode == 0, done.stderr
-    ((name, results),) = results_of(small_disk).items()
-    assert results == undisturbed[name]
+    assert "trials done; the table: gsbench tables small\n" in done.stderr
+    record = json.loads((home / "tuning.json").read_text())
+    for arm, tuned in record["arms"].items():
+        assert [point["state"] for point in tuned["search"]["points"]] == ["done", "done"]
+        best = max(tuned["search"]["points"], key=lambda point: point["value"])
+        (results,) = home.glob(f"courtyard/{arm}/*/inputs.json")
+        text = results.read_text()
+        assert all(str(value) in text for value in best["settings"].values())
+        assert views(home / "courtyard" / arm)
+        assert not views(home / "courtyard" / arm) & views(home.parent / f"small-tune-{arm}" / "courtyard" / arm)
+
+    sheet = gsbench("tables", "small", "--layout", "fairness")
+    assert sheet.stdout.count("is the best of 2 points by psnr of validation views") == 2
+    assert "tuning was unequal" not in sheet.stdout
 
 
-def test_read_only_runs_folder_is_bad_input(gsbench: Run, small_disk: Path) -> None:
-    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
-    done = gsbench(*SMALL, GSBENCH_RUNS=str(small_disk))
-    assert done.returncode == 2, done.stderr
-    (line,) = done.stderr.strip().splitlines()
-    assert line.startswith("gsbench:")
-    assert "may not be written to" in line
-    assert "GSBENCH_RUNS" in line
-    assert os.listdir(small_disk) == []
+def page_of(runs: Path) -> list[str]:
+    """The page without the minute in which its plan was declared, and without what is measured of a machine."""
+    lines = (runs / "check_it" / "claims.md").read_text().splitlines()
+    assert sum(" was declared " in line for line in lines) == 1
+    measured = (" was declared ", "| seconds of training |", "| memory (MB) |")
+    assert all(sum(words in line for line in lines) == 1 for words in measured)
+    return [line for line in lines if not any(words in line for words in measured)]
 
 
-def test_a_failed_trial_does_not_stop_the_others_and_retry_mends_it(gsbench: Run, tmp_path: Path) -> None:
-    """One densifier is the user's own and fails while a file is absent."""
-    (tmp_path / "mine.py").write_text(
-        "from dataclasses import dataclass\nfrom pathlib import Path\nfrom gsbench.densify import ADC\n\n\n"
-        "@dataclass\nclass Mine(ADC):\n    def begin(self, gaussians, context):\n"
-        "        if not Path('mended').exists():\n            raise RuntimeError('not yet')\n"
-        "        super().begin(gaussians, context)\n"
-    )
-    (tmp_path / "conf" / "densify").mkdir(parents=True)
-    (tmp_path / "conf" / "densify" / "mine.yaml").write_text(
-        "defaults: [adc, _self_]\n_target_: mine.Mine\nname: mine\n"
-    )
-    sweep = [
-        "--config-dir",
-        "conf",
-        "-m",
-        *SMALL,
-        "name=own",
-        "densify=mine,adc",
-        "allow_targets=[mine]",
-        "tracking=none",
-    ]
-    sweep += ["train.iterations=20", "eval.lpips=[]", "eval.flip=false"]
-    runs = str(tmp_path / "runs")
-    done = gsbench(*sweep, GSBENCH_RUNS=runs)
-    assert done.returncode == 1, done.stderr
-    assert "random-mine" in done.stderr
-    assert "not yet" in done.stderr
-    assert "1 of 2 trials done" in done.stderr
-    (failed,) = Path(runs).glob("own/*/random-mine/*/failed.json")
-    assert "not yet" in json.loads(failed.read_text())["traceback"]
-    status = gsbench("status", "own", GSBENCH_RUNS=runs)
-    assert status.returncode == 1
-    assert "failed" in status.stdout
-    assert "not yet" in status.stdout
-    assert "2 trials: 1 done, 1 failed" in status.stdout
-    (tmp_path / "mended").touch()
-    retried = gsbench("retry", "own", "allow_targets=[mine]", GSBENCH_RUNS=runs)
-    assert retried.returncode == 0, retried.stderr
-    assert "1 of 1 trials done" in retried.stderr
-    assert not failed.exists()
-    assert gsbench("status", "own", GSBENCH_RUNS=runs).stdout.strip() == "2 trials: 2 done"
+def count_done(runs: Path) -> int:
+    return len(list(runs.glob("check_it/*/*/*/results.json")))
+
+
+def test_a_killed_check_goes_on_and_ends_with_the_same_page(tmp_path: Path) -> None:
+    words = dict(word.split("=", 1) for word in TINY)
+    settings = {key: yaml.safe_load(value) for key, value in words.items()}
+    claim = content()["claims"][0] | {"baseline": "few", "arm": "many"}
+    arms = {"few": {"init.count": 200}, "many": {"init.count": 300}}
+    claims = tmp_path / "claims.yaml"
+    claims.write_text(json.dumps(content() | {"settings": settings, "arms": arms, "claims": [claim], "seeds": 2}))
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    check = [sys.executable, "-m", "gsbench.cli", "check", str(claims)]
+    subprocess.run(check, env=os.environ | {"GSBENCH_RUNS": str(whole)}, check=True, timeout=2 * PATIENCE)
+
+    for trials in (1, 3):  # in the middle of the first look, and once more before its last trial
+        process = subprocess.Popen(check, env=os.environ | {"GSBENCH_RUNS": str(killed)})
+        until = time.monotonic() + PATIENCE
+        while count_done(killed) < trials and time.monotonic() < until and process.poll() is None:
+            time.sleep(0.02)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        assert count_done(killed) >= trials
+        assert not (killed / "check_it" / "claims.md").exists()
+    before = {path: path.read_bytes() for path in killed.glob("check_it/*/*/*/results.json")}
+    subprocess.run(check, env=os.environ | {"GSBENCH_RUNS": str(killed)}, check=True, timeout=2 * PATIENCE)
+    assert page_of(killed) == page_of(whole)
+    assert all(path.read_bytes() == content for path, content in before.items())  # done once
+    assert len((killed / "check_it" / "declared.jsonl").read_text().splitlines()) == 1

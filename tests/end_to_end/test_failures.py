@@ -1,0 +1,103 @@
+"""The program where something fails: a full disk, a folder that may not be written to, a trial that raises."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.end_to_end.conftest import SMALL, SWEEP, Run, results_of
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of three MiB; the test is skipped where this user may not mount one."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(disk)], capture_output=True, check=False
+    )
+    if mounted.returncode != 0:
+        pytest.skip("needs the right to mount a small tmpfs (root)")
+    yield disk
+    subprocess.run(["umount", "-l", str(disk)], check=True)
+
+
+def test_full_disk_ends_the_sweep_in_one_line_and_more_space_mends_it(
+    gsbench: Run, undisturbed: dict[str, Any], small_disk: Path
+) -> None:
+    sweep = [word for word in SWEEP if word not in ("-m", "densify=adc,volumetric")]
+    done = gsbench("-m", *sweep, "densify=adc", "seed=0,1", GSBENCH_RUNS=str(small_disk))
+    assert done.returncode == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    lines = [line for line in done.stderr.strip().splitlines() if line.startswith("gsbench:")]
+    assert lines == [
+        f"gsbench: the disk of {small_disk} is full: free some space, and the same command goes on from here"
+    ]
+    subprocess.run(["mount", "-o", "remount,size=200m", str(small_disk)], check=True)
+    done = gsbench(*sweep, "densify=adc", GSBENCH_RUNS=str(small_disk))
+    assert done.returncode == 0, done.stderr
+    ((name, results),) = results_of(small_disk, "attacked").items()
+    assert results == undisturbed[name]
+
+
+def test_read_only_runs_folder_is_bad_input(gsbench: Run, small_disk: Path) -> None:
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    done = gsbench(*SMALL, GSBENCH_RUNS=str(small_disk))
+    assert done.returncode == 2, done.stderr
+    (line,) = done.stderr.strip().splitlines()
+    assert line.startswith("gsbench:")
+    assert "may not be written to" in line
+    assert "GSBENCH_RUNS" in line
+    assert os.listdir(small_disk) == []
+
+
+def test_a_failed_trial_does_not_stop_the_others_and_retry_mends_it(gsbench: Run, tmp_path: Path) -> None:
+    """One densifier is the user's own and fails while a file is absent."""
+    (tmp_path / "mine.py").write_text(
+        "from dataclasses import dataclass\nfrom pathlib import Path\nfrom gsbench.densify import ADC\n\n\n"
+        "@dataclass\nclass Mine(ADC):\n    def begin(self, gaussians, context):\n"
+        "        if not Path('mended').exists():\n            raise RuntimeError('not yet')\n"
+        "        super().begin(gaussians, context)\n"
+    )
+    (tmp_path / "conf" / "densify").mkdir(parents=True)
+    (tmp_path / "conf" / "densify" / "mine.yaml").write_text(
+        "defaults: [adc, _self_]\n_target_: mine.Mine\nname: mine\n"
+    )
+    sweep = [
+        "--config-dir",
+        "conf",
+        "-m",
+        *SMALL,
+        "name=own",
+        "densify=mine,adc",
+        "allow_targets=[mine]",
+        "tracking=none",
+    ]
+    sweep += ["train.iterations=20", "eval.lpips=[]", "eval.flip=false"]
+    runs = str(tmp_path / "runs")
+    done = gsbench(*sweep, GSBENCH_RUNS=runs)
+    assert done.returncode == 1, done.stderr
+    assert "random-mine" in done.stderr
+    assert "not yet" in done.stderr
+    assert "1 of 2 trials done" in done.stderr
+    (failed,) = Path(runs).glob("own/*/random-mine/*/failed.json")
+    assert "not yet" in json.loads(failed.read_text())["traceback"]
+    status = gsbench("status", "own", GSBENCH_RUNS=runs)
+    assert status.returncode == 1
+    assert "failed" in status.stdout
+    assert "not yet" in status.stdout
+    assert "2 trials: 1 done, 1 failed" in status.stdout
+    (tmp_path / "mended").touch()
+    retried = gsbench("retry", "own", "allow_targets=[mine]", GSBENCH_RUNS=runs)
+    assert retried.returncode == 0, retried.stderr
+    assert "1 of 1 trials done" in retried.stderr
+    assert not failed.exists()
+    assert gsbench("status", "own", GSBENCH_RUNS=runs).stdout.strip() == "2 trials: 2 done"

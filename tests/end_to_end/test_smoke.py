@@ -1,0 +1,219 @@
+"""The program as a user runs it, one short test for each thing that it is used for: part of ``make test``."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from tests.end_to_end.conftest import FINISHED, SMALL, Run
+
+TINY = [*SMALL, "train.iterations=20", "tracking=none", "eval.lpips=[]", "eval.flip=false"]
+OWN = """
+import os, signal
+from dataclasses import dataclass
+from pathlib import Path
+from gsbench.densify import ADC
+
+@dataclass
+class Dies(ADC):
+    def after_step(self, step, gaussians, rng):
+        if step == 150 and not Path("died").exists():
+            Path("died").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+@dataclass
+class Quarter(ADC):
+    \"\"\"Three of four candidates stay as they are.\"\"\"
+    def rules(self, refinement):
+        return super().rules(refinement) if refinement.step % 200 == 0 else []
+"""
+
+
+def trials_of(runs: Path, name: str = FINISHED) -> dict[str, Path]:
+    """The folders of finished trials by densifier and seed, such as ``adc-0``."""
+    found = {}
+    for path in sorted(runs.glob(f"{name}/*/*/*/results.json")):
+        results = json.loads(path.read_text())
+        found[f"{results['densify']}-{results['seed']}"] = path.parent
+    return found
+
+
+@pytest.fixture
+def own_modules(tmp_path: Path) -> list[str]:
+    """Words that let the program find the densifiers ``dies`` and ``quarter`` of a file of the user's."""
+    (tmp_path / "own.py").write_text(OWN)
+    (tmp_path / "conf" / "densify").mkdir(parents=True)
+    for name in ("Dies", "Quarter"):
+        text = f"defaults: [adc, _self_]\n_target_: own.{name}\nname: {name.lower()}\n"
+        (tmp_path / "conf" / "densify" / f"{name.lower()}.yaml").write_text(text)
+    return ["--config-dir", "conf", "allow_targets=[own]"]
+
+
+def test_a_sweep_leaves_complete_trials(finished_runs: Path) -> None:
+    trials = trials_of(finished_runs)
+    assert list(trials) == ["adc-0", "adc-1", "volumetric-0", "volumetric-1"]
+    records = [json.loads((trial / "results.json").read_text()) for trial in trials.values()]
+    for record in records:
+        assert record["status"] == "complete"
+        assert record["protocol"] == "paper-1"
+        assert 13 < record["metrics"]["psnr"] < 40
+        assert "lpips_squeeze" not in record["metrics"]
+        assert "lpips_squeeze" in record["unavailable"]
+        assert record["machine"]["cpu"]
+    assert len({record["hashes"]["cloud"] for record in records}) == 1
+    trial = trials["volumetric-0"]
+    wanted = "config.yaml per_view.csv metrics.jsonl events.jsonl renders ground_truth point_cloud.ply log.txt"
+    assert set(wanted.split()) <= {path.name for path in trial.iterdir()}
+    with (trial / "per_view.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["view"] for row in rows] == ["0000.png", "0008.png"]
+    picture = np.asarray(Image.open(trial / "renders" / "0000.png")).astype(float)
+    truth = np.asarray(Image.open(trial / "ground_truth" / "0000.png")).astype(float)
+    assert picture.shape == truth.shape == (72, 96, 3)
+    assert 10 * np.log10(255**2 / ((picture - truth) ** 2).mean()) == pytest.approx(float(rows[0]["psnr"]), abs=1e-6)
+    flipped = ((picture[::-1] - truth) ** 2).mean()
+    assert ((picture - truth) ** 2).mean() < 0.6 * flipped  # a PSNR alone would not show a flipped picture
+
+
+def test_the_same_command_again_computes_nothing(gsbench: Run, runs: Path) -> None:
+    written = [path.stat().st_mtime_ns for path in sorted(runs.rglob("results.json"))]
+    sweep = ["-m", *SMALL, f"name={FINISHED}", "densify=adc,volumetric", "seed=0,1", "tracking=none"]
+    done = gsbench(*sweep, GSBENCH_RUNS=str(runs))
+    assert done.returncode == 0, done.stderr
+    assert [path.stat().st_mtime_ns for path in sorted(runs.rglob("results.json"))] == written
+
+
+def test_tables_and_report(gsbench: Run, runs: Path) -> None:
+    table = gsbench("tables", FINISHED, GSBENCH_RUNS=str(runs))
+    assert table.returncode == 0, table.stderr
+    assert re.search(r"\| courtyard \| random \| volumetric \|.* ± ", table.stdout)
+    report = gsbench("report", FINISHED, GSBENCH_RUNS=str(runs))
+    assert report.returncode == 0, report.stderr
+    page = (runs / FINISHED / "report.html").read_text()
+    assert page.count("<svg") >= 1
+    assert "data:image/" in page
+
+
+def test_a_killed_trial_goes_on_to_the_same_bits(gsbench: Run, runs: Path, own_modules: list[str]) -> None:
+    command = [*own_modules, *SMALL, "name=killed", "densify=dies", "tracking=none"]
+    killed = gsbench(*command, GSBENCH_RUNS=str(runs))
+    assert killed.returncode == -9
+    assert not trials_of(runs, "killed")
+    resumed = gsbench(*command, GSBENCH_RUNS=str(runs))
+    assert resumed.returncode == 0, resumed.stderr
+    assert "iteration 120" in resumed.stderr  # the checkpoint that it goes on from
+    (trial,) = trials_of(runs, "killed").values()
+    whole = trials_of(runs)["adc-0"]
+    for name in ("point_cloud.ply", "per_view.csv", "renders/0000.png"):
+        assert (trial / name).read_bytes() == (whole / name).read_bytes()
+
+
+def test_a_densifier_of_the_users_own(gsbench: Run, runs: Path, own_modules: list[str]) -> None:
+    done = gsbench(*own_modules, *SMALL, "name=own", "densify=quarter", "tracking=none", GSBENCH_RUNS=str(runs))
+    assert done.returncode == 0, done.stderr
+    counts = [
+        json.loads((trial / "results.json").read_text())["num_gaussians"]
+        for trial in (trials_of(runs, "own")["quarter-0"], trials_of(runs)["adc-0"])
+    ]
+    assert 3000 < counts[0] < counts[1]
+
+
+def test_a_claims_file_and_its_archive(gsbench: Run, runs: Path, tmp_path: Path) -> None:
+    settings = {word.split("=", 1)[0]: yaml.safe_load(word.split("=", 1)[1]) for word in TINY[1:]}
+    claim = {"id": "points", "says": "More points help.", "where": "Table 1", "baseline": "few", "arm": "many"}
+    claim |= {"metric": "psnr", "direction": "higher", "least": 0.01, "refuted_if": "it is worse"}
+    content = {
+        "name": "check_it",
+        "paper": "Made up, 2026",
+        "settings": settings,
+        "arms": {"few": {"init.count": 200}, "many": {"init.count": 2000}},
+        "scenes": {"courtyard": None},
+        "claims": [claim],
+        "seeds": 2,
+    }
+    (tmp_path / "claims.yaml").write_text(yaml.safe_dump(content))
+    checked = gsbench("check", "claims.yaml", GSBENCH_RUNS=str(runs))
+    assert checked.returncode == 0, checked.stderr
+    assert " points: " in checked.stdout
+    page = (runs / "check_it" / "claims.md").read_text()
+    exported = gsbench("export", "--results", "check_it", "--out", "published.zip", GSBENCH_RUNS=str(runs))
+    assert exported.returncode == 0, exported.stderr
+    again = gsbench("check", "claims.yaml", "--from", "published.zip", "--out", "again.md", GSBENCH_RUNS="elsewhere")
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "again.md").read_text() == page
+    assert not (tmp_path / "elsewhere").exists()
+
+
+@pytest.mark.parametrize(
+    ("word", "hint"),
+    [("densify=volumetrik", "volumetric"), ("densify.grad_threshold=1", "gradient_threshold"), ("tabels", "tables")],
+)
+def test_a_misspelt_word_is_one_line_with_the_right_one(gsbench: Run, tmp_path: Path, word: str, hint: str) -> None:
+    done = gsbench(word, GSBENCH_RUNS=str(tmp_path / "runs"))
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert line.startswith("gsbench:")
+    assert word.split("=")[-1] in line or word.split("=")[0] in line
+    assert hint in line
+    assert not list(tmp_path.rglob("results.json"))
+
+
+def test_a_mirror_in_mlflow(gsbench: Run, runs: Path) -> None:
+    done = gsbench("sync", FINISHED, GSBENCH_RUNS=str(runs))
+    assert done.returncode == 0, done.stderr
+    wanted = [json.loads((trial / "results.json").read_text())["metrics"]["psnr"] for trial in trials_of(runs).values()]
+    with sqlite3.connect(runs / "mlflow.db") as database:  # without MLflow's own code
+        sent = [value for (value,) in database.execute("SELECT value FROM latest_metrics WHERE key = 'psnr'")]
+    assert sorted(sent) == pytest.approx(sorted(wanted))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Slurm's commands are scripts of a shell here")
+def test_slurms_job_command_runs_the_trial(gsbench: Run, runs: Path, tmp_path: Path) -> None:
+    """``sbatch`` keeps the script; its command is then run as Slurm would run one task of the array."""
+    pytest.importorskip("submitit", reason="needs the extra slurm")
+    bin_folder = tmp_path / "bin"
+    bin_folder.mkdir()
+    for name in ("sbatch", "srun", "squeue"):
+        (bin_folder / name).write_text('#!/bin/sh\ncp "$1" "$KEPT"\necho Submitted batch job 7\n')
+        (bin_folder / name).chmod(0o755)
+    kept, path = tmp_path / "kept.sh", f"{bin_folder}{os.pathsep}{os.environ['PATH']}"
+    cluster = ["launch=slurm", "launch.wait=false", "launch.gpus_per_trial=0", "launch.cpus_per_trial=1"]
+    done = gsbench(
+        *("-m", *TINY, "name=x", "seed=0,1", "densify=none", *cluster),
+        PATH=path,
+        KEPT=str(kept),
+        GSBENCH_RUNS=str(runs),
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Slurm job 7: 2 trials" in done.stdout
+    script = kept.read_text()
+    assert "#SBATCH --array=0-1" in script
+    assert "#SBATCH --cpus-per-task=1" in script
+    command = script[script.index(sys.executable) :].split()
+    task = {"SLURM_JOB_ID": "7", "SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "1", "SUBMITIT_EXECUTOR": "slurm"}
+    task |= {"SLURM_JOB_NUM_NODES": "1", "SLURM_NTASKS": "1"}
+    task |= {f"SLURM_{name}": "0" for name in ("PROCID", "LOCALID", "NODEID")}
+    ran = subprocess.run(
+        command, cwd=tmp_path, env=os.environ | task, capture_output=True, text=True, timeout=240, check=False
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert list(trials_of(runs, "x")) == ["none-1"]
+
+
+def test_hydra_multirun_with_another_launcher(gsbench: Run, runs: Path) -> None:
+    words = ["-m", *TINY, "densify=none", "hydra/launcher=basic", "name=x", "seed=0,1"]
+    done = gsbench(*words, GSBENCH_RUNS=str(runs))
+    assert done.returncode == 0, done.stderr
+    assert list(trials_of(runs, "x")) == ["none-0", "none-1"]
+    assert "2 trials: 2 done" in gsbench("status", "x", GSBENCH_RUNS=str(runs)).stdout

@@ -1,0 +1,28 @@
+"""Slots for trials at once, and what each gets of the machine."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from gsbench.system.resources import assign_gpu, available_threads, take_slot
+
+
+def test_slots_gpus_and_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with take_slot(tmp_path, 2) as first, take_slot(tmp_path, 2) as second:
+        assert (first, second) == (0, 1)
+    with take_slot(tmp_path, 2) as slot:
+        assert slot == 0
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "as before")
+    for slot, visible, expected in ((0, "3,5", "3"), (1, "3,5", "5"), (2, "3,5", "3")):
+        assign_gpu(slot, visible)
+        assert os.environ["CUDA_VISIBLE_DEVICES"] == expected
+    os.environ["CUDA_VISIBLE_DEVICES"] = ""
+    assign_gpu(0, "")
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == ""
+    monkeypatch.delenv("SLURM_CPUS_PER_TASK", raising=False)
+    assert available_threads(10**6) == 1
+    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "7")
+    assert available_threads(2) == 7
