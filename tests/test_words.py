@@ -25,6 +25,12 @@ from gsbench.settings import option_fields
 REFUSED = {  # command line: a part of the line that refuses it
     # words that nothing reads
     "=3": "names no setting",
+    "tabels": "did you mean tables?",
+    "densify.grad_threshold=1": "did you mean gradient_threshold?",
+    "densify=volumetrik": "did you mean volumetric?",
+    "train.iterations=many": "train.iterations",
+    "scene=photos scene.path=/nowhere/at/all": "/nowhere/at/all",
+    "raster=gsplat device=cpu": "device=cuda",
     "+extra=1": "extra is not a setting",
     "++train.extra=1": "train.extra is not a setting",
     "+scene.sede=1": "did you mean seed?",

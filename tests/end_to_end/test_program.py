@@ -17,39 +17,6 @@ from tests.end_to_end.conftest import SMALL, Run
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["densify.grad_threshold=1"], ["densify.grad_threshold", "gradient_threshold"]),
-        (["densify=volumetrik"], ["volumetrik", "volumetric", "adc"]),
-        (["densify.volume_threshold=abc"], ["densify.volume_threshold"]),
-        (["densify.volume_threshold=-1"], ["densify.volume_threshold", "above 0"]),
-        (["scene=photos"], ["scene.path"]),
-        (["scene=photos", "scene.path=/nowhere/at/all"], ["/nowhere/at/all"]),
-        (["scene=colmap", "scene.path=."], ["sparse"]),
-        (["train.iterations=many"], ["iterations"]),
-        (["raster=gsplat", "device=cpu"], ["raster=gsplat", "device=cuda"]),
-        (["tabels"], ["tabels", "tables"]),
-        (["densify._target_=os.system"], ["os.system", "allow_targets"]),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
-)
-def test_bad_input_is_one_line_and_exit_code_2(
-    gsbench: Run, tmp_path: Path, arguments: list[str], words: list[str]
-) -> None:
-    (tmp_path / "images").mkdir()
-    for i in range(3):
-        Image.new("RGB", (32, 24), (i, 0, 0)).save(tmp_path / "images" / f"{i}.png")
-    done = gsbench(*arguments, GSBENCH_RUNS=str(tmp_path / "runs"))
-    assert done.returncode == 2, done.stderr
-    lines = done.stderr.strip().splitlines()
-    assert len([line for line in lines if line.startswith("gsbench:")]) == 1
-    assert "Traceback" not in done.stderr
-    assert not list((tmp_path / "runs").rglob("results.json"))
-    for word in words:
-        assert word in lines[-1]
-
-
 def test_truncated_photo_is_named(gsbench: Run, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()

@@ -1,0 +1,242 @@
+"""Do the quick tests notice faults? Plant small faults one at a time in a copy, and run the tests of the room.
+
+    python scripts/mutants.py                               # 160 faults over all rooms below, two at a time
+    python scripts/mutants.py --rooms densify eval --count 40 --seed 3
+
+A fault is a flipped comparison, another sign, a whole number that is one off, a dropped statement, or two swapped
+arguments. Texts, messages and annotations get none. A fault is caught when a test of ``make test`` fails or hangs. The
+table and the faults that survived are printed as Markdown; a survivor either shows a gap in the tests or changes
+nothing. Triton's kernels are left out: their tests belong to ``make test-all``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Queue
+
+ROOT = Path(__file__).parents[1]
+SOURCE = "src/gsbench"
+ROOMS = ["analysis", "claims", "densify", "eval", "gaussians", "init", "pipeline", "raster", "runs", "scene", "train"]
+FURTHER_TESTS = {"pipeline": ["tests/end_to_end/test_smoke.py"]}
+LEFT_OUT = "triton"  # in a path
+SYMMETRIC = {"maximum", "minimum", "min", "max", "add"}  # swapped arguments change nothing
+SECONDS = 600  # for the tests of one room; a fault that makes them hang is caught
+FLIPPED: dict[type[ast.AST], type[ast.AST]] = {
+    **{ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq},
+    **{ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or, ast.Or: ast.And},
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One change of one file: the text between two offsets becomes another."""
+
+    file: str
+    line: int
+    kind: str
+    start: int
+    end: int
+    before: str
+    after: str
+
+    @property
+    def room(self) -> str:
+        return Path(self.file).relative_to(SOURCE).parts[0]
+
+
+def describe(fault: Fault) -> str:
+    """One line of Markdown: where the fault is and what it changes."""
+    before, after = (" ".join(text.split()) for text in (fault.before, fault.after))
+    return f"`{fault.file}:{fault.line}` {fault.kind}: `{before}` → `{after}`"
+
+
+def changed_node(node: ast.AST) -> tuple[str, ast.AST] | None:
+    """The kind of fault that fits the node, and the node with it; None where none does."""
+    new = copy.deepcopy(node)
+    if isinstance(new, ast.Compare) and type(new.ops[0]) in FLIPPED:
+        new.ops[0] = FLIPPED[type(new.ops[0])]()  # type: ignore[call-overload]
+        return "comparison", new
+    if isinstance(new, ast.BinOp | ast.BoolOp) and type(new.op) in FLIPPED:
+        if isinstance(new, ast.BinOp) and any(isinstance(side, ast.JoinedStr) for side in (new.left, new.right)):
+            return None
+        new.op = FLIPPED[type(new.op)]()  # type: ignore[assignment]
+        return "sign", new
+    if isinstance(new, ast.Constant) and type(new.value) is int:
+        new.value += 1
+        return "off by one", new
+    if isinstance(new, ast.AugAssign) or (isinstance(new, ast.Expr) and isinstance(new.value, ast.Call)):
+        return "dropped", ast.Pass()
+    if isinstance(new, ast.Call) and len(new.args) > 1 and all(isinstance(arg, ast.Name) for arg in new.args[:2]):
+        if ast.unparse(new.func).rpartition(".")[2] in SYMMETRIC:
+            return None
+        new.args[:2] = new.args[1::-1]
+        return "swapped", new
+    return None
+
+
+def is_silent(node: ast.AST) -> bool:
+    """Whether nothing that the tests could ask for lies below the node: a message, an annotation, a text."""
+    if isinstance(node, ast.Raise | ast.JoinedStr | ast.Assert):
+        return True
+    called = node.func if isinstance(node, ast.Call) else None
+    return isinstance(called, ast.Attribute) and isinstance(called.value, ast.Name) and called.value.id == "log"
+
+
+def visited(node: ast.AST) -> Iterator[ast.AST]:
+    """The nodes in which a fault may lie, parents first."""
+    if is_silent(node) or (isinstance(node, ast.Expr) and is_silent(node.value)):
+        return
+    yield node
+    for name, field in ast.iter_fields(node):
+        if name in ("annotation", "returns", "decorator_list"):
+            continue
+        for child in field if isinstance(field, list) else [field]:
+            if isinstance(child, ast.AST):
+                yield from visited(child)
+
+
+def faults_of(path: Path) -> list[Fault]:
+    """All faults that may be planted in a file."""
+    text = path.read_text()
+    lines = [0]
+    for line in text.encode().splitlines(keepends=True):  # columns of the syntax tree count bytes
+        lines.append(lines[-1] + len(line))
+    found = []
+    for node in visited(ast.parse(text)):
+        change = changed_node(node)
+        if change is None:
+            continue
+        start, end = (
+            lines[row - 1] + column
+            for row, column in ((node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset))
+        )  # type: ignore[attr-defined]
+        before, after = text.encode()[start:end].decode(), ast.unparse(change[1])
+        if isinstance(change[1], ast.BinOp | ast.BoolOp | ast.Compare):
+            after = f"({after})"
+        file = path.relative_to(ROOT).as_posix()
+        found.append(Fault(file, node.lineno, change[0], start, end, before, after))  # type: ignore[attr-defined]
+    return found
+
+
+def chosen(rooms: list[str], count: int, seed: int) -> list[Fault]:
+    """``count`` faults, shared among the rooms by the root of their sizes; the kinds are equally likely."""
+    rng = random.Random(seed)
+    by_room = {
+        room: [
+            fault
+            for path in sorted((ROOT / SOURCE / room).rglob("*.py"))
+            if LEFT_OUT not in path.as_posix()
+            for fault in faults_of(path)
+        ]
+        for room in rooms
+    }
+    weights = {room: len(faults) ** 0.5 for room, faults in by_room.items()}
+    picked = []
+    for room, faults in by_room.items():
+        by_kind = {kind: [f for f in faults if f.kind == kind] for kind in sorted({f.kind for f in faults})}
+        for _ in range(max(1, round(count * weights[room] / sum(weights.values())))):
+            kind = rng.choice([kind for kind, left in by_kind.items() if left])
+            picked.append(by_kind[kind].pop(rng.randrange(len(by_kind[kind]))))
+    return picked
+
+
+def copy_checkout(folder: Path) -> Path:
+    """The files of the checkout, tracked or new, in a folder with the development data beside it, if there are any."""
+    listing = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    place = folder / "checkout"
+    for name in filter(None, listing.stdout.split("\0")):
+        if (ROOT / name).is_file():
+            (place / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, place / name)
+    if (ROOT.parent / "shared").exists():
+        (folder / "shared").symlink_to((ROOT.parent / "shared").resolve())
+    return place
+
+
+def is_caught(fault: Fault | None, place: Path, room: str) -> bool:
+    """Plant the fault in the copy, run the tests of its room, and take the fault out again."""
+    tests = [f"tests/{room}", *FURTHER_TESTS.get(room, [])]
+    original = b""
+    if fault is not None:
+        named = sorted((place / "tests" / room).rglob(f"test_{Path(fault.file).stem}.py"))  # most likely to fail: first
+        tests = [path.relative_to(place).as_posix() for path in named] + tests
+        original = (place / fault.file).read_bytes()
+        (place / fault.file).write_bytes(original[: fault.start] + fault.after.encode() + original[fault.end :])
+    words = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow", "-p", "no:cacheprovider", "-n", "0", *tests]
+    environment = os.environ | {"PYTHONPATH": str(place / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        done = subprocess.run(words, cwd=place, env=environment, capture_output=True, timeout=SECONDS, check=False)
+        return done.returncode != 0
+    except subprocess.TimeoutExpired:
+        return True
+    finally:
+        if fault is not None:
+            (place / fault.file).write_bytes(original)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rooms", nargs="+", default=ROOMS, choices=ROOMS)
+    parser.add_argument("--count", type=int, default=160)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    arguments = parser.parse_args()
+    faults = chosen(arguments.rooms, arguments.count, arguments.seed)
+    random.Random(arguments.seed).shuffle(faults)
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(arguments.workers) as pool:
+        places: Queue[Path] = Queue()
+        for worker in range(arguments.workers):
+            places.put(copy_checkout(Path(folder) / str(worker)))
+
+        def caught(fault: Fault | None, room: str) -> bool:
+            place = places.get()
+            try:
+                found = is_caught(fault, place, room)
+            finally:
+                places.put(place)
+            if fault is not None:
+                print("caught  " if found else "SURVIVED", describe(fault), flush=True)
+            return found
+
+        broken = [
+            room
+            for room, fails in zip(
+                arguments.rooms, pool.map(caught, [None] * len(arguments.rooms), arguments.rooms), strict=True
+            )
+            if fails
+        ]
+        if broken:
+            print(f"the tests of {', '.join(broken)} fail without a fault: mend them first")
+            return 1
+        results = dict(zip(faults, pool.map(caught, faults, [fault.room for fault in faults]), strict=True))
+    planted, seen = Counter(fault.room for fault in results), Counter(fault.room for fault in results if results[fault])
+    print("\n| room | planted | caught |\n|---|---|---|")
+    for room in sorted(planted):
+        print(f"| {room} | {planted[room]} | {seen[room]} |")
+    print(f"| all | {planted.total()} | {seen.total()} ({seen.total() / planted.total():.0%}) |\n")
+    for fault in sorted((f for f, found in results.items() if not found), key=lambda f: (f.file, f.line)):
+        print(f"- {describe(fault)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
