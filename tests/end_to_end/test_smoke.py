@@ -16,27 +16,22 @@ import pytest
 import yaml
 from PIL import Image
 
+from tests.conftest import ROOT
 from tests.end_to_end.conftest import FINISHED, SMALL, Run
 
 TINY = [*SMALL, "train.iterations=20", "tracking=none", "eval.lpips=[]", "eval.flip=false"]
-OWN = """
+MORTAL = """
 import os, signal
 from dataclasses import dataclass
 from pathlib import Path
 from gsbench.densify import ADC
 
 @dataclass
-class Dies(ADC):
+class Mortal(ADC):
     def after_step(self, step, gaussians, rng):
         if step == 150 and not Path("died").exists():
             Path("died").touch()
             os.kill(os.getpid(), signal.SIGKILL)
-
-@dataclass
-class Quarter(ADC):
-    \"\"\"Three of four candidates stay as they are.\"\"\"
-    def rules(self, refinement):
-        return super().rules(refinement) if refinement.step % 200 == 0 else []
 """
 
 
@@ -47,17 +42,6 @@ def trials_of(runs: Path, name: str = FINISHED) -> dict[str, Path]:
         results = json.loads(path.read_text())
         found[f"{results['densify']}-{results['seed']}"] = path.parent
     return found
-
-
-@pytest.fixture
-def own_modules(tmp_path: Path) -> list[str]:
-    """Words that let the program find the densifiers ``dies`` and ``quarter`` of a file of the user's."""
-    (tmp_path / "own.py").write_text(OWN)
-    (tmp_path / "conf" / "densify").mkdir(parents=True)
-    for name in ("Dies", "Quarter"):
-        text = f"defaults: [adc, _self_]\n_target_: own.{name}\nname: {name.lower()}\n"
-        (tmp_path / "conf" / "densify" / f"{name.lower()}.yaml").write_text(text)
-    return ["--config-dir", "conf", "allow_targets=[own]"]
 
 
 def test_a_sweep_leaves_complete_trials(finished_runs: Path) -> None:
@@ -105,8 +89,10 @@ def test_tables_and_report(gsbench: Run, runs: Path) -> None:
     assert "data:image/" in page
 
 
-def test_a_killed_trial_goes_on_to_the_same_bits(gsbench: Run, runs: Path, own_modules: list[str]) -> None:
-    command = [*own_modules, *SMALL, "name=killed", "densify=dies", "tracking=none"]
+def test_a_killed_trial_goes_on_to_the_same_bits(gsbench: Run, runs: Path, tmp_path: Path) -> None:
+    (tmp_path / "mortal.py").write_text(MORTAL)
+    own = ["densify=adc", "densify._target_=mortal.Mortal", "densify.name=mortal", "allow_targets=[mortal]"]
+    command = [*SMALL, "name=killed", "tracking=none", *own]
     killed = gsbench(*command, GSBENCH_RUNS=str(runs))
     assert killed.returncode == -9
     assert not trials_of(runs, "killed")
@@ -119,14 +105,17 @@ def test_a_killed_trial_goes_on_to_the_same_bits(gsbench: Run, runs: Path, own_m
         assert (trial / name).read_bytes() == (whole / name).read_bytes()
 
 
-def test_a_densifier_of_the_users_own(gsbench: Run, runs: Path, own_modules: list[str]) -> None:
-    done = gsbench(*own_modules, *SMALL, "name=own", "densify=quarter", "tracking=none", GSBENCH_RUNS=str(runs))
+def test_the_readmes_own_densifier_acts(gsbench: Run, runs: Path, tmp_path: Path) -> None:
+    (code,) = re.findall(r"```python\n(# mine\.py\n.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (tmp_path / "mine.py").write_text(code)
+    own = ["densify=adc", "densify._target_=mine.Solid", "densify.name=solid", "allow_targets=[mine]"]
+    done = gsbench(*SMALL, "name=own", "tracking=none", *own, "+densify.min_opacity=0.3", GSBENCH_RUNS=str(runs))
     assert done.returncode == 0, done.stderr
     counts = [
         json.loads((trial / "results.json").read_text())["num_gaussians"]
-        for trial in (trials_of(runs, "own")["quarter-0"], trials_of(runs)["adc-0"])
+        for trial in (trials_of(runs, "own")["solid-0"], trials_of(runs)["adc-0"])
     ]
-    assert 3000 < counts[0] < counts[1]
+    assert counts[0] < counts[1]
 
 
 def test_a_claims_file_and_its_archive(gsbench: Run, runs: Path, tmp_path: Path) -> None:
