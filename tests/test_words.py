@@ -30,6 +30,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "densify=volumetrik": "did you mean volumetric?",
     "train.iterations=many": "train.iterations",
     "scene=photos scene.path=/nowhere/at/all": "/nowhere/at/all",
+    "scene.path=/my/fern": "add scene=photos",
     "raster=gsplat device=cpu": "device=cuda",
     "+extra=1": "extra is not a setting",
     "++train.extra=1": "train.extra is not a setting",

@@ -50,6 +50,11 @@ class SceneConfig:
         check_settings(self, "scene")
         if self.kind != "courtyard" and not self.path:
             raise InputError("scene.path is not set: say where the capture lies, for example scene.path=/my/photos")
+        if self.kind == "courtyard" and self.path:
+            raise InputError(
+                f"scene.path={self.path} is not read by the built-in courtyard: add scene=photos (bare photographs), "
+                "scene=colmap or scene=transforms"
+            )
         self.split_rule.check()
         if self.split == "sector" and self.kind == "photos":
             raise InputError(
