@@ -44,8 +44,9 @@ What the rasterizer and the optimiser do is compared elsewhere: every executor w
 
 DashGaussian's schedule of sizes (`train.resolution_schedule`; YouyuChen0207/DashGaussian 4e3b560,
 `utils/schedule_utils.py`, `train_dash.py:75`, `:182`) is stated again in `tests/train/test_resolution.py`: the
-same size at every iteration. Otherwise there: it prunes before it grows, clones and splits each take the whole
-allowance, and the window over a spectrum of odd sides is a pixel off its mean. Here small pictures have 8 bits.
+same size at every iteration. Otherwise there: it prunes before it grows, by opacity alone, and growth at the limit
+replaces what was pruned; clones and splits each take the whole allowance, and the window over a spectrum of odd sides
+is a pixel off its mean. Here small pictures have 8 bits.
 """
 
 
@@ -161,8 +162,9 @@ ARMS = {
         "`:540`; `src/training/kernels/mrnf_kernels.cu:40`, `:97`; no paper",
         f"weights, {ROUND}, decay; noise by its spread",
         (("test_mrnf", "test_mrnf_round"),),
-        "weights of all iterations (views are drawn in the round), Canny's edges, rates that follow the cloud; what "
-        "later versions add",
+        "weights of all iterations (views are drawn in the round), Canny's edges, of another number of views; rates "
+        "that follow the cloud; bounds of every fifth round; noise before the step; pruning of quaternions near zero; "
+        "what the version of August 2026 changed (its pull request 1839)",
     ),
     "steepgs": Arm(
         "arXiv 2505.05587, its splitting matrix and halves; facebookresearch/SteepGS 63eee45, `arguments/__init__.py`, "

@@ -54,6 +54,7 @@ def test_turns_are_compared_with_the_first_and_whole_steps_are_made() -> None:
     assert second["step_ratio"] > 1  # the reference is meant to be read
     assert (first["scene"], first["device"]) == ("random", "cpu")
     assert min(first["steps_per_second"], second["steps_per_second"]) > 0
+    assert min(first["fps"], second["fps"]) > 0
     assert first["waits_per_step"] is None  # there is no device to wait for
 
 

@@ -100,7 +100,7 @@ def test_the_stages_are_those_of_the_authors_loop() -> None:
     assert {stages[step] for step in range(800, 12_000, 100)} == set(range(1, 10))
 
 
-def test_after_the_first_phase_all_opacities_fade_every_500_iterations() -> None:
+def test_from_the_end_of_the_first_phase_on_all_opacities_fade_every_500_iterations() -> None:
     densifier = ResGS(**WINDOW)  # type: ignore[arg-type]
     faded, pruned = [], []
     for step in range(500, 26_000, 500):
@@ -119,7 +119,7 @@ def test_after_the_first_phase_all_opacities_fade_every_500_iterations() -> None
             faded.append(step)
             if step >= 12_000:
                 pruned.append(event.pruned_opacity)
-    assert faded == list(range(3000, 25_000, 500))
+    assert faded == list(range(2500, 25_000, 500))  # their level has gone up when they ask: 45 times
     assert min(pruned) > 0
 
 

@@ -30,10 +30,11 @@ def run_bench(
     ``backward_ms`` the backward pass of loss and render, ``step_ms`` everything; ``loss_ms`` and ``adam_ms`` are the
     rest, and ``cpu_ms`` is the processor time of the step on all threads. ``step_ratio`` is the median of the turns'
     quotients with the first of ``rasters``. ``steps_per_second`` is that of whole training steps, which nothing is
-    waited for in between; ``waits_per_step`` how often one of them makes the host wait for a GPU. ``peak_memory_mb`` is
-    that of a fresh process that makes the same steps (on a GPU: of torch's allocations there), None if ``memory`` is
-    false. With ``stages`` a row also has ms a step by kernel, of further steps. With ``ply`` that model is timed,
-    not ``counts``. Raises InputError for a raster that cannot run here.
+    waited for in between; ``fps`` is frames a second, rendered alone; ``waits_per_step`` how often one of them makes
+    the host wait for a GPU. ``peak_memory_mb`` is that of a fresh process that makes the same steps (on a GPU: of
+    torch's allocations there), None if ``memory`` is false. With ``stages`` a row also has ms a
+    step by kernel, of further steps. With ``ply`` that model is timed, not ``counts``. Raises
+    InputError for a raster that cannot run here.
     """
     rows = []
     with progress("bench") as report:
@@ -52,12 +53,14 @@ def _compare(
     steppers = {raster: Stepper(raster, setting) for raster in rasters}
     parts: dict[str, list[dict[str, float]]] = {raster: [] for raster in rasters}
     speeds: dict[str, list[float]] = {raster: [] for raster in rasters}
+    frames: dict[str, list[float]] = {raster: [] for raster in rasters}
     for repeat in range(turns):
         for raster, stepper in steppers.items():
             report(what, repeat, turns, raster)
-            sample, speed = stepper.step(), stepper.steps_per_second()
+            sample, speed, fps = stepper.step(), stepper.steps_per_second(), stepper.frames_per_second()
             if repeat >= WARM_UP_STEPS:
                 parts[raster].append(sample)
+                frames[raster].append(fps)
                 speeds[raster] += [] if speed is None else [speed]
     rows = []
     for raster, stepper in steppers.items():
@@ -73,6 +76,7 @@ def _compare(
         row |= {
             "step_ratio": _median([own["step_ms"] / first["step_ms"] for own, first in pairs]),
             "steps_per_second": _median(speeds[raster]) if speeds[raster] else None,
+            "fps": _median(frames[raster]),
             "waits_per_step": None if waits is None else waits.total(),
             "threads": stepper.threads,
             "device": stepper.device.type,

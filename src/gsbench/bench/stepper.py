@@ -106,6 +106,15 @@ class Stepper:
         self.trainer.losses.settle()
         return steps / (self._now() - begin)
 
+    def frames_per_second(self) -> float:
+        """Renders of one view as a viewer makes them: no gradients, no other work between."""
+        frames = STEPS_AT_ONCE[self.device.type]
+        begin = self._now()
+        with torch.no_grad():
+            for _ in range(frames):
+                self.trainer.render(0)
+        return frames / (self._now() - begin)
+
     def waits(self) -> Counter[str] | None:
         """Calls that made the host wait for the device in one whole training step; None for the peer and on a CPU."""
         if self.peer is not None or self.device.type == "cpu":

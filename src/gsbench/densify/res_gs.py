@@ -32,8 +32,8 @@ class ResGS(ADC):
     parent's plus one. The window has stages; a Gaussian of level l in stage s > l grows at ``gradient_threshold`` times
     ``level_factor``^(l - s), so that who is behind catches up. The stages are ``stages_a_phase`` equal parts of each
     phase of the window; phases end at ``phase_ends``, fractions of it, and for ``warm_up`` of the window after each end
-    nothing is gathered and nothing grows. After the first end all opacities are multiplied by ``fade`` every
-    ``fade_interval`` iterations, until ``fade_stop``. No opacity reset; pruned are the faint alone.
+    nothing is gathered and nothing grows. From ``fade_start`` of the window on all opacities are multiplied by ``fade``
+    every ``fade_interval`` iterations, until ``fade_stop``. No opacity reset; pruned are the faint alone.
     """
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"level": torch.int32}  # how many residual splits made a Gaussian
@@ -52,6 +52,7 @@ class ResGS(ADC):
     stages_a_phase: PositiveInt = 3
     warm_up: Annotated[float, Interval(ge=0, lt=1)] = 0.044
     fade: Annotated[float, Interval(gt=0, le=1)] = 0.8
+    fade_start: OpenFraction = 0.16
     fade_interval: PositiveInt = 500
     fade_stop: NonNegativeInt = 25_000
 
@@ -88,7 +89,7 @@ class ResGS(ADC):
         step, rules = refinement.step, [rule for rule in super().rules(refinement) if rule != self.reset_opacity]
         if self.warming_up(step):
             rules = []
-        fading = bool(self.phase_ends) and step > self.iteration_at(self.phase_ends[0]) and step < self.fade_stop
+        fading = self.iteration_at(self.fade_start) <= step < self.fade_stop
         if fading and step % self.fade_interval == 0:
             rules += [self.fade_all] if step < self.stop else [self.prune, self.fade_all]
         return rules

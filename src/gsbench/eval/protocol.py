@@ -11,7 +11,7 @@ from typing import Literal
 
 from gsbench.errors import InputError
 
-SsimPadding = Literal["zero", "valid"]
+SsimPadding = Literal["zero", "valid", "reflect"]
 Shrinking = Literal["bicubic", "lanczos"]
 
 # Pixels per degree of a 0.7 m wide, 3840 px display seen from 0.7 m: the default viewer of Andersson et al. 2020.
@@ -69,8 +69,9 @@ OTHERS = {
             "utils/general_utils.py), 1152adc (render.py)",
         ),
         Protocol(
-            "gsplat", 1, eight_bit=False, ssim_padding="valid", lpips="alex", shrinking="bicubic", full_size=True,
-            source="nerfstudio-project/gsplat 90d7b4b (examples/simple_trainer.py, examples/datasets/colmap.py)",
+            "gsplat", 2, eight_bit=False, ssim_padding="reflect", lpips="alex", shrinking="bicubic", full_size=True,
+            source="nerfstudio-project/gsplat 90d7b4b (examples/simple_trainer.py, examples/datasets/colmap.py), "
+            "torchmetrics 1.8.2 (functional/image/ssim.py)",
         ),
         Protocol(
             "nerfbaselines", 1, eight_bit=True, ssim_padding="valid", lpips="alex", shrinking="bicubic",

@@ -26,6 +26,7 @@ COLUMNS = (  # of the table
     "step_ratio",
     "cpu_ms",
     "steps_per_second",
+    "fps",
     "waits_per_step",
     "peak_memory_mb",
 )
