@@ -66,7 +66,8 @@ def test_each_protocol_measures_as_its_program_does() -> None:
     rounded = {view: np.floor(image.astype(np.float64) * 255 + 0.5) / 255 for view, image in exact.items()}
     expected = {  # renders, photographs, how SSIM treats the border
         "3dgs": (rounded, other, "zero"), "gsplat": (exact, other, "mirrored"),
-        "nerfbaselines": (rounded, other, "inside"), "nerfstudio": (exact, other, "inside"), "mipnerf360": (rounded, one, "inside"),
+        "nerfbaselines": (rounded, other, "inside"), "nerfstudio": (exact, other, "inside"),
+        "mipnerf360": (rounded, one, "inside"),
     }  # fmt: skip
     ssims = {"zero": brute_force_ssim, "mirrored": mirrored_ssim, "inside": inside_ssim}
     assert expected.keys() == OTHERS.keys()
