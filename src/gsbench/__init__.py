@@ -1,5 +1,6 @@
 """gsbench tests whether an idea helps 3D Gaussian Splatting. Photographs in; tables, statistics and pictures out."""
 
+import os
 import sys
 import time
 
@@ -7,6 +8,9 @@ if sys.argv[:1] == ["-m"] and "gsbench.cli" in sys.orig_argv and not sys.flags.s
     del sys.path[0]  # `python -m` puts the current folder first, where a capture may hold a module of any name
 
 import zlib  # noqa: F401 - loaded before pycolmap brings its own, with which Pillow's PNG writer crashes
+
+# Before torch is loaded, which reads it then: its idle threads must not spin beside those of our kernels.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 IMPORTED_AT = time.time_ns()  # when this process began to load this package
 __version__ = "0.1.0"

@@ -39,7 +39,6 @@ def main() -> None:
 
 def run(argv: list[str]) -> int:
     """Run the command line ``argv``; returns the exit code and prints errors as one line."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: its idle threads must not spin beside ours
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault(*SAFE_PATH)  # for all Python processes that we start, whoever starts them for us
     set_up_logging()

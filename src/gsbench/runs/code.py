@@ -22,7 +22,7 @@ from typing import Any
 from gsbench import IMPORTED_AT
 from gsbench.files import write_json
 from gsbench.parsing import DamagedError, read_json
-from gsbench.runs.imports import read_imports
+from gsbench.system.imports import read_imports
 
 PACKAGE = Path(__file__).resolve().parents[1]
 RELEASED = "released.json"  # in the package: the digests of all files as they were released
@@ -262,7 +262,7 @@ def _keep_digests() -> None:
 
 def _read_by() -> list[Any]:
     """State of Python and of the code that find digests and imports."""
-    return [sys.version, _stamp("runs/code.py"), _stamp("runs/imports.py")]
+    return [sys.version, _stamp("runs/code.py"), _stamp("system/imports.py")]
 
 
 def _cache_file() -> Path:

@@ -23,7 +23,7 @@ from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any
 
-from gsbench.runs.imports import Imports, read_imports
+from gsbench.system.imports import Imports, read_imports
 from gsbench.system.own_modules import PATH_AT_START, AllowedModules, allowed_modules
 
 OWN = "gsbench."  # classes below it have no hash: versions of gsbench's stages stand for them

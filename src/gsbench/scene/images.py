@@ -14,9 +14,9 @@ from PIL import Image, UnidentifiedImageError
 
 from gsbench.errors import InputError
 from gsbench.files import require_regular
+from gsbench.scene.options import Behind
 
 Resample = Literal["lanczos", "area", "bicubic"]
-Behind = Literal["black", "white"]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 # Formats of files with these names. Pillow would read some forty formats, whatever the name.

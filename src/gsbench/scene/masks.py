@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.scene.images import Behind, image_size, open_image, read_image
+from gsbench.scene.images import image_size, open_image, read_image
 from gsbench.scene.names import stem_of
+from gsbench.scene.options import Behind
 from gsbench.words import some_of
 
 Mask = NDArray[np.bool_]  # [H, W], True where a pixel counts

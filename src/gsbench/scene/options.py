@@ -9,11 +9,11 @@ from annotated_types import Ge, Interval
 from pydantic import NonNegativeInt, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.scene.images import Behind
 from gsbench.scene.sizes import MIN_SIZE, check_final_size
 from gsbench.scene.split import SECTORS, TEST_EVERY, SplitName, SplitRule
 from gsbench.settings import MISSING, FolderName, PathName, check_settings
 
+Behind = Literal["black", "white"]
 MAX_SIZE = 16_384  # px, of a picture of the courtyard
 
 

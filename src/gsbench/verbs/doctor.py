@@ -171,7 +171,7 @@ def check_triton() -> Iterator[Finding]:
 
 def check_kernels() -> Iterator[Finding]:
     """Check the place of the CPU's compiled kernels; without one every start compiles anew."""
-    from gsbench.raster.cpu.jit import TEMPORARY_PREFIX, cache_base
+    from gsbench.system.jit import TEMPORARY_PREFIX, cache_base
 
     place = cache_base()
     if place.name.startswith(TEMPORARY_PREFIX):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.scene.camera import Camera
+from gsbench.system.jit import inlined, kernel
 
 NEAR = 0.05  # world units: surfaces nearer than this are not drawn
 AMBIENT = 0.35  # brightness of a surface seen edge-on; face-on it is 1
@@ -64,7 +64,7 @@ class Canvas:
         return np.clip(np.rint(self.picture), 0, 255).astype(np.uint8)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@inlined
 def _range(focal: float, principal: float, x: float, z: float, radius: float, size: int) -> Any:
     """The pixels [first, end) along one axis that a sphere at (x, z) may cover."""
     if z - radius <= NEAR:
@@ -76,7 +76,7 @@ def _range(focal: float, principal: float, x: float, z: float, radius: float, si
     return int(first), int(last)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _draw_ellipsoids(
     centers: Any, to_sphere: Any, radii: Any, colors: Any, intrinsics: Any, picture: Any, depth: Any
 ) -> None:

@@ -19,9 +19,9 @@ from gsbench.runs.stages import CAPTURE
 from gsbench.runs.step import Step
 from gsbench.scene.colmap import write_frames
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.images import Behind, image_size
+from gsbench.scene.images import image_size
 from gsbench.scene.masks import IMAGES, prepare, prepared_mask
-from gsbench.scene.options import SceneConfig
+from gsbench.scene.options import Behind, SceneConfig
 from gsbench.scene.readers import (
     SPARSE_FOLDERS,
     existing_folder,

@@ -24,10 +24,10 @@ from gsbench.raster.cpu.geometry import (
     to_view,
 )
 from gsbench.raster.cpu.harmonics import F0, MATRIX, direction_gradient, fill_basis
-from gsbench.raster.cpu.jit import inlined, kernel
 from gsbench.raster.cpu.shuffle import REST, by_channel, outer_rest, store_rest, transpose
 from gsbench.raster.cpu.simd import gather, load, prefetch, scatter, select, splat, store
 from gsbench.raster.cpu.vector import LANES
+from gsbench.system.jit import inlined, kernel
 
 AHEAD = 16  # records that the prefetch runs ahead
 ZERO, ONE = np.float32(0), np.float32(1)

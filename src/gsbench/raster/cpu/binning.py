@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from gsbench.raster.cpu import layout as at
-from gsbench.raster.cpu.jit import inlined, kernel
 from gsbench.raster.cpu.simd import prefetch
+from gsbench.system.jit import inlined, kernel
 
 LOG2_ALPHA_MIN_MARGIN = 1e-3  # of the contour's reach, for float32
 PIXEL_MARGIN = 0.02  # px

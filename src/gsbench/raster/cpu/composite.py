@@ -13,7 +13,6 @@ import numpy as np
 
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
-from gsbench.raster.cpu.jit import inlined, kernel
 from gsbench.raster.cpu.simd import (
     absolute,
     exp2,
@@ -31,6 +30,7 @@ from gsbench.raster.cpu.simd import (
     store,
 )
 from gsbench.raster.cpu.vector import LANES
+from gsbench.system.jit import inlined, kernel
 
 LOG2_ALPHA_MIN = np.float32(math.log2(CONSTANTS.alpha_min))
 ALPHA_MAX = np.float32(CONSTANTS.alpha_max)

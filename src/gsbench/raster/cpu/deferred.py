@@ -18,11 +18,11 @@ from gsbench.gaussians.model import NUM_SH_REST
 from gsbench.gaussians.spherical_harmonics import basis
 from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.harmonics import fill_basis
-from gsbench.raster.cpu.jit import inlined, kernel
 from gsbench.raster.cpu.shuffle import REST, load_rest, outer_rest, store_rest
 from gsbench.raster.cpu.simd import fma, load, prefetch, select, square_root
 from gsbench.raster.cpu.vector import LANES
 from gsbench.raster.cpu.workspace import ShardRunner
+from gsbench.system.jit import inlined, kernel
 
 # A chunk of factors: 16 Gaussians, a row of 16 float32 for each of these.
 TO_X, TO_Y, TO_Z, G_RED, G_GREEN, G_BLUE = range(6)  # direction from the camera, gradient of the colour

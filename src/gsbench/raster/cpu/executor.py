@@ -9,7 +9,6 @@ from torch import Tensor
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
-from gsbench.raster.cpu.jit import announce_compilation
 from gsbench.raster.cpu.stages import Frame, Workshop, backward, footprint, forward
 from gsbench.raster.cpu.workspace import ArenaPool
 from gsbench.raster.footprint import Footprint
@@ -36,7 +35,6 @@ class CpuRasterizer(StagedRasterizer[Frame]):
         self._workshop = Workshop(self.threads)
         self._frames = ArenaPool()
         self._scratch = ArenaPool()
-        announce_compilation()
 
     def check(self, gaussians: Gaussians) -> None:
         """Raise ValueError where tensors are not float32 on the CPU."""

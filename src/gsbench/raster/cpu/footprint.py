@@ -8,9 +8,9 @@ import numpy as np
 
 from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, ONE, PIXEL_X, PIXEL_Y, ZERO, place_in_tile
-from gsbench.raster.cpu.jit import kernel
 from gsbench.raster.cpu.simd import fma, lane_sums, load, lowest_bit, select, splat, square_root, store
 from gsbench.raster.cpu.vector import LANES
+from gsbench.system.jit import kernel
 
 # Of a Gaussian's row: how many pixels, the sum of their values, and of their distances; as ``lane_sums`` leaves them.
 COVERED, VALUES, DISTANCES = at.SUM_H, at.SUM_H_T, at.SUM_H_Y

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from gsbench.raster.cpu.jit import inlined
 from gsbench.raster.cpu.simd import exp2, gather, maximum, minimum, square_root
+from gsbench.system.jit import inlined
 
 LOG2_E = 1.0 / math.log(2.0)
 MAX_LOG2 = 126.0  # beyond, exp2 is undefined; a scale of 2^126 has a variance that is not finite, and is culled

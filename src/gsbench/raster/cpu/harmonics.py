@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from gsbench.gaussians.spherical_harmonics import C0, C1, C2, C3
-from gsbench.raster.cpu.jit import inlined
 from gsbench.raster.cpu.shuffle import transpose
 from gsbench.raster.cpu.simd import load, splat, store
 from gsbench.raster.cpu.vector import LANES
+from gsbench.system.jit import inlined
 
 F0, F1 = np.float32(C0), np.float32(C1)
 D0, D1, D2, D3, D4 = (np.float32(value) for value in C2)

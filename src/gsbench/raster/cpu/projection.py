@@ -28,7 +28,6 @@ from gsbench.raster.cpu.geometry import (
     to_view,
 )
 from gsbench.raster.cpu.harmonics import F0, MATRIX, fill_basis
-from gsbench.raster.cpu.jit import inlined, kernel
 from gsbench.raster.cpu.shuffle import as_integers, as_span, by_channel, index_bits, transpose
 from gsbench.raster.cpu.simd import (
     absolute,
@@ -48,6 +47,7 @@ from gsbench.raster.cpu.simd import (
 )
 from gsbench.raster.cpu.vector import LANES
 from gsbench.raster.validate import MIN_QUATERNION_NORM
+from gsbench.system.jit import inlined, kernel
 
 MAX_RADIUS = 2.0**24  # px; keeps the radius of an absurdly large Gaussian inside int32
 MAX_CENTER = 1e9  # px; a centre so far outside the image cannot be told apart in float32

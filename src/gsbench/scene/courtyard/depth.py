@@ -5,13 +5,13 @@ from __future__ import annotations
 from math import inf, sqrt
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.scene.camera import Camera
 from gsbench.scene.courtyard.kernels import SKY, cast, to_local
 from gsbench.scene.courtyard.layout import build_layout
+from gsbench.system.jit import kernel
 
 
 def courtyard_depth(camera: Camera, seed: int = 0) -> NDArray[np.float64]:
@@ -30,7 +30,7 @@ def courtyard_depth(camera: Camera, seed: int = 0) -> NDArray[np.float64]:
     return depth
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@kernel
 def _depths(
     kind: Any,
     center: Any,

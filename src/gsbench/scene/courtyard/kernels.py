@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from math import exp, floor, inf, sqrt
 
-import numba
 import numpy as np
 
 from gsbench.scene.courtyard.layout import BOX, SPHERE
 from gsbench.scene.courtyard.textures import clamp, ground, octaves2, shade_factors
+from gsbench.system.jit import inlined, kernel
 
 GROUND, SKY = -1, -2
 SUN = (-0.5130, -0.4305, 0.7426)  # unit vector towards the sun: from the south-west, 48 degrees high
@@ -20,10 +20,8 @@ EXPOSURE = 1.12
 SUBSAMPLES = 2  # per side of a pixel
 _EPSILON = 1e-4  # m, how far a shadow ray starts above the surface
 
-_inline = numba.njit(nogil=True, error_model="numpy")
 
-
-@_inline
+@inlined
 def to_local(rotation, x, y, z):
     """World to local direction: the transpose of ``rotation`` [3, 3] times (x, y, z)."""
     return (
@@ -33,13 +31,13 @@ def to_local(rotation, x, y, z):
     )
 
 
-@_inline
+@inlined
 def inverse(value):
     """1 / value, large but finite at 0, so that a ray along a face of a box gives no NaN."""
     return 1.0 / value if abs(value) > 1e-12 else 1e12
 
 
-@_inline
+@inlined
 def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
     """(entry, exit) of a ray with inverse direction i through the box from l to h; entry > exit where it misses."""
     ax, bx = (lx - ox) * ix, (hx - ox) * ix
@@ -48,7 +46,7 @@ def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
     return max(min(ax, bx), min(ay, by), min(az, bz)), min(max(ax, bx), max(ay, by), max(az, bz))
 
 
-@_inline
+@inlined
 def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
     """The first distance > 0 at which a ray meets a capped cylinder, or one with a bore; inf where it misses."""
     best = inf
@@ -72,7 +70,7 @@ def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
     return best
 
 
-@_inline
+@inlined
 def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
     """The first distance > 0 along a local ray to the primitive, inf where it misses."""
     if kind == BOX:
@@ -90,7 +88,7 @@ def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
     return hit_tube(size[0], size[1], size[2], ox, oy, oz, dx, dy, dz)
 
 
-@_inline
+@inlined
 def cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz, anything):
     """(distance, primitive) of the first hit, GROUND or SKY included; with ``anything`` the first one found will do."""
     best, index = inf, SKY
@@ -118,7 +116,7 @@ def cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz,
     return best, index
 
 
-@_inline
+@inlined
 def signed_distance(kind, size, x, y, z):
     """Distance from a local point to the primitive's surface, negative inside."""
     if kind == SPHERE:
@@ -132,7 +130,7 @@ def signed_distance(kind, size, x, y, z):
     return outside + min(max(qx, qy, qz), 0.0)
 
 
-@_inline
+@inlined
 def nearest_surface(kind, center, rotation, size, start, low, high, x, y, z, limit):
     """The smallest |distance| from a point to any surface, the ground included, if below ``limit``, else ``limit``."""
     best = min(abs(z), limit)
@@ -151,17 +149,15 @@ def nearest_surface(kind, center, rotation, size, start, low, high, x, y, z, lim
     return best
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def distances(kind, center, rotation, size, start, low, high, points, limit):
-    """`nearest_surface` of points [P, 3] -> [P]."""
-    result = np.empty(len(points))
+@kernel
+def distances(kind, center, rotation, size, start, low, high, points, limit, result):
+    """`nearest_surface` of points [P, 3] into ``result`` [P]."""
     for p in range(len(points)):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
         result[p] = nearest_surface(kind, center, rotation, size, start, low, high, x, y, z, limit)
-    return result
 
 
-@_inline
+@inlined
 def local_normal(kind, size, x, y, z):
     """The outward normal at a local surface point, and coordinates (u, v) in m along the face."""
     if kind == SPHERE:
@@ -181,7 +177,7 @@ def local_normal(kind, size, x, y, z):
     return side * x / radius, side * y / radius, 0.0, np.arctan2(y, x) * size[0], z
 
 
-@_inline
+@inlined
 def sky(dx, dy, dz, seed):
     """The colour of the sky in a direction: a gradient with faint clouds."""
     up = clamp(dz, 0.0, 1.0)
@@ -192,7 +188,7 @@ def sky(dx, dy, dz, seed):
     return red + cloud * (0.95 - red), green + cloud * (0.96 - green), blue + cloud * (0.98 - blue)
 
 
-@_inline
+@inlined
 def shade(kind, center, rotation, size, material, tint, start, low, high, ox, oy, oz, dx, dy, dz, pixel, seed):
     """The linear colour that a camera ray sees; ``pixel`` is the angle that one subsample covers, in rad."""
     t, i = cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz, False)
@@ -237,7 +233,7 @@ def shade(kind, center, rotation, size, material, tint, start, low, high, ox, oy
     )
 
 
-@_inline
+@inlined
 def encode(value):
     """Linear light to an 8-bit sRGB value, with a soft shoulder instead of clipping."""
     value = EXPOSURE * value
@@ -247,7 +243,7 @@ def encode(value):
     return floor(255.0 * clamp(srgb, 0.0, 1.0) + 0.5)
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@kernel
 def render(
     kind, center, rotation, size, material, tint, start, low, high, camera_rotation, origin, intrinsics, image, seed
 ):

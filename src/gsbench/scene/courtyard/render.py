@@ -100,8 +100,10 @@ def surface_distance(points: NDArray[np.float64], seed: int = 0, limit: float = 
     Exact outside all solids; inside, the distance to the nearest surface of any primitive, hidden ones included.
     """
     layout = build_layout(seed)
-    return distances(
+    result = np.empty(len(points))
+    distances(
         layout.kind, layout.center, layout.rotation, layout.size,
         layout.group_start, layout.group_low, layout.group_high,
-        np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3), limit,
+        np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3), limit, result,
     )  # fmt: skip
+    return result

@@ -8,14 +8,11 @@ from __future__ import annotations
 
 from math import floor, sqrt
 
-import numba
-
 from gsbench.scene.courtyard.layout import CLAY, GLASS, LEAVES, LOG, METAL, PAINT, PLASTER, STONE, TILES, WATER, WOOD
+from gsbench.system.jit import inlined
 
-_inline = numba.njit(nogil=True, error_model="numpy")
 
-
-@_inline
+@inlined
 def random_cell(x, y, z, seed):
     """A hash of a lattice cell, uniform in [0, 1)."""
     h = (x * 374761393 + y * 668265263 + z * 1274126177 + seed * 974634777) & 0xFFFFFFFF
@@ -24,7 +21,7 @@ def random_cell(x, y, z, seed):
     return ((h ^ (h >> 16)) & 0xFFFFFFFF) / 4294967296.0
 
 
-@_inline
+@inlined
 def noise2(x, y, seed):
     """Value noise over the plane with unit cells, in [-1, 1]."""
     fx, fy = floor(x), floor(y)
@@ -36,7 +33,7 @@ def noise2(x, y, seed):
     return 2 * (low * (1 - v) + high * v) - 1
 
 
-@_inline
+@inlined
 def noise3(x, y, z, seed):
     """Value noise in space with unit cells, in [-1, 1]."""
     fz = floor(z)
@@ -46,13 +43,13 @@ def noise3(x, y, z, seed):
     return noise2(x, y, seed + 7919 * iz) * (1 - w) + noise2(x, y, seed + 7919 * (iz + 1)) * w
 
 
-@_inline
+@inlined
 def visible(cell, footprint):
     """The weight of a detail of size ``cell`` where a pixel covers ``footprint``: 1 above two pixels, 0 below one."""
     return min(1.0, max(0.0, cell / footprint - 1.0))
 
 
-@_inline
+@inlined
 def octaves2(x, y, cell, count, gain, footprint, seed):
     """Noise octaves over the plane from cells of ``cell`` m downwards, each half as large; about [-1, 1]."""
     total, amplitude = 0.0, 1.0
@@ -66,7 +63,7 @@ def octaves2(x, y, cell, count, gain, footprint, seed):
     return total
 
 
-@_inline
+@inlined
 def octaves3(x, y, z, cell, count, gain, footprint, seed):
     """Noise octaves in space from cells of ``cell`` m downwards, each half as large; about [-1, 1]."""
     total, amplitude = 0.0, 1.0
@@ -80,7 +77,7 @@ def octaves3(x, y, z, cell, count, gain, footprint, seed):
     return total
 
 
-@_inline
+@inlined
 def pebbles(x, y, cell, seed):
     """Cellular noise: (distance to the nearest feature point, that to the cell's border, shade of the cell)."""
     gx, gy = floor(x / cell), floor(y / cell)
@@ -97,7 +94,7 @@ def pebbles(x, y, cell, seed):
     return first, second - first, shade
 
 
-@_inline
+@inlined
 def groove(position, period, width, footprint):
     """1 on the lines between strips of ``period``, 0 elsewhere, softened to the pixel's footprint."""
     offset = abs(position / period - floor(position / period + 0.5)) * period
@@ -106,12 +103,12 @@ def groove(position, period, width, footprint):
     return line * min(1.0, width / soft) * min(1.0, 1.5 * width / soft + 0.2)
 
 
-@_inline
+@inlined
 def clamp(value, low, high):
     return min(high, max(low, value))
 
 
-@_inline
+@inlined
 def ground(x, y, footprint, seed):
     """The lawn with its gravel path and the bare soil along the walls."""
     wobble = 0.10 * octaves2(x, y, 0.7, 4, 0.6, footprint, seed + 11)
@@ -149,7 +146,7 @@ def ground(x, y, footprint, seed):
     return red, green, blue
 
 
-@_inline
+@inlined
 def shade_factors(material, px, py, pz, u, v, footprint, seed):
     """(lightness, warmth) of a material at a point: local coordinates in m, and (u, v) along the face."""
     light, warmth = 1.0, 0.0

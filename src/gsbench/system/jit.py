@@ -1,4 +1,4 @@
-"""Compilation of the kernels: options, the cache on disk, and the word to the user while the first compilation runs."""
+"""Compilation of kernels by numba: options, the cache on disk, and the word to the user while something compiles."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core import event
 
-from gsbench.raster.cpu.imports import PACKAGE, import_closure
+from gsbench.system.imports import PACKAGE, import_closure
 from gsbench.system.machine import numba_target
 
-FIRST_COMPILE_SECONDS = 10  # about; measured 7.5 s of processor time on a 2024 server core
 DIGEST_CHARACTERS = 16
 TEMPORARY_PREFIX = "gsbench-numba-"  # of the folder where no other can be written
 
@@ -24,7 +24,6 @@ njit: Any = numba.njit
 config: Any = numba.config
 
 _logger = logging.getLogger(__name__)
-_used: set[Path] = set()  # the folders of the kernels that this process has
 
 
 @functools.cache
@@ -65,7 +64,6 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     all its arrays and may not allocate.
     """
     folder = cache_folder(Path(function.__code__.co_filename))
-    _used.add(folder)
     previous = config.CACHE_DIR  # read when the decorator runs; other users of numba in this process keep theirs
     config.CACHE_DIR = str(folder)
     try:
@@ -79,8 +77,20 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     return njit(nogil=True, error_model="numpy", forceinline=True, _nrt=False)(function)
 
 
-@functools.cache
-def announce_compilation() -> None:
-    """Tell the user, once, that the first call will take a while, if the cache on disk lacks kernels."""
-    if not all(any(folder.rglob("*.nbc")) for folder in _used):
-        _logger.warning("compiling the CPU rasterizer, about %d s, once", FIRST_COMPILE_SECONDS)
+class _Announcement(event.Listener):
+    """Tells the user, once in a process, why the first call of a kernel takes a while: nothing if all were kept."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def on_start(self, event: event.Event) -> None:
+        ours = event.data["dispatcher"].py_func.__module__.startswith("gsbench.")
+        if ours and not self._said:
+            self._said = True
+            _logger.warning("compiling for this processor, some 10 s, once")
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+event.register("numba:compile", _Announcement())  # sent where the cache on disk has no machine code
