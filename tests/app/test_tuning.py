@@ -169,6 +169,23 @@ def test_killed_anywhere_it_goes_on_and_chooses_the_same(
     assert again.batches == [4]  # what is tuned is not even asked for
 
 
+@pytest.mark.parametrize(
+    "strange",
+    [{"tracking.uri": "http://theirs"}, {"densify.volume_threshold": 7.0}, {"densify.stop": "${oc.env:HOME}"}],
+)
+def test_no_record_sets_what_was_not_searched(strange: dict[str, Any], sweep: Sweep, runs: Path) -> None:
+    assert sweep(Fake()) == 0
+    file = runs / "fair" / "tuning.json"
+    record = json.loads(file.read_text())
+    for point in record["arms"]["random-volumetric"]["search"]["points"]:
+        point["settings"] |= strange
+    file.write_text(json.dumps(record))
+    again = Fake()
+    assert sweep(again) == 0
+    assert all(trial.values["tracking"]["uri"] is None for trial in again.trained)
+    assert strange.items().isdisjoint(chosen(runs, "volumetric").items())
+
+
 @pytest.mark.slow
 def test_seeds_may_be_added_to_a_tuned_sweep_and_it_may_stop_when_decided(sweep: Sweep, runs: Path) -> None:
     assert sweep(Fake(), "launch.stop_when_decided=true", "seed=0,1,2") == 0

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from gsbench.cli import run
+from gsbench.errors import InputError
+from gsbench.tracking import connect, mirror_trial
 from gsbench.tracking.address import VARIABLE, untyped_address
-from tests.tracking.helpers import free_port
-
-from .helpers import begin_trial, trial_values, write_trial
+from gsbench.tracking.mlflow_sink import STATE
+from tests.tracking.helpers import begin_trial, found_runs, free_port, options, trial_values, write_trial
 
 
 def test_an_address_counts_where_it_is_typed_or_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,3 +49,39 @@ def test_sync_leaves_a_strange_tracker_alone(
     if kind == "sqlite":
         assert run(["sync", "theirs", "--uri", address]) == 0
         assert target.is_file()
+
+
+@pytest.mark.parametrize("place", ["http://127.0.0.1:{port}/api", "{outside}", "{runs}/mlartifacts/../../outside"])
+def test_artifacts_go_nowhere_else_than_our_own_folder(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    runs, outside = tmp_path / "runs", tmp_path / "outside"
+    outside.mkdir()
+    values = trial_values(runs, name="theirs")
+    folder = begin_trial(values)
+    write_trial(folder, values)
+    monkeypatch.delenv(VARIABLE, raising=False)
+    address = place.format(port=free_port(), outside=outside, runs=runs)
+    connect(None, runs).create_experiment("theirs", artifact_location=address)
+    with pytest.raises(InputError, match="would send artifacts to"):
+        mirror_trial(options(), runs, folder, values)
+    assert not list(outside.iterdir())
+
+
+def test_no_link_among_the_artifacts_is_written_through(tmp_path: Path) -> None:
+    runs, private = tmp_path / "runs", tmp_path / "private"
+    private.write_text("secret")
+    values = trial_values(runs, name="theirs")
+    folder = begin_trial(values)
+    write_trial(folder, values)
+    client = connect(None, runs)
+    mirror_trial(options(), runs, folder, values)
+    (made,) = found_runs(client, "theirs")
+    shown = runs / "mlartifacts" / "theirs" / made.info.run_id / "artifacts" / "config.yaml"
+    shown.unlink()
+    shown.symlink_to(private)
+    state = json.loads((folder / STATE).read_text())
+    (folder / STATE).write_text(json.dumps(state | {"complete": None}))
+    with pytest.raises(InputError, match="does not follow"):
+        mirror_trial(options(), runs, folder, values)
+    assert private.read_text() == "secret"

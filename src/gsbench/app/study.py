@@ -83,7 +83,7 @@ class Study:
         every = study.get_trials(deepcopy=False)
         known = [trial for trial in every if trial.state != TrialState.WAITING]
         begun = {trial.number: trial.params for trial in known if trial.state == TrialState.RUNNING}
-        left = {number: values for number, values in begun.items() if set(values) == set(self.ranges)}
+        left = {number: values for number, values in begun.items() if lie_in(values, self.ranges)}
         for number in begun.keys() - left.keys():  # killed between its first value and its last
             study.tell(number, state=TrialState.FAIL)
         if left:
@@ -219,6 +219,20 @@ def distribution(override: Override) -> BaseDistribution:
 def lowest(ranges: Ranges) -> Values:
     """The point of the lowest value, or first choice, of all that is searched."""
     return {key: one.choices[0] if hasattr(one, "choices") else one.low for key, one in ranges.items()}  # type: ignore[attr-defined]
+
+
+def lie_in(values: Values, ranges: Ranges) -> bool:
+    """Return whether ``values`` has a value of each range and nothing else; numbers as `text_of` rounds them."""
+    # A record of a stranger's might set anything else, such as where the results are sent.
+    return values.keys() == ranges.keys() and all(_lies_in(value, ranges[key]) for key, value in values.items())
+
+
+def _lies_in(value: Any, one: Any) -> bool:
+    if hasattr(one, "choices"):
+        return value in one.choices
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return float(text_of(one.low)) <= float(text_of(value)) <= float(text_of(one.high))
 
 
 def words_of_values(values: Mapping[str, Any]) -> list[str]:

@@ -14,7 +14,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf
 
-from gsbench.app.study import Values, arm_of, best_words, check_installed, words_of_values
+from gsbench.app.study import Values, arm_of, best_words, check_installed, lie_in, words_of_values
 from gsbench.app.task import Task, launch_trials, trials_of_jobs
 from gsbench.app.tuning_plan import PLACE, Plan, TuneSettings, make_plan
 from gsbench.errors import GsbenchError, InputError
@@ -70,8 +70,14 @@ def _done(plan: Plan) -> TuningRecord | None:
     except DamagedError as error:
         log.warning("left out: %s", error)
         return None
-    whole = all(arm.name in record.arms and _chosen(record, arm.name) is not None for arm in plan.tuned)
-    return record if record.hash == plan.hash and whole else None
+    if record.hash != plan.hash:
+        return None
+    for arm in plan.arms:
+        chosen = _chosen(record, arm.name) if arm.name in record.arms else None
+        if not lie_in(chosen or {}, arm.ranges):
+            log.warning("left out: %s: its values of %s are not of the declared ranges", plan.home / TUNING, arm.name)
+            return None
+    return record
 
 
 def _search(

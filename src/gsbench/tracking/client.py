@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
 
+from gsbench.errors import InputError
 from gsbench.files import atomic, require_own
 from gsbench.runs.layout import ARTIFACTS, DATABASE
 from gsbench.tracking.source import user_tags
@@ -101,6 +102,22 @@ def ensure_parent(client: MlflowClient, experiment_id: str, sweep: dict[str, Any
         run_id = client.create_run(experiment_id, tags=tags, run_name=name).info.run_id
         client.set_terminated(run_id, "FINISHED")
         return str(run_id)
+
+
+def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> None:
+    """Raise InputError where a run of the runs folder's own database has its artifacts outside of that folder.
+
+    ``address`` is what the run says. Another tracker was typed, and says itself where artifacts go.
+    """
+    from mlflow.utils.file_utils import local_file_uri_to_path
+
+    if client.tracking_uri != default_uri(runs):
+        return
+    # The database of a stranger's runs folder may name a server, which would get the files and our password.
+    place = Path(local_file_uri_to_path(address))
+    if not place.is_relative_to(runs / ARTIFACTS) or ".." in place.parts:
+        raise InputError(f"{runs / DATABASE} would send artifacts to {address}: remove it and `gsbench sync --rebuild`")
+    require_own(runs, place, below=True)
 
 
 @contextmanager

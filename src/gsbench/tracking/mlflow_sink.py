@@ -16,7 +16,7 @@ from typing import Any
 from gsbench.files import write_json
 from gsbench.runs import layout
 from gsbench.runs.trial_record import TrialRecord
-from gsbench.tracking.client import connect, default_uri, ensure_experiment, ensure_parent
+from gsbench.tracking.client import connect, default_uri, ensure_experiment, ensure_parent, require_own_artifacts
 from gsbench.tracking.record import TrackedFiles
 from gsbench.tracking.sink import Point, Summary
 from gsbench.tracking.source import source_tags, user_tags
@@ -53,6 +53,8 @@ class MlflowSink:
         """Open the run (see `gsbench.tracking.sink.Sink`); a deleted one, and one in another tracker, count as none."""
         state = self._known(state, results) or self._create_run()
         self.run_id, self._started = state["run_id"], state["started"]
+        address = str(self.client.get_run(self.run_id).info.artifact_uri)
+        require_own_artifacts(self.client, address, self._record.runs)
         if state["complete"] is None:
             self.client.update_run(self.run_id, status="RUNNING")
             if self._program is not None and self._options.get("system_metrics"):
