@@ -66,6 +66,12 @@ def test_no_pixels_and_no_paths_of_the_machine(tmp_path: Path) -> None:
     (path, *_) = write_runs(runs, Plan(pictures=True, views=2))
     config = yaml.safe_load((path / "config.yaml").read_text())
     config["runs"], config["scene"]["path"] = "/home/alice/runs", "/home/alice/photos/garden"
+    config["tracking"] = {"uri": "http://alice:secret@there.org"}
+    config["densify"] |= {
+        "command": "python /home/alice/x.py",
+        "a": "sqlite:////home/alice/a.db",
+        "b": "https://alice:secret@a.org/c",
+    }
     (path / "config.yaml").write_text(json.dumps(config))
     results = json.loads((path / "results.json").read_text())
     looked = (
@@ -77,6 +83,9 @@ def test_no_pixels_and_no_paths_of_the_machine(tmp_path: Path) -> None:
     content = members(tmp_path / "exp.zip")
     assert not any(name.endswith((".png", ".ply")) for name in content)
     assert b"alice" not in b"".join(content.values())
+    assert b"secret" not in b"".join(content.values())
+    assert b"python x.py" in b"".join(content.values())
+    assert b"https://a.org/c" in b"".join(content.values())
     assert any(
         one.config.get("scene.path") == "garden" for one in unpack_archive(tmp_path / "exp.zip", runs / "b").trials
     )

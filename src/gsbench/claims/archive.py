@@ -19,6 +19,7 @@ import csv
 import hashlib
 import io
 import json
+import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -47,7 +48,9 @@ MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
 MOST_BYTES = 1 << 28  # of a file when unpacked; more than any experiment has
 FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # of the files within: the earliest that zip knows
-PRIVATE = ("runs",)  # settings that say where somebody's files lie, and nothing else
+PRIVATE = ("runs", "tracking")  # settings that say where somebody's files and servers are, and nothing else
+PASSWORD = re.compile(r"(?<=://)[^/@\s]*@")  # user and password of an address
+FOLDERS = re.compile(r"(?<=:)///+\S*/")  # of a file's address, such as sqlite:////home/me/a.db
 SEED_KEY = "seed"
 NO_CONFIGURATION = f"it has no {CONFIG}"
 NAMED = ("scene", "init", "densify")  # groups of settings whose names a record repeats
@@ -265,13 +268,15 @@ def _results(trial: TrialResult) -> dict[str, Any]:
 
 
 def without_paths(value: Any) -> Any:
-    """Plain values, of whose absolute paths the last names are kept."""
+    """Plain values, of whose paths on this machine the last names are kept, and of whose addresses no password."""
     if isinstance(value, Mapping):
         return {key: without_paths(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [without_paths(entry) for entry in value]
-    if isinstance(value, str) and (value.startswith(("/", "~")) or PurePath(value).is_absolute()):
-        return PurePath(value).name
+    if isinstance(value, str):
+        if value.startswith(("/", "~")) or PurePath(value).is_absolute():  # with blanks in it, too
+            return PurePath(value).name
+        return without_places(FOLDERS.sub("///", PASSWORD.sub("", value)))
     return value
 
 
