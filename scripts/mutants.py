@@ -88,7 +88,7 @@ def changed_node(node: ast.AST) -> tuple[str, ast.AST] | None:
 
 
 def is_silent(node: ast.AST) -> bool:
-    """Whether nothing that the tests could ask for lies below the node: a message, an annotation, a text."""
+    """True for a message or a text: no test asks for what lies below such a node."""
     if isinstance(node, ast.Raise | ast.JoinedStr | ast.Assert):
         return True
     called = node.func if isinstance(node, ast.Call) else None

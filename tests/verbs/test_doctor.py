@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from gsbench import cli
-from gsbench.raster.cpu import jit
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
+from gsbench.system import jit
 from gsbench.verbs import doctor
 from gsbench.verbs.doctor import Finding
 from tests.conftest import ROOT

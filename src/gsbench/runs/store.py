@@ -83,6 +83,7 @@ class Store:
 
     def __init__(self, root: Path, on_build: Callable[[Stage, Path], None] = lambda stage, folder: None) -> None:
         self.root, self.on_build = root, on_build
+        self._verified: set[Path] = set()  # results whose checksums this process has compared or made
 
     def folder(self, stage: Stage, key: str) -> Path:
         """The folder of the finished result of ``stage`` under ``key``."""
@@ -106,28 +107,34 @@ class Store:
     def get(self, step: Step) -> Entry:
         """The result of ``step``, built unless it is there; published by an atomic rename.
 
-        A damaged result is named and built again. Raises DiskFullError, or InputError where the store is read-only.
+        A damaged result is named and built again. What is found may become the input of further steps, so its checksums
+        are compared once: a flipped bit keeps size and time of change. Raises DiskFullError, or InputError where the
+        store is read-only.
         """
-        found = self.find(step)
-        if found is not None:
-            return found
         final = self.path(step)
+        with suppress(ValueError):
+            return self._read_verified(final)
         with storage_errors(self.root.parent):
             require_own(self.root.parent, self.partial(step.stage, step.key))
             final.parent.mkdir(parents=True, exist_ok=True)
             with hold(final.parent / f".{step.key}.lock", f"{step.stage.name} {step.key[:8]}"):
                 if os.path.lexists(final):
                     try:
-                        return self._read(final)
+                        return self._read_verified(final)
                     except ValueError as error:
                         log.warning("store: %s is damaged (%s) and is built again", final, error)
                         _remove(final)
                 return self._build(step)
 
-    def _read(self, path: Path) -> Entry:
+    def _read_verified(self, path: Path) -> Entry:
+        entry = self._read(path, thorough=path not in self._verified)
+        self._verified.add(path)
+        return entry
+
+    def _read(self, path: Path, thorough: bool = False) -> Entry:
         if path.is_symlink():
             raise ValueError("it is a link")
-        return Entry(path, path.name, read_manifest(path).seconds, cached=True)
+        return Entry(path, path.name, read_manifest(path, thorough=thorough).seconds, cached=True)
 
     def _build(self, step: Step) -> Entry:
         """Build or finish the partial folder and publish it; the caller holds the lock of the step's key."""
@@ -151,6 +158,7 @@ class Store:
                 path.unlink()
         os.replace(partial, final)
         sync_to_disk(final.parent)
+        self._verified.add(final)
         return Entry(final, step.key, seconds, cached=False)
 
     def sweep(self, stages: Iterable[Stage]) -> None:
