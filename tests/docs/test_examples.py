@@ -185,24 +185,3 @@ def test_links_between_documents_lead_somewhere(document: str) -> None:
     for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):
         if "://" not in target:
             assert (path.parent / target).exists(), f"{document} points to {target}"
-
-
-def test_class_of_the_readme_is_a_densifier(folder: Path) -> None:
-    blocks = [block for block in BLOCK.findall((ROOT / "README.md").read_text()) if FILE.match(block)]
-    assert blocks
-    for block in blocks:
-        (folder / FILE.match(block).group(1)).write_text(block)  # type: ignore[union-attr]
-    import mine  # type: ignore[import-not-found]
-
-    from gsbench.densify import DensifyContext
-    from gsbench.gaussians.paper_values import LearningRates
-    from gsbench.gaussians.trainable import TrainableGaussians
-    from tests.gaussians.helpers import random_gaussians
-
-    densifier = mine.Patient(min_views=8)
-    gaussians = TrainableGaussians(random_gaussians(6), LearningRates(), 1.0)
-    densifier.begin(gaussians.values.detach(), DensifyContext(1.0))
-    densifier.statistics["gradient_sum"] += 1.0
-    densifier.statistics["visible_count"] += torch.tensor([7, 8, 9, 1, 2, 3])
-    event = densifier.refine(600, gaussians, torch.Generator().manual_seed(0))
-    assert event.cloned + event.split_gradient == 2  # of those seen in eight views and more
