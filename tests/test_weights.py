@@ -9,16 +9,15 @@ import os
 import pickle
 import subprocess
 import sys
-import threading
-from http.server import BaseHTTPRequestHandler, HTTPServer
+from collections.abc import Iterator
 from pathlib import Path
-from urllib.error import URLError
 
 import pytest
 import torch
 
 from gsbench.errors import InputError
 from gsbench.weights import MissingWeights, WeightsFile, find_all_weights, find_weights, load_state
+from tests.datasets.server import Manners, Server, serve
 
 STATE = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.bias": torch.zeros(2)}
 
@@ -72,36 +71,44 @@ def test_missing_files_are_named_together_with_places_and_sources(tmp_path: Path
         find_weights(spec(), tmp_path / "nowhere")
 
 
-def test_download_is_checked_and_kept(tmp_path: Path, empty_caches: Path):
-    source = tmp_path / "served.bin"
-    source.write_bytes(b"good")
-    found = find_weights(spec(b"good", source.as_uri()))
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    (tmp_path / "served").mkdir()
+    with serve(tmp_path / "served") as running:
+        yield running
+
+
+def served(server: Server, content: bytes) -> str:
+    (server.folder / "served.bin").write_bytes(content)
+    return f"{server.url}/served.bin"
+
+
+def test_download_is_checked_and_kept(server: Server, empty_caches: Path):
+    url = served(server, b"good")
+    found = find_weights(spec(b"good", url))
     assert found == empty_caches / "net.pth"
     assert found.read_bytes() == b"good"
-    source.unlink()
-    assert find_weights(spec(b"good", source.as_uri())) == found
+    assert find_weights(spec(b"good", url)) == found
+    assert len(server.requests) == 1
 
 
-def test_download_says_how_far_it_is(tmp_path: Path, empty_caches: Path, caplog: pytest.LogCaptureFixture):
+def test_download_says_how_far_it_is(server: Server, empty_caches: Path, caplog: pytest.LogCaptureFixture):
     caplog.set_level(logging.INFO, "gsbench")
-    source = tmp_path / "served.bin"
-    source.write_bytes(b"g" * 2_500_000)
-    find_weights(spec(source.read_bytes(), source.as_uri()))
-    lines = [record.getMessage() for record in caplog.records]
+    url = served(server, b"g" * 2_500_000)
+    find_weights(spec(b"g" * 2_500_000, url))
+    lines = [record.getMessage() for record in caplog.records if record.name.startswith("gsbench")]
     assert lines == [
-        f"downloading net.pth (2.5 MB) from {source.as_uri()} to {empty_caches}",  # before anything has come
+        f"downloading net.pth (2.5 MB) from {url} to {empty_caches}",  # before anything has come
         "weights: net.pth 1048576/2500000 1.05 MB of 2.5 MB",
         "weights: net.pth 2500000/2500000 2.5 MB of 2.5 MB",
     ]
 
 
-def test_download_shows_a_bar_on_a_terminal(tmp_path: Path):
+def test_download_shows_a_bar_on_a_terminal(server: Server):
     pty = pytest.importorskip("pty", reason="needs terminals as Unix has them")
-    source = tmp_path / "served.bin"
-    source.write_bytes(b"g" * 2_500_000)
     code = (
         "from gsbench.weights import WeightsFile, find_weights\n"
-        f"find_weights(WeightsFile(('net.pth',), {source.as_uri()!r}, None, 'free', 'example.org'))"
+        f"find_weights(WeightsFile(('net.pth',), {served(server, b'g' * 2_500_000)!r}, None, 'free', 'example.org'))"
     )
     ours, theirs = pty.openpty()
     environment = dict(os.environ) | {"TERM": "xterm", "COLUMNS": "100"}
@@ -117,44 +124,30 @@ def test_download_shows_a_bar_on_a_terminal(tmp_path: Path):
     assert "━".encode() in shown
 
 
-def test_download_that_ends_early_is_no_file(empty_caches: Path):
-    class Short(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.send_header("Content-Length", "100")
-            self.end_headers()
-            self.wfile.write(b"x" * 40)
-
-        def log_message(self, *words: object) -> None:
-            pass
-
-    with HTTPServer(("127.0.0.1", 0), Short) as server:
-        threading.Thread(target=server.handle_request, daemon=True).start()
-        with pytest.raises(MissingWeights, match="the connection ended after 40 of 100 bytes"):
-            find_weights(spec(url=f"http://127.0.0.1:{server.server_port}/net.pth"))
+@pytest.mark.parametrize(
+    ("content", "manners", "said"),
+    [
+        (
+            b"x" * 100_000,
+            Manners(cut_every=40_000),
+            "the download failed: .*1 failures in a row .the connection was cut",
+        ),
+        (b"bad", Manners(), "is damaged: try again"),
+    ],
+)
+def test_download_that_ends_early_or_is_damaged_leaves_nothing(
+    server: Server, empty_caches: Path, content: bytes, manners: Manners, said: str
+):
+    server.manners = manners
+    with pytest.raises(MissingWeights, match=said):
+        find_weights(spec(b"good", served(server, content)))
     assert list(empty_caches.iterdir()) == []
 
 
-def test_damaged_download_leaves_nothing(tmp_path: Path, empty_caches: Path):
-    source = tmp_path / "served.bin"
-    source.write_bytes(b"bad")
-    with pytest.raises(MissingWeights, match="is damaged"):
-        find_weights(spec(b"good", source.as_uri()))
-    assert list(empty_caches.iterdir()) == []
-
-
-def test_without_a_network_the_answer_comes_at_once(monkeypatch: pytest.MonkeyPatch):
+def test_without_a_network_the_answer_comes_at_once():
     """One attempt, and no waiting for another."""
-    attempts = []
-
-    def unreachable(url: str, **_: object):
-        attempts.append(url)
-        raise URLError("Name or service not known")
-
-    monkeypatch.setattr("urllib.request.urlopen", unreachable)
-    with pytest.raises(MissingWeights, match="the download failed"):
-        find_weights(spec(url="http://weights.invalid/net.pth"))
-    assert attempts == ["http://weights.invalid/net.pth"]
+    with pytest.raises(MissingWeights, match=r"the download failed: .*1 failures in a row .*refused"):
+        find_weights(spec(url="http://127.0.0.1:9/net.pth"))
 
 
 @pytest.mark.parametrize("name", ["net.pth", "net.safetensors", "net-pth"])

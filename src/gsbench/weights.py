@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import logging
 import os
-import urllib.request
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gsbench.errors import InputError
-from gsbench.files import CHUNK, atomic, file_sha256
+from gsbench import downloads
+from gsbench.errors import GsbenchError, InputError
+from gsbench.files import atomic, file_sha256
 from gsbench.logs import progress
 from gsbench.words import readable_bytes
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 WEIGHTS_VARIABLE = "GSBENCH_WEIGHTS"
-DOWNLOAD_TIMEOUT_SECONDS = 10.0  # of inactivity: without a network the answer must come at once
+ONE_TRY = downloads.Patience(timeout=10.0, tries=1)  # without a network the answer must come at once
 SAFETENSORS_SUFFIX = ".safetensors"
 
 
@@ -72,7 +72,9 @@ def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, d
         else:
             try:
                 found[spec] = _download(spec, hub_cache())
-            except OSError as error:
+            except (OSError, GsbenchError) as error:
+                if isinstance(error, MissingWeights):  # what came is damaged
+                    raise
                 reasons.append(f"the download failed: {error}")
                 break  # without a network the others would only fail as slowly
     still_missing = [spec for spec in missing if found[spec] is None]
@@ -117,9 +119,6 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
     ``entry`` is the key under which a PyTorch file keeps them, where they are not all it holds. Raises
     ``MissingWeights`` where the file is truncated, is no weights file, or holds anything but tensors.
     """
-    import pickle
-    import zipfile
-
     import torch
 
     try:
@@ -130,13 +129,8 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except ModuleNotFoundError as error:
         raise InputError(f"weights file {path} needs the package safetensors: pip install safetensors") from error
-    except (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
-        raise _unreadable(path, str(error).splitlines()[0] if str(error) else type(error).__name__) from error
-    except Exception as error:
-        # safetensors raises its own class, which exists only where it is installed
-        if type(error).__module__.startswith("safetensors"):
-            raise _unreadable(path, str(error)) from error
-        raise
+    except Exception as error:  # of a damaged or foreign file the two readers and pickle raise a dozen kinds
+        raise _unreadable(path, str(error).partition("\n")[0] or type(error).__name__) from error
     if not isinstance(state, Mapping):
         raise _unreadable(path, f"it holds a {type(state).__name__}, not tensors by name")
     if entry is not None:
@@ -189,22 +183,19 @@ def _download(spec: WeightsFile, folder: Path) -> Path:
     assert spec.url is not None
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / spec.names[0]
-    with atomic(target) as temporary:
-        with (
-            temporary.open("wb") as file,
-            urllib.request.urlopen(spec.url, timeout=DOWNLOAD_TIMEOUT_SECONDS) as source,
-            progress("weights") as report,
-        ):
-            size = int(source.headers.get("Content-Length") or 0) or None
-            log.info("downloading %s (%s) from %s to %s", target.name, readable_bytes(size), spec.url, folder)
-            while piece := source.read(CHUNK):
-                file.write(piece)
-                report(target.name, file.tell(), size, f"{readable_bytes(file.tell())} of {readable_bytes(size)}")
-            if size is not None and file.tell() < size:
-                raise OSError(f"the connection ended after {file.tell()} of {size} bytes")
-        fault = _checksum_fault(temporary, spec)
-        if fault is not None:
-            raise MissingWeights(f"the download of {spec.names[0]} from {spec.url} is damaged: try again ({fault})")
+    with atomic(target) as temporary, progress("weights") as report:
+
+        def advance(done: int, total: int | None) -> None:
+            if done:
+                report(target.name, done, total, f"{readable_bytes(done)} of {readable_bytes(total)}")
+            else:
+                log.info("downloading %s (%s) from %s to %s", target.name, readable_bytes(total), spec.url, folder)
+
+        sha256 = downloads.download(spec.url, temporary, ONE_TRY, advance)
+        if not sha256.startswith((spec.sha256 or "").lower()):
+            raise MissingWeights(
+                f"the download of {target.name} from {spec.url} is damaged: try again (its sha256 is {sha256[:16]}…)"
+            )
     return target
 
 

@@ -1,16 +1,32 @@
-"""Archives of scenes that are damaged, or were packed to do damage."""
+"""Archives of scenes: on servers on a bad day, damaged, or packed to do damage."""
 
 from __future__ import annotations
 
+import contextlib
 import io
+import os
 import struct
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from gsbench.datasets.archive import DamagedError, extract, members_of, open_archive
+from gsbench.datasets.archive import (
+    DamagedError,
+    RangesRefusedError,
+    extract,
+    members_of,
+    open_archive,
+    open_local,
+    open_remote,
+)
+from gsbench.downloads import FetchError, Patience, download, retried
 from gsbench.errors import InputError
+from tests.datasets.server import Manners, Server, serve
+
+PATIENT = Patience(timeout=0.3, tries=3, pause=0.01)
 
 
 def packed(*names: str) -> bytes:
@@ -66,3 +82,125 @@ def test_a_member_without_a_name_is_passed_over() -> None:
 def test_names_that_cannot_lie_side_by_side_are_refused(names: tuple[str, ...], said: str) -> None:
     with open_archive(io.BytesIO(packed(*names)), "x.zip") as archive, pytest.raises(InputError, match=said):
         members_of(archive, "s", ["images"], "x.zip")
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_damaged_bytes_of_a_member_are_damage(compression: int, tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", compression) as archive:
+        archive.writestr("s/images/a.jpg", content := np.random.default_rng(0).bytes(300))
+    data = stream.getvalue()
+    begin = data.index(b"a.jpg") + 5
+    for place in range(begin, begin + 200):
+        damaged = data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :]
+        with open_archive(io.BytesIO(damaged), "x.zip") as archive:
+            (member,) = members_of(archive, "s", ["images"], "x.zip")
+            with contextlib.suppress(DamagedError, InputError):
+                extract(archive, member, tmp_path / "a.jpg", lambda count: None)
+                assert (tmp_path / "a.jpg").read_bytes() == content  # the byte was one that no reader looks at
+                (tmp_path / "a.jpg").unlink()
+    assert not (tmp_path / "a.jpg").exists()
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Server]:
+    with zipfile.ZipFile(tmp_path / "file.zip", "w") as archive:
+        for name in ("first", "second"):
+            archive.writestr(f"s/images/{name}.jpg", np.random.default_rng(len(name)).bytes(300_000))
+    with serve(tmp_path) as running:
+        yield running
+
+
+def fetched(server: Server, target: Path) -> bytes:
+    """The bytes of the second member."""
+    url = f"{server.url}/file.zip"
+    with open_remote(url, PATIENT) as archive:
+        (_, member) = members_of(archive, "s", ["images"], url)
+        retried(lambda: extract(archive, member, target, lambda count: None), url, PATIENT)
+    return target.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "manners",
+    [
+        Manners(),
+        Manners(cut_every=30_000, cuts=2),
+        Manners(stall_every=100_000, cuts=2),
+        Manners(fail_first=2),
+        Manners(redirect=True),
+    ],
+    ids=["good", "cuts", "stalls", "503 at first", "redirect"],
+)
+def test_a_member_comes_whole_and_alone(served: Server, tmp_path: Path, manners: Manners) -> None:
+    served.manners = manners
+    assert fetched(served, tmp_path / "out") == np.random.default_rng(6).bytes(300_000)
+    if not manners.cut_every and not manners.stall_every:
+        assert served.sent < 400_000  # the other member stays there
+
+
+@pytest.mark.parametrize(
+    ("manners", "kind", "said"),
+    [
+        (Manners(cut_every=100), FetchError, r"3 failures in a row .*cut.*the same command goes on"),
+        (Manners(stall_every=1), FetchError, "no answer in time"),
+        (Manners(status={"/file.zip": 403}), InputError, r"403 Forbidden.*--mirror"),
+        (Manners(status={"/file.zip": 503}), FetchError, r"3 failures in a row .*503"),
+        (Manners(ranges=False), RangesRefusedError, None),
+        (Manners(claimed_size=590_000), (FetchError, InputError, DamagedError), None),
+        (Manners(shift=7), DamagedError, None),
+    ],
+)
+def test_says_what_the_server_did(
+    served: Server, tmp_path: Path, manners: Manners, kind: type[Exception], said: str | None
+) -> None:
+    served.manners = manners
+    with pytest.raises(kind, match=said):
+        fetched(served, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_server_at_all() -> None:
+    with pytest.raises(FetchError, match="Connection refused"), open_remote("http://127.0.0.1:9/file.zip", PATIENT):
+        pass
+
+
+def test_a_file_that_changes_in_between_is_damage(served: Server, tmp_path: Path) -> None:
+    url = f"{served.url}/file.zip"
+    with open_remote(url, PATIENT) as archive:
+        (_, member) = members_of(archive, "s", ["images"], url)
+        content = bytearray((served.folder / "file.zip").read_bytes())
+        content[400_000:400_010] = bytes(10)
+        (served.folder / "file.zip").write_bytes(content)
+        with pytest.raises(DamagedError, match="CRC-32"):
+            extract(archive, member, tmp_path / "out", lambda count: None)
+        os.truncate(served.folder / "file.zip", 1000)
+        with pytest.raises(InputError, match="416"):
+            retried(lambda: extract(archive, member, tmp_path / "out", lambda count: None), url, PATIENT)
+
+
+def test_a_whole_file_comes_whole_or_not_at_all(served: Server, tmp_path: Path) -> None:
+    served.manners = Manners(ranges=False, cut_every=300_000, cuts=2)
+    seen: list[tuple[int, int | None]] = []
+    download(f"{served.url}/file.zip", tmp_path / "copy", PATIENT, lambda done, total: seen.append((done, total)))
+    content = (served.folder / "file.zip").read_bytes()
+    assert (tmp_path / "copy").read_bytes() == content
+    assert seen[-1] == (len(content), len(content))
+    served.manners = Manners(ranges=False, cut_every=300_000)
+    with pytest.raises(FetchError, match="cut"):
+        download(f"{served.url}/file.zip", tmp_path / "copy", PATIENT, lambda *_: None)
+
+
+def test_offsets_beyond_four_gigabytes(tmp_path: Path) -> None:
+    """The real archive has 12.5 GB: its entries need zip64. A sparse file of the same kind takes no space."""
+    file = tmp_path / "large.zip"
+    with file.open("wb") as stream:
+        stream.truncate(5 << 30)
+        stream.seek(5 << 30)
+        with zipfile.ZipFile(stream, "w") as archive:
+            archive.writestr("garden/a.JPG", b"far out")
+    with serve(tmp_path) as server, open_remote(f"{server.url}/large.zip", PATIENT) as remote:
+        assert remote.getinfo("garden/a.JPG").header_offset == 5 << 30
+        assert remote.read("garden/a.JPG") == b"far out"
+        assert server.sent < 1_000_000
+    with open_local(file) as local:
+        assert local.read("garden/a.JPG") == b"far out"

@@ -81,12 +81,11 @@ def test_every_kind_of_file_is_among_the_damaged(places: dict[str, Path]) -> Non
 
 # What is ours to read goes through the typed readers; what these files read is somebody else's or their own process's.
 READS_ITSELF = {
-    "analysis/paper.py", "analysis/published/__init__.py", "datasets/catalog.py", "datasets/plan.py",  # of the package
+    "analysis/paper.py", "analysis/published/__init__.py", "datasets/catalog.py",  # of the package
     "claims/here.py", "launch/batch.py", "init/base.py",  # text of this very process
     "analysis/shipped.py",  # arms of the package
     "claims/stopping.py", "verbs/ablate.py",  # text of this process; words of a command line
     "claims/archive.py", "claims/studies.py",  # archives and nerfbaselines' files, which anybody may have made
-    "datasets/records.py",  # beside data sets, not in the runs folder
     "scene/load.py",  # prepared views, beside the store
     "parsing.py",
 }  # fmt: skip

@@ -1,26 +1,34 @@
-"""Zip archives of scenes: which members are wanted, and each of them on the disk, whole and with the right checksum."""
+"""Zip archives of scenes, here or on a server: which members are wanted, and each of them on the disk, checked.
+
+Of an archive on a server only the directory and the wanted members come, each by a request of its own (remotezip).
+"""
 
 from __future__ import annotations
 
-import errno
 import lzma
 import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from errno import EINVAL
 from pathlib import Path, PurePosixPath
 from typing import IO
 
+from gsbench.downloads import USER_AGENT, Patience, retried
 from gsbench.errors import InputError
-from gsbench.files import CHUNK, atomic
+from gsbench.files import CHUNK, atomic, require_regular
 
 MAX_NAME_BYTES = 220  # file systems end at 255 for each folder, and a file that is being written has a longer name
-RUN_GAP_BYTES = 1 << 18  # members closer than this are read in one request, the gap with them
 
 
 class DamagedError(Exception):
     """Error of a file that is not what the archive's directory promises."""
+
+
+class RangesRefusedError(Exception):
+    """Error of a server that sends whole files only."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +43,53 @@ class Member:
         return self.info.file_size
 
 
+@contextmanager
+def open_local(path: Path) -> Iterator[zipfile.ZipFile]:
+    """The archive at ``path``. Raises `InputError` where it cannot be read or is none."""
+    require_regular(path)
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}): mend --mirror") from error
+    with file, open_archive(file, str(path)) as archive:
+        yield archive
+
+
+@contextmanager
+def open_remote(url: str, patience: Patience) -> Iterator[zipfile.ZipFile]:
+    """The archive at ``url``, read by ranges. Raises `RangesRefusedError` where the server serves none."""
+    import remotezip
+    import requests
+
+    def opened() -> zipfile.ZipFile:
+        try:
+            return remotezip.RemoteZip(url, session=session, timeout=patience.timeout, headers=USER_AGENT)
+        except remotezip.RangeNotSupported:
+            raise RangesRefusedError from None
+        except remotezip.RemoteIOError as error:
+            raise (error.__context__ or error) from None  # the library keeps the words of the cause alone
+        except remotezip.RemoteZipError as error:
+            raise zipfile.BadZipFile(str(error)) from None
+
+    with requests.Session() as session:
+        try:
+            archive = retried(opened, url, patience)
+        except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
+            raise _no_archive(url, error) from error
+        with archive:
+            yield archive
+
+
 def open_archive(file: IO[bytes], where: str) -> zipfile.ZipFile:
     """The zip archive in ``file``; `InputError`, one line naming ``where``, if it is none or has been cut."""
     try:
         return zipfile.ZipFile(file)
-    except Exception as error:  # zipfile raises many kinds where the directory is damaged or of a later version
-        if isinstance(error, OSError):
-            raise
-        raise InputError(f"{where} is no whole zip archive ({error}): give another address with --mirror") from error
+    except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
+        raise _no_archive(where, error) from error
+
+
+def _no_archive(where: str, error: Exception) -> InputError:
+    return InputError(f"{where} is no whole zip archive ({error}): give another address with --mirror")
 
 
 def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], where: str) -> list[Member]:
@@ -59,12 +106,12 @@ def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], whe
             continue  # hidden files, ".." among them, are never wanted
         if "\\" in name or "//" in name or ":" in name or PurePosixPath(name).is_absolute():
             raise InputError(f"{where}: the member {info.filename!r} has an unsafe name: give another --mirror")
-        members[name] = Member(name, info)
-    for name in members:
         if len(name.encode("utf-8", "surrogatepass")) > MAX_NAME_BYTES or not name.isprintable():
             raise InputError(
                 f"{where}: the member {name!r:.80} has a name that no file can have: give another --mirror"
             )
+        members[name] = Member(name, info)
+    for name in members:
         if folder_of := next((str(above) for above in PurePosixPath(name).parents if str(above) in members), None):
             raise InputError(f"{where}: {folder_of} is a file and a folder in one: give another --mirror")
     for part in wanted:
@@ -87,26 +134,11 @@ def holds(path: Path, size: int, crc: int) -> bool:
     return checksum == crc
 
 
-def runs_of(archive: zipfile.ZipFile, members: Sequence[Member]) -> Iterator[tuple[list[Member], int]]:
-    """The members in the archive's order, in runs that lie close together, each with the byte where the run ends."""
-    starts = sorted(info.header_offset for info in archive.infolist())
-    ends = dict(zip(starts, [*starts[1:], archive.start_dir], strict=True))
-    run: list[Member] = []
-    end = 0
-    for member in sorted(members, key=lambda member: member.info.header_offset):
-        if run and member.info.header_offset - end > RUN_GAP_BYTES:
-            yield run, end
-            run = []
-        run.append(member)
-        end = ends[member.info.header_offset]
-    if run:
-        yield run, end
-
-
 def extract(archive: zipfile.ZipFile, member: Member, target: Path, advance: Callable[[int], None]) -> None:
     """Write the member to ``target``, which appears only when size and CRC-32 are right; ``advance`` gets bytes.
 
-    Raises `DamagedError`, and `InputError` for a member that the archive has packed in a way not known here.
+    Raises `DamagedError`, `InputError` for a member that the archive has packed in a way not known here, and what the
+    network raises.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     written = 0
@@ -122,15 +154,27 @@ def extract(archive: zipfile.ZipFile, member: Member, target: Path, advance: Cal
                 advance(len(piece))
             if written != member.bytes:
                 raise DamagedError(f"{written} bytes instead of {member.bytes}")
-    except (zipfile.BadZipFile, zlib.error, struct.error, lzma.LZMAError, EOFError, ValueError, DamagedError) as error:
-        if isinstance(error, InputError):
-            raise
+    except Exception as error:
         advance(-written)
-        raise DamagedError(str(error) or type(error).__name__) from error
-    except OSError as error:
-        if error.errno != errno.EINVAL:  # else the directory names a place before the file's beginning
-            raise
-        advance(-written)
-        raise DamagedError(str(error)) from error
-    except (NotImplementedError, RuntimeError) as error:
-        raise InputError(f"{member.info.filename} is packed in a way that cannot be read here ({error})") from error
+        raise _cause(error, member) from error
+
+
+# What zipfile and its decompressors raise for damaged bytes; LZMA's filter raises the last two kinds.
+DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, lzma.LZMAError, EOFError, ValueError, IndexError, TypeError)
+
+
+def _cause(error: Exception, member: Member) -> Exception:
+    """The error to raise for one that `extract` met: of the file, of gsbench, else the error itself."""
+    from remotezip import RemoteIOError, RemoteZipError
+
+    if isinstance(error, InputError | DamagedError):
+        return error
+    if isinstance(error, RemoteIOError):
+        cause = error.__context__
+        return cause if isinstance(cause, Exception) else error
+    # Of the system's errors, EINVAL is a place before the file's beginning; bzip2's own has no number.
+    if isinstance(error, (*DAMAGE, RemoteZipError)) or (isinstance(error, OSError) and error.errno in (None, EINVAL)):
+        return DamagedError(str(error) or type(error).__name__)
+    if isinstance(error, NotImplementedError | RuntimeError):
+        return InputError(f"{member.info.filename} is packed in a way that cannot be read here ({error})")
+    return error

@@ -1,8 +1,9 @@
-"""The data file of public data sets (``catalog.yaml``), and which of them a missing scene belongs to."""
+"""The data file of public data sets (``catalog.yaml``): where scenes lie, and which files of them are wanted."""
 
 from __future__ import annotations
 
 import os
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -12,7 +13,11 @@ from typing import Any
 
 import yaml
 
+from gsbench.errors import InputError
+from gsbench.system.install import conf_dir
+
 DATA_VARIABLE = "GSBENCH_DATA"
+SCENE_PATH = re.compile(r"\$\{oc\.env:GSBENCH_DATA,data\}/(?P<folder>.+)")
 CATALOG_FILE = Path(__file__).with_name("catalog.yaml")
 
 
@@ -46,6 +51,30 @@ class Dataset:
     @property
     def scenes(self) -> tuple[str, ...]:
         return tuple(sorted(scene for archive in self.archives for scene in archive.scenes))
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """Files that conf/scene/<scene>.yaml asks for: its folder below the data folder, and the folders in it."""
+
+    scene: str
+    folder: str
+    parts: tuple[str, ...]  # images before the model: a model alone is no scene
+
+    @property
+    def key(self) -> str:
+        """The name of its record: a scene with other image folders is another record."""
+        return f"{self.scene}/{'+'.join(self.parts)}"
+
+
+def wanted_files(scene: str, images: str | None = None) -> SceneFiles:
+    """The files that a scene file asks for; ``images`` names another image folder than it does."""
+    settings = yaml.safe_load((conf_dir() / "scene" / f"{scene}.yaml").read_text(encoding="utf-8"))
+    match = SCENE_PATH.fullmatch(settings["path"])
+    if match is None:
+        raise InputError(f"conf/scene/{scene}.yaml does not lie below ${DATA_VARIABLE}: it cannot be fetched")
+    parts = (images or settings.get("images") or "images", settings.get("sparse") or "sparse/0")
+    return SceneFiles(scene, match["folder"], parts)
 
 
 def read_catalog() -> dict[str, Dataset]:

@@ -4,27 +4,53 @@ from __future__ import annotations
 
 import logging
 import shutil
+import time
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsbench.datasets.archive import DamagedError, extract, holds, members_of, open_archive, runs_of
-from gsbench.datasets.catalog import DATA_VARIABLE, Archive
-from gsbench.datasets.plan import SceneFiles, ScenePlan, check_unchanged, describe, plan_scene
-from gsbench.datasets.records import RECORDS, FileRecord, SceneRecord, add_record, read_records, today
-from gsbench.datasets.remote import FetchError, Patience, RangesRefusedError, RemoteFile, download, size_of
+from gsbench.datasets.archive import (
+    DamagedError,
+    Member,
+    RangesRefusedError,
+    extract,
+    holds,
+    members_of,
+    open_local,
+    open_remote,
+)
+from gsbench.datasets.catalog import DATA_VARIABLE, Archive, SceneFiles
+from gsbench.datasets.records import RECORDS, FileRecord, SceneRecord, add_record, read_records
+from gsbench.downloads import FetchError, Patience, download, retried
 from gsbench.errors import InputError
-from gsbench.files import atomic, file_sha256, require_regular
+from gsbench.files import atomic, file_sha256
 from gsbench.logs import Progress
-from gsbench.words import readable_bytes, some_of
+from gsbench.words import counted, readable_bytes, some_of
 
 log = logging.getLogger(__name__)
 
 STAGING = ".fetch"  # below the data folder: what has come so far
-ATTEMPTS = 2  # at a member that arrives damaged
 SPARE_BYTES = 1 << 26  # that a fetch leaves free on the disk
+
+
+@dataclass(frozen=True)
+class ScenePlan:
+    """A scene against its archive: its members, and those that neither its folder nor the staging has yet."""
+
+    files: SceneFiles
+    members: tuple[Member, ...]
+    missing: tuple[Member, ...]
+    staged: tuple[Member, ...]
+
+    @property
+    def bytes(self) -> int:
+        return sum(member.bytes for member in self.members)
+
+    @property
+    def missing_bytes(self) -> int:
+        return sum(member.bytes for member in self.missing)
 
 
 @dataclass(frozen=True)
@@ -44,108 +70,129 @@ class Fetcher:
     def record_if_here(self, files: SceneFiles) -> SceneRecord | None:
         """The record of a fetch whose files all lie in the scene's folder, as they were recorded; else None."""
         record, folder = read_records(self.data).get(files.key), self.data / files.folder
-        if record is None:
+        if record is None or self.accept_changes:
             return None
         here = all(holds(folder / name, file.size, file.crc) for name, file in record.files.items())
         return record if here else None
 
-    def location_of(self, archive: Archive) -> str:
-        """The address of the archive, or its path on this machine."""
-        return archive.url if self.mirror is None else f"{self.mirror.rstrip('/')}/{archive.name}"
-
     def plan(self, archive: Archive, scenes: Sequence[SceneFiles]) -> list[ScenePlan]:
         """Plan a fetch; reads only the archive's directory. Raises `RangesRefusedError` where it cannot be read."""
-        with self._opened(archive, may_fetch_whole=False) as (opened, _):
+        with self._opened(archive, may_fetch_whole=False) as opened:
             return [self._plan(archive, opened, files) for files in scenes]
 
     def fetch(self, archive: Archive, scenes: Sequence[SceneFiles]) -> Iterator[str]:
         """Fetch the scenes, one after another; yields a line about each."""
-        with self._opened(archive) as (opened, remote):
+        with self._opened(archive) as opened:
             plans = [self._plan(archive, opened, files) for files in scenes]
             self._require_space(sum(plan.missing_bytes for plan in plans))
             for plan in plans:
-                self._bring(archive, opened, remote, plan)
+                self._extract_missing(archive, opened, plan)
                 yield self._publish(plan, archive)
 
+    def _location(self, archive: Archive) -> str:
+        """The address of the archive, or its path on this machine."""
+        return archive.url if self.mirror is None else f"{self.mirror.rstrip('/')}/{archive.name}"
+
+    def _staging(self, files: SceneFiles) -> Path:
+        return self.data / STAGING / files.scene
+
     @contextmanager
-    def _opened(
-        self, archive: Archive, may_fetch_whole: bool = True
-    ) -> Iterator[tuple[zipfile.ZipFile, RemoteFile | None]]:
-        where = self.location_of(archive)
+    def _opened(self, archive: Archive, may_fetch_whole: bool = True) -> Iterator[zipfile.ZipFile]:
+        """The archive: on this machine, on its server, or the whole of it where the server serves no ranges."""
+        where = self._location(archive)
         if "://" not in where:
-            require_regular(Path(where).expanduser())
-            try:
-                file = Path(where).expanduser().open("rb")
-            except OSError as error:
-                raise InputError(f"{where} cannot be read ({error.strerror}): mend --mirror") from error
-            with file, open_archive(file, where) as opened:
-                yield opened, None
+            with open_local(Path(where).expanduser()) as opened:
+                yield opened
             return
         try:
-            remote = RemoteFile(where, self.patience)
+            with open_remote(where, self.patience) as opened:
+                yield opened
         except RangesRefusedError:
             if not may_fetch_whole:
                 raise
-            with self._whole(archive, where).open("rb") as file, open_archive(file, where) as opened:
-                yield opened, None
-            self._whole_path(archive).unlink()
         else:
-            with remote, open_archive(remote, where) as opened:  # type: ignore[arg-type]  # a RawIOBase reads bytes
-                yield opened, remote
+            return
+        whole = self.data / STAGING / archive.name
+        if not whole.is_file():  # else an earlier fetch was stopped after it
+            self._download(archive, where, whole)
+        try:
+            with open_local(whole) as opened:
+                yield opened
+        except FetchError:
+            whole.unlink()  # a member of it is damaged
+            raise
+        whole.unlink()
 
-    def _whole(self, archive: Archive, where: str) -> Path:
-        """The whole archive in the staging folder; one that an earlier fetch left there is used again."""
-        target = self._whole_path(archive)
-        size = size_of(where, self.patience)
-        if target.is_file() and target.stat().st_size == size:
-            return target
-        log.info("%s: the server serves no ranges: the whole archive comes (%s)", where, readable_bytes(size))
-        self._require_space(size or archive.bytes or 0)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with atomic(target) as temporary:
+    def _download(self, archive: Archive, where: str, whole: Path) -> None:
+        log.info("%s: the server serves no ranges: the whole archive comes", where)
+        self._require_space(archive.bytes or 0)
+        whole.parent.mkdir(parents=True, exist_ok=True)
+        with atomic(whole) as temporary:
             sha256 = download(
-                where, temporary, self.patience, lambda done, total: self.report(archive.name, done, total or done)
+                where, temporary, self.patience, lambda done, total: self.report(archive.name, done, total)
             )
             pinned = archive.sha256.get("archive")
             if pinned not in (None, sha256):
                 raise InputError(f"{where} has sha256 {sha256}, not {pinned}: give another --mirror")
-            with temporary.open("rb") as file:
-                open_archive(file, where).close()
-        return target
+            if not zipfile.is_zipfile(temporary):
+                raise InputError(f"{where} is no whole zip archive: give another address with --mirror")
 
     def _plan(self, archive: Archive, opened: zipfile.ZipFile, files: SceneFiles) -> ScenePlan:
-        where = self.location_of(archive)
+        """Sort the scene's members by where they are.
+
+        Raises `InputError` where the archive has others than an earlier fetch recorded, or the scene's folder holds
+        other files of their names.
+        """
+        where, target = self._location(archive), self.data / files.folder
         members = members_of(opened, archive.scenes[files.scene], files.parts, where)
         record = read_records(self.data).get(files.key)
         if record is not None and not self.accept_changes:
-            check_unchanged(files, members, record, where)
-        return plan_scene(files, members, self.data / files.folder, self._staging(files))
+            recorded = {name: (file.size, file.crc) for name, file in record.files.items()}
+            offered = {member.name: (member.bytes, member.info.CRC) for member in members}
+            changed = sorted(name for name in recorded | offered if recorded.get(name) != offered.get(name))
+            if changed:
+                raise InputError(
+                    f"{where}: {counted(len(changed), 'file')} of {files.scene} differ from what was fetched on "
+                    f"{record.date} ({some_of(changed)}): give another --mirror, or --accept-changes"
+                )
+        staged, missing, other = [], [], []
+        for member in members:
+            if holds(target / member.name, member.bytes, member.info.CRC):
+                continue
+            if (target / member.name).exists():
+                other.append(member.name)
+            elif holds(self._staging(files) / member.name, member.bytes, member.info.CRC):
+                staged.append(member)
+            else:
+                missing.append(member)
+        if other:
+            raise InputError(
+                f"{target}: {counted(len(other), 'file')} there differ from the archive's ({some_of(other)}): move "
+                "this folder away, and the same command fetches it"
+            )
+        return ScenePlan(files, tuple(members), tuple(missing), tuple(staged))
 
-    def _bring(self, archive: Archive, opened: zipfile.ZipFile, remote: RemoteFile | None, plan: ScenePlan) -> None:
+    def _extract_missing(self, archive: Archive, opened: zipfile.ZipFile, plan: ScenePlan) -> None:
         """Extract what is missing into the staging folder."""
-        done, total = 0, plan.missing_bytes
+        where, done = self._location(archive), 0
 
         def advance(count: int) -> None:
             nonlocal done
             done += count
-            self.report(plan.files.scene, done, total)
+            self.report(plan.files.scene, done, plan.missing_bytes)
 
-        staging = self._staging(plan.files)
-        for run, end in runs_of(opened, plan.missing):
-            for member in run:
-                for attempt in range(1, ATTEMPTS + 1):
-                    if remote is not None:
-                        remote.expect(end)
-                    try:
-                        extract(opened, member, staging / member.name, advance)
-                        break
-                    except DamagedError as error:
-                        if attempt == ATTEMPTS:
-                            self._whole_path(archive).unlink(missing_ok=True)
-                            raise FetchError(
-                                f"{self.location_of(archive)}: {member.info.filename} arrives damaged ({error}): try "
-                                "again later, or give another address with --mirror"
-                            ) from error
+        for member in sorted(plan.missing, key=lambda member: member.info.header_offset):
+            target = self._staging(plan.files) / member.name
+            for is_last_try in (False, True):  # of damage on the way; a cut connection is tried again within
+                try:
+                    retried(lambda: extract(opened, member, target, advance), where, self.patience)  # noqa: B023
+                    break
+                except DamagedError as error:
+                    if is_last_try:
+                        raise FetchError(
+                            f"{where}: {member.info.filename} arrives damaged ({error}): try again later, or give "
+                            "another address with --mirror"
+                        ) from error
 
     def _publish(self, plan: ScenePlan, archive: Archive) -> str:
         """Move what was staged to where the scene file looks for it, and record it; returns a line about it."""
@@ -155,13 +202,15 @@ class Fetcher:
             if path.relative_to(staging).as_posix() not in names:
                 path.unlink()  # of an earlier fetch that wanted something else
         places = {name: target if (target / name).exists() else staging for name in names}
-        sha256 = {name: file_sha256(place / name) for name, place in places.items()}
-        known = read_records(self.data).get(files.key)
         record = SceneRecord(
-            self.location_of(archive),
-            today(),
-            {m.name: FileRecord(m.bytes, m.info.CRC, sha256[m.name]) for m in plan.members},
+            url=self._location(archive),
+            date=time.strftime("%Y-%m-%d", time.gmtime()),
+            files={
+                m.name: FileRecord(size=m.bytes, crc=m.info.CRC, sha256=file_sha256(places[m.name] / m.name))
+                for m in plan.members
+            },
         )
+        known = read_records(self.data).get(files.key)
         try:
             verdict = self._compare(files, record, known, archive.sha256.get(files.key))
         except InputError:
@@ -179,7 +228,7 @@ class Fetcher:
         shutil.rmtree(staging, ignore_errors=True)
         if known is None or known.sha256 != record.sha256:
             add_record(self.data, files.key, record)
-        came = plan.fetched_bytes
+        came = sum(member.bytes for member in (*plan.missing, *plan.staged))
         news = f"{readable_bytes(came)} fetched" if came else "was there, as in the archive"
         return f"{files.scene}: {describe(self.data, files, record)}: {news}; {verdict}"
 
@@ -201,12 +250,6 @@ class Fetcher:
             )
         return f"sha256 as recorded on {known.date}"
 
-    def _staging(self, files: SceneFiles) -> Path:
-        return self.data / STAGING / files.scene
-
-    def _whole_path(self, archive: Archive) -> Path:
-        return self.data / STAGING / archive.name
-
     def _require_space(self, needed: int) -> None:
         place = next(folder for folder in (self.data, *self.data.absolute().parents) if folder.exists())
         free = shutil.disk_usage(place).free
@@ -215,3 +258,9 @@ class Fetcher:
                 f"{readable_bytes(needed)} are to be fetched into {self.data}, where {readable_bytes(free)} are free: "
                 f"free some space, or set {DATA_VARIABLE} to a folder on another disk"
             )
+
+
+def describe(data: Path, files: SceneFiles, record: SceneRecord) -> str:
+    """Describe in words what a record holds."""
+    size = f"{counted(len(record.files), 'file')}, {readable_bytes(record.bytes)}"
+    return f"{size} in {data / files.folder} ({', '.join(files.parts)})"

@@ -2,24 +2,37 @@
 
 from __future__ import annotations
 
+import argparse
+import math
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
+from urllib.parse import urlsplit
 
-from gsbench.datasets.catalog import DATA_VARIABLE, Archive, Dataset, data_dir, read_catalog
-from gsbench.datasets.fetch import STAGING, Fetcher
-from gsbench.datasets.plan import SceneFiles, describe, wanted_files
+from gsbench.datasets.archive import RangesRefusedError
+from gsbench.datasets.catalog import (
+    DATA_VARIABLE,
+    Archive,
+    Dataset,
+    SceneFiles,
+    data_dir,
+    read_catalog,
+    wanted_files,
+)
+from gsbench.datasets.fetch import STAGING, Fetcher, describe
 from gsbench.datasets.records import SceneRecord, read_records
-from gsbench.datasets.remote import Patience, RangesRefusedError
+from gsbench.downloads import Patience
 from gsbench.errors import InputError
 from gsbench.files import remove_temporaries, storage_errors
 from gsbench.logs import progress
 from gsbench.system.locks import hold
 from gsbench.verbs.arguments import ArgumentParser
-from gsbench.words import closest, readable_bytes
+from gsbench.words import closest, is_path, readable_bytes
 
 MIRROR_VARIABLE = "GSBENCH_MIRROR"
 LOCK = ".fetch.lock"
+MAX_SECONDS, MAX_TRIES = 86_400, 1_000
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -36,7 +49,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     mirror = _mirror(options.mirror or os.environ.get(MIRROR_VARIABLE))
     print(f"{dataset.title}: {dataset.page}\nlicence: {dataset.licence}\nplease cite: {dataset.citation}", flush=True)
     with storage_errors(data), progress("fetch") as report:
-        data.mkdir(parents=True, exist_ok=True)
+        _make_folder(data)
 
         def show(phase: str, done: int, total: int | None, note: str = "") -> None:
             report(phase, done, total, note or f"{readable_bytes(done)} of {readable_bytes(total or done)}")
@@ -51,11 +64,20 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
+def _make_folder(data: Path) -> None:
+    try:
+        data.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError, FileNotFoundError) as error:  # a file, or in /proc
+        raise InputError(
+            f"{data} cannot be the data folder ({error.strerror}): set {DATA_VARIABLE} to another"
+        ) from error
+
+
 def _fetch(fetcher: Fetcher, archive: Archive, scenes: Sequence[SceneFiles], dry_run: bool) -> None:
     """Fetch the scenes of one archive and print a line about each; those that are here ask nothing of the network."""
     unfinished = []
     for files in scenes:
-        record = None if fetcher.accept_changes else fetcher.record_if_here(files)
+        record = fetcher.record_if_here(files)
         if record is None:
             unfinished.append(files)
         else:
@@ -127,7 +149,10 @@ def _mirror(mirror: str | None) -> str | None:
     """The address or folder to fetch from instead of the published address; raises `InputError` for others."""
     if not mirror:
         return None
-    if mirror.startswith(("http://", "https://")) or Path(mirror).expanduser().is_dir():
+    with suppress(ValueError):  # an address such as http://[::1
+        if urlsplit(mirror).hostname and mirror.startswith(("http://", "https://")):
+            return mirror
+    if is_path(mirror) and Path(mirror).expanduser().is_dir():
         return mirror
     raise InputError(f"--mirror {mirror} is neither an http(s) address nor a folder")
 
@@ -152,6 +177,22 @@ def _parser(names: Sequence[str]) -> ArgumentParser:
     parser.add_argument(
         "--accept-changes", action="store_true", help="take files that differ from an earlier fetch's as the new record"
     )
-    parser.add_argument("--timeout", type=float, default=30.0, metavar="SECONDS", help="patience with silence (30)")
-    parser.add_argument("--tries", type=int, default=5, help="failures in a row until it gives up (5)")
+    parser.add_argument("--timeout", type=_seconds, default=30.0, metavar="SECONDS", help="patience with silence (30)")
+    parser.add_argument("--tries", type=_tries, default=5, help="tries of one file until it gives up (5)")
     return parser
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value <= MAX_SECONDS:
+        raise argparse.ArgumentTypeError(f"must be a number of seconds above 0, up to {MAX_SECONDS:,}, got {text!r}")
+    return value
+
+
+def _tries(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= MAX_TRIES:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to {MAX_TRIES}, got {text!r}")
+    return int(text)

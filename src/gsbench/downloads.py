@@ -1,0 +1,113 @@
+"""Downloads over HTTP: tries that follow a failure, and what to say when there is none left."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from gsbench.errors import GsbenchError, InputError
+from gsbench.files import CHUNK
+
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+
+USER_AGENT = {"User-Agent": "gsbench"}
+TRANSIENT = (408, 425, 429, 500, 502, 503, 504)  # HTTP statuses that may be another in a moment
+MAX_PAUSE_SECONDS = 30.0
+
+
+class FetchError(GsbenchError):
+    """Error of the network or the server (exit code 1); the same command goes on from here."""
+
+
+@dataclass(frozen=True)
+class Patience:
+    """Limits of waiting for a server: seconds without a byte, and tries of one file (each waits twice as long)."""
+
+    timeout: float = 30.0
+    tries: int = 5
+    pause: float = 1.0  # seconds before the second try
+
+
+def retried(action: Callable[[], T], url: str, patience: Patience) -> T:
+    """The result of ``action``, which asks the server of ``url``; tried again after a failure of the network.
+
+    Raises `InputError` where the server refuses for good, `FetchError` after the last try.
+    """
+    import requests
+    import urllib3
+
+    for failures in range(1, patience.tries + 1):
+        try:
+            return action()
+        except requests.exceptions.SSLError as error:
+            raise InputError(
+                f"{url}: the certificate is not trusted here ({error}): mend it, or give --mirror"
+            ) from None
+        except (requests.exceptions.InvalidURL, requests.exceptions.InvalidSchema) as error:
+            raise InputError(f"{url}: no address that can be fetched ({error}): give another with --mirror") from None
+        except (requests.RequestException, urllib3.exceptions.HTTPError) as error:
+            answer = getattr(error, "response", None)
+            if answer is not None and answer.status_code not in TRANSIENT:
+                raise InputError(
+                    f"{url}: the server says {answer.status_code} {answer.reason}: give another address with --mirror"
+                ) from None
+            reason = _reason(error)
+            if failures == patience.tries:
+                raise FetchError(
+                    f"{url}: {failures} failures in a row ({reason}): the same command goes on from here"
+                ) from error
+        pause = min(MAX_PAUSE_SECONDS, patience.pause * 2 ** (failures - 1))
+        log.info("%s: trying again in %.3g s", reason, pause)
+        time.sleep(pause)
+    raise AssertionError("no try was allowed")
+
+
+def download(url: str, target: Path, patience: Patience, advance: Callable[[int, int | None], None]) -> str:
+    """Write the file at ``url`` to ``target``; returns its sha256 in hexadecimal.
+
+    ``advance`` gets the bytes so far and in all, as far as the server says. A try that fails starts from the beginning.
+    Raises as `retried` does.
+    """
+    import requests
+
+    def once() -> str:
+        digest, done = hashlib.sha256(), 0
+        # A packed answer would have another length than the file.
+        headers = USER_AGENT | {"Accept-Encoding": "identity"}
+        with (
+            requests.get(url, headers=headers, stream=True, timeout=patience.timeout) as answer,
+            target.open("wb") as file,
+        ):
+            answer.raise_for_status()
+            length = answer.headers.get("Content-Length", "")
+            total = int(length) if length.isdigit() else None
+            advance(0, total)
+            for piece in answer.iter_content(CHUNK):  # which raises where fewer bytes come than were announced
+                file.write(piece)
+                digest.update(piece)
+                done += len(piece)
+                advance(done, total)
+        return digest.hexdigest()
+
+    return retried(once, url, patience)
+
+
+def _reason(error: Exception) -> str:
+    """The innermost cause of an error of requests, which wraps those of urllib3, in a few words."""
+    import requests
+    import urllib3
+
+    if isinstance(error, requests.exceptions.Timeout | urllib3.exceptions.TimeoutError) or "timed out" in str(error):
+        return "no answer in time"
+    if isinstance(error, requests.exceptions.ChunkedEncodingError | urllib3.exceptions.ProtocolError):
+        return "the connection was cut"
+    inner = error
+    while isinstance(inner, Exception) and inner.args and isinstance(inner.args[0], Exception):
+        inner = inner.args[0]
+    return str(getattr(inner, "reason", None) or inner) or type(error).__name__
