@@ -42,6 +42,8 @@ PROGRAMS = {
     "external/gsplat": ["densify.options.code=/code", "allow_targets=[python,git]"],
     "external/opensplat": ["allow_targets=[opensplat]"],
     "external/brush": ["allow_targets=[brush]"],
+    "external/fvdb": ["allow_targets=[python]"],
+    "external/lichtfeld": ["allow_targets=[LichtFeld-Studio]"],
     "external/nerfstudio": ["allow_targets=[bash]"],
 }
 

@@ -99,14 +99,14 @@ def experiment(name: str) -> list[Trial]:
     return compose_trials([f"+experiment={name}"])
 
 
-PROGRAM = ["densify.version=1.0", "allow_targets=[mine,python,git,brush,opensplat,bash]"]
+PROGRAM = ["densify.version=1.0", "allow_targets=[mine,python,git,brush,opensplat,bash,LichtFeld-Studio]"]
 WITH_CODE = [*PROGRAM, "densify.options.code=/code"]
 NEEDED = {  # what a YAML leaves to its user
     ("train", "none"): ["densify=none"],
     ("densify", "external/program"): [*PROGRAM, "densify.command=[mine]", "densify.result=mine.ply"],
     ("densify", "external/3dgs"): WITH_CODE,
     ("densify", "external/gsplat"): WITH_CODE,
-    **{("densify", f"external/{name}"): PROGRAM for name in ("brush", "nerfstudio", "opensplat")},
+    **{("densify", f"external/{name}"): PROGRAM for name in ("brush", "fvdb", "lichtfeld", "nerfstudio", "opensplat")},
 }
 
 
