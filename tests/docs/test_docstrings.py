@@ -80,7 +80,7 @@ def unplain(path: Path) -> list[str]:
 
 def test_docstrings_and_titles_begin_with_a_verb_or_a_noun() -> None:
     paths = sorted({*(ROOT / "src").rglob("*.py"), *(ROOT / "scripts").rglob("*.py"), *TITLED})
-    assert len(paths) > 300
+    assert len(paths) > 200
     assert [line for path in paths for line in unplain(path)] == []
 
 

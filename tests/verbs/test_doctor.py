@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import os
 import tomllib
 from collections.abc import Iterable
@@ -127,6 +128,9 @@ def test_the_whole_of_it_on_this_machine(tmp_path: Path, capsys: pytest.CaptureF
     topics = {line.split()[1] for line in lines}
     assert {"gsbench", "python", "torch", "gpu", "rasterizer", "kernels", "data", "runs", "weights"} <= topics
     assert all(line.split()[0] in ("ok", "note", "bad") for line in lines)
+    for module in doctor.OPTIONAL:
+        (line,) = (line for line in lines if line.split()[1] == module)
+        assert ("not installed" in line) == (importlib.util.find_spec(module) is None)
 
 
 def test_a_sample_of_the_store_is_read_whole(tmp_path: Path) -> None:

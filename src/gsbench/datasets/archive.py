@@ -159,7 +159,7 @@ def extract(archive: zipfile.ZipFile, member: Member, target: Path, advance: Cal
         raise _cause(error, member) from error
 
 
-# What zipfile and its decompressors raise for damaged bytes; LZMA's filter raises the last two kinds.
+# The kinds of error that zipfile and its decompressors raise for damaged bytes; the last two are of LZMA's filter.
 DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, lzma.LZMAError, EOFError, ValueError, IndexError, TypeError)
 
 

@@ -10,7 +10,7 @@ import contextlib
 import importlib
 import io
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from gsbench.runs.experiments import list_experiments
@@ -65,8 +65,26 @@ def _of_verb(verb: str, words: Sequence[str], word: str, runs: Path) -> Iterable
             return _addresses(runs, word, whole=words[-1] == "--truth")
         if re.search(rf"(?<![\w-]){words[-1]} [A-Z]", _help_of(verb, runs)):
             return []  # a value of its own: a file, for which the shell has a better list
-    arguments = [argument for argument in words if not argument.startswith("-")]
-    return ARGUMENTS.get(verb, _none)(arguments, word, runs)
+    given = [argument for argument in words if not argument.startswith("-")]
+    match verb:
+        case "tables" | "report" | "status" | "sync" | "ui":
+            return [] if given else list_experiments(runs)
+        case "retry":
+            return _settings(given[1:], word) if given else list_experiments(runs)
+        case "explain":
+            return _settings(given, word) if "=" in word else _cells(word, runs)
+        case "view" | "video":
+            return _addresses(runs, word, whole=True)
+        case "export":
+            return [*([] if given else ["init"]), *_addresses(runs, word, whole=True)]
+        case "fetch":
+            from gsbench.datasets.catalog import read_catalog
+
+            catalog = read_catalog()
+            return catalog if not given else catalog[given[0]].scenes if given[0] in catalog else []
+        case "completion":
+            return [] if given else list(SCRIPTS)
+    return []
 
 
 def _help_of(verb: str, runs: Path) -> str:
@@ -75,36 +93,13 @@ def _help_of(verb: str, runs: Path) -> str:
     return text.getvalue()
 
 
-def _none(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
-    return []
-
-
-def _experiment(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
-    return [] if arguments else list_experiments(runs)
-
-
-def _retry(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
-    return _settings(arguments[1:], word) if arguments else list_experiments(runs)
-
-
-def _trial(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
-    return _addresses(runs, word, whole=True)
-
-
-def _export(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
-    return [*([] if arguments else ["init"]), *_addresses(runs, word, whole=True)]
-
-
-def _cell(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
+def _cells(word: str, runs: Path) -> list[str]:
     """``EXPERIMENT:SCENE:METRIC:ARM``, a part at a time."""
-    if "=" in word:
-        return _settings(arguments, word)
     name, *rest = word.split(":")
     if not rest:
         return [f"{experiment}:" for experiment in list_experiments(runs)]
-    scenes = sorted({folder.parents[1].name for folder in _trials(runs, name)})
     if len(rest) == 1:
-        return [f"{name}:{scene}:" for scene in scenes]
+        return [f"{name}:{scene}:" for scene in {folder.parents[1].name for folder in _trials(runs, name)}]
     if len(rest) == 2:
         from gsbench.eval.facts import known_keys
 
@@ -113,44 +108,15 @@ def _cell(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
     return [f"{name}:{rest[0]}:{rest[1]}:{arm}" for arm in arms]
 
 
-def _dataset(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
-    from gsbench.datasets.catalog import read_catalog
-
-    catalog = read_catalog()
-    return catalog if not arguments else catalog[arguments[0]].scenes if arguments[0] in catalog else []
-
-
-def _shell(arguments: Sequence[str], word: str, runs: Path) -> Iterable[str]:
-    return [] if arguments else list(SCRIPTS)
-
-
-ARGUMENTS: dict[str, Callable[[Sequence[str], str, Path], Iterable[str]]] = {
-    "tables": _experiment,
-    "report": _experiment,
-    "status": _experiment,
-    "sync": _experiment,
-    "ui": _experiment,
-    "retry": _retry,
-    "explain": _cell,
-    "view": _trial,
-    "export": _export,
-    "fetch": _dataset,
-    "completion": _shell,
-}
-
-
 def _addresses(runs: Path, word: str, whole: bool) -> list[str]:
     """``EXPERIMENT:SCENE:ARM:SEED`` of the trials that are there, a part at a time; if not ``whole``, experiments."""
     depth = word.count(":")
-    found = set()
-    for name in [word.split(":")[0]] if depth else list_experiments(runs):
-        if not depth:
-            found.add(f"{name}:")
-            continue
-        for folder in _trials(runs, name) if whole else []:
-            scene, arm, seed = folder.parents[1].name, folder.parent.name, folder.name.rpartition(SEED)[2]
-            parts = [name, scene, arm, seed][: depth + 1]
-            found.add(":".join(parts) + (":" if len(parts) < 4 else ""))
+    if not depth:
+        return [f"{name}:" for name in list_experiments(runs)]
+    name, found = word.split(":")[0], set()
+    for folder in _trials(runs, name) if whole else []:
+        scene, arm, seed = folder.parents[1].name, folder.parent.name, folder.name.rpartition(SEED)[2]
+        found.add(":".join([name, scene, arm, seed][: depth + 1]) + (":" if depth < 3 else ""))
     return sorted(found)
 
 

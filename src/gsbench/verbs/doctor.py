@@ -12,7 +12,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, packages_distributions, version
 from pathlib import Path
 from typing import Literal
 
@@ -28,9 +28,9 @@ from gsbench.words import counted, readable_bytes
 Verdict = Literal["ok", "note", "bad"]
 LITTLE_SPACE_GB = 5.0
 TRITON_CAPABILITY = (8, 0)  # "NVIDIA GPUs (Compute Capability 8.0+)", in Triton's README
-OPTIONAL = {  # package -> what needs it, and the extra that brings it
+OPTIONAL = {  # module -> what needs it, and the extra that brings it
     "transformers": ("init=dim", "dim"),
-    "gsplat": ("raster=gsplat and export --to compressed", "gsplat"),
+    "gsplat": ("raster=gsplat", "gsplat"),
     "optuna": ("hydra/sweeper=optuna", "search"),
     "submitit": ("launch=local and launch=slurm", "slurm"),
     "tensorboard": ("tracking=tensorboard", "tensorboard"),
@@ -147,8 +147,9 @@ def check_packages() -> Iterator[Finding]:
         installed = _version(name)
         verdict: Verdict = "bad" if installed is None else "ok"
         yield Finding(verdict, name, installed or f"missing: {install_command()}")
+    distributions = packages_distributions()  # cv2 comes in several
     for name, (purpose, extra) in OPTIONAL.items():
-        installed = _version(name)
+        installed = _version(distributions.get(name, [name])[0])
         text = installed or f"not installed; needed for {purpose}: {install_command(extra)}"
         yield Finding("ok" if installed else "note", name, text)
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
+import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 from gsbench.analysis.results import load_experiment, read_experiment
 from gsbench.errors import InputError
@@ -18,23 +18,25 @@ from gsbench.runs.stages import INIT
 from gsbench.settings import is_folder_name
 from gsbench.verbs.arguments import ArgumentParser, path
 from gsbench.view import ADDRESS
-
-if TYPE_CHECKING:
-    from gsbench.gaussians.model import Gaussians
+from gsbench.words import readable_bytes
 
 log = logging.getLogger(__name__)
 
 FORMATS = {
     "ply": "the 3DGS point cloud, as every viewer and trainer reads it (248 bytes a Gaussian)",
-    "splat": "antimatter15's .splat for browsers: 32 bytes a Gaussian, colour without view dependence",
     "spz": "Niantic's .spz: about a tenth of the .ply, harmonics included",
-    "compressed": "PlayCanvas's compressed .ply for SuperSplat: about 16 bytes a Gaussian and harmonics; needs gsplat",
+    "compressed": "PlayCanvas's compressed .ply for SuperSplat: about 16 bytes a Gaussian and harmonics",
 }
 # The command of the program that writes it, from its manual: developer.playcanvas.com/user-manual/splat-transform
-SOG = (
-    "gsbench writes no .sog: export {ply}, then `npm install -g @playcanvas/splat-transform` and `splat-transform "
-    "{ply} {sog}`"
+SPLAT_TRANSFORM = (
+    "gsbench writes no {suffix}: export {ply}, then `npm install -g @playcanvas/splat-transform` and `splat-transform "
+    "{ply} {out}`"
 )
+# A .spz has y up and z backward where a .ply has y down and z forward: signs of (x, y, z), and of the 15 harmonics
+# above the constant one, each odd in y and z together or not.
+SPZ_AXES = (1.0, -1.0, -1.0)
+SPZ_HARMONICS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
+SPZ_POSITION_BITS, SPZ_MAX_FRACTION_BITS = 24, 20  # signed; a millionth of a unit is enough
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -86,8 +88,9 @@ def main(argv: Sequence[str], runs: Path) -> int:
             export_init(trial.path.parents[3] / STORE / INIT.name / trial.record.hashes[INIT.name], out)
         else:
             export_model(model_file(trial), options.to or _format_of(out), out)
-    log.info("%s", trial.label)
-    print(out)
+    count = "the initial model" if is_init else f"{trial.record.num_gaussians:,} Gaussians"
+    size = sum(path.stat().st_size for path in ([out] if out.is_file() else out.rglob("*")))
+    print(f"{out}: {trial.label}, {count}, {readable_bytes(size)}")
     return 0
 
 
@@ -110,7 +113,7 @@ def export_results(name: str, runs: Path, out: Path | None, shares: Sequence[Pat
             left_out = write_archive(load_experiment(runs, name), file)
     for line in left_out:
         log.warning("left out: %s", line)
-    print(file)
+    print(f"{file}: results of {name}, {readable_bytes(file.stat().st_size)}")
     return 0
 
 
@@ -130,15 +133,48 @@ def _export_together(name: str, runs: Path, shares: Sequence[Path], file: Path) 
 
 def export_model(ply: Path, form: str, out: Path) -> None:
     """Write the Gaussians of the 3DGS file ``ply`` to ``out``, in one of ``FORMATS``."""
-    if form == "ply":
-        _write(out, lambda temporary: shutil.copyfile(ply, temporary))
-        return
-    from gsbench.gaussians.ply import read_ply
-    from gsbench.gaussians.spz import spz_bytes
+    with atomic(out, sync=False) as temporary:
+        if form == "ply":
+            shutil.copyfile(ply, temporary)
+        else:
+            # gsply goes by the name of the file that it writes.
+            named = temporary.with_name(f"{temporary.name}.{'spz' if form == 'spz' else 'compressed.ply'}")
+            try:
+                (write_spz if form == "spz" else write_compressed)(ply, named)
+                named.replace(temporary)
+            finally:
+                named.unlink(missing_ok=True)
 
-    writers = {"splat": splat_bytes, "spz": spz_bytes, "compressed": compressed_bytes}
-    content = writers[form](read_ply(ply))
-    _write(out, lambda temporary: temporary.write_bytes(content))
+
+def write_spz(ply: Path, out: Path) -> None:
+    """Write version 3 of Niantic's format, whose positions have as many bits behind the point as the farthest leaves.
+
+    gsply leaves axes as they are, and takes 12 bits, by which positions beyond 2,048 units would be cut off.
+    """
+    import gsply
+    import numpy as np
+
+    model = gsply.plyread(ply)
+    axes = np.array(SPZ_AXES, dtype=np.float32)
+    means = model.means * axes  # [N, 3]
+    before_the_point = max(0, math.frexp(float(np.abs(means).max()))[1]) + 1  # and the sign
+    turned = gsply.GSData(
+        means=means,
+        scales=model.scales,
+        quats=model.quats * np.append(np.float32(1), axes),  # [N, 4] (w, x, y, z)
+        opacities=model.opacities,
+        sh0=model.sh0,
+        shN=model.shN * np.array(SPZ_HARMONICS[: model.shN.shape[1]], dtype=np.float32)[:, None],  # [N, K, 3]
+    )
+    bits = min(SPZ_MAX_FRACTION_BITS, max(0, SPZ_POSITION_BITS - before_the_point))
+    gsply.write_spz(out, turned, fractional_bits=bits)
+
+
+def write_compressed(ply: Path, out: Path) -> None:
+    """Write PlayCanvas's compressed PLY."""
+    import gsply
+
+    gsply.plywrite(out, gsply.plyread(ply), compressed=True)
 
 
 def export_init(entry: Path, out: Path) -> None:
@@ -154,63 +190,13 @@ def export_init(entry: Path, out: Path) -> None:
     shutil.copytree(model, out / MODEL_FOLDER)
 
 
-def splat_bytes(gaussians: Gaussians) -> bytes:
-    """antimatter15's layout, 32 bytes a Gaussian, the most important first.
-
-    Position and scale are 3 + 3 float32, colour and opacity 4 bytes (RGBA), the rotation 4 bytes, (w, x, y, z) of the
-    unit quaternion as 128 + 128 q. Importance is opacity times volume, as his ``convert.py`` orders them (viewers may
-    draw the first part of a file only).
-    """
-    import numpy as np
-    import torch
-
-    from gsbench.gaussians.spherical_harmonics import dc_to_rgb
-
-    raw = gaussians.detach()
-    record = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
-    table = np.empty(len(raw), record)
-    opacity = torch.sigmoid(raw.opacity_logits)  # [N]
-    colors = torch.cat([dc_to_rgb(raw.sh_dc), opacity[:, None]], dim=1)  # [N, 4]
-    rotation = torch.nn.functional.normalize(raw.quaternions, dim=1)  # [N, 4]
-    table["mean"] = raw.means.numpy()
-    table["scale"] = raw.log_scales.exp().numpy()
-    table["rgba"] = (colors * 255).clamp(0, 255).to(torch.uint8).numpy()
-    table["rotation"] = (rotation * 128 + 128).clamp(0, 255).to(torch.uint8).numpy()
-    importance = raw.log_scales.sum(dim=1).exp() * opacity
-    order = torch.argsort(importance, descending=True, stable=True).numpy()
-    return table[order].tobytes()
-
-
-def compressed_bytes(gaussians: Gaussians) -> bytes:
-    """PlayCanvas's compressed PLY, as gsplat writes it. Raises InputError where gsplat is not installed."""
-    try:
-        from gsplat.exporter import export_splats
-    except ImportError:
-        raise InputError("--to compressed needs gsplat: pip install gsplat (its CUDA part is not used)") from None
-    raw = gaussians.detach()
-    return export_splats(
-        raw.means,
-        raw.log_scales,
-        raw.quaternions,
-        raw.opacity_logits,
-        raw.sh_dc[:, None],
-        raw.sh_rest,
-        "ply_compressed",
-    )
-
-
 def _format_of(out: Path) -> str:
     name = out.name.lower()
     if name.endswith(".compressed.ply"):
         return "compressed"
-    if name.endswith(".sog"):
-        raise InputError(SOG.format(ply=out.with_suffix(".ply"), sog=out))
     form = out.suffix.lower().lstrip(".")
+    if form in ("sog", "splat"):
+        raise InputError(SPLAT_TRANSFORM.format(suffix=out.suffix, ply=out.with_suffix(".ply"), out=out))
     if form not in FORMATS:
         raise InputError(f"what is {out.name} to hold? give --to {', '.join(FORMATS)}")
     return form
-
-
-def _write(out: Path, write: Callable[[Path], object]) -> None:
-    with atomic(out, sync=False) as temporary:
-        write(temporary)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gsbench.errors import InputError
 from gsbench.system.install import install_command
+from gsbench.system.stopping import stop_on_signals
 from gsbench.verbs.arguments import ArgumentParser, port
 from gsbench.view import ADDRESS
 
@@ -39,11 +40,12 @@ def main(argv: Sequence[str], runs: Path) -> int:
     trials = [find_trial(address, runs) for address in options.trial]
     rasterizer = create_rasterizer("auto", device)
     viewer = Viewer([TrialPainter(load_viewed(trial, device), rasterizer) for trial in trials], options.port)
-    print(f"{viewer.url}  (Ctrl+C ends it)", flush=True)
-    try:
-        threading.Event().wait()
-    except KeyboardInterrupt:
-        print("stopped")
-    finally:
-        viewer.stop()
+    with stop_on_signals():
+        print(f"{viewer.url}  (Ctrl+C ends it)", flush=True)
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            print("stopped")
+        finally:
+            viewer.stop()
     return 0
