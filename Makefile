@@ -52,7 +52,8 @@ lint: $(VENV)/.stamp-dev ## check style and types
 	$(BIN)/mypy
 
 docs: $(VENV)/.stamp-docs ## write the documentation as a site to site/; fails where a link leads nowhere
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs --quiet build
+	$(BIN)/python scripts/site.py
+	$(BIN)/zensical build --clean
 
 lock: $(VENV)/.stamp-run ## bring uv.lock to the versions of constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
@@ -62,13 +63,14 @@ lock: $(VENV)/.stamp-run ## bring uv.lock to the versions of constraints.txt
 $(VENV)/.stamp-run: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "gsbench needs Python 3.11 or newer: make PYTHON=python3.12 ...")'
 	$(PYTHON) -m venv $(VENV)
+	$(PIP) 'pip>=25.1' # the first that knows --group
 	$(PIP) -e .
 	@touch $@
 
 $(VENV)/.stamp-dev: $(VENV)/.stamp-run
-	$(PIP) -e '.[dev]'
+	$(PIP) -e . --group dev
 	@touch $@
 
 $(VENV)/.stamp-docs: $(VENV)/.stamp-run
-	$(PIP) -e '.[docs]'
+	$(PIP) -e . --group docs
 	@touch $@

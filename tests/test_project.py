@@ -33,6 +33,10 @@ def locked() -> list[dict[str, Any]]:
     return tomllib.loads((ROOT / "uv.lock").read_text())["package"]
 
 
+def names(requirements: list[str]) -> set[str]:
+    return {normal(re.match(r"[\w.-]+", line).group()) for line in requirements}  # type: ignore[union-attr]
+
+
 def steps(workflow: Path) -> list[dict[str, Any]]:
     return [step for job in yaml.safe_load(workflow.read_text())["jobs"].values() for step in job["steps"]]
 
@@ -54,10 +58,12 @@ def test_every_constraint_is_of_a_package_that_something_needs() -> None:
 def test_the_lock_locks_what_the_project_file_asks_for() -> None:
     (own,) = (package for package in locked() if "editable" in package["source"])
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
     asked = [*project["dependencies"], *(line for extra in project["optional-dependencies"].values() for line in extra)]
-    names = {normal(re.match(r"[\w.-]+", line).group()) for line in asked}  # type: ignore[union-attr]
     assert own["name"] == project["name"]
-    assert {entry["name"] for entry in own["metadata"]["requires-dist"]} == names - {own["name"]}, "make lock"
+    assert {entry["name"] for entry in own["metadata"]["requires-dist"]} == names(asked), "make lock"
+    for group, lines in groups.items():
+        assert {entry["name"] for entry in own["metadata"]["requires-dev"][group]} == names(lines), "make lock"
     assert tomllib.loads((ROOT / "uv.lock").read_text())["requires-python"] == project["requires-python"], "make lock"
 
 
@@ -87,7 +93,6 @@ def test_the_check_before_a_commit_formats_as_ours_does() -> None:
 def test_workflows_call_targets_and_files_that_there_are(workflow: Path) -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     called = {name for step in steps(workflow) for name in re.findall(r"\bmake ([a-z-]+)", step.get("run", ""))}
-    assert called
     assert called <= targets
     for step in steps(workflow):
         for name in re.findall(r"@(\S+)", step.get("run", "")):
@@ -121,16 +126,29 @@ def test_the_site_has_every_document() -> None:
     """Quickly, without building it: `make docs` finds links that lead nowhere."""
 
     class Loader(yaml.SafeLoader):
-        """Reads MkDocs' tag for environment variables as a list."""
+        """Reads the tag for environment variables as a list."""
 
     Loader.add_constructor("!ENV", lambda loader, node: loader.construct_sequence(node))
     config = yaml.load((ROOT / "mkdocs.yml").read_text(), Loader)
     pages = re.findall(r"'([\w./-]+\.md)'", str(config["nav"]))
-    generated = {"changelog.md", "contributing.md"}
     assert len(pages) == len(set(pages))
-    assert set(pages) - generated == {path.name for path in (ROOT / "docs").glob("*.md")}
+    build_site = script("build_site")
+    made = {page for name, page in build_site.PAGES.items() if (ROOT / name).is_file()} | {"api.md"}
+    docs = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    assert set(pages) >= docs
+    assert set(pages) <= docs | made
     index = (ROOT / "docs" / "index.md").read_text()
-    assert [name for name in set(pages) - generated - {"index.md"} if f"]({name}" not in index] == []
+    assert [name for name in docs - {"index.md"} if f"]({name}" not in index] == []
+
+
+def script(name: str) -> Any:
+    """A file of scripts/ as a module."""
+    specification = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module
 
 
 REPOSITORY = "https://example.org/owner/gsbench/"
@@ -143,9 +161,7 @@ REPOSITORY = "https://example.org/owner/gsbench/"
         ("[a](#here)", "docs", None, "[a](#here)"),
         ("[a](docs/search.md#here)", "", None, "[a](search.md#here)"),
         ("[a](../CONTRIBUTING.md)", "docs", None, "[a](contributing.md)"),
-        ("[a](../README.md#verbs)", "docs", None, "[a](index.md)"),
-        ("[a](../src/gsbench/eval/facts.py)", "docs", None, "[a](reference/gsbench/eval/facts.md)"),
-        ("[a](../src/gsbench/raster/__init__.py)", "docs", None, "[a](reference/gsbench/raster/index.md)"),
+        ("[a](../README.md)", "docs", None, "[a](index.md)"),
         ("[a](../conf/densify/)", "docs", None, "a (`conf/densify`)"),
         ("[conf/densify](../conf/densify/)", "docs", None, "conf/densify"),
         ("[a](../conf/densify/)", "docs", REPOSITORY, "[a](https://example.org/owner/gsbench/tree/main/conf/densify)"),
@@ -158,9 +174,18 @@ REPOSITORY = "https://example.org/owner/gsbench/"
     ],
 )
 def test_links_lead_on_from_the_site(link: str, folder: str, repository: str | None, wanted: str) -> None:
-    specification = importlib.util.spec_from_file_location("site_links", ROOT / "scripts" / "site_links.py")
-    assert specification is not None
-    assert specification.loader is not None
-    site_links = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(site_links)
-    assert site_links.led_on(link, ROOT / folder, repository) == wanted
+    assert script("build_site").led_on(link, ROOT / folder, repository) == wanted
+
+
+@pytest.mark.parametrize(
+    ("link", "wanted"),
+    [
+        ("[a](docs/gpu.md#x)", f"[a]({REPOSITORY}blob/main/docs/gpu.md#x)"),
+        ("![a](docs/demo.jpg)", f"![a]({REPOSITORY}raw/main/docs/demo.jpg)"),
+        ("[a](#here) [b](https://example.com)", "[a](#here) [b](https://example.com)"),
+        ("```\n[a](b.md)\n```", "```\n[a](b.md)\n```"),
+    ],
+)
+def test_the_readme_of_the_package_has_absolute_links(link: str, wanted: str) -> None:
+    pytest.importorskip("hatchling", reason="needs hatchling (group dev)")
+    assert script("hatch_readme").absolute_links(link, REPOSITORY) == wanted

@@ -4,7 +4,7 @@ import os
 import sys
 import time
 
-if sys.argv[:1] == ["-m"] and "gsbench.cli" in sys.orig_argv and not sys.flags.safe_path:
+if sys.argv[:1] == ["-m"] and {"gsbench", "gsbench.cli"} & set(sys.orig_argv) and not sys.flags.safe_path:
     del sys.path[0]  # `python -m` puts the current folder first, where a capture may hold a module of any name
 
 import zlib  # noqa: F401 - loaded before pycolmap brings its own, with which Pillow's PNG writer crashes

@@ -97,7 +97,7 @@ def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path, launc
 def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, launcher: str) -> None:
     package = f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher"
     if find_spec(package) is None:
-        pytest.skip(f"needs {package} (extra dev)")
+        pytest.skip(f"needs {package} (group dev)")
     words = ["-m", *TINY, f"hydra/launcher={launcher}", "name=x", "seed=0,1"]
     done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
     assert done.returncode == 0, done.stderr
@@ -115,7 +115,7 @@ def test_a_callback_of_yours_is_found_in_the_processes_of_another_launcher(
 ) -> None:
     package = f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher"
     if find_spec(package) is None:
-        pytest.skip(f"needs {package} (extra dev)")
+        pytest.skip(f"needs {package} (group dev)")
     (tmp_path / "notes.py").write_text(CALLBACK)
     own = ["+hydra.callbacks.note={_target_: notes.Note, path: notes.txt}", "allow_targets=[notes]"]
     words = ["-m", *TINY, f"hydra/launcher={launcher}", "name=x", "seed=0,1", *own]

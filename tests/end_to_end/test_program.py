@@ -42,7 +42,7 @@ def test_help_is_quick_to_load(gsbench: Run) -> None:
 
 
 def test_wheel_runs_a_trial_outside_the_checkout(environment: dict[str, str], tmp_path: Path) -> None:
-    pytest.importorskip("hatchling", reason="building the wheel offline needs hatchling (extra dev)")
+    pytest.importorskip("hatchling", reason="building the wheel offline needs hatchling (group dev)")
     build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path / "dist"), str(ROOT)]
     subprocess.run(build, check=True, capture_output=True, timeout=300)
     (wheel,) = (tmp_path / "dist").glob("gsbench_3dgs-*.whl")

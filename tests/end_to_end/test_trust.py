@@ -75,7 +75,7 @@ def test_nor_by_python_m_but_for_what_python_imports_before_it_comes_to_gsbench(
     for name in {name.split(".")[0] for name in before.split()} | {"gsbench"}:
         (capture / f"{name}.py").unlink(missing_ok=True)
     for words in (["--help"], ["--cfg", "job"], ["seed=1", "--dry-run"]):
-        done = gsbench(capture, *words, start=("-m", "gsbench.cli"))
+        done = gsbench(capture, *words, start=("-m", "gsbench"))
         assert done.returncode == 0, done.stderr
     assert not (capture.parent / "exploded").exists(), (capture.parent / "exploded").read_text()
 

@@ -23,8 +23,8 @@ def test_every_notebook_is_a_pair() -> None:
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_pair_is_equal_and_has_no_outputs(path: Path) -> None:
-    jupytext = pytest.importorskip("jupytext", reason="needs jupytext (extra dev)")
-    nbformat = pytest.importorskip("nbformat", reason="needs nbformat (extra dev)")
+    jupytext = pytest.importorskip("jupytext", reason="needs jupytext (group dev)")
+    nbformat = pytest.importorskip("nbformat", reason="needs nbformat (group dev)")
     source = jupytext.read(path)
     notebook = nbformat.read(path.with_suffix(".ipynb"), as_version=4)
     nbformat.validate(notebook)
@@ -38,9 +38,9 @@ def test_pair_is_equal_and_has_no_outputs(path: Path) -> None:
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    nbclient = pytest.importorskip("nbclient", reason="needs nbclient and ipykernel (extra dev)")
-    nbformat = pytest.importorskip("nbformat", reason="needs nbformat (extra dev)")
-    pytest.importorskip("ipykernel", reason="needs nbclient and ipykernel (extra dev)")
+    nbclient = pytest.importorskip("nbclient", reason="needs nbclient and ipykernel (group dev)")
+    nbformat = pytest.importorskip("nbformat", reason="needs nbformat (group dev)")
+    pytest.importorskip("ipykernel", reason="needs nbclient and ipykernel (group dev)")
     for key in os.environ:
         if key.startswith(("GSBENCH_", "MLFLOW_")):
             monkeypatch.delenv(key)

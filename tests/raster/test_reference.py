@@ -161,7 +161,7 @@ def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc() -> None:
 
 
 def test_projection_matches_gsplat() -> None:
-    gsplat = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat (extra dev) is not installed")
+    gsplat = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat (group dev) is not installed")
     gaussians, camera = random_gaussians(200, seed=7), front_camera(64, 48)
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3], matrix[:3, 3] = torch.from_numpy(camera.rotation), torch.from_numpy(camera.translation)
@@ -178,7 +178,7 @@ def test_projection_matches_gsplat() -> None:
 
 
 def test_spherical_harmonics_match_gsplat() -> None:
-    gsplat = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat (extra dev) is not installed")
+    gsplat = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat (group dev) is not installed")
     from gsbench.gaussians.spherical_harmonics import colors
 
     gaussians = random_gaussians(50, seed=9)

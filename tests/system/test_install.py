@@ -16,10 +16,11 @@ from tests.conftest import ROOT
 
 
 def test_the_name_is_that_of_the_project_file() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    content = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    project = content["project"]
     assert project["name"] == DISTRIBUTION
     assert list(project["scripts"]) == ["gsbench"]
-    assert f"{DISTRIBUTION}[dim,search,slurm,tensorboard,video,view]" in project["optional-dependencies"]["dev"]
+    assert f"{DISTRIBUTION}[dim,search,slurm,tensorboard,video,view]" in content["dependency-groups"]["dev"]
 
 
 def test_from_a_checkout_the_hint_installs_the_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

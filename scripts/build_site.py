@@ -1,0 +1,89 @@
+"""Put together the pages of the site in build/pages/, from which Zensical builds it (``make docs``).
+
+The pages are those of docs/, the files of the root that readers look for, the findings, and what is made from the
+code (`reference.py`). In the repository a page may link to any file. On the site, a link to a file that is no page
+leads to the repository where its address is known (``$GSBENCH_REPOSITORY``), else only its name stays. A link to
+nothing is left as it is, and Zensical refuses it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = {
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CODE_OF_CONDUCT.md": "conduct.md",
+    "SECURITY.md": "report_a_weakness.md",
+    "findings/README.md": "findings/README.md",
+}  # file of the repository: page of the site
+LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]+)(?P<anchor>#[^)]*)?\)")
+FENCE = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
+MADE = {"settings.md": "settings", "results.md": "results"}  # page: what `reference.py` adds at its end
+
+
+def led_on(markdown: str, folder: Path, repository: str | None) -> str:
+    """The text of a page that lies in ``folder``, with links that work on the site; blocks of code are left alone."""
+
+    def replace(match: re.Match[str]) -> str:
+        text, target, anchor = match["text"], match["target"], match["anchor"] or ""
+        path = Path(os.path.normpath(folder / target))
+        if "://" in target or not path.exists() or not path.is_relative_to(ROOT):
+            return match[0]
+        name = path.relative_to(ROOT).as_posix()
+        page = page_of(name)
+        if page is not None:
+            here = page_of(folder.relative_to(ROOT).as_posix() + "/x.md") or ""
+            return f"[{text}]({os.path.relpath(page, Path(here).parent).replace(os.sep, '/')}{anchor})"
+        if repository:
+            return f"[{text}]({repository.rstrip('/')}/{'tree' if path.is_dir() else 'blob'}/main/{name}{anchor})"
+        return text if name in text else f"{text} (`{name}`)"
+
+    parts = FENCE.split(markdown)
+    parts[::2] = [LINK.sub(replace, part) for part in parts[::2]]
+    return "".join(parts)
+
+
+def page_of(name: str) -> str | None:
+    """The page of the site that a file of the repository becomes; None where it becomes none."""
+    if name == "README.md":
+        return "index.md"
+    if name.startswith("docs/"):
+        return name.removeprefix("docs/")
+    return name if name.startswith("findings/") and name.endswith(".md") else PAGES.get(name)
+
+
+def put_together(target: Path, repository: str | None) -> None:
+    """Write every page, and the pictures beside them, to the folder ``target``."""
+    import reference
+
+    shutil.rmtree(target, ignore_errors=True)
+    for folder in (DOCS, ROOT / "findings"):
+        for path in sorted(folder.rglob("*")) if folder.is_dir() else ():
+            if path.suffix in {".jpg", ".png", ".svg", ".txt", ".css"}:
+                place = target / str(page_of(path.relative_to(ROOT).as_posix()) or path.relative_to(ROOT))
+                place.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, place)
+    sources = [*DOCS.rglob("*.md"), *(ROOT / "findings").glob("*.md"), *(ROOT / name for name in PAGES)]
+    for path in sources:
+        if not path.is_file():
+            continue
+        name = path.relative_to(ROOT).as_posix()
+        place = target / (PAGES.get(name) or str(page_of(name)))
+        place.parent.mkdir(parents=True, exist_ok=True)
+        text = path.read_text(encoding="utf-8")
+        if name.removeprefix("docs/") in MADE:
+            text += "\n" + reference.PAGES[MADE[name.removeprefix("docs/")]]()
+        place.write_text(led_on(text, path.parent, repository), encoding="utf-8")
+    (target / "api.md").write_text(reference.api_page(), encoding="utf-8")
+    (target / "results.schema.json").write_text(reference.schema_text(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    put_together(Path(sys.argv[1]) if sys.argv[1:] else ROOT / "build" / "pages", os.environ.get("GSBENCH_REPOSITORY"))

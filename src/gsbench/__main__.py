@@ -1,0 +1,5 @@
+"""Command line without its script: ``python -m gsbench`` is ``gsbench``."""
+
+from gsbench.cli import main
+
+main()
