@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Interval
@@ -11,15 +12,21 @@ from pydantic import NonNegativeInt, PositiveInt
 from gsbench.errors import InputError
 from gsbench.scene.sizes import MIN_SIZE, check_final_size
 from gsbench.scene.split import SECTORS, TEST_EVERY, SplitName, SplitRule
-from gsbench.settings import MISSING, FolderName, PathName, check_settings
+from gsbench.settings import MISSING, FolderName, PathName, check_settings, is_folder_name
 
 Behind = Literal["black", "white"]
 MAX_SIZE = 16_384  # px, of a picture of the courtyard
 
 
+def folder_name(path: str | None) -> str:
+    """The name of the scene in the folder ``path``; ``scene`` where that cannot name a folder of results."""
+    name = Path(path or "").expanduser().absolute().name
+    return name if is_folder_name(name) else "scene"
+
+
 @dataclass
 class SceneConfig:
-    name: FolderName = MISSING
+    name: FolderName | None = MISSING  # null: that of the folder `path`
     kind: Literal["colmap", "photos", "transforms", "courtyard"] = MISSING
     path: PathName | None = None  # folder of the capture
     images: PathName | None = None  # image folder below path; null: images
@@ -47,6 +54,8 @@ class SceneConfig:
     seed: Annotated[int, Interval(ge=0, le=2**31 - 1)] = 0
 
     def __post_init__(self) -> None:
+        if self.name is None:
+            self.name = folder_name(self.path)
         check_settings(self, "scene")
         if self.kind != "courtyard" and not self.path:
             raise InputError("scene.path is not set: say where the capture lies, for example scene.path=/my/photos")

@@ -44,7 +44,7 @@ class CaptureSource:
     """
 
     def __init__(self, options: SceneConfig) -> None:
-        self.options = options
+        self.options, self.name = options, str(options.name)
         self._captures: dict[Path | None, Capture] = {}
 
     @cached_property
@@ -68,15 +68,15 @@ class CaptureSource:
         selection: dict[str, Any] = {"max_images": options.max_images, "split": options.split_rule}
         if options.kind == "courtyard":
             assert made is not None
-            return read_colmap(options.name, made, exact_poses=True, **selection)
+            return read_colmap(self.name, made, exact_poses=True, **selection)
         path, selection["masks"] = str(options.path), options.masks
         if options.kind == "transforms":
             assert made is not None
-            capture = read_transforms(options.name, path, self._transforms, made / SPARSE_FOLDERS[0], **selection)
+            capture = read_transforms(self.name, path, self._transforms, made / SPARSE_FOLDERS[0], **selection)
         elif options.kind == "photos":
-            capture = read_photos(options.name, path, images=options.images, **selection)
+            capture = read_photos(self.name, path, images=options.images, **selection)
         else:
-            capture = read_colmap(options.name, path, images=options.images, sparse=options.sparse, **selection)
+            capture = read_colmap(self.name, path, images=options.images, sparse=options.sparse, **selection)
         for name in capture.image_names:
             file = capture.images / name
             check_final_size(image_size(file), options.downscale, options.max_size, str(file))
@@ -84,7 +84,7 @@ class CaptureSource:
 
     @cached_property
     def _transforms(self) -> Transforms:
-        return read_transforms_files(existing_folder(self.options.name, str(self.options.path)))
+        return read_transforms_files(existing_folder(self.name, str(self.options.path)))
 
 
 def _courtyard_step(options: SceneConfig) -> Step:
