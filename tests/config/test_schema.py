@@ -62,7 +62,8 @@ def test_every_option_composes(group: str, option: str) -> None:
     extra += ["densify=none"] if (group, option) == ("train", "none") else []
     extra += needs(option) if group == "densify" else []
     values = composed(f"{group}={option}", *extra)
-    assert values[group]["name"] == {"external/program": "external"}.get(option, option.rpartition("/")[2])
+    own = {"external/program": "external", **dict.fromkeys(("photos", "colmap", "transforms"), "capture")}
+    assert values[group]["name"] == own.get(option, option.rpartition("/")[2])
 
 
 @pytest.mark.parametrize("option", options("densify"))

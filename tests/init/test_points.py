@@ -129,11 +129,18 @@ def bad_ply(path: Path) -> None:
     path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n2\n3\n")
 
 
+def cut_header(path: Path) -> None:
+    """Write a file whose header ends within its dictionary, where numpy raises what Python's tokenizer does."""
+    header = b"{'descr': '<f8', 'shape': ("
+    path.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+
+
 @pytest.mark.parametrize(
     ("name", "make", "message"),
     [
         ("a.ply", bad_ply, "no property y, z"),
         ("a.ply", lambda path: path.write_bytes(b"no cloud"), "not a readable file of points"),
+        ("a.npy", cut_header, "not a readable file of points"),
         ("a.npy", lambda path: np.save(path, XYZ[:, :2]), "3 or 6 columns"),
         ("a.npy", lambda path: np.save(path, XYZ[:0]), "holds no point"),
         ("a.npy", lambda path: np.save(path, np.where(XYZ > 1.9, np.nan, XYZ)), "no finite numbers"),

@@ -133,7 +133,9 @@ def test_above_for_cameras_that_look_down():
     np.testing.assert_allclose(axes[2], [0, 0, 1], atol=1e-9)
 
 
-def test_picture_shows_points_in_their_colours(tmp_path: Path):
+def test_picture_shows_points_in_their_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "matplotlibrc").write_text("text.usetex: true\n")  # would run LaTeX, were it read
+    monkeypatch.chdir(tmp_path)
     draw_cloud(model_of(CENTERS), tmp_path / "cloud.png", "hand-made")
     pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB")).reshape(-1, 3)
     assert (np.abs(pixels - [10, 20, 30]).max(axis=1) < 8).any()

@@ -115,6 +115,12 @@ def test_a_folder_goes_by_its_own_name_and_a_linked_one_by_the_link(photos: Path
     assert list_images(photos) == ["c.png", "far/b.png", "z/a.png"]
 
 
+def test_photographs_that_cannot_be_read_are_counted(photos: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (photos / "d.HEIC").touch()
+    assert list_images(photos) == ["a.png", "b.png", "c.png"]
+    assert f"{photos}: 1 HEIC file is not read" in caplog.text
+
+
 def test_a_dangling_link_is_named(photos: Path, tmp_path: Path) -> None:
     (photos / "d.png").symlink_to("nowhere.png")
     with pytest.raises(InputError, match=r"d\.png"):

@@ -11,7 +11,8 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.scene.names import match_names, select_images, split_names
-from gsbench.scene.readers import list_images, read_colmap, read_photos
+from gsbench.scene.options import SceneConfig
+from gsbench.scene.readers import list_images, missing_model, read_colmap, read_photos
 from gsbench.scene.split import SplitRule
 
 
@@ -151,3 +152,9 @@ def test_truncated_model_is_one_clear_line(make_scene, file: str, keep: float):
     with pytest.raises(InputError, match=rf"{file}\.bin: .*(truncated|too few)") as caught:
         read_colmap("toy", root)
     assert "\n" not in str(caught.value)
+
+
+def test_a_scene_is_called_after_its_folder_and_a_missing_model_is_named(tmp_path: Path) -> None:
+    assert SceneConfig(name=None, kind="photos", path=str(tmp_path / "my fern")).name == "my fern"
+    assert SceneConfig(name=None, kind="photos", path="/").name == "scene"
+    assert missing_model("fern", tmp_path, None).startswith(f"scene fern: {tmp_path}: no COLMAP model in")

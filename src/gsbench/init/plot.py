@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+from math import floor, log10
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from PIL import Image, ImageDraw
 
 from gsbench.init.colmap.alignment import Array
 from gsbench.scene.colmap import points_of
 
-SIDE_INCHES = 8.0
-DPI = 120
+if TYPE_CHECKING:
+    import pycolmap
+
+SIDE, MARGIN = 960, 60  # px
 MAX_POINTS = 200_000  # drawn; more would only hide each other
 VISIBLE_SHARE = 0.98  # of the points; stray ones far off must not shrink the rest to a dot
 FLATNESS = 0.5  # third over second singular value of the camera centres: below it they lie in a plane
 ROUND = 0.05  # second over first: below it they lie on a line
 VIEW_LINE = 0.06  # length of the lines of sight, as a share of the picture's side
+CAMERA_COLOR = (214, 39, 40)
 
 
 def draw_cloud(model: pycolmap.Reconstruction, path: Path, title: str) -> None:
@@ -33,23 +36,29 @@ def draw_cloud(model: pycolmap.Reconstruction, path: Path, title: str) -> None:
     axes = view_from_above(centers, rotations, points)  # [3, 3]
     order = np.argsort(points @ axes[2], kind="stable")  # the highest are drawn last
     flat, flat_centers = points[order] @ axes[:2].T, centers @ axes[:2].T  # [P, 2], [V, 2]
-    sights = rotations[:, 2] @ axes[:2].T  # [V, 2] viewing directions
-
     low, high = _limits(flat, flat_centers)
-    figure = Figure(figsize=(SIDE_INCHES, SIDE_INCHES), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    plot = figure.add_subplot(facecolor="white")
-    size = float(np.clip(20_000 / max(len(flat), 1), 0.5, 6.0))
-    plot.scatter(flat[:, 0], flat[:, 1], s=size, c=colors[order] / 255.0, linewidths=0)
-    ends = flat_centers + VIEW_LINE * (high - low).max() * sights
-    plot.plot(*np.stack([flat_centers, ends], axis=2).transpose(1, 2, 0), color="#d62728", linewidth=0.8)
-    plot.scatter(flat_centers[:, 0], flat_centers[:, 1], s=14, color="#d62728", zorder=3)
-    plot.set_xlim(low[0], high[0])
-    plot.set_ylim(low[1], high[1])
-    plot.set_aspect("equal")
-    plot.set_xlabel("model units")
-    plot.set_title(title)
-    figure.savefig(path, format="png", metadata={"Software": None})
+    scale = (SIDE - 2 * MARGIN) / (high - low).max()  # px for a unit of the model
+
+    def pixels(places: Array) -> Array:
+        return SIDE / 2 + (places - (low + high) / 2) * scale * (1, -1)
+
+    canvas = np.full((SIDE, SIDE, 3), 255, dtype=np.uint8)
+    columns, rows = np.floor(pixels(flat)).astype(np.int64).T  # [P] each
+    size = 1 if len(flat) > 50_000 else 2 if len(flat) > 5_000 else 3  # px of a point
+    for dx, dy in np.ndindex(size, size):
+        inside = (columns + dx >= 0) & (columns + dx < SIDE) & (rows + dy >= 0) & (rows + dy < SIDE)
+        canvas[rows[inside] + dy, columns[inside] + dx] = colors[order][inside]
+    picture = Image.fromarray(canvas)
+    draw = ImageDraw.Draw(picture)
+    sights = flat_centers + VIEW_LINE * (high - low).max() * rotations[:, 2] @ axes[:2].T  # [V, 2]
+    for (x, y), (to_x, to_y) in zip(pixels(flat_centers), pixels(sights), strict=True):
+        draw.line((x, y, to_x, to_y), fill=CAMERA_COLOR, width=2)
+        draw.ellipse((x - 3, y - 3, x + 3, y + 3), fill=CAMERA_COLOR)
+    draw.text((MARGIN, 16), title, fill="black", font_size=18)
+    bar = 10.0 ** floor(log10((high - low).max() / 2))  # model units
+    draw.line((MARGIN, SIDE - 24, MARGIN + bar * scale, SIDE - 24), fill="black", width=3)
+    draw.text((MARGIN, SIDE - 48), f"{bar:g} model units", fill="black", font_size=16)
+    picture.save(path, format="PNG")
 
 
 def view_from_above(centers: Array, rotations: Array, points: Array) -> Array:

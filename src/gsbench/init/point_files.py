@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyData
 
 from gsbench.errors import InputError
 from gsbench.files import require_regular
 from gsbench.init.colmap.alignment import Array, Similarity
+from gsbench.parsing import one_line
 
 COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts")
@@ -35,8 +36,8 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
             points, colors = _columns(np.loadtxt(path, delimiter="," if suffix == ".csv" else None, ndmin=2))
         else:
             raise ValueError(f"known are .ply, .npy, {', '.join(TEXT_SUFFIXES)}")
-    except (OSError, KeyError, IndexError, ValueError, EOFError, MemoryError, PlyParseError) as error:
-        raise InputError(f"{path}: not a readable file of points ({error})") from error
+    except Exception as error:  # readers raise anything on a damaged file, numpy even what Python's tokenizer raises
+        raise InputError(f"{path}: not a readable file of points ({one_line(str(error))})") from error
     if len(points) == 0:
         raise InputError(f"{path}: holds no point")
     bad = ~np.isfinite(points).all(axis=1)

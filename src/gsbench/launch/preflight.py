@@ -17,15 +17,19 @@ from gsbench.system.install import install_command
 
 
 def missing_folders(trials: Sequence[Composed]) -> list[str]:
-    """A line for each folder of photographs or weights that the trials name and that is not there, and the mend."""
+    """A line for each folder of photographs, model or weights that trials name and that is not there, and the mend."""
     from gsbench.datasets.catalog import how_to_get
-    from gsbench.scene.readers import missing_folder
+    from gsbench.scene.readers import missing_folder, missing_model
 
     given = [scene for scene in (trial.values["scene"] for trial in trials) if scene["kind"] != "courtyard"]
     scenes = {(scene["name"], scene["path"]) for scene in given}
     folders = [(name, Path(path).expanduser()) for name, path in sorted(scenes, key=str)]
     missing = [(name, folder) for name, folder in folders if not folder.is_dir()]
     lines = [missing_folder(name, folder) for name, folder in missing]
+    models = {(scene["name"], scene["path"], scene["sparse"]) for scene in given if scene["kind"] == "colmap"}
+    for name, path, sparse in sorted(models, key=str):
+        if (root := Path(path).expanduser()).is_dir() and (line := missing_model(name, root, sparse)):
+            lines.append(line)
     return lines + ([how_to_get(missing)] if missing else []) + missing_weights(trials)
 
 

@@ -21,10 +21,11 @@ from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, check_picture_names, mat
 from gsbench.scene.split import EVERY_NTH, TEST_LIST, TRAIN_LIST, SplitRule
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.types import Capture
-from gsbench.words import some_of
+from gsbench.words import counted, some_of
 
 log = logging.getLogger(__name__)
 
+HEIC_SUFFIXES = frozenset({".heic", ".heif"})  # of telephones; neither Pillow nor COLMAP reads them
 SPARSE_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 
 
@@ -147,12 +148,22 @@ def missing_folder(name: str, root: Path) -> str:
     return f"scene {name}: the folder {root} {'is a file' if root.exists() else 'does not exist'}"
 
 
+def missing_model(name: str, root: Path, sparse: str | None) -> str:
+    """The reason why the folder ``root`` of the scene ``name`` has no COLMAP model, "" where it has one."""
+    try:
+        _find_sparse(root, sparse)
+    except InputError as error:
+        return f"scene {name}: {error}"
+    return ""
+
+
 def list_images(folder: Path) -> list[str]:
     """The sorted image files in a folder and its sub-folders, relative, with "/" as separator; hidden ones left out.
 
     Links to folders are followed, and no folder is read twice.
     """
     names: list[str] = []
+    unread = 0
     waiting, links, seen = [folder], list[Path](), set[tuple[int, int]]()
     while waiting or links:
         parent = waiting.pop() if waiting else links.pop(0)  # a folder goes by its own name rather than by a link's
@@ -166,6 +177,12 @@ def list_images(folder: Path) -> list[str]:
                 (links if entry.is_symlink() else waiting).append(Path(entry.path))
             elif Path(entry.name).suffix.lower() in IMAGE_SUFFIXES:
                 names.append(Path(entry.path).relative_to(folder).as_posix())
+            elif Path(entry.name).suffix.lower() in HEIC_SUFFIXES:
+                unread += 1
+    if unread:
+        log.warning(
+            "%s: %s not read: save as JPEG", folder, f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}"
+        )
     return sorted(names)
 
 
@@ -306,4 +323,4 @@ def _find_sparse(root: Path, sparse: str | None) -> Path:
 
 def _require_enough(count: int, folder: Path, which: str) -> None:
     if count < MIN_IMAGES:
-        raise InputError(f"{folder}: {count} images {which}, but at least {MIN_IMAGES} are needed")
+        raise InputError(f"{folder}: {counted(count, 'image')} {which}, but at least {MIN_IMAGES} are needed")

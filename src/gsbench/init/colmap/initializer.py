@@ -14,6 +14,7 @@ from gsbench.init.colmap.options import ColmapOptions
 from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
+from gsbench.words import counted
 
 logger = logging.getLogger(__name__)
 
@@ -68,7 +69,8 @@ class ColmapInitializer(ColmapOptions, Initializer):
         """Raise ``InputError``, before any work, where this capture cannot be initialised like this."""
         if len(capture.image_names) < MIN_IMAGES:
             raise InputError(
-                f"scene {capture.name} has {len(capture.image_names)} images: {self.name} needs at least {MIN_IMAGES}"
+                f"scene {capture.name} has {counted(len(capture.image_names), 'image')}: {self.name} needs at least "
+                f"{MIN_IMAGES}"
             )
         if reference is None and self.needs_reference(capture):
             raise InputError(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -62,7 +61,7 @@ class FeatureStore:
                 width, height, file_width, file_height = (int(side) for side in data["sizes"])
                 arrays = data["keypoints"], data["descriptors"], data["scores"]
                 return Features(*arrays, (width, height), (file_width, file_height))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        except Exception:  # noqa: BLE001  numpy raises anything on a damaged file, which is then made anew
             return None
 
     def write_features(self, name: str, features: Features) -> None:
@@ -80,7 +79,7 @@ class FeatureStore:
         """The stored matches [M, 2] of a pair; None where there are none, or a damaged file."""
         try:
             matches = np.load(self.matches_path(first, second), allow_pickle=False)
-        except (OSError, ValueError, EOFError):
+        except Exception:  # noqa: BLE001  as above
             return None
         return matches if matches.ndim == 2 and matches.shape[1] == 2 else None
 
