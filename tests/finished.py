@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
-from gsbench.runs.trial_record import TrialRecord, results_text
+from gsbench.runs.trial_record import TrialRecord
 
 
 def record_of(values: dict[str, Any], **changes: Any) -> TrialRecord:
@@ -34,5 +35,5 @@ def write_results(folder: Path, values: dict[str, Any], **changes: Any) -> Trial
     """Write ``results.json`` alone, without a record of what the trial was made of."""
     record = record_of(values, **changes)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "results.json").write_text(results_text(record))
+    (folder / "results.json").write_text(json.dumps(record.to_json()))
     return record

@@ -27,7 +27,7 @@ from gsbench.runs.explain_cache import explain_steps
 from gsbench.runs.stages import EVALUATE, INIT, TRAIN
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.stopping import Stopped
 from gsbench.verbs import doctor, export, retry, ui
 from tests.finished import write_results
@@ -101,7 +101,7 @@ def test_hydra_shows_the_configuration(capfd: pytest.CaptureFixture[str]) -> Non
 def make_experiment(runs: Path) -> list[Path]:
     trials = compose_trials(["name=x", "densify=adc", "seed=0,1,2"], multirun=True)
     add_to_plan(trials)
-    folders = [TrialPaths.of(trial.values).folder for trial in trials]
+    folders = [TrialFolder.of(trial.values).path for trial in trials]
     folders[0].mkdir(parents=True)
     (folders[0] / "config.yaml").write_text(trials[0].yaml)
     write_results(folders[0], trials[0].values)
@@ -141,14 +141,14 @@ def test_retry_runs_the_unfinished_with_their_own_settings(
     assert cli.run(["retry", "x", "launch=local", "launch.parallel=3"]) == 0
     assert [(t.values["densify"]["name"], t.values["seed"]) for t in ran] == [("adc", 1), ("adc", 2)]
     assert {t.values["launch"]["parallel"] for t in ran} == {3}
-    assert {TrialPaths.of(t.values).runs for t in ran} == {runs}
+    assert {TrialFolder.of(t.values).runs for t in ran} == {runs}
 
 
 def test_retry_of_a_trial_without_a_plan_takes_its_own_configuration(runs: Path) -> None:
     folders = make_experiment(runs)
     (runs / "x" / "plan.json").unlink()
     again = retry.recompose(folders[1], None, runs, [], str(runs.parent))
-    assert TrialPaths.of(again.values).folder == folders[1]
+    assert TrialFolder.of(again.values).path == folders[1]
     assert again.values == compose_one(["name=x", "densify=adc", "seed=1"]).values
 
 
@@ -176,7 +176,7 @@ def test_a_second_retry_without_a_plan_runs_the_same_trial(
 def finished_trial(runs: Path, gaussians: Gaussians) -> Path:
     """A complete trial as the readers of results see it, with its model in the store."""
     values = compose_one(["name=x", "densify=adc"]).values
-    folder = TrialPaths.of(values).folder
+    folder = TrialFolder.of(values).path
     folder.mkdir(parents=True)
     write_ply(gaussians, folder / "point_cloud.ply")
     (runs / "store" / "init" / "abc" / "sparse" / "0").mkdir(parents=True)

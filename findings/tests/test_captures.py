@@ -108,8 +108,8 @@ def test_a_capture_without_a_model_gets_the_estimated_one(tmp_path: Path, monkey
         (trial,) = compose_trials(command[1:])
         assert trial.values["init"]["name"] == "sfm"
         assert Path(trial.values["scene"]["path"]) == tmp_path / "data" / "monstree"
-        trial.paths.folder.mkdir(parents=True)
-        (trial.paths.folder / "here").touch()
+        trial.folder.mkdir(parents=True)
+        (trial.folder / "here").touch()
 
     monkeypatch.setattr(captures.subprocess, "run", answer)
     captures.prepare(tmp_path / "data", tmp_path / "out")

@@ -13,7 +13,7 @@ from gsbench.analysis.per_view import read_views
 from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
 from gsbench.runs.experiments import list_experiments
-from gsbench.runs.rows import read_curve
+from gsbench.runs.rows import read_rows
 from tests.analysis.synthetic import Plan, write_runs
 
 
@@ -114,8 +114,8 @@ def test_views_must_average_to_the_metrics_of_their_trial(tmp_path: Path) -> Non
 
 def test_json_lines_end_at_a_damaged_line(tmp_path: Path) -> None:
     (tmp_path / "m.jsonl").write_text('{"step": 1}\n{"step": 2}\n{"st')
-    assert read_curve(tmp_path / "m.jsonl") == [{"step": 1}, {"step": 2}]
-    assert read_curve(tmp_path / "absent.jsonl") == []
+    assert read_rows(tmp_path / "m.jsonl") == [{"step": 1}, {"step": 2}]
+    assert read_rows(tmp_path / "absent.jsonl") == []
 
 
 def test_reading_and_tabulating_load_no_torch() -> None:

@@ -12,7 +12,7 @@ from gsbench.app.hydra_app import compose_trials
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.plan import add_to_plan, read_plan
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 from tests.finished import write_results
 
 # Trials of `threshold` as they were named when it was one grid with a threshold of a million in place of the baseline.
@@ -50,7 +50,7 @@ def test_words_are_shared_own_or_given() -> None:
 
 def test_thresholds_beside_a_baseline_that_knows_none() -> None:
     trials = compose_trials(["+experiment=threshold"])
-    places = ["/".join(TrialPaths.of(trial.values).folder.parts[-2:]) for trial in trials]
+    places = ["/".join(TrialFolder.of(trial.values).path.parts[-2:]) for trial in trials]
     assert len(places) == len(set(places)) == 21
     assert set(places) > KNOWN  # results from before are found again
     assert [place.split("/")[0] for place in places[:4]] == ["sfm-adc"] * 3 + ["sfm-volumetric-0.001"]
@@ -105,7 +105,7 @@ def test_plan_dry_run_and_retry_see_one_experiment(
     assert "2 trials: 2 missing" in capsys.readouterr().out
     trials = compose_trials(words)
     add_to_plan(trials)
-    first, second = (TrialPaths.of(trial.values).folder for trial in trials)
+    first, second = (TrialFolder.of(trial.values).path for trial in trials)
     assert [trial.folder for trial in read_plan(runs / "threshold")] == [first, second]
     first.mkdir(parents=True)
     (first / "config.yaml").write_text(trials[0].yaml)
@@ -113,7 +113,7 @@ def test_plan_dry_run_and_retry_see_one_experiment(
     ran: list[Path] = []
 
     def run_trials(again: list[object]) -> int:
-        ran.extend(TrialPaths.of(trial.values).folder for trial in again)  # type: ignore[attr-defined]
+        ran.extend(TrialFolder.of(trial.values).path for trial in again)  # type: ignore[attr-defined]
         return 0
 
     monkeypatch.setattr("gsbench.app.command.run_trials", run_trials)

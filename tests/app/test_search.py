@@ -13,9 +13,7 @@ from gsbench.analysis.report.search_charts import search_part
 from gsbench.errors import GsbenchError
 from gsbench.launch import serial
 from gsbench.launch.outcome import Outcome, outcome_of_error
-from gsbench.runs.finished import Done, NotDone
-from gsbench.runs.inputs import read_results
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 from tests.finished import write_results
 
 optuna = pytest.importorskip("optuna", reason="needs Optuna (extra search)")
@@ -43,7 +41,7 @@ class Trials:
         self.stops: set[int] = set()
 
     def run_one(self, trial: Any, wait: bool) -> Outcome:
-        folder = TrialPaths.of(trial.values).folder
+        folder = TrialFolder.of(trial.values).path
         number = len(self.trained)
         threshold, seed = trial.values["densify"]["volume_threshold"], trial.values["seed"]
         self.trained.append((threshold, seed))
@@ -64,16 +62,15 @@ def trials(monkeypatch: pytest.MonkeyPatch) -> Trials:
     monkeypatch.setattr(serial, "run_one", stand_in.run_one)
 
     # What a stand-in leaves has no record of what it was made of; how finished trials are known is tested elsewhere.
-    def found(values: dict[str, Any], *rest: Any) -> Done | NotDone:
-        path = results_of(values)
-        return Done(read_results(path.parent)[0]) if path.exists() else NotDone("unfinished", "")
+    def why_not_done(self: TrialFolder, *rest: Any) -> str:
+        return "" if self.sound_record() else "it is not there"
 
-    monkeypatch.setattr("gsbench.launch.batch.find_finished", found)
+    monkeypatch.setattr(TrialFolder, "why_not_done", why_not_done)
     return stand_in
 
 
 def results_of(values: dict[str, Any]) -> Path:
-    return TrialPaths.of(values).folder / "results.json"
+    return TrialFolder.of(values).path / "results.json"
 
 
 def points(runs: Path) -> list[dict[str, Any]]:

@@ -54,7 +54,7 @@ class Fake:
             if not results.exists():
                 views = {"psnr": self.psnr(arm, seed) + np.arange(3.0)}
                 data = trial_data(Plan(experiment="stop"), "courtyard", "random", arm, seed, views)
-                write_trial(trial.paths.runs, data, views, trial.folder.name.partition("-")[0])
+                write_trial(trial.files.runs, data, views, trial.folder.name.partition("-")[0])
                 (trial.folder / CONFIG).write_text(trial.yaml)
             outcomes.append(outcome_of_results(trial.folder, record_from(results.read_bytes(), results)))
         return outcomes

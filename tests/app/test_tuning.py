@@ -75,7 +75,7 @@ class Fake:
             error = abs(np.log(values["densify"][KEYS[arm]] / BEST[arm])) if arm in KEYS else 0.0
             views = {"psnr": 26.0 - error + 0.01 * values["seed"] + np.arange(3.0)}
             data = trial_data(Plan(experiment=values["name"]), "courtyard", "random", arm, values["seed"], views)
-            write_trial(trial.paths.runs, data, views, trial.folder.name.partition("-")[0])
+            write_trial(trial.files.runs, data, views, trial.folder.name.partition("-")[0])
             (trial.folder / CONFIG).write_text(trial.yaml)
         return outcome_of_results(trial.folder, record_from(results.read_bytes(), results))
 

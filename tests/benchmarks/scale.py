@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.runs.hashing import config_hash, sha256_of
-from gsbench.runs.trial_files import TrialPaths
-from gsbench.runs.trial_record import results_text
+from gsbench.runs.trial_folder import TrialFolder
 from tests.finished import record_of
 
 NAME = "scale"
@@ -44,8 +43,8 @@ def values_of(runs: Path, scene: int, arm: int, seed: int) -> dict[str, Any]:
 
 
 def write_trial(values: dict[str, Any], psnr: float) -> None:
-    """The files of a finished trial, as `write_finished` of `gsbench.runs.inputs` leaves them."""
-    folder = TrialPaths.of(values).folder
+    """The files of a finished trial, as `gsbench.runs.trial_folder` leaves them."""
+    folder = TrialFolder.of(values).path
     folder.mkdir(parents=True)
     views = [psnr + k / 10 for k in range(-3, 4)]
     per_view = "view,psnr\n" + "".join(f"v{k},{value!r}\n" for k, value in enumerate(views))
@@ -59,19 +58,18 @@ def write_trial(values: dict[str, Any], psnr: float) -> None:
         init_report={f"number_{k}": k / 3 for k in range(40)},
         machine={"cpu": "c", "architecture": "a", "kernels": "k", "torch": "t", "device": "cpu"},
     )
-    text = results_text(record)
     published = {f"renders/{k:04d}.png": (18000 + k, 1795342870763741765 + k) for k in range(30)}
-    digests = {"results.json": text, "per_view.csv": per_view, "metrics.jsonl": curve}
-    inputs = {
-        "version": 1,
+    files = {"per_view.csv": per_view, "metrics.jsonl": curve}
+    made_of = {
         "config": config_hash(values),
         "results": sha256_of(record.to_json()),
-        "digests": {name: hashlib.sha256(content.encode()).hexdigest() for name, content in digests.items()},
+        "digests": {name: hashlib.sha256(content.encode()).hexdigest() for name, content in files.items()},
         "stages": {}, "pycolmap": None, "sources": {}, "folders": {}, "entries": {},
         "published": published,
         "settings": values,
     }  # fmt: skip
-    for name, content in (digests | {"inputs.json": json.dumps(inputs, indent=1)}).items():
+    results = json.dumps(record.to_json() | {"made_of": made_of}, indent=1)
+    for name, content in (files | {"results.json": results}).items():
         (folder / name).write_text(content)
 
 

@@ -33,7 +33,7 @@ from gsbench.raster.cpu.workspace import ShardRunner
 from gsbench.runs.layout import POINT_CLOUD, STORE
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.store import Store
-from gsbench.runs.trial_files import read_config
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.types import Scene, View
 from gsbench.train.trainer import Trainer
 
@@ -45,7 +45,7 @@ NAMES = {"<lambda>": "fill", "step": "Adam of harmonics"}  # of the functions th
 
 def trained(folder: Path, width: int) -> tuple[Gaussians, Scene]:
     """A trial's model, and its first training view, ``width`` px wide, with noise for a photograph."""
-    values = read_config(folder)
+    values = TrialFolder(folder).configuration()
     steps = TrialSteps(Parts(values), Store(Path(values["runs"]) / STORE))
     next(step for step in steps.steps() if step.stage == TRAIN)  # whose views are known by then
     camera = steps.views.scene.train[0].camera

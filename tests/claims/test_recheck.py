@@ -22,7 +22,7 @@ from gsbench.config.compose import Composed
 from gsbench.errors import InputError
 from gsbench.launch.declare import declare_plan
 from gsbench.runs.layout import CONFIG, DECLARED
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 from tests.claims.test_archive import members
 from tests.claims.test_sweep import FakeRunner, content, ready
 
@@ -40,7 +40,7 @@ class Runner(FakeRunner):
     def __call__(self, trials: Sequence[Composed]) -> None:
         super().__call__(trials)
         for trial in trials:
-            folder, scene = TrialPaths.of(trial.values).folder, trial.values["scene"]["name"]
+            folder, scene = TrialFolder.of(trial.values).path, trial.values["scene"]["name"]
             made = folder.parents[2] / "courtyard" / folder.parent.name / folder.name
             if made != folder:
                 folder.parent.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,7 @@ from gsbench.config.compose import Composed
 from gsbench.config.sweep_jobs import with_seed
 from gsbench.errors import InputError
 from gsbench.runs.declaration import DeclaredPlan, read_plans
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs.check import describe
 from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.claims.test_file import GOOD, changed, without
@@ -50,20 +50,20 @@ class FakeRunner:
 
         self.batches.append(len(trials))
         for trial in trials:
-            paths, values = TrialPaths.of(trial.values), trial.values
+            folder, values = TrialFolder.of(trial.values), trial.values
             if values["seed"] == self.fails:
-                paths.folder.mkdir(parents=True)
-                (paths.folder / "failed.json").write_text('{"error": "InputError", "message": "no room\\nat all"}')
+                folder.path.mkdir(parents=True)
+                (folder.path / "failed.json").write_text('{"error": "InputError", "message": "no room\\nat all"}')
                 continue
             arm = values["densify"]["name"]
             rng = np.random.default_rng([values["seed"], arm == "adc"])
             views = {"psnr": 26 + EFFECT * (arm != "adc") + rng.normal(0, self.noise) + np.zeros(3)}
             data = trial_data(Plan(experiment="check_it"), "courtyard", "sfm", arm, values["seed"], views)
-            write_trial(paths.runs, data, views, paths.folder.name.partition("-")[0])
+            write_trial(folder.runs, data, views, folder.path.name.partition("-")[0])
 
 
 def ready(trial: Composed) -> bool:
-    return (TrialPaths.of(trial.values).folder / "results.json").exists()
+    return (TrialFolder.of(trial.values).path / "results.json").exists()
 
 
 def test_a_clear_effect_ends_at_the_first_look_and_again_nothing_is_run(tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_another_seed_is_another_folder_and_the_same_settings(tmp_path: Path) ->
     other = with_seed(trial, 7)
     assert yaml.safe_load(other.yaml)["seed"] == other.values["seed"] == 7
     assert yaml.safe_load(other.yaml) | {"seed": 0} == yaml.safe_load(trial.yaml)
-    assert TrialPaths.of(other.values).folder.name == TrialPaths.of(trial.values).folder.name.replace("seed0", "seed7")
+    assert TrialFolder.of(other.values).path.name == TrialFolder.of(trial.values).path.name.replace("seed0", "seed7")
     assert "seed=7" in other.overrides
 
 

@@ -17,7 +17,7 @@ from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
 from gsbench.launch.plan import add_to_plan
 from gsbench.pipeline.components import build
-from gsbench.runs.trial_files import read_config
+from gsbench.runs.trial_folder import TrialFolder
 from tests.strange import no_trial
 from tests.strange import place as place
 
@@ -79,7 +79,7 @@ def test_explain_runs_nothing_of_a_strange_folder_unasked(case: str, capsys: pyt
 def test_a_configuration_that_was_read_allows_nothing() -> None:
     folder = strange_runs({})
     assert "bomb" in (folder / "config.yaml").read_text()
-    assert read_config(folder)["allow_targets"] == []
+    assert TrialFolder(folder).configuration()["allow_targets"] == []
 
 
 def test_retry_does_what_it_is_allowed_to(monkeypatch: pytest.MonkeyPatch) -> None:

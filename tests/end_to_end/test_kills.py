@@ -170,7 +170,7 @@ def test_a_killed_tuning_goes_on_and_its_values_are_trained(
     for arm, tuned in record["arms"].items():
         assert [point["state"] for point in tuned["search"]["points"]] == ["done", "done"]
         best = max(tuned["search"]["points"], key=lambda point: point["value"])
-        (results,) = home.glob(f"courtyard/{arm}/*/inputs.json")
+        (results,) = home.glob(f"courtyard/{arm}/*/results.json")
         text = results.read_text()
         assert all(str(value) in text for value in best["settings"].values())
         assert views(home / "courtyard" / arm)

@@ -36,9 +36,7 @@ from gsbench.launch.experience import Experience
 from gsbench.launch.plan import read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.runs.declaration import read_declarations, read_plans
-from gsbench.runs.finished import find_finished
-from gsbench.runs.inputs import write_finished
-from gsbench.runs.trial_files import TrialPaths, read_config, stage_and_step
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking.record import TrackedFiles
 from gsbench.tracking.state import read_state
 from gsbench.verbs.status import lines_of
@@ -48,7 +46,7 @@ from tests.fuzz.corrupt import corrupt
 SLOW_SECONDS = 20.0
 DONE, FAILED, EXPERIMENT = "sfm-adc", "sfm-volumetric", "exp"
 NAMES = (
-    "results.json", "inputs.json", "config.yaml", "plan.json", "declared.jsonl", "metrics.jsonl", "events.jsonl",
+    "results.json", "config.yaml", "plan.json", "declared.jsonl", "metrics.jsonl", "events.jsonl",
     "volume_histograms.jsonl", "per_view.csv", "failed.json", "building.json", ".submitted.json", "search.json",
     "tuning.json", "mlflow.json", ".lock.holder",
 )  # fmt: skip
@@ -78,7 +76,7 @@ def values_of(runs: Path, densify: str, seed: int, threshold: float) -> dict[str
 def write_trial(runs: Path, densify: str, seed: int, threshold: float = 0.03) -> Path:
     """A trial with every file that its readers look for."""
     values = values_of(runs, densify, seed, threshold)
-    folder = TrialPaths.of(values).folder
+    folder = TrialFolder.of(values).path
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text(json.dumps(values))
     steps = range(10, 101, 10)
@@ -103,7 +101,7 @@ def write_trial(runs: Path, densify: str, seed: int, threshold: float = 0.03) ->
         versions={"gsbench": "0"},
         machine={"cpu": "c", "kernels": "k", "torch": "t", "device": "cpu"},
     )
-    write_finished(folder, values, record)
+    TrialFolder(folder).write_finished(values, record)
     return folder
 
 
@@ -112,7 +110,9 @@ def write_original(runs: Path) -> dict[str, Path]:
     home = runs / EXPERIMENT
     done, *_ = [write_trial(runs, name, seed) for name in ("adc", "volumetric") for seed in (0, 1)]
     variant = write_trial(runs, "volumetric", 0, 0.5)
-    (variant / "inputs.json").unlink()  # so that its settings are read from the YAML
+    content = json.loads((variant / "results.json").read_text())
+    del content["made_of"]  # so that its settings are read from the YAML
+    (variant / "results.json").write_text(json.dumps(content))
     failed = write_trial(runs, "volumetric", 1, 0.5)
     (failed / "results.json").unlink()
     (failed / "failed.json").write_text(json.dumps({"error": "E", "message": "m", "time": 1.0, "seed": 1}))
@@ -244,16 +244,16 @@ def look(runs: Path, places: dict[str, Path]) -> int:
     attempt(lambda: (read_declarations(home), read_plans(home)))
     attempt(lambda: search_part(home))
     for folder in {path.parent for path in places.values()} - {home}:
-        attempt(lambda folder=folder: read_config(folder))  # type: ignore[misc]
-        attempt(lambda folder=folder: stage_and_step(folder))  # type: ignore[misc]
+        attempt(lambda folder=folder: TrialFolder(folder).configuration())  # type: ignore[misc]
+        attempt(lambda folder=folder: TrialFolder(folder).stage_and_step())  # type: ignore[misc]
         attempt(lambda folder=folder: read_state(folder / "mlflow.json"))  # type: ignore[misc]
         attempt(lambda folder=folder: _mirror(runs, folder))  # type: ignore[misc]
-    attempt(lambda: find_finished(values_of(runs, "adc", 0, 0.03)))
+    attempt(lambda: TrialFolder.of(v := values_of(runs, "adc", 0, 0.03)).why_not_done(v))
     return refused
 
 
 def _mirror(runs: Path, folder: Path) -> None:
-    record = TrackedFiles(runs, folder, read_config(folder))
+    record = TrackedFiles(runs, folder, TrialFolder(folder).configuration())
     assert record.params()
     assert record.tags()
     record.sweep()

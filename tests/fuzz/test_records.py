@@ -48,7 +48,7 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize("damage", [*DAMAGES, "fifo", "folder"])
-@pytest.mark.parametrize("name", ["results.json", "inputs.json", "plan.json", "config.yaml", "metrics.jsonl"])
+@pytest.mark.parametrize("name", ["results.json", "plan.json", "config.yaml", "metrics.jsonl"])
 def test_the_verbs_say_one_line_for_a_damaged_file(
     name: str,
     damage: str,
@@ -71,7 +71,7 @@ def test_the_verbs_say_one_line_for_a_damaged_file(
             assert name == "metrics.jsonl" or name == "plan.json" or any(name in line for line in said)
         if argv == ["status", EXPERIMENT]:
             assert name != "plan.json" or any(name in line for line in said)
-            assert ("damaged" in captured.out) == (name in ("results.json", "inputs.json"))
+            assert ("damaged" in captured.out) == (name == "results.json")
     assert cli.run(["explain", f"{EXPERIMENT}:courtyard:psnr:adc"]) == 0
 
 

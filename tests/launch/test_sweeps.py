@@ -31,17 +31,16 @@ from gsbench.launch.outcome import Outcome
 from gsbench.launch.plan import add_to_plan, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.launch.trial import Trial
-from gsbench.runs import finished
-from gsbench.runs.finished import Done, NotDone, find_finished
+from gsbench.runs import made_of
 from gsbench.runs.hashing import config_hash
-from gsbench.runs.inputs import write_finished
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
-from gsbench.runs.trial_files import TrialPaths, state_of
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.locks import BusyError, hold, is_held
 from tests.finished import record_of
+from tests.runs.test_trial_folder import edit
 
 
 @pytest.fixture(autouse=True)
@@ -61,6 +60,10 @@ def trial_values(*words: str) -> dict[str, Any]:
     return _composed(*words).values | {"runs": os.environ["GSBENCH_RUNS"]}
 
 
+def why_not_done(values: dict[str, Any], unavailable: Sequence[str] = ()) -> str:
+    return TrialFolder.of(values).why_not_done(values, lambda options: unavailable)
+
+
 def finish(
     values: dict[str, Any],
     seconds: float = 100.0,
@@ -68,17 +71,17 @@ def finish(
     awaited: Sequence[str] = (),
 ) -> TrialRecord:
     """Make the files of a finished trial, with one stage result in the store and one source file."""
-    paths = TrialPaths.of(values)
-    paths.folder.mkdir(parents=True, exist_ok=True)
-    source = paths.runs.parent / "photos" / "a.jpg"
+    folder = TrialFolder.of(values)
+    folder.path.mkdir(parents=True, exist_ok=True)
+    source = folder.runs.parent / "photos" / "a.jpg"
     source.parent.mkdir(exist_ok=True)
     if not source.exists():
         source.write_bytes(b"photo")
-    entry = Store(paths.runs / "store").get(
+    entry = Store(folder.runs / "store").get(
         Step(TRAIN, {"x": 1}, lambda folder: (folder / "model").write_text("m"))  # type: ignore[arg-type,return-value]
     )
-    (paths.folder / "table.csv").write_text("a,b")
-    (paths.folder / "config.yaml").write_text("")
+    (folder.path / "table.csv").write_text("a,b")
+    (folder.path / "config.yaml").write_text("")
     results = record_of(
         values,
         unavailable=unavailable or {},
@@ -86,7 +89,7 @@ def finish(
         hashes={"config": config_hash(values)},
         awaited=list(awaited),
     )
-    write_finished(paths.folder, values, results, [source], {"train": entry.path}, [paths.folder / "table.csv"])
+    folder.write_finished(values, results, [source], {"train": entry.path}, [folder.path / "table.csv"])
     return results
 
 
@@ -128,7 +131,7 @@ def test_paper_experiments_have_the_papers_trials_and_share_them() -> None:
     table1, table2 = experiment("table1"), experiment("table2")
     assert (len(table1), len(table2)) == (78, 144)
     leaves = [
-        {(t.values["scene"]["name"], TrialPaths.of(t.values).folder.name) for t in table} for table in (table1, table2)
+        {(t.values["scene"]["name"], TrialFolder.of(t.values).path.name) for t in table} for table in (table1, table2)
     ]
     assert [len(leaf) for leaf in leaves] == [78, 144]
     assert len(leaves[0] | leaves[1]) == 150
@@ -253,39 +256,40 @@ def test_own_and_allowed_targets_pass() -> None:
 
 def test_finished_trial_is_recognised_until_something_changes(runs: Path) -> None:
     values = trial_values()
-    assert isinstance(find_finished(values), NotDone)
+    assert why_not_done(values) == "results.json is not there, or not complete"
     results = finish(values)
-    assert find_finished(values) == Done(results)
-    assert state_of(TrialPaths.of(values).folder) == "done"
-    assert isinstance(find_finished(trial_values("seed=1")), NotDone)
+    assert why_not_done(values) == ""
+    assert TrialFolder.of(values).record() == results
+    assert TrialFolder.of(values).state() == "done"
+    assert why_not_done(trial_values("seed=1"))
 
 
 @pytest.mark.parametrize(
-    ("change", "cause", "names"),
+    ("change", "names"),
     [
-        ("photo", "file", "photos/a.jpg has changed"),
-        ("photo gone", "file", "photos/a.jpg cannot be read (No such file"),
-        ("new photo", "file", "files have come to .*photos, or gone"),
-        ("published", "file", "table.csv cannot be read"),
-        ("store", "store", r"stage train in the store is damaged or gone \(model differs"),
-        ("store gone", "store", "stage train .*manifest.json is missing"),
-        ("stage", "stage", "version 1 of the stage train, which is now at 2"),
-        ("package", "package", "made with pycolmap 0.1, and .* is installed"),
-        ("results", "record", "results.json is not as it was written"),
-        ("no inputs", "record", "inputs.json is not there"),
-        ("an input less", "record", "inputs.json is damaged: it lacks 'entries'"),
-        ("inputs of another kind", "record", "inputs.json is damaged: sources is "),
-        ("weights", "metric", "it lacks lpips_vgg, which may"),
-        ("half a file", "record", "results.json is not JSON"),
+        ("photo", "photos/a.jpg has changed"),
+        ("photo gone", "photos/a.jpg cannot be read (No such file"),
+        ("new photo", "files have come to .*photos, or gone"),
+        ("published", "table.csv cannot be read"),
+        ("a flipped bit", "table.csv has changed"),
+        ("store", r"stage train in the store is damaged or gone \(model differs"),
+        ("store gone", "stage train .*manifest.json is missing"),
+        ("stage", "version 1 of the stage train, which is now at 2"),
+        ("package", "made with pycolmap 0.1, and .* is installed"),
+        ("results", "results.json is not as it was written"),
+        ("no inputs", "results.json does not say what it was made of"),
+        ("an input less", "results.json is damaged: it lacks 'made_of.entries'"),
+        ("inputs of another kind", "results.json is damaged: made_of.sources is "),
+        ("weights", "it lacks lpips_vgg, which may"),
+        ("half a file", "results.json is not JSON"),
     ],
 )
-def test_changes_are_noticed_and_named(
-    change: str, cause: str, names: str, runs: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_changes_are_noticed_and_named(change: str, names: str, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     values = trial_values()
     finish(values, awaited=["lpips_vgg"] if change == "weights" else ())
-    folder = TrialPaths.of(values).folder
-    record = json.loads((folder / "inputs.json").read_text())
+    folder = TrialFolder.of(values).path
+    content = json.loads((folder / "results.json").read_text())
+    record = content["made_of"]
     if change == "photo":
         (runs.parent / "photos" / "a.jpg").write_bytes(b"other")
     elif change == "photo gone":
@@ -294,32 +298,31 @@ def test_changes_are_noticed_and_named(
         os.utime(runs.parent / "photos", ns=(1, 1))
     elif change == "published":
         (folder / "table.csv").unlink()
+    elif change == "a flipped bit":
+        edit(folder / "table.csv", "a,b", "a,c")
     elif change == "store":
         (model,) = (runs / "store" / "train").glob("*/model")
         model.write_text("n")
     elif change == "store gone":
         shutil.rmtree(runs / "store")
     elif change == "stage":
-        monkeypatch.setattr(finished, "STAGES", [replace(stage, version=2) for stage in finished.STAGES[2:3]])
+        monkeypatch.setattr(made_of, "STAGES", [replace(stage, version=2) for stage in made_of.STAGES[2:3]])
         record["stages"] = {"train": 1}
     elif change == "package":
         record["pycolmap"] = "0.1"
     elif change == "results":
-        (folder / "results.json").write_text((folder / "results.json").read_text().replace("20.5", "30.5"))
+        content["metrics"]["psnr"] = 30.5
     elif change == "an input less":
         del record["entries"]
     elif change == "inputs of another kind":
         record["sources"] = ["a.jpg"]
-    elif change == "half a file":
-        (folder / "results.json").write_text((folder / "results.json").read_text()[:100])
-    (folder / "inputs.json").write_text(json.dumps(record))
-    if change == "no inputs":
-        (folder / "inputs.json").unlink()
-    found = find_finished(values)
-    assert isinstance(found, NotDone)
-    assert found.cause == cause
-    assert re.search(names.replace("read (No", r"read \(No"), found.reason), found.reason
-    assert "\n" not in found.reason
+    elif change == "no inputs":
+        del content["made_of"]
+    text = json.dumps(content)
+    (folder / "results.json").write_text(text[:100] if change == "half a file" else text)
+    reason = why_not_done(values, ())
+    assert re.search(names.replace("read (No", r"read \(No"), reason), reason
+    assert "\n" not in reason
 
 
 def test_a_dry_run_says_what_has_changed(runs: Path) -> None:
@@ -337,14 +340,14 @@ def test_metric_that_cannot_come_later_does_not_hinder() -> None:
         values,
         unavailable={"flip": "not asked for (eval.flip)", "lpips_alex": "a view is 20x20 px, below 63 px a side"},
     )
-    assert isinstance(find_finished(values), Done)
+    assert not why_not_done(values)
 
 
 def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do() -> None:
     values = trial_values()
     finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"}, awaited=["lpips_vgg"])
-    assert isinstance(find_finished(values, lambda options: {"lpips_vgg", "flip"}), Done)
-    assert isinstance(find_finished(values, lambda options: {"flip"}), NotDone)
+    assert not why_not_done(values, ["lpips_vgg", "flip"])
+    assert why_not_done(values, ["flip"])
 
 
 # ---- plan and states
@@ -353,17 +356,17 @@ def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do() -> None:
 def test_what_is_awaited_is_not_read_from_the_prose_of_reasons() -> None:
     values = trial_values("seed=3")
     finish(values, unavailable={"lpips_vgg": "weights not found", "own": "no reason that anyone knows"}, awaited=[])
-    assert isinstance(find_finished(values), Done)
+    assert not why_not_done(values)
     finish(values, unavailable={"lpips_vgg": "a view is too small"}, awaited=["lpips_vgg"])
-    assert isinstance(find_finished(values), NotDone)
-    assert isinstance(find_finished(values, lambda options: ["lpips_vgg"]), Done)
+    assert why_not_done(values)
+    assert not why_not_done(values, ["lpips_vgg"])
 
 
 def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs: Path) -> None:
     trials = compose_trials(["name=x", "densify=adc", "seed=0,1,2,3"], multirun=True)
     add_to_plan(trials[:2])
     add_to_plan(trials)
-    folders = [TrialPaths.of(trial.values).folder for trial in trials]
+    folders = [TrialFolder.of(trial.values).path for trial in trials]
     assert [trial.folder for trial in read_plan(runs / "x")] == folders
     assert compose_one(read_plan(runs / "x")[1].overrides).values == trials[1].values
     finish(trials[0].values)
@@ -404,7 +407,7 @@ def test_dry_run_tells_states_and_time(runs: Path) -> None:
     assert "as in other: nothing to compute" in lines[1]
     assert lines[4] == "4 trials: 1 done, 3 missing"
     assert lines[5] == "time: about 15 min, 2 at once, judged by 2 finished trials"  # 2 x (600 + 1200) / 2, two at once
-    assert Experience(runs).elsewhere(TrialPaths.of(trials[1].values)) == "other"
+    assert Experience(runs).elsewhere(TrialFolder.of(trials[1].values)) == "other"
     assert describe_plan(trials[1:2])[1:] == [
         "1 trial: 1 missing",
         "time: seconds, since other experiments have the results",
@@ -434,7 +437,7 @@ def fake_trial(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
         if isinstance(error, BusyError) and not wait:
             raise error
         order.append(seed)
-        folder = TrialPaths.of(trial.values).folder
+        folder = TrialFolder.of(trial.values).path
         if error is not None and not isinstance(error, BusyError):
             from gsbench.launch.outcome import outcome_of_error
 

@@ -8,7 +8,7 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = 150
@@ -25,7 +25,7 @@ def trial_values(runs: Path, seed: int = 0, name: str = "tracked") -> dict[str, 
 
 def begin_trial(values: dict[str, Any], uri: str | None = None, patience: float = 30.0, **more: Any) -> Path:
     """The folder of a trial that has written its configuration, as the mirror finds it."""
-    folder = TrialPaths.of(values).folder
+    folder = TrialFolder.of(values).path
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.yaml").write_text(json.dumps(values | {"tracking": options(uri, patience) | more}))
     return folder

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 import psutil
 import pytest
 
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, mirror_trial, prepare
 from gsbench.tracking.client import SETTINGS
 from tests.end_to_end.conftest import SMALL
@@ -208,7 +208,7 @@ def test_a_tracker_may_go_at_any_moment(
         assert "gsbench sync" in mirror_a_trial(tmp_path, uri, seed, patience=PATIENCE)
         gate.mended()
         values = trial_values(tmp_path, seed)
-        mirror_trial(options(uri), tmp_path, TrialPaths.of(values).folder, values)
+        mirror_trial(options(uri), tmp_path, TrialFolder.of(values).path, values)
     client = connect(uri, tmp_path)
     found = found_runs(client, "tracked")
     assert sorted(run.data.tags["seed"] for run in found) == [str(seed) for seed in range(4)]

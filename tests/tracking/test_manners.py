@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from gsbench.errors import InputError
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import Mirror, connect, default_uri, mirror_trial, prepare, tracker_uri
 from gsbench.tracking.source import source_tags
 from gsbench.verbs.ui import address_of
@@ -36,7 +36,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def mirrored(runs: Path, seed: int, **more: Any) -> tuple[Any, Any]:
     """A client, and the run of a finished trial."""
     values = trial_values(runs, seed)
-    folder = TrialPaths.of(values).folder
+    folder = TrialFolder.of(values).path
     write_trial(folder, values)
     (folder / "point_cloud.ply").write_text("ply\n")
     assert mirror_trial(options() | more, runs, folder, values)
@@ -158,7 +158,7 @@ def test_a_moved_runs_folder_keeps_its_runs_and_their_files(runs: Path, tmp_path
     shutil.rmtree(runs / "mlartifacts")
     try:
         values = trial_values(moved, seed=26)
-        folder = TrialPaths.of(values).folder
+        folder = TrialFolder.of(values).path
         assert not mirror_trial(options(), moved, folder, values)  # the same run, and it is known
         client = connect(None, moved)
         assert "results.json" in artifacts(client, run)
@@ -166,7 +166,7 @@ def test_a_moved_runs_folder_keeps_its_runs_and_their_files(runs: Path, tmp_path
             (moved / "mlartifacts" / "tracked").as_uri()
         )
         values = trial_values(moved, seed=27)
-        folder = TrialPaths.of(values).folder
+        folder = TrialFolder.of(values).path
         write_trial(folder, values)
         mirror_trial(options(), moved, folder, values)
         assert not (runs / "mlartifacts").exists()
@@ -193,7 +193,7 @@ def test_a_rebuilt_mirror_shows_each_trial_once(runs: Path) -> None:
     client, run = mirrored(runs, seed=28)
     client.set_tag(run.info.run_id, "psnr", "meddled")
     values = trial_values(runs, seed=28)
-    assert mirror_trial(options(), runs, TrialPaths.of(values).folder, values, anew=True)
+    assert mirror_trial(options(), runs, TrialFolder.of(values).path, values, anew=True)
     (again,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "28"]
     assert again.info.run_id != run.info.run_id
     assert "psnr" not in again.data.tags

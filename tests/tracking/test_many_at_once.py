@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, mirror_trial
 from tests.tracking.helpers import RECORDS, child_environment, found_runs, history, options, trial_values
 
@@ -43,7 +43,7 @@ def run_jobs(runs: Path, uri: str | None) -> None:
     # A loaded machine may be too slow for the last words of some; sync is what makes up for that, and nothing else is.
     for seed in range(JOBS):
         values = trial_values(runs, seed)
-        mirror_trial(options(uri), runs, TrialPaths.of(values).folder, values)
+        mirror_trial(options(uri), runs, TrialFolder.of(values).path, values)
 
 
 def check_jobs(client: Any) -> None:

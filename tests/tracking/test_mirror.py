@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import Mirror, connect, ensure_experiment, mirror_trial, prepare
 from gsbench.tracking.mirror import SECONDS_IN_VAIN
 from gsbench.tracking.mlflow_sink import STATE
@@ -72,7 +72,7 @@ def test_all_that_the_files_say_is_mirrored_once(runs: Path) -> None:
 
 def test_a_crash_between_sending_and_noting_it_repeats_nothing(runs: Path) -> None:
     values = trial_values(runs, seed=2)
-    folder = TrialPaths.of(values).folder
+    folder = TrialFolder.of(values).path
     write_trial(folder, values)
     assert mirror_trial(options(), runs, folder, values)
     state = json.loads((folder / STATE).read_text())
@@ -86,7 +86,7 @@ def test_a_crash_between_sending_and_noting_it_repeats_nothing(runs: Path) -> No
 
 def test_results_that_changed_replace_the_run(runs: Path) -> None:
     values = trial_values(runs, seed=3)
-    folder = TrialPaths.of(values).folder
+    folder = TrialFolder.of(values).path
     write_trial(folder, values)
     assert mirror_trial(options(), runs, folder, values)
     write_trial(folder, values, psnr=33.0)

@@ -8,10 +8,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from gsbench.parsing import DamagedError, read_yaml
+from gsbench.parsing import DamagedError
 from gsbench.runs.hashing import NOT_HASHED, flatten
-from gsbench.runs.inputs import read_settings
 from gsbench.runs.layout import CONFIG
+from gsbench.runs.trial_folder import TrialFolder
 
 ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
 GROUPS = ("scene", "init", "densify")  # of a configuration: what every trial has
@@ -60,13 +60,8 @@ class Configurations:
 
 
 def load_flat_config(folder: Path) -> dict[str, Any]:
-    """The configuration of the trial in ``folder`` with dotted keys; raises FileNotFoundError and DamagedError.
-
-    It is read from ``inputs.json`` where that has it, which is some twenty times quicker than YAML.
-    """
-    values = read_settings(folder)
-    if values is None:
-        values = read_yaml(folder / CONFIG)
+    """The configuration of the trial in ``folder`` with dotted keys; raises FileNotFoundError and DamagedError."""
+    values = TrialFolder(folder).settings()
     if not isinstance(values, dict) or not all(isinstance(values.get(group), dict) for group in GROUPS):
         raise DamagedError(folder / CONFIG, f"is damaged: it lacks one of the groups {', '.join(GROUPS)}")
     return flatten(values)

@@ -24,7 +24,6 @@ from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.shipped import REFERENCE, notes_of, resolved, shipped_arms, shipped_name
 from gsbench.analysis.tables import Column, Entry, Row, Table
 from gsbench.analysis.tuning import tuning_lines
-from gsbench.runs.layout import EVENTS
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted, listed
 
@@ -150,11 +149,11 @@ def _each(read: Callable[[TrialResult], str | None]) -> Callable[[Sequence[Trial
 
 def _rounds(trial: TrialResult) -> float | None:
     """Say how often the densifier refined; a log that is missing or empty says nothing."""
-    return float(len(trial.curve(EVENTS))) or None
+    return float(len(trial.folder.events())) or None
 
 
 def _last_round(trial: TrialResult) -> float | None:
-    steps = [row["step"] for row in trial.curve(EVENTS)]
+    steps = [row["step"] for row in trial.folder.events()]
     return float(max(steps)) if steps else None
 
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 
 from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
-from gsbench.parsing import DamagedError, one_line
-from gsbench.records import MOST
-from gsbench.runs.inputs import read_unchanged
+from gsbench.parsing import DamagedError
 from gsbench.runs.layout import PER_VIEW
 
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
@@ -23,17 +19,11 @@ def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
     """
     path = trial.path / PER_VIEW
     try:
-        text = read_unchanged(path, trial.digests).decode("utf-8")
-        views = {
-            row["view"]: {key: _number(value) for key, value in row.items() if key != "view" and value != ""}
-            for row in csv.DictReader(io.StringIO(text, newline=""))
-        }
+        views = trial.folder.views()
     except FileNotFoundError:
         raise InputError(f"{path} is missing: give the trial's own command again") from None
     except DamagedError as error:
         raise InputError(f"{error}: delete it, and give the trial's own command again") from None
-    except (UnicodeDecodeError, KeyError, TypeError, ValueError, csv.Error) as error:
-        raise InputError(f"{path} is damaged ({one_line(repr(error))}): give the trial's own command again") from None
     for key, expected in trial.metrics.items():
         values = [view[key] for view in views.values() if key in view]
         mean = math.fsum(values) / len(values) if values else math.nan
@@ -44,10 +34,3 @@ def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
                 f"{path} does not average to the {key} of its trial ({mean:.6g}, not {expected:.6g}): damaged"
             )
     return views
-
-
-def _number(text: str) -> float:
-    value = float(text)
-    if not abs(value) <= MOST:
-        raise ValueError(f"{text} is no measured number")
-    return value

@@ -21,14 +21,11 @@ from gsbench.files import require_own
 from gsbench.parsing import DamagedError, one_line
 from gsbench.runs.declaration import QUESTIONS
 from gsbench.runs.experiments import experiment_home, places_of_trials
-from gsbench.runs.inputs import read_results
 from gsbench.runs.layout import CONFIG, FAILED, RESULTS, SEED
-from gsbench.runs.origin import FROM_RENDERS
-from gsbench.runs.rows import read_curve
 from gsbench.runs.splits import split_text
 from gsbench.runs.translation_record import Translation
-from gsbench.runs.trial_files import failure_of
-from gsbench.runs.trial_record import TrialRecord, UnfinishedError
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError
 
 log = logging.getLogger(__name__)
 
@@ -41,15 +38,13 @@ Arm = tuple[str, str]  # initialiser, densifier
 class TrialResult:
     """One complete trial; ``record`` is its ``results.json``, ``config_hash`` that in its folder's name.
 
-    ``digests`` are the sha256 of its other files where they are known, ``settings`` the configurations of its
-    experiment, each read once.
+    ``settings`` are the configurations of its experiment, each read once.
     """
 
     path: Path
     config_hash: str
     record: TrialRecord = field(repr=False)
     variant: str = ""  # the swept settings that tell this trial from others of its initialiser and densifier
-    digests: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
     settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
     translation: Translation | None = None  # of the metrics, where they are those of another protocol
     translated_from: str = ""  # the trial's own protocol then
@@ -120,9 +115,10 @@ class TrialResult:
         except (FileNotFoundError, DamagedError):
             return {}
 
-    def curve(self, name: str) -> list[dict[str, bool | int | float]]:
-        """The rows of the trial's ``metrics.jsonl`` or ``events.jsonl``; see `gsbench.runs.rows`."""
-        return read_curve(self.path / name, self.digests)
+    @cached_property
+    def folder(self) -> TrialFolder:
+        """The files of the trial."""
+        return TrialFolder(self.path)
 
     @cached_property
     def code(self) -> dict[str, str]:
@@ -283,7 +279,7 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
     """Read and check one trial folder."""
     try:
         require_own(runs_dir, path, below=True)
-        record, digests = read_results(path)
+        record = TrialFolder(path).record()
     except FileNotFoundError:
         raise _UnusableError(_why_unfinished(path)) from None
     except UnfinishedError as error:
@@ -302,12 +298,12 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
             raise _UnusableError(f"foreign, its {RESULTS} is of {key} {value!r}")
     if str(record.seed) != match["seed"]:
         raise _UnusableError(f"foreign, its {RESULTS} is of seed {record.seed}")
-    return TrialResult(path, match["hash"], record, digests=digests, settings=settings)
+    return TrialResult(path, match["hash"], record, settings=settings)
 
 
 def _why_unfinished(path: Path) -> str:
     if (path / FAILED).exists():
-        return f"failed, {failure_of(path)}"
+        return f"failed, {TrialFolder(path).failure()}"
     return f"unfinished, no {RESULTS} yet" if (path / CONFIG).is_file() else "foreign, not a trial"
 
 

@@ -10,7 +10,7 @@ from gsbench.analysis.declaration import standing
 from gsbench.analysis.pairing import ViewCache, choose_pairs, controls_of
 from gsbench.analysis.results import Arm, Experiment, TrialResult
 from gsbench.runs.layout import SEARCH
-from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
+from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 
 _BY_PROGRAM = (
     ("Trained here by another program, its model rendered by gsbench", FROM_MODEL),

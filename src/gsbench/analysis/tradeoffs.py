@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.runs.layout import CURVES
 
 GRID = 200  # points at which two curves are compared
 
@@ -60,7 +59,7 @@ def training_curve(trials: Sequence[TrialResult], cost: str, quality: str) -> Cu
     key = {"gaussians": "num_gaussians", "seconds": "seconds"}[cost]
     by_step: dict[int, list[tuple[float, float]]] = {}
     for trial in trials:
-        for row in trial.curve(CURVES):
+        for row in trial.folder.curves():
             if key in row and quality in row:
                 by_step.setdefault(int(row["step"]), []).append((row[key], row[quality]))
     full = {step: rows for step, rows in by_step.items() if len(rows) == len(trials)}

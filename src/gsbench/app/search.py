@@ -116,7 +116,7 @@ def search(
         print(f"a search of {points} with {seeds} each; the point of the lowest values would be")
         task.launch(first)
     make_runs_folder(checked_runs_folder(first[0].values["runs"]))
-    home = first[0].paths.home
+    home = first[0].files.home
     make_home(home)
     study = Study(
         home,

@@ -22,9 +22,9 @@ from gsbench.errors import InputError
 from gsbench.eval.facts import find, known_keys
 from gsbench.files import require_own, write_json
 from gsbench.launch.trial import Trial
-from gsbench.runs.inputs import sound_results
 from gsbench.runs.layout import SEARCH, SEARCH_JOURNAL
 from gsbench.runs.search_record import Point, SearchRecord
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.install import install_command
 from gsbench.words import closest, counted
 
@@ -103,7 +103,7 @@ class Study:
         """Judge a point by the files of its trials: by their mean, and as failed where one lacks the metric."""
         from optuna.trial import TrialState
 
-        records = [sound_results(trial.folder) for trial in trials]
+        records = [TrialFolder(trial.folder).sound_record() for trial in trials]
         found = [None if record is None else record.metrics.get(self.goal.metric) for record in records]
         values = [value for value in found if value is not None]
         if len(values) < len(found):

@@ -140,7 +140,7 @@ def make_plan(context: HydraContext, master: DictConfig, wanted: TuneSettings, j
     """The plan of the tuning that ``wanted`` asks for of the arms of a sweep's jobs; raises InputError where it fits
     none."""
     trials = trials_of_jobs(context, master, jobs)
-    homes = {trial.paths.home for trial in trials}
+    homes = {trial.files.home for trial in trials}
     if len(homes) > 1:
         raise InputError(f"{PLACE}: all trials of the sweep need one name, got {listed(sorted(h.name for h in homes))}")
     if any(trial.values["scene"]["validation"] for trial in trials):

@@ -29,7 +29,7 @@ from gsbench.eval.facts import MetricFacts, facts_of, find
 from gsbench.runs.declaration import STOPPING, DeclaredPlan, read_plans
 from gsbench.runs.hashing import flatten, sha256_of
 from gsbench.runs.layout import SEED
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted
 
@@ -168,7 +168,7 @@ class Stopping(Generic[T]):
 
 def plan_sweep(trials: Sequence[T]) -> Stopping[T]:
     """The plan of a sweep's trials; raises InputError, one line, where a sweep cannot be looked at seed by seed."""
-    homes = {TrialPaths.of(trial.values).home for trial in trials}
+    homes = {TrialFolder.of(trial.values).home for trial in trials}
     metrics = {trial.values["eval"].get("primary") for trial in trials}
     if len(homes) > 1 or len(metrics) > 1:
         raise InputError("launch.stop_when_decided: all trials of the sweep need one name and one eval.primary")
@@ -227,7 +227,7 @@ def headline(verdict: Verdict) -> str:
 
 def _expected(trial: Composed) -> TrialResult:
     """The trial as if it had run: it has a configuration and no results."""
-    values, folder = trial.values, TrialPaths.of(trial.values).folder
+    values, folder = trial.values, TrialFolder.of(trial.values).path
     record = TrialRecord(
         status="complete",  # as the type has it: no file says so
         experiment=values["name"],

@@ -28,7 +28,7 @@ from gsbench.runs.declaration import DeclaredPlan
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import FAILED
 from gsbench.runs.stages import INIT
-from gsbench.runs.trial_files import Failure, TrialPaths, label_of
+from gsbench.runs.trial_folder import Failure, TrialFolder
 from gsbench.words import closest, counted, some_of, without_places
 
 log = logging.getLogger(__name__)
@@ -127,7 +127,7 @@ class Check:
         for pair in sorted(self._planned_pairs(questions, seeds), key=lambda pair: pair.seed):
             if (pair.claim, pair.scene) in self.run_here and not self._is_shared(pair):
                 for trial in pair.trials:
-                    found.setdefault(TrialPaths.of(trial.values).folder, trial)
+                    found.setdefault(TrialFolder.of(trial.values).path, trial)
         return list(found.values())
 
     def verdicts(self, declared: DeclaredPlan) -> list[Verdict]:
@@ -176,17 +176,17 @@ class Check:
         """The trials of a question that failed, each with the reason; of several with one reason the first."""
         found: dict[str, str] = {}
         for trial in self.trials([question], self.looks[-1]):
-            folder = TrialPaths.of(trial.values).folder
+            folder = TrialFolder.of(trial.values).path
             failure = None if find(trial) is not None else read_if_sound(folder / FAILED, Failure)
             if failure is not None:
-                found.setdefault(failure.reason, label_of(folder))
+                found.setdefault(failure.reason, TrialFolder(folder).label)
         return [f"{label}: {reason}" for reason, label in found.items()]
 
     def find_here(self) -> Find:
         """Find trials in the runs folder, as it is now."""
         trials = read_experiment(self.home).trials if self.home.is_dir() else ()
         by_folder = {trial.path: trial for trial in trials}
-        return lambda trial: by_folder.get(TrialPaths.of(trial.values).folder)
+        return lambda trial: by_folder.get(TrialFolder.of(trial.values).path)
 
     def pairs(self, question: Question, here: Find) -> dict[PairKey, Pair]:
         """The pairs by scene and seed, each from the source with most metrics, then with pictures or their measures.
@@ -342,6 +342,6 @@ def _composed(words: Sequence[str], runs: Path, where: str) -> Composed:
 def _check_different(claim: Claim, scenes: Sequence[str], first: dict[tuple[str, str, str], Composed]) -> None:
     """Raise InputError where both arms are one and the same trial."""
     for scene in scenes:
-        one, other = (TrialPaths.of(first[claim.id, scene, arm].values).folder for arm in (claim.baseline, claim.arm))
+        one, other = (TrialFolder.of(first[claim.id, scene, arm].values).path for arm in (claim.baseline, claim.arm))
         if one == other:
             raise InputError(f"claim {claim.id}: {claim.baseline} and {claim.arm} are the same trial on {scene}")

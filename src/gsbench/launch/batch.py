@@ -18,7 +18,6 @@ from gsbench.launch.plan import add_to_plan
 from gsbench.launch.preflight import borrowed_names, check_parts, check_trackers, missing_folders, missing_weights
 from gsbench.launch.serial import run_serial
 from gsbench.launch.trial import Trial, drop_parts
-from gsbench.runs.finished import Done, NotDone, find_finished
 from gsbench.runs.layout import STORE
 from gsbench.runs.stages import STAGES
 from gsbench.runs.store import Store
@@ -57,7 +56,7 @@ def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
 
     values = trials[0].values
     with storage_errors(checked_runs_folder(values["runs"])):
-        _begin(trials, [trial for trial in trials if not isinstance(_find(trial), Done)])
+        _begin(trials, [trial for trial in trials if _why_not_done(trial)])
         drop_parts(trials)  # Hydra composes each of its launcher's trials itself
         prepare_tracking(values)
 
@@ -97,17 +96,16 @@ def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]
         if folder in seen:  # a sweep may list a value twice
             continue
         seen.add(folder)
-        found = _find(trial)
-        if isinstance(found, Done):
-            outcomes.append(outcome_of_results(folder, found.results))
+        if not _why_not_done(trial):
+            outcomes.append(outcome_of_results(folder, trial.files.record()))
             log.info("%s: was done  %s", outcomes[-1].label, outcomes[-1].message)
         else:
             unfinished.append(trial)
     return outcomes, unfinished
 
 
-def _find(trial: Trial) -> Done | NotDone:
-    return find_finished(trial.values, _unavailable_metrics)
+def _why_not_done(trial: Trial) -> str:
+    return trial.files.why_not_done(trial.values, _unavailable_metrics)
 
 
 def _unavailable_metrics(options: dict[str, Any]) -> frozenset[str]:

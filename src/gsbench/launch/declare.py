@@ -37,7 +37,7 @@ def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
     """
     found: dict[Path, str | None] = {}
     for trial in trials:
-        home = trial.paths.home
+        home = trial.files.home
         metric, known = trial.values["eval"].get("primary"), found.get(home)
         if metric and known and metric != known:
             raise InputError(
@@ -54,7 +54,7 @@ def planned_trials(trials: Sequence[Trial]) -> dict[Path, Planned]:
     for trial in trials:
         scene, arm, leaf = trial.folder.parts[-3:]
         key = trial_key(scene, arm, leaf.partition(SEED)[0])
-        found.setdefault(trial.paths.home, {}).setdefault(key, set()).add(trial.values["seed"])
+        found.setdefault(trial.files.home, {}).setdefault(key, set()).add(trial.values["seed"])
     return {home: {key: tuple(sorted(seeds)) for key, seeds in planned.items()} for home, planned in found.items()}
 
 

@@ -11,9 +11,8 @@ from itertools import compress
 from pathlib import Path
 from typing import Any
 
-from gsbench.runs.inputs import sound_results
 from gsbench.runs.layout import RESULTS, TRIAL_GLOB
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 
 # Of scene, init and densify, which must be the same: most alike first.
 ALIKE = ((True, True, True), (True, False, True), (True, False, False), (False, False, True), (False, False, False))
@@ -43,7 +42,7 @@ class Experience:
         self._folders: dict[str, list[Path]] = defaultdict(list)
         self._times: dict[tuple[tuple[bool, ...], tuple[str, ...]], _Times] = defaultdict(_Times)
         for path in runs.glob(f"*/{TRIAL_GLOB}/{RESULTS}"):
-            results = sound_results(path.parent)
+            results = TrialFolder(path.parent).sound_record()
             if results is None:
                 continue
             self._folders[path.parent.name].append(path.parent)
@@ -55,10 +54,10 @@ class Experience:
                 times.per_iteration += results.seconds.get("train", 0.0) / results.iterations
                 times.evaluate += results.seconds.get("evaluate", 0.0)
 
-    def elsewhere(self, paths: TrialPaths) -> str | None:
+    def elsewhere(self, trial: TrialFolder) -> str | None:
         """The other experiment, if any, that has finished the same trial: its stages are reused, not computed again."""
-        others = (folder for folder in self._folders.get(paths.folder.name, ()) if folder != paths.folder)
-        return next((folder.relative_to(paths.runs).parts[0] for folder in others), None)
+        others = (folder for folder in self._folders.get(trial.path.name, ()) if folder != trial.path)
+        return next((folder.relative_to(trial.runs).parts[0] for folder in others), None)
 
     def estimate(self, values: dict[str, Any]) -> Estimate:
         """Seconds for the whole trial with ``values``, as finished ones took, most alike first, per iteration."""

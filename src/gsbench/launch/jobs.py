@@ -25,9 +25,8 @@ from gsbench.files import require_own
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.queue import forget_submission
 from gsbench.launch.trial import Trial
-from gsbench.runs.finished import Done, find_finished
 from gsbench.runs.layout import JOBS
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.install import install_command
 from gsbench.system.own_modules import allowed_modules, take_over
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
@@ -65,7 +64,7 @@ class TrialJob:
         try:
             with stop_on_signals(), ExitStack() as stack:
                 if launch["name"] == "local":
-                    slot = stack.enter_context(take_slot(TrialPaths.of(self.values).runs, launch["parallel"]))
+                    slot = stack.enter_context(take_slot(TrialFolder.of(self.values).runs, launch["parallel"]))
                     assign_gpu(slot, self.visible_gpus)
                 assign_threads(self.values["threads"], launch["parallel"])
                 from gsbench.launch.serial import run_one
@@ -106,7 +105,7 @@ def need_submitit(launcher: str) -> None:
 
 def job_folder(values: dict[str, Any]) -> Path:
     """The folder in which the jobs of an experiment write what they print; made if it is not there."""
-    runs = TrialPaths.of(values).runs
+    runs = TrialFolder.of(values).runs
     folder = runs / JOBS / values["name"]
     require_own(runs, folder, below=True)
     folder.mkdir(parents=True, exist_ok=True)
@@ -141,9 +140,9 @@ def _run(trials: Sequence[Trial], executor: Executor, parallel: int) -> list[Out
 def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome:
     """The outcome of an ended job: the trial's files first, then what the job returned, then its log's last words."""
     values = next(trial.values for trial in trials if trial.folder == folder)
-    finished = find_finished(values)
-    if isinstance(finished, Done):
-        return outcome_of_results(folder, finished.results)
+    files = TrialFolder(folder)
+    if not files.why_not_done(values):
+        return outcome_of_results(folder, files.record())
     if job.paths.result_pickle.exists():
         try:
             kind, value = _read_result(job.paths.result_pickle)
@@ -188,4 +187,4 @@ def prepare_tracking(values: dict[str, Any]) -> None:
     """Make the tracker's tables and the experiment once, before many jobs would at the same time."""
     from gsbench.tracking import prepare
 
-    prepare(values["tracking"], TrialPaths.of(values).runs, values["name"])
+    prepare(values["tracking"], TrialFolder.of(values).runs, values["name"])

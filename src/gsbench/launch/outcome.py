@@ -10,7 +10,7 @@ from typing import Literal
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import DiskFullError
 from gsbench.runs.layout import LOG
-from gsbench.runs.trial_files import label_of
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 
 OBJECTIVE = "psnr"  # what a trial returns to Hydra's sweepers
@@ -33,7 +33,7 @@ class Outcome:
 
     @property
     def label(self) -> str:
-        return label_of(self.folder)
+        return TrialFolder(self.folder).label
 
 
 def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:

@@ -19,11 +19,9 @@ from gsbench.launch.experience import Experience
 from gsbench.launch.queue import ask_queue, state_in_queue
 from gsbench.launch.trial import Trial
 from gsbench.runs.experiments import make_home
-from gsbench.runs.finished import NotDone, find_finished
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import PLAN, RESULTS, STORE
 from gsbench.runs.plan_file import Entry, Sweep, read_entries, write_entries
-from gsbench.runs.trial_files import stage_and_step, state_of
 from gsbench.system.locks import hold
 from gsbench.words import counted, readable_time
 
@@ -49,9 +47,9 @@ def add_to_plan(trials: Sequence[Trial]) -> None:
     for trial in trials:
         if trial.recorded:
             continue
-        paths = trial.paths
+        folder = trial.files
         entry = Entry(overrides=tuple(trial.overrides), cwd=os.getcwd(), time=time.time())
-        by_plan.setdefault(paths.home, {})[paths.folder.relative_to(paths.home).as_posix()] = entry
+        by_plan.setdefault(folder.home, {})[folder.path.relative_to(folder.home).as_posix()] = entry
     for home, entries in by_plan.items():
         if len(entries) > 1:  # the same command is the same sweep, whenever it is given
             sweep = Sweep(id=sha256_of(sorted(entries))[:8], count=len(entries))
@@ -93,7 +91,7 @@ def read_plan(home: Path) -> list[Planned]:
 
 def _stage_finder(trials: Sequence[Trial]) -> Callable[[Trial], list[str]]:
     """A function that tells which stages of a trial are in the store; loads torch only where there is such a store."""
-    store = trials[0].paths.runs / STORE if trials else None
+    store = trials[0].files.runs / STORE if trials else None
     if store is None or not store.is_dir():
         return lambda trial: []
     from gsbench.pipeline.wiring import StepFinder
@@ -118,34 +116,34 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
         0,
         dict.fromkeys(("done", "partial", "missing", "running", "queued", "failed", "damaged"), 0),
     )
-    experience = Experience(trials[0].paths.runs) if trials else None
+    experience = Experience(trials[0].files.runs) if trials else None
     learned = 0
     built_stages = _stage_finder(trials)
     queue = ask_queue(trial.folder for trial in trials)
     for trial in trials:
-        paths = trial.paths
-        state: str = state_of(paths.folder)
+        folder = trial.files
+        state: str = folder.state()
         if state not in ("done", "running"):
-            state = state_in_queue(paths.folder, queue) or state
+            state = state_in_queue(folder.path, queue) or state
         note = ""
         if state == "done":
-            if isinstance(found := find_finished(trial.values), NotDone):
-                note = f"  will be checked: {found.reason}"
+            if reason := folder.why_not_done(trial.values):
+                note = f"  will be checked: {reason}"
         else:
             assert experience is not None
-            shared = experience.elsewhere(paths)
+            shared = experience.elsewhere(folder)
             if shared is not None:
                 note = f"  as in {shared}: nothing to compute"
             else:
                 estimate = experience.estimate(trial.values)
-                done = stage_and_step(paths.folder)[1] / max(1, trial.values["train"]["iterations"])
+                done = folder.stage_and_step()[1] / max(1, trial.values["train"]["iterations"])
                 remaining += estimate.seconds * (1 - min(1.0, done))
                 learned = max(learned, estimate.learned_from)
                 if built := built_stages(trial):
                     note = f"  the store has its {', '.join(built)}"
                 unknown += estimate.learned_from == 0
         counts[state] += 1
-        lines.append(f"{state:<8} {paths.label}{note}")
+        lines.append(f"{state:<8} {folder.label}{note}")
     summary = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
     lines.append(f"{counted(len(trials), 'trial')}: {summary}")
     if counts["done"] < len(trials):

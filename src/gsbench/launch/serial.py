@@ -9,7 +9,7 @@ from functools import partial
 from gsbench.launch.outcome import Outcome, objective, outcome_of_error, outcome_of_results
 from gsbench.launch.trial import Trial, drop_parts
 from gsbench.runs.layout import LOCK
-from gsbench.runs.trial_files import label_of
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.locks import BusyError, describe_holder, is_held
 
@@ -46,7 +46,7 @@ def run_one(trial: Trial, wait: bool) -> Outcome:
         if trial.job is None:
             return outcome_of_results(folder, _run(trial, wait))
         if not wait and is_held(folder / LOCK):  # before Hydra's callbacks hear of a start
-            raise BusyError(f"{label_of(folder)}: {describe_holder(folder / LOCK)} is at it")
+            raise BusyError(f"{TrialFolder(folder).label}: {describe_holder(folder / LOCK)} is at it")
         results = trial.job.run(partial(_run, trial, wait), lambda results: objective(results.metrics))
         return outcome_of_results(folder, results)
     except BusyError:

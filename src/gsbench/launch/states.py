@@ -16,9 +16,8 @@ from gsbench.launch.queue import Queue, ask_queue, read_submission, state_in_que
 from gsbench.parsing import DamagedError
 from gsbench.runs.experiments import places_of_trials
 from gsbench.runs.hashing import determining
-from gsbench.runs.inputs import read_results
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED
-from gsbench.runs.trial_files import State, failure_of, read_config, stage_and_step, state_of
+from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
 
 
@@ -34,6 +33,11 @@ class TrialState:
     state: State | Literal["queued", "superseded"]
     since: float | None
     note: str
+
+    @property
+    def label(self) -> str:
+        """Scene, arm and seed, for people."""
+        return TrialFolder(self.folder).label
 
 
 def states_of_experiment(home: Path) -> list[TrialState]:
@@ -79,14 +83,14 @@ def _same_settings(folder: Path, others: Sequence[TrialState]) -> TrialState | N
 
 def _settings(folder: Path) -> dict[str, Any] | None:
     try:
-        return determining(read_config(folder))
+        return determining(TrialFolder(folder).configuration())
     except InputError:
         return None
 
 
 def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialState:
     """The state of the trial in ``folder``; ``planned`` is when it was asked for."""
-    state = state_of(folder)
+    state = TrialFolder(folder).state()
     if state == "done":
         return TrialState(folder, state, _changed(folder / RESULTS), "")
     if state == "running":
@@ -105,7 +109,7 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
             return TrialState(folder, found, _changed(submission.note), note)
         lost = f"; Slurm job {submission.job} has ended, log: {submission.log}"
     if state == "failed":
-        return TrialState(folder, state, _changed(folder / FAILED), failure_of(folder))
+        return TrialState(folder, state, _changed(folder / FAILED), TrialFolder(folder).failure())
     if state == "partial":
         return TrialState(folder, state, _changed(folder / CONFIG), f"stopped {_reached(folder)}".strip() + lost)
     return TrialState(folder, state, planned, "never started" + lost)
@@ -113,14 +117,14 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
 
 def _damage(folder: Path) -> str:
     try:
-        read_results(folder)
+        TrialFolder(folder).record()
     except (FileNotFoundError, DamagedError) as error:
         return f"{error.path.name} {error.reason}" if isinstance(error, DamagedError) else ""
     return ""
 
 
 def _reached(folder: Path) -> str:
-    stage, step = stage_and_step(folder)
+    stage, step = TrialFolder(folder).stage_and_step()
     return f"in {stage}" + (f" at iteration {step}" if stage == "train" and step else "") if stage else ""
 
 

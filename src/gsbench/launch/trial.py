@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsbench.config.compose import Composed
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 
 if TYPE_CHECKING:
     from gsbench.pipeline.parts import Parts
@@ -26,14 +26,14 @@ class Trial(Composed):
         return cls(composed.values, composed.yaml, composed.overrides, composed.job, composed.recorded)
 
     @cached_property
-    def paths(self) -> TrialPaths:
-        """The paths of the trial's files."""
-        return TrialPaths.of(self.values)
+    def files(self) -> TrialFolder:
+        """The trial's folder, with all that is in it."""
+        return TrialFolder.of(self.values)
 
     @property
     def folder(self) -> Path:
-        """The trial's own folder."""
-        return self.paths.folder
+        """Where that folder lies."""
+        return self.files.path
 
     @cached_property
     def parts(self) -> Parts:

@@ -16,15 +16,26 @@ from gsbench.parsing import read_json
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.hashing import config_hash, flatten, sha256_of
 from gsbench.runs.layout import EVENTS
-from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS, MADE_ELSEWHERE, RENDERS_ALONE
-from gsbench.runs.rows import read_curve
+from gsbench.runs.rows import read_rows
 from gsbench.runs.source import sources_of
 from gsbench.runs.splits import split_text
-from gsbench.runs.stage_records import Training, read_evaluation, read_training
 from gsbench.runs.stages import EVALUATE, INIT, STAGES, TRAIN
 from gsbench.runs.store import Entry, read_manifest
-from gsbench.runs.trial_files import TrialPaths
-from gsbench.runs.trial_record import Budget, Code, Declared, Trainer, TrialRecord
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.trial_record import (
+    FROM_MODEL,
+    FROM_RENDERS,
+    MADE_ELSEWHERE,
+    RENDERS_ALONE,
+    Budget,
+    Code,
+    Declared,
+    Trainer,
+    Training,
+    TrialRecord,
+    read_evaluation,
+    read_training,
+)
 from gsbench.scene.types import Capture, Scene
 
 PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")  # on whose versions a result depends
@@ -46,7 +57,7 @@ def results_of(
     init, trained, evaluated = entries[INIT.name], entries[TRAIN.name], entries[EVALUATE.name]
     training, evaluation = read_training(trained.path), read_evaluation(evaluated.path)
     manifest = read_manifest(evaluated.path)
-    events = read_curve(trained.path / EVENTS)
+    events = read_rows(trained.path / EVENTS)
     sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]}, reverse=True)
     results = TrialRecord(
         status="complete",
@@ -123,7 +134,7 @@ def _by_program(results: TrialRecord, training: Training, trainer: Trainer) -> T
 
 def _declared(values: dict[str, Any]) -> Declared | None:
     """The metric that the verdict was declared to be about when the trial was run, and since when; else nothing."""
-    home = TrialPaths.of(values).home
+    home = TrialFolder.of(values).home
     metric = values["eval"].get("primary")
     said = [declaration for declaration in read_declarations(home) if declaration.metric == metric]
     return said[-1].summary() if said else None

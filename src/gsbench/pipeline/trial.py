@@ -23,13 +23,11 @@ from gsbench.pipeline.results import results_of
 from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs import layout
 from gsbench.runs.code import WIRING, state_of
-from gsbench.runs.finished import Done, find_finished
-from gsbench.runs.inputs import write_finished
 from gsbench.runs.layout import BUILDING, CONFIG, FAILED, LOG
 from gsbench.runs.stages import EVALUATE, GROUND_TRUTH, INIT, TRAIN
 from gsbench.runs.step import Stage
 from gsbench.runs.store import Entry, Store
-from gsbench.runs.trial_files import TrialPaths
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture
@@ -51,28 +49,27 @@ def run_trial(parts: Parts, config_yaml: str, wait: bool = True) -> TrialRecord:
     another process runs this trial, waits for it, or raises BusyError if ``wait`` is False.
     """
     take_signals_back()
-    paths = TrialPaths.of(parts.values)
-    with storage_errors(paths.runs):
-        require_own(paths.runs, paths.folder, below=True)
-        require_own(paths.runs, paths.runs / layout.STORE / layout.VIEWS)
-        paths.folder.mkdir(parents=True, exist_ok=True)
-        with hold(paths.lock, paths.label, wait), log_to(paths.folder / LOG):
-            finished = find_finished(parts.values)
-            if isinstance(finished, Done):
-                log.info("%s: was done", paths.label)
-                return finished.results
-            remove_temporaries(paths.folder)
-            return _run(parts, config_yaml, paths)
+    folder = TrialFolder.of(parts.values)
+    with storage_errors(folder.runs):
+        folder.require_own()
+        require_own(folder.runs, folder.runs / layout.STORE / layout.VIEWS)
+        folder.path.mkdir(parents=True, exist_ok=True)
+        with hold(folder.lock, folder.label, wait), log_to(folder.path / LOG):
+            if not folder.why_not_done(parts.values):
+                log.info("%s: was done", folder.label)
+                return folder.record()
+            remove_temporaries(folder.path)
+            return _run(parts, config_yaml, folder)
 
 
 @contextmanager
-def _recorded_failures(values: dict[str, Any], paths: TrialPaths) -> Iterator[None]:
+def _recorded_failures(values: dict[str, Any], folder: TrialFolder) -> Iterator[None]:
     """Write down why the block failed, before anyone beside the trial is told that it did."""
     try:
-        with storage_errors(paths.runs), _exits_as_errors():
+        with storage_errors(folder.runs), _exits_as_errors():
             yield
     except Exception as error:
-        _record_failure(error, values, paths)
+        _record_failure(error, values, folder)
         raise
 
 
@@ -99,48 +96,48 @@ def _exits_as_errors() -> Iterator[None]:
         os._exit = end_at_once
 
 
-def _record_failure(error: Exception, values: dict[str, Any], paths: TrialPaths) -> None:
+def _record_failure(error: Exception, values: dict[str, Any], folder: TrialFolder) -> None:
     log.debug("the trial failed", exc_info=True)
     kind = type(error).__name__
     message = str(error) if isinstance(error, GsbenchError) else f"{kind}: {error}"
     record = {"status": "failed", "error": kind, "message": message, "traceback": traceback.format_exc()}
     with suppress(OSError):  # on a full disk the error itself has to do
-        write_json(paths.folder / FAILED, record | {"time": time.time(), "seed": values["seed"]})
+        write_json(folder.path / FAILED, record | {"time": time.time(), "seed": values["seed"]})
 
 
-def _run(parts: Parts, config_yaml: str, paths: TrialPaths) -> TrialRecord:
+def _run(parts: Parts, config_yaml: str, folder: TrialFolder) -> TrialRecord:
     """Build every step, show its files in the trial's folder, write the results."""
     values = parts.values
-    with _recorded_failures(values, paths):
+    with _recorded_failures(values, folder):
         parts.complete()
         torch.set_num_threads(parts.threads)
-        mirror = Mirror(values["tracking"], paths.runs, paths.folder)
+        mirror = Mirror(values["tracking"], folder.runs, folder.path)
 
-        def announce(stage: Stage, folder: Path) -> None:
-            write_json(paths.folder / BUILDING, {"stage": stage.name, "folder": str(folder)})
+        def announce(stage: Stage, place: Path) -> None:
+            write_json(folder.path / BUILDING, {"stage": stage.name, "folder": str(place)})
 
-        store = Store(paths.runs / layout.STORE, announce)
-        write_text(paths.folder / CONFIG, config_yaml)
-        (paths.folder / FAILED).unlink(missing_ok=True)
+        store = Store(folder.runs / layout.STORE, announce)
+        write_text(folder.path / CONFIG, config_yaml)
+        (folder.path / FAILED).unlink(missing_ok=True)
         trial = TrialSteps(parts, store)
     entries: dict[str, Entry] = {}
     code = {file: state_of(file) for file in WIRING}
-    with mirror, _recorded_failures(values, paths):
+    with mirror, _recorded_failures(values, folder):
         for step in trial.steps():
             entries[step.stage.name] = entry = store.get(step)
             code |= step.code
             if step.stage is INIT:
-                link_or_copy(entry.path / REPORT_FILE, paths.folder / layout.INIT_REPORT)
+                link_or_copy(entry.path / REPORT_FILE, folder.path / layout.INIT_REPORT)
         scene = trial.views.scene
-        log.info("%s: %d training and %d test views", paths.label, len(scene.train), len(scene.test))
+        log.info("%s: %d training and %d test views", folder.label, len(scene.train), len(scene.test))
         results = results_of(values, trial.capture, scene, parts.rasterizer.name, entries, code)
-        published = _publish(paths.folder, entries)
+        published = _publish(folder.path, entries)
         made_of = {stage.name: entries[stage.name].path for stage in (INIT, TRAIN, GROUND_TRUTH, EVALUATE)}
-        again = write_finished(paths.folder, values, results, source_files(trial.taken, store), made_of, published)
-        (paths.folder / BUILDING).unlink(missing_ok=True)
+        again = folder.write_finished(values, results, source_files(trial.taken, store), made_of, published)
+        (folder.path / BUILDING).unlink(missing_ok=True)
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
     size = "" if results.num_gaussians is None else f"  {results.num_gaussians} Gaussians"
-    log.info("%s: %s%s%s", paths.label, metrics, size, "  (was done)" if again else "")
+    log.info("%s: %s%s%s", folder.label, metrics, size, "  (was done)" if again else "")
     return results
 
 

@@ -24,11 +24,10 @@ from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.renders.reference_images import Truth
 from gsbench.runs.code import files_of
 from gsbench.runs.hashing import sha256_of
-from gsbench.runs.inputs import write_finished
 from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, MASKS, PER_VIEW, RENDERS, SEED
-from gsbench.runs.origin import FROM_RENDERS, RENDERS_ALONE
 from gsbench.runs.stages import EVALUATE
-from gsbench.runs.trial_record import Code, TrialRecord
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.trial_record import FROM_RENDERS, RENDERS_ALONE, Code, TrialRecord
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
 from gsbench.settings import is_folder_name
@@ -137,7 +136,7 @@ def enter(
     config = _config(place, truth, runs)
     write_text(folder / CONFIG, yaml.safe_dump(config, sort_keys=False))
     write_per_view(folder / PER_VIEW, per_view)
-    write_finished(folder, config, _results(place, truth, identity, per_view, evaluator, source))
+    TrialFolder(folder).write_finished(config, _results(place, truth, identity, per_view, evaluator, source))
     return folder
 
 

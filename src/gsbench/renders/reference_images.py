@@ -17,7 +17,7 @@ from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs import stages
 from gsbench.runs.layout import GROUND_TRUTH, MASKS, RENDERS, RESULTS, STORE
 from gsbench.runs.store import Store
-from gsbench.runs.trial_files import read_config
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.images import image_size
 from gsbench.scene.names import png_name
 from gsbench.scene.readers import fingerprint, list_images
@@ -77,7 +77,7 @@ def truth_of_trial(trial: TrialResult) -> Truth:
         what,
         trial.record.hashes["data"],
         trial.record.resolution,
-        read_config(trial.path),
+        TrialFolder(trial.path).configuration(),
         trial.scene,
         trial.init,
         _masks(trial.path / MASKS, photographs),

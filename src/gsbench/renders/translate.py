@@ -29,7 +29,7 @@ from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs.layout import GROUND_TRUTH, MASKS, POINT_CLOUD, PROTOCOLS, RENDERS, STORE, VIEWS
 from gsbench.runs.store import Store
 from gsbench.runs.translation_record import VERSION, Translation, Translations, made_of, read_translations
-from gsbench.runs.trial_files import read_config
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.images import read_image
 from gsbench.scene.load import load_scene
 from gsbench.scene.masks import Mask, read_mask
@@ -152,7 +152,7 @@ def material_of(trial: TrialResult, runs: Path) -> Material:
 
     @cache
     def source() -> tuple[Parts, TrialSteps]:
-        config = read_config(trial.path) | {"runs": str(runs)}
+        config = TrialFolder(trial.path).configuration() | {"runs": str(runs)}
         if trial.from_renders:
             raise InputError("renders of another program are what they are")
         parts = Parts(config)

@@ -36,7 +36,6 @@ FAILED = "failed.json"  # why it failed
 LOG = "log.txt"
 LOCK = ".lock"
 SUBMITTED = ".submitted.json"  # the Slurm job that was given the trial
-INPUTS = "inputs.json"  # what the results were made of: a finished trial is recognised without reading photographs
 BUILDING = "building.json"  # the stage that an unfinished trial is at, and where
 INIT_REPORT = "init_report.json"
 PER_VIEW = "per_view.csv"

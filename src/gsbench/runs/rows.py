@@ -1,24 +1,21 @@
-"""The JSON-lines files of a training: what a row may hold, and reading them."""
+"""The JSON-lines files of a training: what a row may hold."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
 from gsbench.parsing import DamagedError, read_bytes
 from gsbench.records import Amount, Count, Number, Part, Whole, iterate_rows
-from gsbench.runs.inputs import read_unchanged
 
 log = logging.getLogger(__name__)
 
 STEP = "step"  # the key of every row: the iteration
-NO_DIGESTS: Mapping[str, str] = MappingProxyType({})
 Exponent = Annotated[float, Field(ge=-300, le=300)]  # ten to this power is a number
 
 
@@ -52,18 +49,19 @@ class Histogram(Stepped):
             raise ValueError("the edges are not one more than the counts")
 
 
-def read_curve(path: Path, digests: Mapping[str, str] = NO_DIGESTS) -> list[dict[str, bool | int | float]]:
-    """The rows of ``metrics.jsonl`` or ``events.jsonl``, each with an integer ``step``; [] where there is none.
+def read_rows(path: Path, kind: Any = Row, read: Callable[[Path], bytes] = read_bytes) -> list[Any]:
+    """The rows of a file, each of type ``kind``; [] where there is none.
 
-    ``digests`` are those of a finished trial (`gsbench.runs.inputs`). A file that is not as it was written is left out,
-    as is what follows a damaged row, with a warning.
+    ``read`` gives the content. What cannot be read, and what follows a damaged row, is left out, with a warning.
     """
-    return _read(path, digests, Row)
-
-
-def read_histograms(path: Path, digests: Mapping[str, str] = NO_DIGESTS) -> list[Histogram]:
-    """The rows of ``volume_histograms.jsonl``, as `read_curve` reads them."""
-    return _read(path, digests, Histogram)
+    try:
+        content = read(path)
+    except FileNotFoundError:
+        return []
+    except DamagedError as error:
+        log.warning("left out: %s", error)
+        return []
+    return [row for _, row in iterate_rows(content, kind, path)]
 
 
 def whole_lines(path: Path) -> list[tuple[str, int]]:
@@ -73,14 +71,3 @@ def whole_lines(path: Path) -> list[tuple[str, int]]:
     except FileNotFoundError:
         return []
     return [(line, row.step) for line, row in iterate_rows(content, Stepped, path)]
-
-
-def _read(path: Path, digests: Mapping[str, str], kind: Any) -> list[Any]:
-    try:
-        content = read_unchanged(path, digests)
-    except FileNotFoundError:
-        return []
-    except DamagedError as error:
-        log.warning("left out: %s", error)
-        return []
-    return [row for _, row in iterate_rows(content, kind, path)]

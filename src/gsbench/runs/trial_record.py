@@ -1,20 +1,26 @@
-"""Content of a finished trial's ``results.json``: its writers fill this record, its readers are given it."""
+"""Content of a finished trial's ``results.json``, and of the records that its stages leave in the store beside their
+files (``training.json``, ``metrics.json``): its writers fill these, its readers are given them.
+"""
 
 from __future__ import annotations
 
-import json
 import reprlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, ValidationError
 
 from gsbench.parsing import DamagedError, fault_of
-from gsbench.records import MOST, Amount, Count, Number, Part, Text, adapter, misfit
-from gsbench.runs.origin import FROM_RENDERS
+from gsbench.records import MOST, Amount, Count, Number, Part, Text, adapter, misfit, read_typed
+from gsbench.runs.layout import METRICS, TRAINING
 
-COMPLETE = "complete"
+# ``evaluated_from`` of what gsbench did not train itself: the model was rendered here, or only renders are known.
+FROM_MODEL: Final = "model"
+FROM_RENDERS: Final = "renders"
+MADE_ELSEWHERE = "made by another program"  # how the reason of a quantity starts that nobody can know of such a trial
+RENDERS_ALONE = f"{MADE_ELSEWHERE}, of which only the renders are known"
+
 Iteration = Annotated[str, Field(pattern=r"^\d{1,18}$")]  # as the key of an object
 
 
@@ -148,6 +154,39 @@ def record_from(content: bytes, path: Path) -> TrialRecord:
         raise DamagedError(path, misfit(error)) from None
 
 
-def results_text(record: TrialRecord) -> str:
-    """The content of ``results.json``."""
-    return json.dumps(record.to_json(), indent=1, allow_nan=False) + "\n"
+@dataclass(frozen=True, kw_only=True)
+class Training(Part):
+    """Record of what a training took and gave; of another program's, ``trained_by`` and ``evaluated_from`` are set."""
+
+    iterations: Count
+    num_init_points: Count
+    num_gaussians: Count | None
+    causes: dict[str, Count]
+    scene_extent: Amount
+    seconds: Amount
+    peak_memory_mb: Amount | None
+    machine: dict[str, str]
+    checkout: dict[str, Any] = field(default_factory=dict)  # the commit of gsbench's own, and whether it was edited
+    evaluated_from: Literal["model", "renders"] | None = None
+    trained_by: Trainer | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation(Part):
+    """The means of the metrics, why others are missing, and which of those may still come."""
+
+    metrics: dict[str, Number]
+    unavailable: dict[str, str]
+    awaited: list[str]
+    facts: dict[str, MetricRecord] = field(default_factory=dict)  # of a user's own metrics
+    at: dict[Iteration, Earlier] = field(default_factory=dict)  # by earlier iterations
+
+
+def read_training(folder: Path) -> Training:
+    """The record of the training in ``folder``; raises FileNotFoundError and DamagedError."""
+    return read_typed(folder / TRAINING, Training)
+
+
+def read_evaluation(folder: Path) -> Evaluation:
+    """The record of the evaluation in ``folder``; raises as `read_training` does."""
+    return read_typed(folder / METRICS, Evaluation)

@@ -19,7 +19,7 @@ from typing import Any, NoReturn, TextIO
 
 from gsbench.errors import InputError
 from gsbench.runs.experiments import places_of_trials
-from gsbench.runs.trial_files import label_of, read_config, state_of
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
 from gsbench.tracking.address import untyped_address
 from gsbench.tracking.client import connect, ensure_experiment
@@ -36,10 +36,10 @@ def follow() -> NoReturn:
     runs, folder, program = Path(sys.argv[2]), Path(sys.argv[3]), sys.argv[4]
 
     def work(ended: threading.Event, out: TextIO) -> None:
-        values = read_config(folder)
+        values = TrialFolder(folder).configuration()
         _follow(Follower(values["tracking"], runs, folder, values, program), ended)
 
-    _serve(work, patience=float(read_config(folder)["tracking"]["patience_seconds"]))
+    _serve(work, patience=float(TrialFolder(folder).configuration()["tracking"]["patience_seconds"]))
 
 
 def prepare() -> NoReturn:
@@ -55,23 +55,23 @@ def sync() -> NoReturn:
     def work(ended: threading.Event, out: TextIO) -> None:
         new = known = 0
         for folder in (folder for home in homes for folder in sorted(map(Path, places_of_trials(Path(home))))):
-            state = state_of(folder)
+            state = TrialFolder(folder).state()
             if state == "damaged":
-                print(f"left out: {label_of(folder)}: damaged, see gsbench status", file=out, flush=True)
+                print(f"left out: {TrialFolder(folder).label}: damaged, see gsbench status", file=out, flush=True)
             if state not in ("done", "failed"):
                 continue
             try:
-                values = read_config(folder)
+                values = TrialFolder(folder).configuration()
             except InputError as error:
                 print(f"left out: {error}", file=out, flush=True)
                 continue
             if strange := untyped_address(values["tracking"] | ({"uri": uri} if uri else {}), uri):
                 text = f"its configuration names the tracker {strange}, and --uri {strange} was not typed"
-                print(f"left out: {label_of(folder)}: {text}", file=out, flush=True)
+                print(f"left out: {TrialFolder(folder).label}: {text}", file=out, flush=True)
                 continue
             if _sync_one(folder, values, runs, uri, anew, out):
                 new += 1
-                print(f"mirrored {label_of(folder)}", file=out, flush=True)
+                print(f"mirrored {TrialFolder(folder).label}", file=out, flush=True)
             else:
                 known += 1
         print(f"{counted(new, 'trial')} mirrored, {known} were", file=out)
@@ -85,10 +85,12 @@ def _sync_one(folder: Path, values: dict[str, Any], runs: Path, uri: str | None,
     try:
         return mirror_trial(options, runs, folder, values, anew)
     except BusyError:
-        print(f"{label_of(folder)} is being mirrored by another process", file=out, flush=True)
+        print(f"{TrialFolder(folder).label} is being mirrored by another process", file=out, flush=True)
         return False
     except Exception as error:  # whatever the tracker raises
-        raise MissedError(f"{name_of(options)} does not take {label_of(folder)} ({kind_and_words(error)})") from error
+        raise MissedError(
+            f"{name_of(options)} does not take {TrialFolder(folder).label} ({kind_and_words(error)})"
+        ) from error
 
 
 class MissedError(Exception):

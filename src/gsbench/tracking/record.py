@@ -10,11 +10,10 @@ from typing import Any
 from gsbench.errors import InputError
 from gsbench.runs import layout
 from gsbench.runs.hashing import flatten, sha256_of
-from gsbench.runs.inputs import sound_results
 from gsbench.runs.plan_file import read_entries
-from gsbench.runs.rows import read_curve
+from gsbench.runs.rows import read_rows
 from gsbench.runs.stages import TRAIN
-from gsbench.runs.trial_files import read_building
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.tracking.sink import Point, Summary
 
@@ -67,7 +66,7 @@ class TrackedFiles:
 
     def results(self) -> TrialRecord | None:
         """The content of ``results.json``; empty where there is none."""
-        return sound_results(self.folder)
+        return TrialFolder(self.folder).sound_record()
 
     def results_hash(self) -> str | None:
         """The hash of the results, by which a mirror knows whether it shows them."""
@@ -76,11 +75,11 @@ class TrackedFiles:
 
     def curves(self, logged: dict[str, int]) -> Iterator[tuple[str, int, list[Point]]]:
         """Read each file of curves: its name, its newest iteration, and its points after ``logged[name]``."""
-        building = read_building(self.folder)  # a training in progress writes elsewhere
+        building = TrialFolder(self.folder).building()  # a training in progress writes elsewhere
         sources = [Path(building.folder)] if building.stage == TRAIN.name else []
         for name, prefix in CURVES.items():
             source = next((folder / name for folder in (*sources, self.folder) if (folder / name).exists()), None)
-            records = [] if source is None else [r for r in read_curve(source) if r["step"] > logged.get(name, 0)]
+            records = [] if source is None else [r for r in read_rows(source) if r["step"] > logged.get(name, 0)]
             if records:
                 points = [
                     Point(f"{prefix}/{key}", float(value), int(record["step"]), _seconds(record))

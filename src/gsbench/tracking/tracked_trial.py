@@ -7,7 +7,7 @@ from typing import Any
 
 from gsbench.files import require_own, write_json
 from gsbench.runs import layout
-from gsbench.runs.trial_files import failure_of
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
 from gsbench.tracking.record import TrackedFiles
 from gsbench.tracking.sink import DEFAULT, Sink
@@ -55,7 +55,7 @@ class TrackedTrial:
         self.add_curves()
         folder = self.record.folder
         if (folder / layout.FAILED).exists():
-            self.sink.stop("FAILED", failure_of(folder))
+            self.sink.stop("FAILED", TrialFolder(folder).failure())
         elif (results := self.record.results()) is None:
             self.sink.stop("KILLED", None)
         else:

@@ -60,7 +60,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     if options.dry_run:
         print("\n".join(describe_plan(flat, flat[0].values["launch"]["parallel"])))
         return 0
-    home = flat[0].paths.home
+    home = flat[0].files.home
     code = run_trials(flat)
     folders = {run: tuple(t.folder.relative_to(home).as_posix() for t in group) for run, group in trials.items()}
     record = Record(densify, switches, tuple(folders.items()), options.fractional)
@@ -114,7 +114,7 @@ def _trials(words: Sequence[str]) -> list[Trial]:
 
 def _only_densifier(trials: Sequence[Trial]) -> str:
     arms = {(trial.values["init"]["name"], trial.values["densify"]["name"]) for trial in trials}
-    if len(arms) > 1 or len({trial.paths.home for trial in trials}) > 1:
+    if len(arms) > 1 or len({trial.files.home for trial in trials}) > 1:
         raise InputError("ablate takes one initialiser and one densifier apart: only scene and seed may list values")
     if len({(trial.values["scene"]["name"], trial.values["seed"]) for trial in trials}) < len(trials):
         raise InputError("ablate: only scene and seed may list values")

@@ -20,7 +20,7 @@ from gsbench.launch.plan import describe_plan
 from gsbench.launch.preflight import missing_folders
 from gsbench.launch.trial import Trial
 from gsbench.runs.declaration import CLAIMS, read_plans, standing_plan
-from gsbench.runs.finished import Done, find_finished
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs.arguments import ArgumentParser, names, path
 from gsbench.words import counted
 
@@ -171,7 +171,7 @@ def _run(check: Check, archives: Sequence[Path], shares: Shares | None, all_seed
         declared = standing_plan(plans)
 
     def is_done(trial: Composed) -> bool:
-        return isinstance(find_finished(trial.values), Done)
+        return not TrialFolder.of(trial.values).why_not_done(trial.values)
 
     def run(trials: Sequence[Composed]) -> None:
         run_batch([Trial.of(trial) for trial in trials])

@@ -48,13 +48,13 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
     from gsbench.renders.import_renders import is_entered
     from gsbench.runs.explain_cache import explain_steps
     from gsbench.runs.store import Store
-    from gsbench.runs.trial_files import read_config
+    from gsbench.runs.trial_folder import TrialFolder
 
     places = [word for word in words if not word.startswith(f"{PERMISSIONS}=")]
     if len(places) == 1 and (Path(places[0]) / CONFIG).exists():
         allowed = typed_permissions([word for word in words if word not in places])
         allow_modules(allowed)
-        values = read_config(Path(places[0])) | {PERMISSIONS: list(allowed)}
+        values = TrialFolder(Path(places[0])).configuration() | {PERMISSIONS: list(allowed)}
         if is_entered(values):
             raise InputError(f"{places[0]} was entered from renders: it has no stages")
     elif "=" not in words[0]:

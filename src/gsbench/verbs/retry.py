@@ -18,8 +18,8 @@ from gsbench.launch.states import states_of_experiment
 from gsbench.launch.trial import Trial
 from gsbench.runs.experiments import experiment_home
 from gsbench.runs.layout import CONFIG
-from gsbench.runs.origin import FROM_RENDERS
-from gsbench.runs.trial_files import TrialPaths, label_of, read_config
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.own_modules import allow_modules
 from gsbench.tracking.address import VARIABLE, untyped_address
 from gsbench.verbs.arguments import ArgumentParser
@@ -64,7 +64,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         return 0
     replaced = [old for old, trial in zip(unfinished, trials, strict=True) if trial.folder != old]
     for old in replaced:
-        log.info("%s: its configuration has changed since; the new one is run", label_of(old))
+        log.info("%s: its configuration has changed since; the new one is run", TrialFolder(old).label)
     code = run_trials(trials)
     forget(home, [old for old in replaced if old in planned])
     return code
@@ -76,7 +76,7 @@ def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
     for trial in trials:
         if strange := untyped_address(trial.values["tracking"], typed):
             raise InputError(
-                f"{label_of(trial.folder)} would send its results to {strange}, as a file says: to allow it, type "
+                f"{trial.files.label} would send its results to {strange}, as a file says: to allow it, type "
                 f"{TRACKER}={strange} (in no plan: set {VARIABLE}={strange}); tracking=none sends nothing"
             )
 
@@ -109,12 +109,13 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
             return found
     if any(key_of(change) != PERMISSIONS for change in changes):
         raise InputError(
-            f"{label_of(folder)} is in no plan, so no setting of it can be changed: run it by its own command"
+            f"{TrialFolder(folder).label} is in no plan, so no setting of it can be changed: run it by its own command"
         )
     allow_modules(allowed, here)
-    values = read_config(folder) | {"runs": str(runs), PERMISSIONS: list(allowed)}
+    files = TrialFolder(folder)
+    values = files.configuration() | {"runs": str(runs), PERMISSIONS: list(allowed)}
     if values["densify"].get("evaluated_from") == FROM_RENDERS:
-        raise InputError(f"{label_of(folder)} was entered from renders: give the command of `gsbench evaluate` again")
+        raise InputError(f"{files.label} was entered from renders: give the command of `gsbench evaluate` again")
     check_permissions(values)
     return Trial(values, yaml.safe_dump(values, sort_keys=False), (), recorded=True)
 
@@ -126,5 +127,5 @@ def key_of(word: str) -> str:
 
 def _identity(trial: Composed) -> Path:
     """The trial's place within any runs folder."""
-    paths = TrialPaths.of(trial.values)
-    return paths.folder.relative_to(paths.runs)
+    folder = TrialFolder.of(trial.values)
+    return folder.path.relative_to(folder.runs)

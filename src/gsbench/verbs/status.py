@@ -14,7 +14,6 @@ from gsbench.launch.plan import forget, read_plan, remove
 from gsbench.launch.states import TrialState, states_of_experiment
 from gsbench.runs.experiments import experiment_home, list_experiments
 from gsbench.runs.source import source_on_disk
-from gsbench.runs.trial_files import label_of
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
@@ -84,7 +83,7 @@ def lines_of(trials: list[TrialState], everything: bool) -> list[str]:
             continue
         for trial in trials:
             if trial.state == state:
-                lines.append(f"{state:<8} {label_of(trial.folder):<50} {_age(trial):>10}  {trial.note}".rstrip())
+                lines.append(f"{state:<8} {trial.label:<50} {_age(trial):>10}  {trial.note}".rstrip())
     lines.append(summary_of(trials))
     return lines
 

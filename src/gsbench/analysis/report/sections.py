@@ -24,7 +24,6 @@ from gsbench.analysis.verdicts import ArmVerdicts, Verdict, judge
 from gsbench.errors import InputError
 from gsbench.events import Cause, RefineEvent
 from gsbench.runs import layout
-from gsbench.runs.rows import read_histograms
 from gsbench.words import signed
 
 CROPS = 4  # places of each kind
@@ -161,7 +160,7 @@ def _mean_curves(trials: Sequence[TrialResult], name: str, keys: Sequence[str]) 
     """The mean over trials of each key of a file of curves, which is read once."""
     found: dict[str, list[list[tuple[float, float]]]] = {key: [] for key in keys}
     for trial in trials:
-        rows = trial.curve(name)
+        rows = trial.folder.rows(name)
         for key, curves in found.items():
             curves.append([(float(row["step"]), float(row[key])) for row in rows if key in row])
     return {key: mean_by_step(curves) for key, curves in found.items()}
@@ -299,7 +298,7 @@ def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, list[tuple[fl
     """Pooled counts of ``volume_histograms.jsonl`` by iteration, as (volume at the bin's centre, share)."""
     pooled: dict[int, dict[float, float]] = {}
     for trial in trials:
-        for row in read_histograms(trial.path / layout.HISTOGRAMS, trial.digests):
+        for row in trial.folder.histograms():
             for low, high, count in zip(row.log10_edges, row.log10_edges[1:], row.counts, strict=False):
                 bins, volume = pooled.setdefault(row.step, {}), 10 ** ((low + high) / 2)
                 bins[volume] = bins.get(volume, 0.0) + count

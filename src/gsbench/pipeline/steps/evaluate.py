@@ -37,10 +37,9 @@ from gsbench.pipeline.steps.model_metrics import (
 from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
 from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, MAPS, METRICS, PER_VIEW, POINT_CLOUD, RENDERS
-from gsbench.runs.stage_records import Evaluation
 from gsbench.runs.stages import EVALUATE
 from gsbench.runs.step import Step
-from gsbench.runs.trial_record import Earlier
+from gsbench.runs.trial_record import Earlier, Evaluation
 from gsbench.scene.columns import COUNTED
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name

@@ -30,9 +30,9 @@ from gsbench.pipeline.components import options_of
 from gsbench.pipeline.steps.code import step_of_code
 from gsbench.pipeline.steps.views import Views
 from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG, TRAINING
-from gsbench.runs.origin import FROM_MODEL, FROM_RENDERS
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.step import Step
+from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 from gsbench.system.checkout import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.own_modules import SAFE_PATH

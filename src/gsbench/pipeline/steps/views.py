@@ -9,8 +9,8 @@ from gsbench.init.base import MODEL_FOLDER
 from gsbench.logs import progress
 from gsbench.pipeline.steps.held_out import split_of
 from gsbench.runs.code import edited, files_of
-from gsbench.runs.inputs import PYCOLMAP, version_of
 from gsbench.runs.layout import VIEWS
+from gsbench.runs.made_of import PYCOLMAP, version_of
 from gsbench.runs.step import Step
 from gsbench.runs.store import Store
 from gsbench.scene.load import load_scene

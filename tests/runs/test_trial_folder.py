@@ -13,10 +13,7 @@ from gsbench.analysis.per_view import read_views
 from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
 from gsbench.launch.states import states_of_experiment
-from gsbench.parsing import DamagedError
-from gsbench.runs.inputs import read_results
-from gsbench.runs.layout import CURVES
-from gsbench.runs.trial_files import state_of
+from gsbench.runs.trial_folder import TrialFolder
 from tests.fuzz.records import EXPERIMENT, write_trial
 
 
@@ -42,7 +39,7 @@ def test_changed_results_are_left_out_and_named(trial: Path, capsys: pytest.Capt
     (line,) = experiment.warnings
     assert "results.json is not as it was written" in line
     assert f"gsbench retry {EXPERIMENT}" in line
-    assert state_of(trial) == "damaged"
+    assert TrialFolder(trial).state() == "damaged"
     assert cli.run(["tables", EXPERIMENT]) == 0
     said = capsys.readouterr()
     assert "43.2" not in said.out
@@ -58,36 +55,28 @@ def test_other_spaces_and_another_time_are_no_change(trial: Path) -> None:
     path = trial / "results.json"
     path.write_text(json.dumps(json.loads(path.read_text())))
     os.utime(path, (1, 1))
-    assert read_results(trial)[0].metrics == {"psnr": 26.5}
-    assert state_of(trial) == "done"
+    assert TrialFolder(trial).record().metrics == {"psnr": 26.5}
+    assert TrialFolder(trial).state() == "done"
 
 
 def test_results_without_a_record_of_them_are_believed(trial: Path) -> None:
-    (trial / "inputs.json").unlink()
+    path = trial / "results.json"
+    content = json.loads(path.read_text())
+    del content["made_of"]
+    path.write_text(json.dumps(content))
     edit(trial / "results.json", "26.5", "43.2")
-    assert read_results(trial)[0].metrics == {"psnr": 43.2}
-
-
-def test_a_record_from_before_there_were_digests_still_tells(trial: Path) -> None:
-    path = trial / "inputs.json"
-    record = json.loads(path.read_text())
-    del record["digests"], record["settings"]
-    path.write_text(json.dumps(record))
-    assert read_results(trial)[0].metrics == {"psnr": 26.5}
-    edit(trial / "results.json", "26.5", "43.2")
-    with pytest.raises(DamagedError, match="not as it was written"):
-        read_results(trial)
+    assert TrialFolder(trial).record().metrics == {"psnr": 43.2}
 
 
 def test_changed_views_and_curves_are_not_used(trial: Path, caplog: pytest.LogCaptureFixture) -> None:
     edit(trial / "per_view.csv", "a,25.5\nb,27.5", "a,24.5\nb,28.5")  # the mean is as it was
-    edit(trial / CURVES, "20.2", "40.2")
+    edit(trial / "metrics.jsonl", "20.2", "40.2")
     (one,) = (one for one in load_experiment(trial.parents[3], EXPERIMENT).trials if one.path == trial)
     with pytest.raises(InputError, match=r"per_view\.csv is not as it was written"):
         read_views(one)
-    assert one.curve(CURVES) == []
+    assert one.folder.curves() == []
     assert "metrics.jsonl is not as it was written" in caplog.text
-    assert len(one.curve("events.jsonl")) == 10
+    assert len(one.folder.events()) == 10
 
 
 def test_settings_are_those_that_the_results_were_made_by(trial: Path) -> None:
