@@ -17,7 +17,7 @@ NEXT_HYDRA := 'hydra-core>=1.4.0rc1,<1.5' 'omegaconf>=2.4.1rc1,<2.5'
 NEXT_HYDRA_TESTS := tests/app tests/config tests/end_to_end/test_hydra.py
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow test-all test-generic next-hydra test-next-hydra lint docs lock
+.PHONY: help install demo test test-slow test-all test-generic next-hydra test-next-hydra lint docs notebooks picture lock
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -54,6 +54,12 @@ lint: $(VENV)/.stamp-dev ## check style and types
 docs: $(VENV)/.stamp-docs ## write the documentation as a site to site/; fails where a link leads nowhere
 	$(BIN)/python scripts/site.py
 	$(BIN)/zensical build --clean
+
+notebooks: $(VENV)/.stamp-dev ## run the notebooks and keep their outputs in the .ipynb files
+	$(BIN)/python scripts/notebooks.py
+
+picture: $(VENV)/.stamp-run ## draw the README's picture from the trials of `make demo`
+	$(BIN)/python scripts/readme_picture.py
 
 lock: $(VENV)/.stamp-run ## bring uv.lock to the versions of constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
