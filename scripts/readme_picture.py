@@ -1,0 +1,105 @@
+"""Draw the README's picture from the trials of ``gsbench +experiment=demo``: ``make picture``.
+
+A strip of one held-out view (photograph, initial cloud, baseline, idea, where the two differ) above the table of the
+experiment with its verdict.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from gsbench.analysis import load_experiment, to_frame
+
+TARGET = Path(__file__).resolve().parents[1] / "docs" / "demo.jpg"
+BASELINE, IDEA = "adc", "volumetric"
+COLUMNS = {"psnr": "PSNR (dB) ↑", "ssim": "SSIM ↑", "lpips_squeeze": "LPIPS ↓", "num_gaussians": "Gaussians"}
+FORMATS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips_squeeze": "{:.3f}", "num_gaussians": "{:,.0f}"}
+
+
+def pixels(path: Path) -> NDArray[np.float64]:
+    """A picture [H, W, 3] in [0, 1]."""
+    return np.asarray(Image.open(path).convert("RGB"), float) / 255
+
+
+def initial_cloud(model: Path, view: str, size: tuple[int, int]) -> NDArray[np.float64]:
+    """The points of a COLMAP model as its camera of ``view`` sees them, the near ones in front: [H, W, 3]."""
+    reconstruction = pycolmap.Reconstruction(model)
+    (image,) = (entry for entry in reconstruction.images.values() if Path(entry.name).stem == Path(view).stem)
+    width, height = size
+    points = np.array([point.xyz for point in reconstruction.points3D.values()])
+    colors = np.array([point.color for point in reconstruction.points3D.values()]) / 255
+    pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+    local = points @ pose.rotation.matrix().T + pose.translation
+    front = local[:, 2] > 0.05
+    local, colors = local[front], colors[front]
+    camera = reconstruction.cameras[image.camera_id]
+    at = np.array([camera.img_from_cam(point) for point in local]) * width / camera.width
+    picture = np.full((height, width, 3), 0.08)
+    for index in np.argsort(-local[:, 2]):
+        x, y = at[index].astype(int)
+        if 0 <= x < width and 0 <= y < height:
+            picture[max(0, y - 1) : y + 1, max(0, x - 1) : x + 1] = colors[index]
+    return picture
+
+
+def main(runs: Path, verdict: str) -> None:
+    """Write the picture from the experiment ``demo`` of a runs folder; ``verdict`` is its last line."""
+    experiment = load_experiment(runs, "demo")
+    frame = to_frame(experiment)
+    arms = {
+        arm: min((t for t in experiment.trials if t.densify == arm), key=lambda t: t.seed) for arm in (BASELINE, IDEA)
+    }
+    views = sorted(path.name for path in (arms[IDEA].path / "renders").glob("*.png"))
+    view = views[len(views) // 2]
+    truth = pixels(arms[IDEA].path / "ground_truth" / view)
+    renders = {arm: pixels(trial.path / "renders" / view) for arm, trial in arms.items()}
+    errors = {arm: np.abs(picture - truth).mean(-1) for arm, picture in renders.items()}
+    gain = gaussian_filter(errors[BASELINE] - errors[IDEA], 2.0)
+    key = arms[IDEA].record.hashes["init"]
+    cloud = initial_cloud(runs / "store" / "init" / key / "sparse" / "0", view, (truth.shape[1], truth.shape[0]))
+
+    figure = plt.figure(figsize=(12.5, 3.3), dpi=110)
+    grid = figure.add_gridspec(
+        2, 5, height_ratios=(2.1, 1), left=0.005, right=0.995, top=0.92, bottom=0.02, wspace=0.02
+    )
+    panels = {"photograph": truth, "initial cloud": cloud, f"baseline: {BASELINE}": renders[BASELINE]}
+    panels |= {f"idea: {IDEA}": renders[IDEA], "blue: idea nearer; red: baseline": gain}
+    for place, (title, picture) in enumerate(panels.items()):
+        axis = figure.add_subplot(grid[0, place])
+        bound = 0.06 if picture.ndim == 2 else None
+        axis.imshow(picture, cmap="RdBu", vmin=-bound if bound else None, vmax=bound, interpolation="lanczos")
+        axis.set_title(title, fontsize=11)
+        axis.axis("off")
+    below = figure.add_subplot(grid[1, :])
+    below.axis("off")
+    there = [name for name in COLUMNS if name in frame]
+    cells = []
+    for arm in (BASELINE, IDEA):
+        rows = frame[frame["densify"] == arm]
+        shown = [f"{FORMATS[n].format(rows[n].mean())} ± {FORMATS[n].format(rows[n].std())}" for n in there]
+        cells.append([arm, *shown])
+    table = below.table(cells, colLabels=["", *(COLUMNS[name] for name in there)], loc="upper center", cellLoc="center")
+    table.auto_set_font_size(False)
+    table.set_fontsize(11)
+    table.scale(0.8, 1.25)
+    for cell in table.get_celld().values():
+        cell.set_edgecolor("#cccccc")
+    below.text(0.5, -0.02, verdict, ha="center", va="bottom", fontsize=11, transform=below.transAxes)
+    figure.savefig(TARGET, pil_kwargs={"quality": 88})
+    print(f"{TARGET}: {TARGET.stat().st_size // 1000} kB")
+
+
+if __name__ == "__main__":
+    main(Path(os.environ.get("GSBENCH_RUNS", "runs")), " ".join(sys.argv[1:]))
