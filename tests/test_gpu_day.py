@@ -57,7 +57,7 @@ def test_the_whole_day_in_the_interpreter(tmp_path: Path) -> None:
     assert "did not end well" not in said
     assert re.search(r"^\| trained \| 3 \| 16x16 \| `triton` \| [\d.]+ \|", said, re.MULTILINE)
     assert re.search(r"^\| a trained bonsai \| \d+ \| 16x16 \| `cpu` \|", said, re.MULTILINE)
-    assert re.search(r"^\| `decomposite` \| [\d.]+ \| [\d.]+ \|$", said, re.MULTILINE)
+    assert re.search(r"^\| `composite_backward` \| [\d.]+ \| [\d.]+ \|$", said, re.MULTILINE)
     assert re.search(r"^\| `triton` \| 2 \| \d+ \| [\d.]+ \| \d+ \| [\d.]+ \| [\d.]+ \|$", said, re.MULTILINE)
 
 

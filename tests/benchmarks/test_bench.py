@@ -144,7 +144,7 @@ def test_stages_name_the_kernels(capsys: pytest.CaptureFixture[str]) -> None:
     (row,) = json.loads(capsys.readouterr().out)
     stages = row["stages"]
     assert cpu_stages.composite_tiles is kernel  # as it was
-    assert {"project_shard", "composite_tiles", "decomposite_tiles", "similarity_rows", REST} <= stages.keys()
+    assert {"project_shard", "composite_tiles", "composite_backward_tiles", "similarity_rows", REST} <= stages.keys()
     assert min(stages.values()) >= 0
     kernels = [ms for name, ms in stages.items() if name != REST]
     assert kernels == sorted(kernels, reverse=True)
@@ -188,7 +188,7 @@ def test_what_a_gpu_ran_is_counted_once(monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.parametrize(
     ("kernel", "name"),
     [
-        ("decomposite", "decomposite"),
+        ("composite_backward", "composite_backward"),
         ("void at::native::vectorized_elementwise_kernel<4, at::native::FillFunctor<float>>(int, float)",
          "vectorized_elementwise_kernel"),
         ("void cub::DeviceRadixSortOnesweepKernel<cub::Policy<int, long>::P800, false>(long*, int)",

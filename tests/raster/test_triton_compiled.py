@@ -14,7 +14,7 @@ from torch.utils._pytree import tree_leaves
 
 pytest.importorskip("triton")
 
-from gsbench.gaussians.deferred import DeferredHarmonics
+
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.contract import Case
@@ -54,24 +54,6 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
         yield record
 
 
-def deferred_step(case: Case, harmonics: DeferredHarmonics, rasterizer: TritonRasterizer) -> None:
-    """One training step's render, backward and step of harmonics that are put off."""
-    device = harmonics.values.device
-    gaussians = case.gaussians().map(lambda tensor: tensor.float().to(device).requires_grad_())
-    output = rasterizer.render_deferred(
-        gaussians, harmonics, case.camera(), case.sh_degree, torch.zeros(3, device=device)
-    )
-    output.image.sum().backward()
-    assert harmonics.gradient is not None
-    harmonics.gradient.step(harmonics, 1e-3, 1e-15)
-    harmonics.coasting.advance(1e-3)
-
-
-def harmonics_of(case: Case, device: str = "cpu") -> DeferredHarmonics:
-    values, first, second = (torch.zeros(case.count, 15, 3, device=device) for _ in range(3))
-    return DeferredHarmonics(values, first, second, torch.zeros(case.count, dtype=torch.int32, device=device))
-
-
 def step(
     case: Case, device: str = "cpu", absolute: bool = False, footprint: bool = False
 ) -> tuple[Gaussians, RenderOutput]:
@@ -96,13 +78,10 @@ def step(
 def test_kernels_compile_without_spills(launches: list[Launch], target: int, monkeypatch: pytest.MonkeyPatch) -> None:
     step(CASE)
     step(CASE, absolute=True, footprint=True)
-    deferred_step(CASE, harmonics_of(CASE), TritonRasterizer())
     if target == 90:  # the other variants: the lower degrees, and blocks that are numbered in 32 bits
         monkeypatch.setattr(lists, "MAX_INT16", 0)
         for degree in (0, 1, 2):
             step(replace(CASE, sh_degree=degree))
-            if degree > 0:
-                deferred_step(replace(CASE, sh_degree=degree), harmonics_of(CASE), TritonRasterizer())
     compiled = {}
     for launch in launches:
         variant = launch.name, str(specialization(launch, target))
@@ -114,7 +93,7 @@ def test_kernels_compile_without_spills(launches: list[Launch], target: int, mon
         assert made.spilled == 0, variant
         if launch.name == "composite":
             assert made.inner_loop / composite.UNROLL.value < FORWARD_ENTRY
-        if launch.name == "decomposite":
+        if launch.name == "composite_backward":
             assert made.inner_loop / composite.UNROLL_BACK.value < BACKWARD_ENTRY
     assert len({name for name, _ in compiled}) == 14
     assert len(compiled) == (32 if target == 90 else 19)
@@ -125,7 +104,6 @@ def test_growing_compiles_nothing_anew(launches: list[Launch]) -> None:
     cases = (Case(33, 49, 50, 3), Case(32, 48, 64, 3), Case(1, 16, 1, 3))
     for case in cases:
         step(case)
-        deferred_step(case, harmonics_of(case), TritonRasterizer())
     names = [launch.name for launch in launches]
     each = len(names) // len(cases)
     assert names == names[:each] * len(cases)
@@ -187,17 +165,3 @@ def test_a_step_waits_once(launches: list[Launch]) -> None:
     with Watch() as watch:
         torch.zeros(3).to("meta")
     assert len(watch.waits) == 1
-
-
-def test_a_step_of_harmonics_that_are_put_off_waits_once(launches: list[Launch]) -> None:
-    """For how much there is to composite. What changes of the table of drifts goes to the device as one copy, on CUDA
-    from pinned memory, so that nobody waits for it."""
-    harmonics, rasterizer = harmonics_of(CASE, "meta"), TritonRasterizer()
-    deferred_step(CASE, harmonics, rasterizer)
-    asked = Answer.asked
-    with Watch() as watch:
-        deferred_step(CASE, harmonics, rasterizer)
-    made_by_the_test = 6  # tensors of Gaussians that go there
-    assert sorted(watch.waits) == ["aten._to_copy.default"] * made_by_the_test + ["aten.copy_.default"]
-    assert Answer.asked == asked + 1
-    assert [launch.name for launch in launches].count("step_harmonics") == 2

@@ -15,18 +15,13 @@ from triton import language as tl
 from triton.runtime.interpreter import interpreter_builder
 
 from gsbench.densify import ADC
-from gsbench.gaussians import spherical_harmonics
-from gsbench.gaussians.deferred import DeferredHarmonics
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.paper_values import LearningRates
-from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster import staged
 from gsbench.raster.base import Rasterizer, RenderOutput
 from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.raster.triton import composite, layout, lists
-from gsbench.raster.triton.deferred import Factors, Tables
 from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.raster.triton.memory import BYTES_OF_BORDER, PAIRS_OF_BORDER, workspace_bytes
 from gsbench.raster.triton.workspace import Workspace
@@ -146,89 +141,6 @@ def test_segments_change_nothing_but_the_last_digits(monkeypatch: pytest.MonkeyP
     assert int(crossed.sum()) > 15
     assert bool(((frame.lists.starts[1:] - frame.lists.starts[:-1] - 1) // 8 > crossed).any())
     assert max(errors.values()) < 1e-5
-
-
-def random_factors(harmonics: DeferredHarmonics, degree: int, seed: int) -> tuple[Factors, Tensor]:
-    """A gradient of a random half of the Gaussians, in rows that are full of NaN elsewhere, and as a tensor."""
-    count, generator = len(harmonics.last), torch.Generator().manual_seed(seed)
-    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
-    color = torch.randn(count, 3, generator=generator)
-    seen = torch.rand(count, generator=generator) < 0.3 + 0.4 * (torch.arange(count) % 2)
-    rows = torch.full((count, 8), torch.nan)
-    rows[seen, :6] = torch.cat([direction, color], 1)[seen]
-    rows.view(torch.int32)[:, 6] = torch.where(seen, harmonics.last, -1)
-    functions = spherical_harmonics.basis(direction.double(), degree)[:, 1:]  # [N, K]
-    gradient = torch.zeros(count, 15, 3)
-    gradient[:, : functions.shape[1]] = torch.einsum("nk,nc->nkc", functions * seen[:, None], color.double()).float()
-    return Factors(Tables(rows.device), rows, degree), gradient
-
-
-def test_harmonics_that_are_put_off_come_to_the_same_as_dense_steps() -> None:
-    """Against torch's Adam, 300 steps of growing degree: with a densification, an opacity reset, a resume, a look."""
-    initial = random_gaussians(40, seed=5).map(Tensor.float)
-    dense, lazy = (TrainableGaussians(initial, LearningRates(), 1.0) for _ in range(2))
-    lazy.defer_harmonics()
-    tables, behind = Tables(torch.device("cpu")), 0
-    for step in range(300):
-        degree = min(3, step // 30)
-        if degree > 0:
-            factors, gradient = random_factors(lazy.deferred, degree, seed=step)
-            factors._tables = tables  # one for all steps, as a rasterizer has
-            lazy.deferred.receive(factors)
-            dense.values.sh_rest.grad = gradient
-        for each in (dense, lazy):
-            each.leaves.means.grad = torch.zeros_like(each.leaves.means)
-            if step == 250:
-                torch.testing.assert_close(each.values.sh_rest.grad, gradient, rtol=1e-5, atol=1e-6)
-            each.optimizer_step(degree)
-        behind = max(behind, int((lazy.deferred.coasting.step - lazy.deferred.last).max()))
-        if step == 100:
-            for each in (dense, lazy):
-                each.edit(torch.arange(40) % 7 != 3, append=initial.select(torch.arange(0, 30, 2)))
-        if step == 150:
-            for each in (dense, lazy):
-                each.overwrite("opacity_logits", each.leaves.opacity_logits.detach().clamp_max(0.5))
-        if step == 200:
-            state = lazy.state_dict()
-            assert state["deferred"]["last"].min() < lazy.deferred.coasting.step
-            lazy, tables = TrainableGaussians.load(state, LearningRates(), 1.0), Tables(torch.device("cpu"))
-    assert behind > 5
-    assert (dense.leaves.sh_rest[:30] - initial.sh_rest[:30]).abs().max() > 0.01
-    expected = dense.optimizer.state[dense.leaves.sh_rest]
-    found = lazy.deferred.settled()
-    for value, wanted in zip(found, (dense.leaves.sh_rest, expected["exp_avg"], expected["exp_avg_sq"]), strict=True):
-        assert (value - wanted).abs().max() < 2e-6 * wanted.abs().max()
-
-
-def test_a_render_sees_what_harmonics_have_missed() -> None:
-    """The picture and all gradients are those of settled Gaussians, and nothing is settled for it."""
-    trainable = TrainableGaussians(TINY.gaussians().map(Tensor.float), LearningRates(sh_rest=0.05), 1.0)
-    trainable.defer_harmonics()
-    for seed in range(4):
-        trainable.deferred.receive(random_factors(trainable.deferred, 3, seed)[0])
-        trainable.optimizer_step()
-    harmonics, rasterizer = trainable.deferred, TritonRasterizer()
-    assert 0 < (harmonics.last < 4).sum() < 20
-    before, last = trainable.leaves.sh_rest.detach().clone(), harmonics.last.clone()
-    background = torch.tensor([0.2, 0.5, 0.9])
-    settled = trainable.snapshot().map(lambda tensor: tensor.clone().requires_grad_())
-    assert (settled.sh_rest - before).abs().max() > 0.01
-    expected = rasterizer.render(settled, TINY.camera(), 3, background)
-    expected.image.square().sum().backward()
-    output = rasterizer.render_deferred(trainable.leaves, harmonics, TINY.camera(), 3, background)
-    assert torch.equal(output.radii, expected.radii)
-    assert (output.image - expected.image).abs().max() < 1e-6
-    output.image.square().sum().backward()
-    assert trainable.leaves.sh_rest.grad is None
-    assert torch.equal(trainable.leaves.sh_rest, before)
-    assert torch.equal(harmonics.last, last)
-    trainable.settle()  # leaves the gradient, too
-    assert torch.equal(trainable.leaves.sh_rest, settled.sh_rest)
-    for name, tensor in trainable.leaves.tensors().items():
-        wanted = getattr(settled, name).grad
-        assert (tensor.grad - wanted).abs().max() < 1e-5 * wanted.abs().max(), name
-    rasterizer.render_deferred(trainable.leaves, harmonics, TINY.camera(), 0, background).image.sum().backward()
-    assert harmonics.gradient is None
 
 
 def test_equal_depths_are_blended_in_the_order_of_the_index() -> None:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from gsbench.gaussians.deferred import DeferredHarmonics
     from gsbench.gaussians.model import Gaussians
     from gsbench.raster.footprint import Footprint
     from gsbench.scene.camera import Camera
@@ -128,30 +127,5 @@ class Rasterizer(Protocol):
 
         Differentiable in the six tensors of ``gaussians`` and in ``screen_points``. Pixel (column i, row j) is sampled
         at its centre: a point projects to ``fx x/z + cx - 0.5`` in units where pixel centres are integers.
-        """
-        ...
-
-
-class DeferringRasterizer(Rasterizer, Protocol):
-    """Offer of a rasterizer beyond the contract: renders that keep the harmonics' optimiser steps for later.
-
-    Whether one does shows in its having the method. A trainer uses it where nobody but its own optimiser needs the
-    gradient of ``sh_rest`` as a tensor; everything else (metrics, scores, a user's own loop) goes through ``render``.
-    """
-
-    def render_deferred(
-        self,
-        gaussians: Gaussians,
-        harmonics: DeferredHarmonics,
-        camera: Camera,
-        sh_degree: int,
-        background: Tensor,
-        absolute_gradient: bool = False,
-        splitting_matrix: bool = False,
-    ) -> RenderOutput:
-        """The same picture as ``render`` of the settled Gaussians: with what harmonics have missed.
-
-        It changes nothing. The backward pass gives ``harmonics.receive`` the gradient of ``sh_rest`` as factors, and
-        ``gaussians.sh_rest`` none.
         """
         ...

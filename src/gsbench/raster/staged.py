@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsbench.gaussians.deferred import DeferredHarmonics
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.footprint import Footprint
@@ -30,17 +29,13 @@ class Request(NamedTuple):
     camera: Camera
     degree: int
     background: Tensor
-    harmonics: DeferredHarmonics | None
     absolute: Tensor | None
 
 
 class Gradients(NamedTuple):
-    """Gradients of the six tensors, of ``screen_points`` and, where they are asked for, the splitting matrices.
+    """Gradients of the six tensors, of ``screen_points`` and, where they are asked for, the splitting matrices."""
 
-    With harmonics that are put off that of ``sh_rest`` is None.
-    """
-
-    tensors: list[Tensor | None]
+    tensors: list[Tensor]
     screen: Tensor  # [N, 2]
     splitting: Tensor | None  # [N, 3, 3]
 
@@ -48,7 +43,7 @@ class Gradients(NamedTuple):
 class StagedRasterizer(ABC, Generic[FrameT]):
     """A rasterizer whose forward pass leaves a frame for its backward pass and for questions after its footprint.
 
-    Both renders of the contract are here, and the bridge to autograd; a subclass has the stages. What these get is
+    The render of the contract is here, and the bridge to autograd; a subclass has the stages. What these get is
     contiguous.
     """
 
@@ -88,42 +83,15 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         splitting_matrix: bool = False,
     ) -> RenderOutput:
         """Render as ``raster.base.Rasterizer`` says. Raises ValueError naming the parameter that cannot be used."""
-        return self._render(gaussians, None, camera, sh_degree, background, absolute_gradient, splitting_matrix)
-
-    def render_deferred(
-        self,
-        gaussians: Gaussians,
-        harmonics: DeferredHarmonics,
-        camera: Camera,
-        sh_degree: int,
-        background: Tensor,
-        absolute_gradient: bool = False,
-        splitting_matrix: bool = False,
-    ) -> RenderOutput:
-        """Render as ``raster.base.DeferringRasterizer`` says."""
-        return self._render(gaussians, harmonics, camera, sh_degree, background, absolute_gradient, splitting_matrix)
-
-    def _render(
-        self,
-        gaussians: Gaussians,
-        harmonics: DeferredHarmonics | None,
-        camera: Camera,
-        sh_degree: int,
-        background: Tensor,
-        absolute_gradient: bool,
-        splitting_matrix: bool,
-    ) -> RenderOutput:
         check_settings(gaussians, camera, sh_degree, background)
         self.check(gaussians)
         screen_points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         absolute = torch.zeros_like(screen_points) if absolute_gradient else None
         probe = screen_points.new_zeros(len(gaussians), 3, 3, requires_grad=True) if splitting_matrix else None
-        request = Request(camera, sh_degree, background.detach().contiguous(), harmonics, absolute)
+        request = Request(camera, sh_degree, background.detach().contiguous(), absolute)
         kept: _Kept[FrameT] = _Kept()
-        tensors = gaussians.tensors()
-        if harmonics is not None:  # autograd does not see what is changed behind its back, and gets no gradient for
-            tensors["sh_rest"] = tensors["sh_rest"].detach()
-        image, alpha, radii = _Render.apply(self, kept, request, background, screen_points, probe, *tensors.values())
+        tensors = gaussians.tensors().values()
+        image, alpha, radii = _Render.apply(self, kept, request, background, screen_points, probe, *tensors)
         footprint = partial(_footprint, self, kept, gaussians.map(Tensor.detach), camera)
         return RenderOutput(image, alpha, radii, screen_points, absolute, footprint, probe)
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 
@@ -22,7 +22,7 @@ from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster import Rasterizer
-from gsbench.raster.base import DeferringRasterizer, RenderOutput
+from gsbench.raster.base import RenderOutput
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.scene.types import Scene
 from gsbench.system.stopping import deferred, requested
@@ -95,7 +95,6 @@ class Trainer:
         is_white = bool((self.background == 1).all())
         self.context = DensifyContext(scene.extent, is_white, self.device, views, limit)
         densifier.begin(initial, self.context)
-        self._defer()
 
     def run(self, folder: Path, on_status: Callable[[Status], None] = lambda status: None) -> Gaussians:
         """Train to the last iteration, or to the end of the time budget; returns the Gaussians, detached."""
@@ -178,7 +177,7 @@ class Trainer:
         if step == options.iterations:  # 3DGS saves before it would refine or step
             return None
         if step in self.snapshot_at:
-            write_ply(self.gaussians.snapshot(), folder / snapshot_file(step))
+            write_ply(self.gaussians.values, folder / snapshot_file(step))
         self.densifier.observe(step, render)
         if options.step_after_refine:
             self._optimize(render.visible)
@@ -194,17 +193,17 @@ class Trainer:
 
     def render(self, index: int) -> RenderOutput:
         """The training view ``index`` as the present iteration draws it, with a graph."""
-        deferred, camera = self.gaussians.deferred, self.pictures.at(self.scale)[0][index]
-        rest = camera, self.sh_degree, self.background, self.densifier.needs_absolute_gradient
+        camera = self.pictures.at(self.scale)[0][index]
+        # Only where it is wanted: a rasterizer of a user's own may not know this argument.
         beyond: dict[str, Any] = {"splitting_matrix": True} if self.densifier.needs_splitting_matrix else {}
-        if deferred is None:
-            return self.rasterizer.render(self.gaussians.values, *rest, **beyond)
-        rasterizer = cast("DeferringRasterizer", self.rasterizer)  # or else nothing would be deferred
-        return rasterizer.render_deferred(self.gaussians.leaves, deferred, *rest, **beyond)
-
-    def _defer(self) -> None:
-        """Put off steps of harmonics where the rasterizer can, and the optimiser is the plain one of 3DGS."""
-        self.gaussians.defer_harmonics(hasattr(self.rasterizer, "render_deferred") and not self.options.visible_adam)
+        return self.rasterizer.render(
+            self.gaussians.values,
+            camera,
+            self.sh_degree,
+            self.background,
+            self.densifier.needs_absolute_gradient,
+            **beyond,
+        )
 
     @contextmanager
     def _explained(self, folder: Path) -> Iterator[None]:
@@ -248,7 +247,6 @@ class Trainer:
             self.gaussians = TrainableGaussians.load(
                 state["gaussians"], self.gaussians.rates, self.gaussians.spatial_scale, self.device
             )
-            self._defer()
             self.densifier.load_state_dict(state["densifier"], self.context)
             if self.resolution is not None:
                 self.resolution.momentum = state["momentum"]

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from gsbench.raster.cpu import layout as at
-from gsbench.raster.cpu.deferred import CHUNK, G_BLUE, G_GREEN, G_RED, INDEX, TO_X, TO_Y, TO_Z, load_settled
 from gsbench.raster.cpu.geometry import (
     dot,
     exponential,
@@ -24,7 +23,7 @@ from gsbench.raster.cpu.geometry import (
     to_view,
 )
 from gsbench.raster.cpu.harmonics import F0, MATRIX, direction_gradient, fill_basis
-from gsbench.raster.cpu.shuffle import REST, by_channel, outer_rest, store_rest, transpose
+from gsbench.raster.cpu.shuffle import REST, by_channel, load_rest, outer_rest, store_rest, transpose
 from gsbench.raster.cpu.simd import gather, load, prefetch, scatter, select, splat, store
 from gsbench.raster.cpu.vector import LANES
 from gsbench.system.jit import inlined, kernel
@@ -73,13 +72,11 @@ def backproject_shard(
     begin: int,
     end: int,
     visible: int,
-    chunk: int,
     means: Any,
     log_scales: Any,
     quaternions: Any,
     logits: Any,
     sh_rest: Any,
-    pending: Any,
     degree: int,
     v: Any,
     record_ints: Any,
@@ -91,16 +88,13 @@ def backproject_shard(
     g_logits: Any,
     g_sh_dc: Any,
     g_sh_rest: Any,
-    factors: Any,
-    factor_ints: Any,
     g_screen: Any,
     g_absolute: Any,
     g_splitting: Any,
 ) -> None:
     """Write every gradient of the Gaussians ``begin`` to ``end``; reads and clears their ``rows`` [shards * N * 16].
 
-    ``g_absolute`` and ``g_splitting`` [N, 9] may be empty. Where ``g_sh_rest`` is empty, the harmonics' goes to
-    ``factors`` from ``chunk`` on, for the Gaussians that are seen.
+    ``g_absolute`` and ``g_splitting`` [N, 9] may be empty.
     """
     unseen = begin  # the first Gaussian whose gradients are not written yet
     for record in range(begin, begin + visible + 1):
@@ -111,8 +105,7 @@ def backproject_shard(
             _clear(g_quaternions, unseen, past)
             _clear(g_logits, unseen, past)
             _clear(g_sh_dc, unseen, past)
-            if len(g_sh_rest) > 0:
-                _clear(g_sh_rest, unseen, past)
+            _clear(g_sh_rest, unseen, past)
             _clear(g_screen, unseen, past)
             if len(g_absolute) > 0:
                 _clear(g_absolute, unseen, past)
@@ -134,24 +127,17 @@ def backproject_shard(
         scatter(g_sh_dc, indices, 3, 0, red * F0)
         scatter(g_sh_dc, indices, 3, 1, green * F0)
         scatter(g_sh_dc, indices, 3, 2, blue * F0)
-        dense = len(g_sh_rest) > 0
         if degree > 0:
-            if dense:
-                fill_basis(degree, to[0], to[1], to[2], basis)
+            fill_basis(degree, to[0], to[1], to[2], basis)
             for lane in range(LANES):
                 place = lane * LANES
                 r, g, b = colors[lane], colors[LANES + lane], colors[2 * LANES + lane]
-                by_red, by_green, by_blue = by_channel(load_settled(sh_rest, indices[lane], pending))
+                by_red, by_green, by_blue = by_channel(load_rest(sh_rest, indices[lane] * REST))
                 store(pulled, place, by_red * r + by_green * g + by_blue * b)
-                if dense:
-                    store_rest(g_sh_rest, indices[lane] * REST, outer_rest(load(basis, place), r, g, b))
-        elif dense:
+                store_rest(g_sh_rest, indices[lane] * REST, outer_rest(load(basis, place), r, g, b))
+        else:
             for lane in range(LANES):
                 store_rest(g_sh_rest, indices[lane] * REST, (splat(ZERO), splat(ZERO), splat(ZERO)))
-        if not dense:
-            _keep_factors(
-                (chunk + (record - begin) // LANES) * CHUNK, to, (red, green, blue), indices, factors, factor_ints
-            )
         through = direction_gradient(degree, to[0], to[1], to[2], pulled)
 
         # The forward geometry once more.
@@ -265,19 +251,6 @@ def _scatter_splitting(g_splitting: Any, indices: Any, d00: Any, d01: Any, d11: 
 def _difference(a: Any, b: Any) -> Any:
     """a^2 - b^2, to the last digits and without overflow of what does not overflow."""
     return (a - b) * (a + b)
-
-
-@inlined
-def _keep_factors(start: int, to: Any, color: Any, indices: Any, factors: Any, factor_ints: Any) -> None:
-    """Write a chunk of factors to ``factors[start:]``."""
-    store(factors, start + TO_X * LANES, to[0])
-    store(factors, start + TO_Y * LANES, to[1])
-    store(factors, start + TO_Z * LANES, to[2])
-    store(factors, start + G_RED * LANES, color[0])
-    store(factors, start + G_GREEN * LANES, color[1])
-    store(factors, start + G_BLUE * LANES, color[2])
-    for lane in range(LANES):
-        factor_ints[start + INDEX * LANES + lane] = indices[lane]
 
 
 @inlined

@@ -65,11 +65,12 @@ def _put(key: Any, digit: int, counts: Any, target: Any) -> None:
 
 
 @inlined
-def _columns(records: Any, base: int, tile_y: int, first: int, past: int, cutoff: Any) -> Any:
-    """Tiles of row ``tile_y``, within ``first`` to ``past``, that the contour reaches: first, past the last."""
+def _columns(records: Any, base: int, tile_y: int, first: int, past: int, reach: Any, flatness: Any) -> Any:
+    """Tiles of row ``tile_y``, within ``first`` to ``past``, that the contour reaches: first, past the last.
+
+    The contour is t^2 = ``reach`` - ``flatness`` dy^2, with t = dx + shear dy.
+    """
     shear, mean_y = np.float64(records[base + at.SHEAR]), np.float64(records[base + at.MEAN_Y])
-    curve_t, curve_y = np.float64(records[base + at.CURVE_T]), np.float64(records[base + at.CURVE_Y])
-    reach = np.float64(records[base + at.LOG2_OPACITY]) - cutoff + LOG2_ALPHA_MIN_MARGIN
     top = tile_y * at.TILE - mean_y - PIXEL_MARGIN
     bottom = top + (at.TILE - 1) + 2 * PIXEL_MARGIN
     # The contour's x over y is concave on the right and convex on the left: the extremes within the row are at its
@@ -77,8 +78,8 @@ def _columns(records: Any, base: int, tile_y: int, first: int, past: int, cutoff
     rightmost = np.float64(records[base + at.RIGHTMOST_Y])
     y_right = min(max(rightmost, top), bottom)
     y_left = min(max(-rightmost, top), bottom)
-    right = math.sqrt(max(0.0, (reach + curve_y * y_right * y_right) / -curve_t)) - shear * y_right
-    left = -math.sqrt(max(0.0, (reach + curve_y * y_left * y_left) / -curve_t)) - shear * y_left
+    right = math.sqrt(max(0.0, reach - flatness * y_right * y_right)) - shear * y_right
+    left = -math.sqrt(max(0.0, reach - flatness * y_left * y_left)) - shear * y_left
     mean_x = np.float64(records[base + at.MEAN_X])
     low = math.ceil(min(max(mean_x + left - PIXEL_MARGIN, -1e6), 1e6))
     high = math.floor(min(max(mean_x + right + PIXEL_MARGIN, -1e6), 1e6))
@@ -104,10 +105,13 @@ def pair_shard(
         base = int(record) * at.RECORD
         spans_x, spans_y = record_ints[base + at.TILES_X], record_ints[base + at.TILES_Y]
         first, past = spans_x & 0xFFFF, spans_x >> 16
+        inverse = -1.0 / np.float64(records[base + at.CURVE_T])
+        reach = (np.float64(records[base + at.LOG2_OPACITY]) - cutoff + LOG2_ALPHA_MIN_MARGIN) * inverse
+        flatness = np.float64(records[base + at.CURVE_Y]) * -inverse
         for tile_y in range(spans_y & 0xFFFF, spans_y >> 16):
             low, high = first, past
             if past - first > 1:
-                low, high = _columns(records, base, tile_y, first, past, cutoff)
+                low, high = _columns(records, base, tile_y, first, past, reach, flatness)
             for tile in range(tile_y * tiles_x + low, tile_y * tiles_x + high):
                 counts[tile] += 1
                 if place < room:

@@ -1,7 +1,7 @@
 """Compositing of tiles, forward and backward, 4x4 pixels at a time.
 
 A tile is 16 blocks of 4x4 pixels; a block's state is one vector per quantity. A bit mask says which blocks a record can
-touch; the forward pass leaves in ``masks`` the blocks that it did touch, for the backward pass.
+touch; the forward pass leaves it in ``masks`` for the backward pass.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from gsbench.raster.cpu.simd import (
     exp2,
     fma,
     lane_sums,
+    lanes_with_bit,
     load,
     lowest_bit,
     mask_bits,
@@ -41,7 +42,10 @@ ONE = np.float32(1)
 ZERO = np.float32(0)
 BLOCK_SPAN = np.float32(at.BLOCK - 1)
 TO_PRECISION = np.float32(2 * math.log(2.0))  # -curve to entry of the inverse covariance, up to sign
-AHEAD = 6  # list entries that the prefetch runs ahead
+BATCH = 64  # entries that the forward pass blends block by block: as many as a word has bits
+BATCH_AHEAD = 24  # list entries that the forward pass's prefetch runs ahead
+AHEAD = 6  # and that of the backward pass, which does more for each
+NEVER_STOPPED = np.float32(1e9)  # more entries than a tile can have
 
 LANE_X = (np.arange(LANES) % at.BLOCK).astype(np.float32)  # px within a block
 LANE_Y = (np.arange(LANES) // at.BLOCK).astype(np.float32)
@@ -96,75 +100,101 @@ def composite_tiles(
     """Blend the tiles ``first`` to ``past``.
 
     In: ``starts`` [tiles + 1], ``entries`` [pairs], ``records``, ``background`` [3]. Out: ``image`` [H * W * 3],
-    ``alpha`` [H * W]; for the backward pass ``masks`` [pairs] uint16, ``processed`` [tiles], and by tile, block and
-    lane [tiles * 256] the final ``transmittance`` and ``last``, the number of the last entry that was blended, plus
-    one.
+    ``alpha`` [H * W]; for the backward pass ``masks`` [pairs] uint16, the blocks that each entry may touch,
+    ``processed`` [tiles], and by tile, block and lane [tiles * 256] the final ``transmittance`` and ``last``, the
+    number of entries before the one that stopped the pixel (`NEVER_STOPPED` where none did, 0 outside the image).
     """
     tiles_x = (width + at.TILE - 1) // at.TILE
     lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
     column, row = lane_x * np.float32(at.BLOCK), lane_y * np.float32(at.BLOCK)
-    floats, live = memory
+    floats, integers = memory
     red, green, blue = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :], floats[2 * at.TILE_PIXELS :]
+    batch = floats[3 * at.TILE_PIXELS :]  # [BATCH * RECORD]
+    live, touched = integers[:LANES], integers[LANES:].view(np.uint16)  # [16] pixels by block, [BATCH] blocks by entry
     for tile in range(first, past):
         left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
         tile_x, tile_y = np.float32(left), np.float32(top)
         state = tile * at.TILE_PIXELS
-        alive = np.uint64(0)
+        alive = np.uint64(0)  # bit b: block b has a pixel that has not stopped
         for block in range(16):
             place = block * LANES
             store(red, place, splat(ZERO))
             store(green, place, splat(ZERO))
             store(blue, place, splat(ZERO))
             store(transmittance, state + place, splat(ONE))
-            store(last, state + place, splat(ZERO))
             x, y = left + block % 4 * at.BLOCK, top + block // 4 * at.BLOCK
             live[block] = mask_bits((lane_x < np.float32(width - x)) & (lane_y < np.float32(height - y)))
+            store(last, state + place, select(mask_from_bits(live[block]), splat(NEVER_STOPPED), ZERO))
             if live[block] != 0:
                 alive |= np.uint64(1) << np.uint64(block)
 
+        # A batch of entries at a time, and within it block by block. Entry by entry, a block's state would be loaded
+        # and stored for every entry that touches it, each store waited for by the next load; so it stays in registers
+        # through a batch. The first loop has no branch that depends on a record, so nothing is guessed wrongly there,
+        # and it leaves the records in the first-level cache, where the second loop reads them up to 16 times.
         begin, end = starts[tile], starts[tile + 1]
         entry = begin
         while entry < end and alive != 0:
-            base = entries[entry] * at.RECORD
-            prefetch(records, entries[min(entry + AHEAD, end - 1)] * at.RECORD)
-            todo = _touched_blocks(records, base, tile_x, tile_y, column, row) & alive
-            used = np.uint64(0)
-            shear = splat(records[base + at.SHEAR])
-            curve_t, curve_y = splat(records[base + at.CURVE_T]), splat(records[base + at.CURVE_Y])
-            log2_opacity = splat(records[base + at.LOG2_OPACITY])
-            r, g, b = splat(records[base + at.RED]), splat(records[base + at.GREEN]), splat(records[base + at.BLUE])
-            offset_x, offset_y = tile_x - records[base + at.MEAN_X], tile_y - records[base + at.MEAN_Y]
-            number = splat(np.float32(entry - begin + 1))
-            while todo != 0:
-                block = lowest_bit(todo)
-                todo &= todo - np.uint64(1)
-                place = block * np.uint64(LANES)
-                dx = load(PIXEL_X, place) + offset_x
-                dy = load(PIXEL_Y, place) + offset_y
-                t = fma(dy, shear, dx)
-                power = fma(curve_y * dy, dy, fma(curve_t * t, t, log2_opacity))  # log2(alpha)
-                blend = (power >= LOG2_ALPHA_MIN) & mask_from_bits(live[block])
-                opacity = minimum(exp2(power), splat(ALPHA_MAX))
-                before = load(transmittance, state + place)
-                after = before - before * opacity
-                stop = blend & (after < TRANSMITTANCE_MIN)
-                blend = blend & ~stop
-                weight = select(blend, before * opacity, ZERO)
-                store(red, place, fma(weight, r, load(red, place)))
-                store(green, place, fma(weight, g, load(green, place)))
-                store(blue, place, fma(weight, b, load(blue, place)))
-                store(transmittance, state + place, select(blend, after, before))
-                store(last, state + place, select(blend, number, load(last, state + place)))
+            count = min(BATCH, end - entry)
+            for k in range(count):
+                base = entries[entry + k] * at.RECORD
+                prefetch(records, entries[min(entry + k + BATCH_AHEAD, end - 1)] * at.RECORD)
+                blocks = _touched_blocks(records, base, tile_x, tile_y, column, row) & alive
+                touched[k] = blocks
+                masks[entry + k] = blocks
+                store(batch, k * at.RECORD, load(records, base))
+                batch[k * at.RECORD + at.MEAN_X] = tile_x - records[base + at.MEAN_X]  # from the mean to the tile
+                batch[k * at.RECORD + at.MEAN_Y] = tile_y - records[base + at.MEAN_Y]
+            for k in range(count, BATCH):
+                touched[k] = 0
+            blocks = alive
+            while blocks != 0:
+                block = lowest_bit(blocks)
                 bit = np.uint64(1) << block
-                if mask_bits(blend) != 0:
-                    used |= bit
-                stopped = mask_bits(stop)
-                if stopped != 0:
-                    live[block] &= ~np.int64(stopped)
-                    if live[block] == 0:
-                        alive &= ~bit
-            masks[entry] = used
-            entry += 1
+                blocks &= blocks - np.uint64(1)
+                todo = lanes_with_bit(touched, 0, bit)  # bit k: entry k of the batch touches this block
+                if todo == 0:
+                    continue
+                place = block * np.uint64(LANES)
+                pixel_x, pixel_y = load(PIXEL_X, place), load(PIXEL_Y, place)
+                before = load(transmittance, state + place)
+                r, g, b = load(red, place), load(green, place), load(blue, place)
+                lanes = mask_from_bits(live[block])
+                while todo != 0:
+                    k = lowest_bit(todo)
+                    todo &= todo - np.uint64(1)
+                    base = k * np.uint64(at.RECORD)
+                    dx = pixel_x + batch[base + np.uint64(at.MEAN_X)]
+                    dy = pixel_y + batch[base + np.uint64(at.MEAN_Y)]
+                    t = fma(dy, batch[base + np.uint64(at.SHEAR)], dx)
+                    along_t = fma(t * batch[base + np.uint64(at.CURVE_T)], t, batch[base + np.uint64(at.LOG2_OPACITY)])
+                    power = fma(dy * batch[base + np.uint64(at.CURVE_Y)], dy, along_t)  # log2(alpha)
+                    blend = (power >= LOG2_ALPHA_MIN) & lanes
+                    weight = before * minimum(exp2(power), splat(ALPHA_MAX))
+                    after = before - weight
+                    stop = blend & (after < TRANSMITTANCE_MIN)
+                    stopped = mask_bits(stop)
+                    if stopped != 0:
+                        number = np.float32(entry - begin + np.int64(k))
+                        store(last, state + place, select(stop, splat(number), load(last, state + place)))
+                        live[block] &= ~np.int64(stopped)
+                        lanes = mask_from_bits(live[block])
+                        blend = blend & ~stop
+                        if live[block] == 0:
+                            alive &= ~bit
+                            while todo != 0:  # entries behind reach nothing here, and the backward pass skips them
+                                masks[entry + np.int64(lowest_bit(todo))] &= ~bit
+                                todo &= todo - np.uint64(1)
+                    weight = select(blend, weight, ZERO)
+                    r = fma(weight, batch[base + np.uint64(at.RED)], r)
+                    g = fma(weight, batch[base + np.uint64(at.GREEN)], g)
+                    b = fma(weight, batch[base + np.uint64(at.BLUE)], b)
+                    before = select(blend, after, before)
+                store(transmittance, state + place, before)
+                store(red, place, r)
+                store(green, place, g)
+                store(blue, place, b)
+            entry += count
         processed[tile] = entry
 
         for block in range(16):
@@ -190,7 +220,7 @@ def place_in_tile(x: int, y: int) -> int:
 
 
 @kernel
-def decomposite_tiles(
+def composite_backward_tiles(
     memory: Any,
     first: int,
     past: int,
@@ -211,14 +241,16 @@ def decomposite_tiles(
 ) -> None:
     """Add the gradient sums of the tiles ``first`` to ``past`` to ``rows`` [N * 16], back to front.
 
-    Behind a record lies light S = sum of later (c . g) alpha T plus what the background gets; the loss changes with its
-    alpha by T (c . g) - S / (1 - alpha). Going back to front S grows from the background's part, so that nothing
-    cancels. ``g_alpha`` may be empty for zero. ``want_absolute`` is True or None: a value that numba compiles out.
+    With U = (sum over the later of (c . g) alpha T, and the background's part) / T, all T counted from behind a record,
+    the loss changes with its alpha by T (c . g - U), where T is the transmittance before it; then U of the record
+    before is U + alpha (c . g - U). Going back to front U grows from the background's part by weighted means, so that
+    nothing cancels, and one division a record, that for T, is enough. ``g_alpha`` may be empty for zero.
+    ``want_absolute`` is True or None: a value that numba compiles out.
     """
     tiles_x = (width + at.TILE - 1) // at.TILE
     floats, _ = memory
     red, green, blue = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :], floats[2 * at.TILE_PIXELS :]
-    behind, through = floats[3 * at.TILE_PIXELS :], floats[4 * at.TILE_PIXELS :]  # S, and T behind the current record
+    behind, through = floats[3 * at.TILE_PIXELS :], floats[4 * at.TILE_PIXELS :]  # U, and T behind the current record
     for tile in range(first, past):
         left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
         tile_x, tile_y = np.float32(left), np.float32(top)
@@ -242,7 +274,7 @@ def decomposite_tiles(
             light = fma(load(red, place), background[0], load(behind, place))
             light = fma(load(green, place), background[1], light)
             light = fma(load(blue, place), background[2], light)
-            store(behind, place, light * final)
+            store(behind, place, light)
             store(through, place, final)
 
         for entry in range(end - 1, begin - 1, -1):
@@ -275,15 +307,14 @@ def decomposite_tiles(
                 blended = (power >= LOG2_ALPHA_MIN) & (number <= load(last, state + place))
                 raw = select(blended, exp2(power), ZERO)
                 opacity = minimum(raw, splat(ALPHA_MAX))
-                inverse = ONE / (ONE - opacity)
-                after = load(through, place)
-                before = after * inverse
+                before = load(through, place) / (ONE - opacity)
                 weight = before * opacity
                 g_red, g_green, g_blue = load(red, place), load(green, place), load(blue, place)
                 light = fma(g_red, r, fma(g_green, g, g_blue * b))
                 later = load(behind, place)
-                h = raw * (before * light - later * inverse)
-                store(behind, place, fma(weight, light, later))
+                gain = light - later
+                h = before * raw * gain
+                store(behind, place, fma(opacity, gain, later))
                 store(through, place, before)
                 sum_r = fma(weight, g_red, sum_r)
                 sum_g = fma(weight, g_green, sum_g)

@@ -43,7 +43,7 @@ SUM_ABS_T, SUM_ABS_Y = SUM_LANES[9:11]  # |h t|, |h (d power / d dy)|
 
 def kernel_memory() -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Scratch memory for one call of a kernel; kernels allocate nothing themselves."""
-    return np.empty(5 * TILE_PIXELS, np.float32), np.empty(LANES, np.int64)
+    return np.empty(8 * TILE_PIXELS, np.float32), np.empty(2 * LANES, np.int64)
 
 
 class View(NamedTuple):

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from gsbench.raster.cpu import layout as at
-from gsbench.raster.cpu.deferred import load_settled
 from gsbench.raster.cpu.geometry import (
     LOG2_E,
     dot,
@@ -28,7 +27,7 @@ from gsbench.raster.cpu.geometry import (
     to_view,
 )
 from gsbench.raster.cpu.harmonics import F0, MATRIX, fill_basis
-from gsbench.raster.cpu.shuffle import as_integers, as_span, by_channel, index_bits, transpose
+from gsbench.raster.cpu.shuffle import REST, as_integers, as_span, by_channel, index_bits, load_rest, transpose
 from gsbench.raster.cpu.simd import (
     absolute,
     ceil,
@@ -78,7 +77,6 @@ def project_shard(
     logits: Any,
     sh_dc: Any,
     sh_rest: Any,
-    pending: Any,
     degree: int,
     v: Any,
     records: Any,
@@ -159,7 +157,7 @@ def project_shard(
                 lane = lowest_bit(left)
                 left &= left - np.uint64(1)
                 own = load(basis, lane * np.uint64(LANES))
-                by_red, by_green, by_blue = by_channel(load_settled(sh_rest, start + np.int64(lane), pending))
+                by_red, by_green, by_blue = by_channel(load_rest(sh_rest, (start + np.int64(lane)) * REST))
                 store(rows, lane * np.uint64(LANES), own * by_red)
                 store(scratch, lane * np.uint64(LANES), own * by_green)
                 store(scratch, MATRIX + lane * np.uint64(LANES), own * by_blue)

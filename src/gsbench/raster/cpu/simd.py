@@ -238,6 +238,24 @@ def mask_from_bits(typing_context: Any, bits: Any) -> Any:
 
 
 @intrinsic
+def lanes_with_bit(typing_context: Any, masks: Any, index: Any, bit: Any) -> Any:
+    """A word whose bit k says whether ``masks.flat[index + k] & bit``, for 64 numbers of a uint16 array."""
+    lanes = 64
+    kind = ir.VectorType(ir.IntType(16), lanes)
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        values = builder.load(builder.bitcast(address(context, builder, sig, args), kind.as_pointer()), align=2)
+        undefined = ir.Constant(kind, ir.Undefined)
+        wanted = context.cast(builder, args[2], sig.args[2], types.uint16)
+        first = builder.insert_element(undefined, wanted, ir.Constant(ir.IntType(32), 0))
+        everywhere = builder.shuffle_vector(first, undefined, lane_indices([0] * lanes))
+        found = builder.icmp_unsigned("!=", builder.and_(values, everywhere), ir.Constant(kind, [0] * lanes))
+        return builder.bitcast(found, ir.IntType(lanes))
+
+    return types.uint64(masks, index, bit), codegen
+
+
+@intrinsic
 def lowest_bit(typing_context: Any, bits: Any) -> Any:
     """The place of the lowest set bit of an integer that is not zero."""
 

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsbench.gaussians.model import NUM_SH_REST, Gaussians
+from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.backprojection import backproject_shard
@@ -23,12 +23,10 @@ from gsbench.raster.cpu.binning import (
     sort_by_depth,
     start_tiles,
 )
-from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_tiles, decomposite_tiles
-from gsbench.raster.cpu.deferred import CHUNK, Factors, pending_of
+from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_backward_tiles, composite_tiles
 from gsbench.raster.cpu.footprint import cover_tiles
 from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, project_shard
 from gsbench.raster.cpu.shuffle import REST
-from gsbench.raster.cpu.vector import LANES
 from gsbench.raster.cpu.workspace import HEADROOM, Arena, ShardRunner, TensorPool
 from gsbench.raster.footprint import Footprint, view_depths
 from gsbench.raster.staged import Gradients, Request
@@ -86,7 +84,7 @@ def forward(
     count = len(gaussians)
     view = at.make_view(request.camera, CONSTANTS)
     tiles = view.tiles_x * view.tiles_y
-    arrays, pending = _arrays(gaussians), pending_of(request.harmonics)
+    arrays = _arrays(gaussians)
     records = arena.take("records", (count * at.RECORD,), np.float32)
     record_ints = records.view(np.int32)
     keys = arena.take("keys", (count,), np.uint64)
@@ -101,7 +99,6 @@ def forward(
             begin,
             end,
             *arrays,
-            pending,
             request.degree,
             view,
             records,
@@ -206,37 +203,31 @@ def backward(
     g_alpha: NDArray[np.float32],
     want_splitting: bool,
 ) -> Gradients:
-    """The gradients, and those in absolute values where ``request`` has room for them; ``g_alpha`` may be empty.
-
-    With harmonics that are put off the factors of their gradient go there.
-    """
-    count, harmonics, absolute = len(gaussians), request.harmonics, request.absolute
+    """The gradients, and those in absolute values where ``request`` has room for them; ``g_alpha`` may be empty."""
+    count, absolute = len(gaussians), request.absolute
     rows = arena.take("rows", (TILE_SHARDS, count * at.ROW), np.float32, zero=True)
     want_absolute = None if absolute is None else True
 
-    def decomposite(shard: int) -> None:
-        decomposite_tiles(*_tiles_of(frame, shard), *_blending_of(frame), g_image, g_alpha, rows[shard], want_absolute)
+    def composite_backward(shard: int) -> None:
+        composite_backward_tiles(
+            *_tiles_of(frame, shard), *_blending_of(frame), g_image, g_alpha, rows[shard], want_absolute
+        )
 
-    workshop.runner.run(TILE_SHARDS, decomposite)
+    workshop.runner.run(TILE_SHARDS, composite_backward)
 
     means, log_scales, quaternions, logits, _, sh_rest = _arrays(gaussians)
     take = workshop.tensors.empty
-    gradients = {name: take(tuple(tensor.shape)) for name, tensor in gaussians.tensors().items() if name != "sh_rest"}
+    gradients = {name: take(tuple(tensor.shape)) for name, tensor in gaussians.tensors().items()}
     g_screen = take((count, 2))
     g_absolute = np.empty((0, 2), np.float32) if absolute is None else absolute.numpy()
     g_splitting = take((count, 3, 3)) if want_splitting else None
     edges = _edges(count, GAUSSIAN_SHARDS)
-    # A shard's chunks of factors: as many as its Gaussians could fill.
-    chunks = [edge // LANES + shard for shard, edge in enumerate(edges)]
-    g_sh_rest = take((count if harmonics is None else 0, NUM_SH_REST, 3))
-    factors = take((0 if harmonics is None else chunks[-1] * CHUNK,))
     common = (
         means,
         log_scales,
         quaternions,
         logits,
         sh_rest,
-        pending_of(harmonics),
         frame.degree,
         frame.view,
         frame.records.view(np.int32),
@@ -247,9 +238,7 @@ def backward(
         gradients["quaternions"].numpy(),
         gradients["opacity_logits"].numpy().reshape(count, 1),
         gradients["sh_dc"].numpy(),
-        g_sh_rest.numpy().reshape(-1, REST),
-        factors.numpy(),
-        factors.numpy().view(np.int32),
+        gradients["sh_rest"].numpy().reshape(-1, REST),
         g_screen.numpy(),
         g_absolute,
         np.empty((0, 9), np.float32) if g_splitting is None else g_splitting.numpy().reshape(-1, 9),
@@ -257,15 +246,10 @@ def backward(
 
     def backproject(shard: int) -> None:
         begin, end, visible = edges[shard], edges[shard + 1], int(frame.visible[shard])
-        backproject_shard(at.kernel_memory(), begin, end, visible, chunks[shard], *common)
+        backproject_shard(at.kernel_memory(), begin, end, visible, *common)
 
     workshop.runner.run(GAUSSIAN_SHARDS, backproject)
-    if harmonics is None:
-        return Gradients([*gradients.values(), g_sh_rest], g_screen, g_splitting)
-    if frame.degree > 0:
-        visible = [int(number) for number in frame.visible]
-        harmonics.receive(Factors(workshop.runner, factors, chunks[:-1], visible, frame.degree, count))
-    return Gradients([*gradients.values(), None], g_screen, g_splitting)
+    return Gradients(list(gradients.values()), g_screen, g_splitting)
 
 
 def _arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:

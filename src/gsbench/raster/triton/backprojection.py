@@ -24,10 +24,6 @@ from gsbench.raster.triton.geometry import (
 from gsbench.raster.triton.harmonics import F0, store_gradients
 from gsbench.raster.triton.layout import (
     CLAMPED,
-    FACTORS,
-    G_COLOR,
-    LAST,
-    NOT_SEEN,
     RECORD,
     ROW,
     SUM_ABS_T,
@@ -41,7 +37,6 @@ from gsbench.raster.triton.layout import (
     SUM_H_Y,
     SUM_H_YY,
     SUM_RED,
-    TO,
 )
 
 
@@ -130,7 +125,6 @@ def backproject(
     log_scales,
     quaternions,
     logits,
-    last,
     count,
     v,
     record_ints,
@@ -149,19 +143,12 @@ def backproject(
     g_screen,
     g_absolute,
     g_splitting,
-    factors,
-    factor_ints,
     DEGREE: tl.constexpr,
-    DEFERRED: tl.constexpr,
     ABSOLUTE: tl.constexpr,
     SPLITTING: tl.constexpr,
     GROUP: tl.constexpr,
 ):
-    """Write the gradients of the Gaussians that were seen; those of the others stay as they are.
-
-    If ``DEFERRED``, ``factors`` [N, 8] gets what the gradient of harmonics is made of, in place of ``g_sh_rest``, and
-    the ``last`` [N] step of each; ``factor_ints`` is its memory.
-    """
+    """Write the gradients of the Gaussians that were seen; those of the others stay as they are."""
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     row_count = tl.load(row_counts + index, mask=index < count, other=0)
     seen = row_count > 0
@@ -188,15 +175,7 @@ def backproject(
         for c in tl.static_range(3):
             slope = load_vector(color_slopes + 3 * c, 3 * index, seen)
             pulled = (pulled[0] + g_rgb[c] * slope[0], pulled[1] + g_rgb[c] * slope[1], pulled[2] + g_rgb[c] * slope[2])
-    if DEFERRED:
-        place = index * FACTORS
-        for k in tl.static_range(3):
-            tl.store(factors + place + TO + k, to[k], mask=seen)
-            tl.store(factors + place + G_COLOR + k, g_rgb[k], mask=seen)
-        step = tl.load(last + index, mask=seen, other=NOT_SEEN)
-        tl.store(factor_ints + place + LAST, step, mask=index < count)
-    else:
-        store_gradients(to, g_rgb, g_sh_rest, index, seen, DEGREE)
+    store_gradients(to, g_rgb, g_sh_rest, index, seen, DEGREE)
     radial = dot(pulled, to)
     from_x = (pulled[0] - radial * to[0]) * inverse_distance
     from_y = (pulled[1] - radial * to[1]) * inverse_distance

@@ -274,7 +274,7 @@ def _segment(order, starts, blocks, inner):
 
 
 @triton.jit(do_not_specialize=["blocks", "inner", "closing", "width", "height", "blocks_x"])
-def decomposite(
+def composite_backward(
     order,
     starts,
     blocks,

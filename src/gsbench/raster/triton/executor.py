@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from weakref import WeakKeyDictionary
-
 import torch
 from torch import Tensor
 
-from gsbench.gaussians.deferred import Coasting, DeferredHarmonics
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.footprint import Footprint
 from gsbench.raster.staged import Gradients, Holder, Request, StagedRasterizer
-from gsbench.raster.triton.deferred import Pending, Tables
 from gsbench.raster.triton.layout import TILE
 from gsbench.raster.triton.stages import Frame, backward, footprint, forward
 from gsbench.raster.triton.toolchain import load_driver
@@ -34,7 +30,6 @@ class TritonRasterizer(StagedRasterizer[Frame]):
             raise ValueError(f"the Triton rasterizer has tiles of {TILE.value} px, the contract {CONSTANTS.tile}")
         self._frames = WorkspacePool()
         self._scratch = WorkspacePool()
-        self._tables: WeakKeyDictionary[Coasting, Tables] = WeakKeyDictionary()
 
     def check(self, gaussians: Gaussians) -> None:
         """Raise ValueError where tensors are not float32, or the device's driver cannot be loaded."""
@@ -53,8 +48,7 @@ class TritonRasterizer(StagedRasterizer[Frame]):
         with torch.cuda.device_of(image):
             memory = self._frames.lease(holder, device)
             scratch = self._scratch.lease(while_drawn, device)
-            pending = self._pending(request.harmonics)
-            return image, alpha, radii, forward(memory, scratch, gaussians, pending, request, image, alpha, radii)
+            return image, alpha, radii, forward(memory, scratch, gaussians, request, image, alpha, radii)
 
     def backward(
         self,
@@ -77,9 +71,3 @@ class TritonRasterizer(StagedRasterizer[Frame]):
         with torch.cuda.device_of(gaussians.means):
             scratch = self._scratch.lease(holder, gaussians.means.device)
             return footprint(scratch, frame, gaussians, camera, values)
-
-    def _pending(self, harmonics: DeferredHarmonics | None) -> Pending:
-        if harmonics is None:
-            return Pending(None, None)
-        tables = self._tables.setdefault(harmonics.coasting, Tables(harmonics.values.device))
-        return Pending(harmonics, tables.follow(harmonics.coasting))

@@ -38,26 +38,12 @@ def basis(direction, DEGREE: tl.constexpr):
 
 
 @triton.jit
-def coasting_direction(first, second):
-    """Direction in which Adam's moments carry a value without gradients; 0 where there never was one."""
-    return tl.where(second > 0, first / tl.sqrt(second), 0.0)
-
-
-@triton.jit
-def _coefficients(sh_rest, first, second, coasted, index, k: tl.constexpr, mask, DEFERRED: tl.constexpr):
-    """The k-th coefficients of degree 1 and up, in red, green and blue, after the steps that they have missed."""
+def _coefficients(sh_rest, index, k: tl.constexpr, mask):
+    """The k-th coefficients of degree 1 and up, in red, green and blue."""
     place = index * REST + 3 * k
     red = tl.load(sh_rest + place, mask=mask, other=0.0)
     green = tl.load(sh_rest + place + 1, mask=mask, other=0.0)
     blue = tl.load(sh_rest + place + 2, mask=mask, other=0.0)
-    if DEFERRED:
-        behind = coasted != 0
-        m0, v0 = tl.load(first + place, mask=behind, other=0.0), tl.load(second + place, mask=behind, other=0.0)
-        m1, v1 = tl.load(first + place + 1, mask=behind, other=0.0), tl.load(second + place + 1, mask=behind, other=0.0)
-        m2, v2 = tl.load(first + place + 2, mask=behind, other=0.0), tl.load(second + place + 2, mask=behind, other=0.0)
-        red -= coasting_direction(m0, v0) * coasted
-        green -= coasting_direction(m1, v1) * coasted
-        blue -= coasting_direction(m2, v2) * coasted
     return red, green, blue
 
 
@@ -75,18 +61,12 @@ def colors(
     direction,
     dc,
     sh_rest,
-    first,
-    second,
-    coasted,
     index,
     mask,
     DEGREE: tl.constexpr,
-    DEFERRED: tl.constexpr,
 ):
     """SH + 0.5 (not clamped) at the unit ``direction`` of each Gaussian ``index``, whose constant terms are ``dc``, and
     its derivatives by x, y and z of the direction (not yet tangential), each for red, green and blue.
-
-    If ``DEFERRED``, coefficients have coasted on Adam's moments ``first`` and ``second``, as far as ``coasted`` says.
     """
     x, y, z = direction
     rgb = (dc[0] * F0 + 0.5, dc[1] * F0 + 0.5, dc[2] * F0 + 0.5)
@@ -94,45 +74,45 @@ def colors(
     by_x, by_y, by_z = (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
     if DEGREE >= 1:
         values = basis(direction, DEGREE)
-        c = _coefficients(sh_rest, first, second, coasted, index, 0, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 0, mask)
         rgb, by_y = _add(rgb, c, values[0]), _add(by_y, c, -F1)
-        c = _coefficients(sh_rest, first, second, coasted, index, 1, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 1, mask)
         rgb, by_z = _add(rgb, c, values[1]), _add(by_z, c, F1)
-        c = _coefficients(sh_rest, first, second, coasted, index, 2, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 2, mask)
         rgb, by_x = _add(rgb, c, values[2]), _add(by_x, c, -F1)
     if DEGREE >= 2:
-        c = _coefficients(sh_rest, first, second, coasted, index, 3, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 3, mask)
         rgb, by_x, by_y = _add(rgb, c, values[3]), _add(by_x, c, D0 * y), _add(by_y, c, D0 * x)
-        c = _coefficients(sh_rest, first, second, coasted, index, 4, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 4, mask)
         rgb, by_y, by_z = _add(rgb, c, values[4]), _add(by_y, c, D1 * z), _add(by_z, c, D1 * y)
-        c = _coefficients(sh_rest, first, second, coasted, index, 5, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 5, mask)
         rgb, by_x = _add(rgb, c, values[5]), _add(by_x, c, -2 * D2 * x)
         by_y, by_z = _add(by_y, c, -2 * D2 * y), _add(by_z, c, 4 * D2 * z)
-        c = _coefficients(sh_rest, first, second, coasted, index, 6, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 6, mask)
         rgb, by_x, by_z = _add(rgb, c, values[6]), _add(by_x, c, D3 * z), _add(by_z, c, D3 * x)
-        c = _coefficients(sh_rest, first, second, coasted, index, 7, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 7, mask)
         rgb, by_x, by_y = _add(rgb, c, values[7]), _add(by_x, c, 2 * D4 * x), _add(by_y, c, -2 * D4 * y)
     if DEGREE >= 3:
         xx, yy, zz = x * x, y * y, z * z
         xy, yz, xz = x * y, y * z, x * z
-        c = _coefficients(sh_rest, first, second, coasted, index, 8, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 8, mask)
         rgb, by_x, by_y = _add(rgb, c, values[8]), _add(by_x, c, 6 * T0 * xy), _add(by_y, c, 3 * T0 * (xx - yy))
-        c = _coefficients(sh_rest, first, second, coasted, index, 9, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 9, mask)
         rgb, by_x = _add(rgb, c, values[9]), _add(by_x, c, T1 * yz)
         by_y, by_z = _add(by_y, c, T1 * xz), _add(by_z, c, T1 * xy)
-        c = _coefficients(sh_rest, first, second, coasted, index, 10, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 10, mask)
         rgb, by_x = _add(rgb, c, values[10]), _add(by_x, c, -2 * T2 * xy)
         by_y, by_z = _add(by_y, c, T2 * (4 * zz - xx - 3 * yy)), _add(by_z, c, 8 * T2 * yz)
-        c = _coefficients(sh_rest, first, second, coasted, index, 11, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 11, mask)
         rgb, by_x = _add(rgb, c, values[11]), _add(by_x, c, -6 * T3 * xz)
         by_y, by_z = _add(by_y, c, -6 * T3 * yz), _add(by_z, c, T3 * (6 * zz - 3 * xx - 3 * yy))
-        c = _coefficients(sh_rest, first, second, coasted, index, 12, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 12, mask)
         rgb, by_x = _add(rgb, c, values[12]), _add(by_x, c, T4 * (4 * zz - 3 * xx - yy))
         by_y, by_z = _add(by_y, c, -2 * T4 * xy), _add(by_z, c, 8 * T4 * xz)
-        c = _coefficients(sh_rest, first, second, coasted, index, 13, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 13, mask)
         rgb, by_x = _add(rgb, c, values[13]), _add(by_x, c, 2 * T5 * xz)
         by_y, by_z = _add(by_y, c, -2 * T5 * yz), _add(by_z, c, T5 * (xx - yy))
-        c = _coefficients(sh_rest, first, second, coasted, index, 14, mask, DEFERRED)
+        c = _coefficients(sh_rest, index, 14, mask)
         rgb, by_x, by_y = _add(rgb, c, values[14]), _add(by_x, c, 3 * T6 * (xx - yy)), _add(by_y, c, -6 * T6 * xy)
     return rgb, by_x, by_y, by_z
 

@@ -54,12 +54,6 @@ SUM_ABS_T, SUM_ABS_Y = tl.constexpr(9), tl.constexpr(10)  # |h t|, |h (d power /
 
 COLOR_SLOPES = tl.constexpr(9)  # derivatives of red by x, y and z of the direction, of green, of blue
 
-# Parts of the gradient of a Gaussian's harmonics, 8 float32.
-FACTORS = tl.constexpr(8)
-TO, G_COLOR = tl.constexpr(0), tl.constexpr(3)  # direction from the camera, gradient of the colour
-LAST = tl.constexpr(6)  # int32: the step up to which the harmonics had come
-NOT_SEEN = tl.constexpr(-1)  # in its place, where no block lists the Gaussian
-
 LOG2_E = tl.constexpr(1 / math.log(2.0))
 ALPHA_MIN = tl.constexpr(CONSTANTS.alpha_min)
 LOG2_ALPHA_MIN = tl.constexpr(math.log2(CONSTANTS.alpha_min))

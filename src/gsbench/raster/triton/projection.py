@@ -73,10 +73,6 @@ def project(
     logits,
     sh_dc,
     sh_rest,
-    first,
-    second,
-    last,
-    drift,
     count,
     v,
     records,
@@ -87,15 +83,13 @@ def project(
     radii,
     flags,
     DEGREE: tl.constexpr,
-    DEFERRED: tl.constexpr,
     GROUP: tl.constexpr,
 ):
     """Fill ``radii`` [N]; of every Gaussian that can be seen its record, elsewhere rubbish, and at N one that cannot be
     seen; ``color_slopes`` [N, 9], likewise, the derivatives of colour by the direction, unless ``DEGREE`` is 0;
     ``keys`` [N] by which depth is sorted; ``row_counts`` [N], the rows of blocks that its contour can touch.
     ``flags`` [1] becomes 1 where a value is not finite or a quaternion has no length. ``record_ints`` is the memory of
-    ``records`` [N + 1, 16]. If ``DEFERRED``, harmonics are read with Adam's steps since the ``last`` [N] of each, from
-    its moments ``first`` and ``second`` [N, 15, 3] and the table ``drift``."""
+    ``records`` [N + 1, 16]."""
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = index < count
     mean, log_scale = load_vector(means, index, inside), load_vector(log_scales, index, inside)
@@ -145,10 +139,7 @@ def project(
     distance = tl.sqrt(dot(offset, offset))
     inverse = 1.0 / tl.where(distance > 0, distance, 1.0)
     direction = (offset[0] * inverse, offset[1] * inverse, offset[2] * inverse)
-    coasted = tl.zeros_like(distance)
-    if DEFERRED:  # the table is 0 at the present step
-        coasted = tl.load(drift + tl.load(last + index, mask=seen, other=0), mask=seen, other=0.0)
-    rgb, by_x, by_y, by_z = colors(direction, dc, sh_rest, first, second, coasted, index, seen, DEGREE, DEFERRED)
+    rgb, by_x, by_y, by_z = colors(direction, dc, sh_rest, index, seen, DEGREE)
     red, green, blue = rgb
     if DEGREE > 0:
         for c in tl.static_range(3):

@@ -11,15 +11,13 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.raster.footprint import Footprint, view_depths
 from gsbench.raster.staged import Gradients, Request
 from gsbench.raster.triton.backprojection import backproject, sum_units
-from gsbench.raster.triton.composite import composite, decomposite
-from gsbench.raster.triton.deferred import Factors, Pending
+from gsbench.raster.triton.composite import composite, composite_backward
 from gsbench.raster.triton.footprint import cover, sum_cover
 from gsbench.raster.triton.launch import launch, launch_grid
 from gsbench.raster.triton.layout import (
     BLOCK_PIXELS,
     BORDER,
     COLOR_SLOPES,
-    FACTORS,
     RECORD,
     ROW,
     Grid,
@@ -40,7 +38,6 @@ class Frame:
 
     grid: Grid
     view: View
-    pending: Pending
     projected: Projected
     units: Units
     lists: Lists
@@ -55,7 +52,6 @@ def forward(
     memory: Workspace,
     scratch: Workspace,
     gaussians: Gaussians,
-    pending: Pending,
     request: Request,
     image: Tensor,
     alpha: Tensor,
@@ -66,13 +62,12 @@ def forward(
     count, blocks, background = len(gaussians), grid.blocks, request.background
     flags = scratch.take("flags", 1, torch.int32).zero_()
     keys = scratch.take("depth_keys", count, torch.int32)
-    projected = _project(memory, gaussians, pending, view, request.degree, keys, radii, flags)
+    projected = _project(memory, gaussians, view, request.degree, keys, radii, flags)
     units, owners = find_all_units(memory, scratch, gaussians, projected, grid, keys, flags, background)
     lists = make_lists(memory, scratch, units, owners, blocks)
     frame = Frame(
         grid,
         view,
-        pending,
         projected,
         units,
         lists,
@@ -108,7 +103,6 @@ def forward(
 def _project(
     memory: Workspace,
     gaussians: Gaussians,
-    pending: Pending,
     view: View,
     degree: int,
     keys: Tensor,
@@ -125,7 +119,6 @@ def _project(
     parameters = [tensor.detach() for tensor in gaussians.tensors().values()]
     launch(project, count + 1, 128)(
         *parameters,
-        *pending.tensors(parameters[-1]),
         count,
         view,
         projected.records,
@@ -136,7 +129,6 @@ def _project(
         radii,
         flags,
         DEGREE=degree,
-        DEFERRED=pending.harmonics is not None,
     )
     return projected
 
@@ -150,15 +142,12 @@ def backward(
     g_alpha: Tensor | None,
     want_splitting: bool,
 ) -> Gradients:
-    """The gradients, and those in absolute values where ``request`` has room for them.
-
-    With harmonics that are put off the factors of their gradient go there.
-    """
+    """The gradients, and those in absolute values where ``request`` has room for them."""
     grid, units, lists, count = frame.grid, frame.units, frame.lists, len(gaussians)
-    projected, pending, absolute = frame.projected, frame.pending, request.absolute
+    projected, absolute = frame.projected, request.absolute
     rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)
     inner = count_borders(units.pairs)
-    launch_grid(decomposite, inner + grid.blocks)(
+    launch_grid(composite_backward, inner + grid.blocks)(
         lists.order,
         lists.starts,
         grid.blocks,
@@ -184,12 +173,7 @@ def backward(
     )
     _sum_units(frame, rows)
     means, log_scales, quaternions, logits, *_ = gaussians.tensors().values()
-    deferred = pending.harmonics is not None
-    *gradients, g_sh_rest = (
-        torch.zeros_like(tensor[:0] if deferred and name == "sh_rest" else tensor)
-        for name, tensor in gaussians.tensors().items()
-    )
-    factors = means.new_empty(count if deferred else 0, FACTORS.value)
+    gradients = [torch.zeros_like(tensor) for tensor in gaussians.tensors().values()]
     g_screen = torch.zeros_like(means[:, :2])
     g_splitting = means.new_zeros(count, 3, 3) if want_splitting else None
     launch(backproject, count, 128)(
@@ -197,7 +181,6 @@ def backward(
         log_scales,
         quaternions,
         logits,
-        projected.row_counts if pending.harmonics is None else pending.harmonics.last,
         count,
         frame.view,
         projected.records.view(torch.int32),
@@ -208,22 +191,14 @@ def backward(
         units.widths,
         rows,
         *gradients,
-        g_sh_rest,
         g_screen,
         g_screen if absolute is None else absolute,
         g_screen if g_splitting is None else g_splitting,
-        factors,
-        factors.view(torch.int32),
         DEGREE=request.degree,
-        DEFERRED=deferred,
         ABSOLUTE=absolute is not None,
         SPLITTING=want_splitting,
     )
-    if pending.harmonics is None or pending.tables is None:
-        return Gradients([*gradients, g_sh_rest], g_screen, g_splitting)
-    if request.degree > 0:
-        pending.harmonics.receive(Factors(pending.tables, factors, request.degree))
-    return Gradients([*gradients, None], g_screen, g_splitting)
+    return Gradients(gradients, g_screen, g_splitting)
 
 
 def _sum_units(frame: Frame, rows: Tensor) -> None:
