@@ -19,9 +19,8 @@ from gsbench import cli
 from gsbench.app.hydra_app import compose_trials
 from gsbench.config.compose import compose_one
 from gsbench.errors import GsbenchError, InputError
-from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.model import Gaussians, colors
 from gsbench.gaussians.ply import read_ply, write_ply
-from gsbench.gaussians.spherical_harmonics import colors
 from gsbench.launch.plan import add_to_plan
 from gsbench.runs.explain_cache import explain_steps
 from gsbench.runs.stages import EVALUATE, INIT, TRAIN

@@ -26,7 +26,7 @@ from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.raster.cpu import CpuRasterizer
-from gsbench.raster.cpu import stages as cpu_stages
+from gsbench.raster.cpu import executor as cpu_executor
 from gsbench.raster.reference import project
 from gsbench.verbs.bench import main, parser
 
@@ -138,12 +138,12 @@ def test_every_scene_can_be_chosen() -> None:
 
 
 def test_stages_name_the_kernels(capsys: pytest.CaptureFixture[str]) -> None:
-    kernel = cpu_stages.composite_tiles
+    kernel = cpu_executor.composite_tiles
     arguments = ["--size", "40x30", "--count", "60", "--repeats", "2", "--no-memory", "--threads", "1", "--stages"]
     assert main([*arguments, "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     stages = row["stages"]
-    assert cpu_stages.composite_tiles is kernel  # as it was
+    assert cpu_executor.composite_tiles is kernel  # as it was
     assert {"project_shard", "composite_tiles", "composite_backward_tiles", "similarity_rows", REST} <= stages.keys()
     assert min(stages.values()) >= 0
     kernels = [ms for name, ms in stages.items() if name != REST]
@@ -153,15 +153,15 @@ def test_stages_name_the_kernels(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_kernels_are_put_back_when_a_step_fails() -> None:
-    kernel = cpu_stages.composite_tiles
+    kernel = cpu_executor.composite_tiles
 
     def step() -> None:
-        assert cpu_stages.composite_tiles is not kernel
+        assert cpu_executor.composite_tiles is not kernel
         raise RuntimeError("step")
 
     with pytest.raises(RuntimeError, match="step"), timed_kernels("cpu"):
         step()
-    assert cpu_stages.composite_tiles is kernel
+    assert cpu_executor.composite_tiles is kernel
 
 
 def test_what_a_gpu_ran_is_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,7 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.wiring import TrialSteps
-from gsbench.raster.cpu import CpuRasterizer, stages
+from gsbench.raster.cpu import CpuRasterizer, executor
 from gsbench.raster.cpu.workspace import ShardRunner
 from gsbench.runs.layout import POINT_CLOUD, STORE
 from gsbench.runs.stages import TRAIN
@@ -102,7 +102,7 @@ def makespan(times: Sequence[float], threads: int) -> float:
 def simulate(title: str, gaussians: Gaussians, scene: Scene) -> None:
     """Print the simulated times of a step, by number of threads and of shards of tiles."""
     for shards in TILE_SHARDS:
-        with mock.patch.object(stages, "TILE_SHARDS", shards):
+        with mock.patch.object(executor, "TILE_SHARDS", shards):
             training = Timed(gaussians, scene)
             steps = [training.step() for _ in range(2 + STEPS)][2:]
         names = [name for name, _ in steps[0][0]]

@@ -9,8 +9,7 @@ import torch
 from gsbench.densify import ADC, DensifyContext, PixelGS, Refinement
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
-from gsbench.raster.base import RenderOutput
-from gsbench.raster.footprint import Footprint
+from gsbench.raster.base import Footprint, RenderOutput
 from tests.densify import restatement
 from tests.densify.test_rounds import EXTENT, assert_same, noise_of, to_rows
 from tests.gaussians.helpers import random_gaussians

@@ -9,7 +9,7 @@ import torch
 
 from gsbench.densify import DensifyContext, Volumetric
 from gsbench.densify.budget import admit, allowance
-from gsbench.densify.volume import child_log_scales, log_condition, log_volume
+from gsbench.densify.volumetric import child_log_scales, log_condition, log_volume
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from tests.gaussians.helpers import random_gaussians

@@ -24,7 +24,7 @@ from gsbench.config.old_names import RENAMED
 from gsbench.config.schema import ComponentConfig, LaunchConfig, TrackingConfig
 from gsbench.eval.options import EvalConfig
 from gsbench.external.settings import External
-from gsbench.raster.options import RasterConfig
+from gsbench.raster.executors import RasterConfig
 from gsbench.scene.options import SceneConfig
 from gsbench.train.options import TrainConfig
 from gsbench.verbs.queries import QUERIES

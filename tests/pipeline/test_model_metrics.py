@@ -15,8 +15,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.eval.facts import FLICKER, GEOMETRY, OF_MODELS
-from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.spherical_harmonics import rgb_to_dc
+from gsbench.gaussians.model import Gaussians, rgb_to_dc
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.steps.maps import unproject
 from gsbench.pipeline.steps.model_metrics import (

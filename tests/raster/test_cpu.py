@@ -14,7 +14,7 @@ import torch
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.raster.cpu import CpuRasterizer, binning, shuffle, simd, stages, vector
+from gsbench.raster.cpu import CpuRasterizer, binning, executor, shuffle, simd, vector
 from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
 from gsbench.raster.reference import ReferenceRasterizer
 from tests.raster.strategies import Case, render_with_gradients
@@ -142,7 +142,7 @@ def test_an_interrupted_backward_leaves_no_trace(monkeypatch: pytest.MonkeyPatch
         rasterizer = CpuRasterizer(threads=threads)
         _, expected = render_with_gradients(rasterizer, CASE, torch.float32)
         with monkeypatch.context() as patch:
-            patch.setattr(stages, "backproject_shard", _interrupt)
+            patch.setattr(executor, "backproject_shard", _interrupt)
             with pytest.raises(KeyboardInterrupt):
                 render_with_gradients(rasterizer, CASE, torch.float32)
         _, gradients = render_with_gradients(rasterizer, CASE, torch.float32)

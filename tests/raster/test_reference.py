@@ -179,7 +179,7 @@ def test_projection_matches_gsplat() -> None:
 
 def test_spherical_harmonics_match_gsplat() -> None:
     gsplat = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat (group dev) is not installed")
-    from gsbench.gaussians.spherical_harmonics import colors
+    from gsbench.gaussians.model import colors
 
     gaussians = random_gaussians(50, seed=9)
     directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)

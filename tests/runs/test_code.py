@@ -157,7 +157,7 @@ def test_where_all_is_as_released_nothing_is_in_the_key(package: Path, monkeypat
     (package / "train" / "loss_log.py").unlink()  # as a release may
     code.main()
     again(monkeypatch)
-    assert state_of("train/loss_log.py") == AS_RELEASED
+    assert state_of("train/journal.py") == AS_RELEASED
 
 
 def test_an_edit_of_what_is_loaded_is_taken_for_unknown(
@@ -173,13 +173,13 @@ def test_an_edit_of_what_is_loaded_is_taken_for_unknown(
 
 
 def test_what_is_loaded_after_an_edit_is_told(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "gsbench.train.loss_log", raising=False)
+    monkeypatch.delitem(sys.modules, "gsbench.train.journal", raising=False)
     monkeypatch.setitem(sys.modules, "gsbench.train.loss", sys)
     files = files_of(ADC)
     for name in ("loss.py", "loss_log.py"):
         (package / "train" / name).touch()
-    assert changed_while_running(files, in_processes=False) == ["train/loss_log.py"]
-    assert changed_while_running(files, in_processes=True) == ["train/loss.py", "train/loss_log.py"]
+    assert changed_while_running(files, in_processes=False) == ["train/journal.py"]
+    assert changed_while_running(files, in_processes=True) == ["train/loss.py", "train/journal.py"]
 
 
 def test_it_is_quick_and_does_without_a_cache(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsbench.densify import ADC, MCMC, PixelGS, Volumetric
-from gsbench.densify.budgeted import Budgeted
+from gsbench.densify.budget import Budgeted
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster import create_rasterizer

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsbench.raster.readback import Readback
-from gsbench.train.loss_log import LossLog
+from gsbench.train.journal import LossLog
 
 
 def scalars(step: int, total: float | None = None) -> tuple[Tensor, ...]:

@@ -12,8 +12,7 @@ from gsbench.raster import create_rasterizer
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
 from gsbench.train.loss import PhotometricLoss
-from gsbench.train.targets import Targets
-from gsbench.train.training_views import SceneViews
+from gsbench.train.views import SceneViews, Targets
 
 HEIGHT, WIDTH = 37, 53
 

@@ -21,10 +21,9 @@ from gsbench.raster.base import Rasterizer
 from gsbench.runs.hashing import config_hash
 from gsbench.scene.types import Scene, View
 from gsbench.train.options import TrainConfig
-from gsbench.train.resolution import Pictures, Resolution
-from gsbench.train.spectrum import Levels, levels
-from gsbench.train.targets import Targets
+from gsbench.train.resolution import Levels, Pictures, Resolution, levels
 from gsbench.train.trainer import Status, Trainer
+from gsbench.train.views import Targets
 from tests.config.test_schema import composed
 from tests.gaussians.helpers import random_gaussians
 from tests.train.conftest import orbit_camera

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsbench.scene.types import View
-from gsbench.train.targets import Targets
+from gsbench.train.views import Targets
 from tests.gaussians.helpers import front_camera
 
 CPU = torch.device("cpu")

@@ -19,9 +19,9 @@ from gsbench.raster.readback import Readback
 from gsbench.scene.types import Scene
 from gsbench.train import trainer
 from gsbench.train.checkpoint import CheckpointWriter
-from gsbench.train.draws import CameraOrder, generator
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Status, Trainer, learning_rates, snapshot_file
+from gsbench.train.views import CameraOrder, generator
 
 CPU = torch.device("cpu")
 

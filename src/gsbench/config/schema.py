@@ -22,7 +22,7 @@ from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveIn
 from gsbench.config.trust import check_permissions, is_external
 from gsbench.errors import InputError
 from gsbench.eval.options import EvalConfig
-from gsbench.raster.options import RasterConfig
+from gsbench.raster.executors import RasterConfig
 from gsbench.runs.layout import IN_RUNS
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import (

@@ -2,12 +2,11 @@
 
 from gsbench.densify.absgs import AbsGS
 from gsbench.densify.adc import ADC
-from gsbench.densify.base import Densifier, DensifyContext, NoDensifier, Refinement, Rule, Statistic
-from gsbench.densify.budgeted import Budgeted
+from gsbench.densify.base import Densifier, DensifyContext, Lineage, NoDensifier, Refinement, Rule, Statistic
+from gsbench.densify.budget import Budgeted
 from gsbench.densify.edge_aware import EdgeAware
 from gsbench.densify.fast_gs import FastGS
 from gsbench.densify.gns import GNS
-from gsbench.densify.lineage import Lineage
 from gsbench.densify.long_axis import LongAxis
 from gsbench.densify.mcmc import MCMC
 from gsbench.densify.mrnf import MRNF

@@ -13,13 +13,13 @@ from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from gsbench.densify.base import NEVER, Refinement, Rule, Statistic
-from gsbench.densify.budget import admit
-from gsbench.densify.budgeted import Budgeted
+from gsbench.densify.budget import Budgeted, admit
 from gsbench.densify.operations import revised_logits
 from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction, Switch
 
+MOST_CHILDREN = 64  # of one split; more is a slip in the settings, and fills the memory in one round
 LOCKED_ROUNDS = 5  # after an opacity reset the governor does not raise the cull; our choice
 
 
@@ -57,7 +57,7 @@ class ADC(Budgeted):
     gradient_threshold: PositiveFloat = 2e-4
     threshold_inclusive: bool = True  # >= as 3DGS; False: > as gsplat
     split_size: PositiveFloat = 0.01  # largest scale above it: split, else clone ("percent_dense")
-    split_children: Annotated[int, Ge(2)] = 2
+    split_children: Annotated[int, Interval(ge=2, le=MOST_CHILDREN)] = 2
     split_shrink: Annotated[float, Ge(1)] = 1.6  # children's scales are divided by it (0.8 x 2)
     revised_opacity: bool = False  # children of clones and splits share their parent's opacity (arXiv 2404.06109)
     prune_opacity: Annotated[float, Interval(ge=0, lt=1)] = 0.005

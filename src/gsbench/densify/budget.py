@@ -1,15 +1,19 @@
-"""Limits on the number of Gaussians of an arm, shared by all densifiers."""
+"""Limits on the number of Gaussians: the arithmetic of all caps, and the base of densifiers that have one."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor
 
+from gsbench.densify.base import Densifier, DensifyContext, Refinement, Rule
 from gsbench.errors import InputError
+from gsbench.gaussians.model import Gaussians
 
 CapKind = Literal["soft", "freeze", "hard", "curve", "governor"]
 SETTLE_STEPS = 40  # halvings of a range of the logarithm: far below the distance of neighbouring float32 scores
@@ -78,3 +82,125 @@ def settle(count: Callable[[float], int], target: int, low: float, high: float) 
             return math.exp(middle)
         a, b = (middle, b) if reached > target else (a, middle)
     return min(high, math.exp(b))
+
+
+PAPER_CAP = 3_400_000  # the paper's, for the baseline and its own rule alike
+STRICTNESS_LIMITS = (1e-3, 1e3)  # of the factor on the thresholds of growth
+CULL_LIMITS = (1.0, 10.0)  # of the factor on the opacity below which Gaussians are pruned
+DEADBAND = 0.01  # so far above its target a count is not culled (the paper of the governor: "e.g., 1%")
+
+
+@dataclass
+class Budgeted(Densifier):
+    """Base of densifiers that have rounds of growth and pruning, and a limit on their Gaussians.
+
+    ``cap`` says how ``max_gaussians`` is kept:
+
+    - ``soft``: nothing grows in a round that starts beyond it, pruning goes on;
+    - ``freeze``: such a round neither grows nor prunes;
+    - ``hard``: the candidates of the highest score are taken up to it, never more;
+    - ``curve``: as ``hard``, with a limit that rises to it over the window;
+    - ``governor``: the thresholds are moved so that the count follows that curve and ends at it (`govern`).
+
+    With ``soft`` and ``hard`` the training may have a limit of its own for each round (``train.resolution_schedule``).
+
+    A subclass asks `allowance` for the first four. For ``freeze`` and ``governor`` it says, by ``forecast``, what count
+    a round would lead to, and multiplies its own thresholds by ``strictness`` and its opacity cull by ``cull``.
+    """
+
+    start: NonNegativeInt = 500  # a round where start < step < stop and step % interval == 0
+    stop: int = 15_000
+    interval: PositiveInt = 100
+    max_gaussians: PositiveInt | None = PAPER_CAP  # None: no limit, as 3DGS
+    cap: CapKind = "soft"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.stop <= self.start:
+            raise InputError(f"densify.stop must be above densify.start ({self.start}), got {self.stop}")
+        if self.cap in ("freeze", "curve", "governor") and self.max_gaussians is None:
+            raise InputError(f"densify.max_gaussians must be set for densify.cap={self.cap}")
+        if self.cap in ("freeze", "governor") and type(self).forecast is Budgeted.forecast:
+            raise InputError(f"densify.cap={self.cap} needs the method forecast, which {type(self).__name__} lacks")
+
+    def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
+        if self.most_gaussians is not None:
+            check_room(self.most_gaussians, len(gaussians))
+        super().begin(gaussians, context)
+
+    def due(self, step: int) -> bool:
+        """Return whether a round of growth and pruning is due."""
+        return self.start < step < self.stop and step % self.interval == 0
+
+    def allowance(self, refinement: Refinement) -> int | None:
+        """The number of Gaussians that may be added now; None for no limit."""
+        initial = self.lineage.initial_count
+        limit = limit_at(refinement.step, self.start, self.stop, initial, self.max_gaussians, self.cap)
+        count = len(refinement.gaussians)
+        allowed = allowance(count, limit, self.cap)
+        if self.context.limit is None or self.cap not in ("soft", "hard"):
+            return allowed
+        most = self.context.limit(refinement, self.max_gaussians if self.cap == "hard" else None)
+        return max(0, most - count) if allowed is None else max(0, min(allowed, most - count))
+
+    def forecast(self, refinement: Refinement) -> int:
+        """The number of Gaussians that there would be after a round with the present ``strictness`` and ``cull``."""
+        raise NotImplementedError
+
+    def frozen(self, refinement: Refinement) -> bool:
+        """Return whether this round is left out because the count is beyond the limit (``cap=freeze``)."""
+        over = self.max_gaussians is not None and len(refinement.gaussians) > self.max_gaussians
+        return self.cap == "freeze" and over
+
+    def governing(self) -> list[Rule]:
+        """The rules that a round starts with: `govern`, where that is the cap."""
+        return [self.govern] if self.cap == "governor" else []
+
+    def stand_still(self, refinement: Refinement) -> None:
+        """The only rule of a frozen round: say how many Gaussians it would have added."""
+        refinement.event.blocked_by_cap += self._forecast_at(refinement) - self._forecast_at(refinement, math.inf)
+
+    def govern(self, refinement: Refinement) -> None:
+        """The first rule of a governed round: set ``strictness`` and ``cull`` so that it ends at the curve's count.
+
+        From Bisht and Kolb, "Smart Target Point Control for Gaussian Splatting Methods" (arXiv 2605.16158): the target
+        n0 + (n - n0) (2x - x^2) (their eq. 3 to 5); only the thresholds of growth and the opacity cull move; below the
+        target the cull is at its own value, above it growth is at its strictest and the cull rises; a deadband; no
+        raised cull for some time after an opacity reset (eq. 13).
+
+        Ours: the curve ends at the last round, x = 1; one factor for all thresholds of growth; and it is not stepped
+        towards the quota by a bounded update (eq. 8 to 12, whose gains are not stated) but is the one at which
+        ``forecast`` meets the target, found by bisection, so that a window of ten rounds is followed as well as one of
+        144.
+        """
+        event = refinement.event
+        target = self.target(refinement)
+        free = self._forecast_at(refinement)
+        self.strictness = settle(lambda s: self._forecast_at(refinement, s), target, *STRICTNESS_LIMITS)
+        reached = self._forecast_at(refinement, self.strictness)
+        if reached > (1 + DEADBAND) * target and self.may_cull(refinement.step):
+            self.cull = settle(lambda c: self._forecast_at(refinement, self.strictness, c), target, *CULL_LIMITS)
+        event.target, event.strictness, event.cull = target, self.strictness, self.cull
+        event.blocked_by_cap += max(0, free - reached)
+
+    def target(self, refinement: Refinement) -> int:
+        """The count that a governed round is to end at; that of the last round is ``max_gaussians``.
+
+        A round closes the share of what is missing that the curve closes at its place, ((1 - x0)^2 - (1 - x)^2) / (1 -
+        x0)^2 for progress x0 before and x after it: on the curve that is the curve, and an arm that fell behind catches
+        up little by little.
+        """
+        assert self.max_gaussians is not None  # __post_init__ asks for it
+        last = (self.stop - 1) // self.interval
+        left, ahead = last - refinement.step // self.interval, last - self.start / self.interval  # rounds
+        before = min(left + 1, ahead)
+        count = len(refinement.gaussians)
+        return count + round((self.max_gaussians - count) * (1 - (left / before) ** 2))
+
+    def may_cull(self, step: int) -> bool:
+        """Return whether opacities mean something now; not soon after they were reset."""
+        return True
+
+    def _forecast_at(self, refinement: Refinement, strictness: float = 1.0, cull: float = 1.0) -> int:
+        self.strictness, self.cull = strictness, cull
+        return self.forecast(refinement)

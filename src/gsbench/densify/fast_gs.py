@@ -82,7 +82,7 @@ class FastGS(AbsGS):
         """Remove some of the faint and, after the first opacity reset, of the huge: more likely those that err."""
         values, score = refinement.gaussians.values, self.statistics["score"]
         faint, huge = self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
-        removed = refinement.event.split_gradient // (self.split_children - 1)  # parents; who remains stands first
+        removed = refinement.event.split_gradient // (self.split_children - 1)  # parents; those that remain stand first
         known = torch.arange(len(score), device=score.device) < refinement.event.before - removed  # the new: no score
         drawn = draw(known, 1 / (LEAST_WEIGHT + 1 - score), int((faint | huge).sum()) // 2, refinement.rng)
         self._remove(refinement, faint & drawn, huge & ~faint & drawn)

@@ -1,4 +1,4 @@
-"""The long-axis split of Improved-GS: whom ADC would clone or split becomes two halves along its longest axis."""
+"""The long-axis split of Improved-GS: every candidate of ADC becomes two halves along its longest axis."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class LongAxis(ADC):
         )
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
-        """Split whose mean gradient reaches the threshold."""
+        """Split those whose mean gradient reaches the threshold."""
         over, _ = self.candidates(refinement)
         selected, blocked = self.choose(refinement, over, 1)
         parents = selected.nonzero().squeeze(-1)  # [S]

@@ -14,7 +14,7 @@ from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from gsbench.densify.base import Refinement, Rule
-from gsbench.densify.budgeted import Budgeted
+from gsbench.densify.budget import Budgeted
 from gsbench.densify.operations import standard_normal
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians

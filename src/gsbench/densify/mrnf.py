@@ -13,7 +13,7 @@ from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveIn
 from torch import Tensor
 
 from gsbench.densify.base import Refinement, Rule
-from gsbench.densify.budgeted import Budgeted
+from gsbench.densify.budget import Budgeted
 from gsbench.densify.long_axis import halves
 from gsbench.densify.mcmc import spread_out
 from gsbench.densify.operations import standard_normal
@@ -65,7 +65,7 @@ class MRNF(Budgeted):
     growth_share: Fraction = 0.07
     score_views: PositiveInt = 10
     prune_opacity: Annotated[float, Interval(ge=0, lt=1)] = 1 / 255
-    opacity_decay: Fraction = 0.004
+    opacity_decay: Annotated[float, Interval(ge=0, lt=1)] = 0.004
     scale_decay: Annotated[float, Interval(ge=0, lt=1)] = 0.002
     decay_until: PositiveInt = 30_000  # iterations; the length of the training
     noise_rate: NonNegativeFloat = 50.0  # times the learning rate of the means
@@ -142,7 +142,7 @@ class MRNF(Budgeted):
 
     @torch.no_grad()
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
-        if step >= self.stop:
+        if step >= self.stop or len(gaussians) == 0:
             return
         values, seen = gaussians.values, self.statistics["seen"]
         _, _, size = bounds(values.means)

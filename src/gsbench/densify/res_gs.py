@@ -30,7 +30,7 @@ class ResGS(ADC):
     Lyu et al. (ICCV 2025, arXiv 2412.07494): the child is drawn from the parent's density, is ``split_shrink`` smaller
     and as opaque as the parent was, so that it adds what is missing to what the parent showed. Its level is the
     parent's plus one. The window has stages; a Gaussian of level l in stage s > l grows at ``gradient_threshold`` times
-    ``level_factor``^(l - s), so that who is behind catches up. The stages are ``stages_a_phase`` equal parts of each
+    ``level_factor``^(l - s), so that those behind catch up. The stages are ``stages_a_phase`` equal parts of each
     phase of the window; phases end at ``phase_ends``, fractions of it, and for ``warm_up`` of the window after each end
     nothing is gathered and nothing grows. From ``fade_start`` of the window on all opacities are multiplied by ``fade``
     every ``fade_interval`` iterations, until ``fade_stop``. No opacity reset; pruned are the faint alone.
@@ -41,7 +41,7 @@ class ResGS(ADC):
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
         "absolute_gradient": Switch({"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"),
         "fading": Switch({"fade": 1.0}, "opacities that fade"),
-        "levels": Switch({"level_factor": 1.0}, "lower thresholds for whom earlier stages passed over"),
+        "levels": Switch({"level_factor": 1.0}, "lower thresholds for those that earlier stages passed over"),
     }
 
     gradient: Literal["signed", "absolute"] = "absolute"

@@ -8,8 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.spherical_harmonics import C0
+from gsbench.gaussians.model import C0, Gaussians
 from gsbench.raster.base import RenderOutput
 
 LUMINANCE = (19595, 38470, 7471)  # 2^16 times ITU-R 601-2, as Pillow turns RGB into L

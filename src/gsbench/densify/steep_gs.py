@@ -1,4 +1,4 @@
-"""SteepGS: who sits on a saddle of the loss is split along the direction in which a split lowers it most."""
+"""SteepGS: Gaussians at a saddle of the loss are split along the direction in which a split lowers it most."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class Saddles(NamedTuple):
 
 @dataclass
 class SteepGS(ADC):
-    """ADC of those whom a split would help, and halves that go apart where it helps most (Wang et al., CVPR 2025).
+    """ADC of the candidates that a split would help, into halves that move apart where it helps most (Wang et al., CVPR 2025).
 
     Of arXiv 2505.05587: to second order, two halves that a Gaussian leaves at small distances +-d change the loss by d
     S d / 2, with S the splitting matrix: the sum over pixels of (d loss / d s) times the second derivative of s, the
-    opacity times the density there, by the mean. So only who has an S with an eigenvalue below zero gains by a split,
+    opacity times the density there, by the mean. So only a Gaussian whose S has an eigenvalue below zero gains by a split,
     most along the eigenvector of the least one; and of all weights of two halves a half each is the best.
 
     A candidate of ADC grows only if the least eigenvalue of its S, averaged over the iterations in which it was
@@ -85,7 +85,7 @@ class SteepGS(ADC):
         return values[:, 0] * self.context.extent**2, least * largest.sign()
 
     def saddles(self, refinement: Refinement) -> Saddles:
-        """The candidates of ADC whom a split would help."""
+        """The candidates of ADC that a split would help."""
         over, large = super().candidates(refinement)
         index = over.nonzero().squeeze(-1)  # [C]
         values, directions = self.steepest(index)

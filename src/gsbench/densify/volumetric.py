@@ -1,7 +1,7 @@
 """The paper's rule: besides the gradient rule, split Gaussians whose volume is too large.
 
 Every question that the paper leaves open is an option; the defaults are its equations where they speak and the ADC
-split, which the rule extends, where they do not.
+split, which the rule extends, where they do not. Volumes and condition numbers are computed in log space.
 """
 
 from __future__ import annotations
@@ -12,19 +12,53 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import torch
-from annotated_types import Ge
+from annotated_types import Ge, Interval
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.adc import ADC, Grown
+from gsbench.densify.adc import ADC, MOST_CHILDREN, Grown
 from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.budget import admit
 from gsbench.densify.operations import quantile
-from gsbench.densify.volume import ConditionOf, child_log_scales, log_volume
 from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.settings import OpenFraction, Switch
+
+LOG_SPHERE = math.log(4 * math.pi / 3)
+ConditionOf = Literal["eigenvalues", "scales", "nothing"]
+
+
+def log_volume(log_scales: Tensor) -> Tensor:
+    """log V = log(4 pi / 3) + sum of log s_i (eq. 5), [N] from [N, 3]; world units^3, never underflows."""
+    return LOG_SPHERE + log_scales.sum(-1)
+
+
+def log_condition(log_scales: Tensor) -> Tensor:
+    """log kappa = 2 (log s_max - log s_min) (eq. 6: the ratio of the eigenvalues s^2), [N] from [N, 3], at least 0."""
+    return 2 * (log_scales.amax(-1) - log_scales.amin(-1))
+
+
+def child_log_scales(
+    log_scales: Tensor,
+    applied_to: ConditionOf = "eigenvalues",
+    max_condition: float | None = None,
+    plain_shrink: float = 1.6,
+) -> Tensor:
+    """Scales of the children (eq. 7), [N, 3].
+
+    ``eigenvalues``: lambda' = lambda / kappa, so log s' = log s - log(kappa) / 2. ``scales``: s' = s / kappa.
+    ``nothing``: s' = s / ``plain_shrink``, as ADC splits, in place of eq. 7. ``max_condition`` (at least 1) limits the
+    kappa that is divided by.
+    """
+    if applied_to == "nothing":
+        return log_scales - math.log(plain_shrink)
+    condition = log_condition(log_scales)  # [N]
+    if max_condition is not None:
+        condition = condition.clamp_max(math.log(max_condition))
+    factor = 0.5 if applied_to == "eigenvalues" else 1.0
+    return log_scales - (factor * condition).unsqueeze(-1)
+
 
 ThresholdMode = Literal["absolute", "extent_relative", "quantile", "auto"]
 TUKEY_FENCE = 1.5  # interquartile ranges above the third quartile (Tukey 1977)
@@ -61,7 +95,7 @@ class Volumetric(ADC):
     )
     max_condition: Annotated[float, Ge(1)] | None = None  # limits kappa, so that children of needles do not vanish
     split_isotropic: bool = True  # False: leave those whose children would be above the threshold again
-    volume_children: Annotated[int, Ge(2)] = 2
+    volume_children: Annotated[int, Interval(ge=2, le=MOST_CHILDREN)] = 2
     keep_parent: bool = False
     placement: Literal["sampled", "parent_mean"] = "sampled"
     volume_order: Literal["after_adc", "before_adc", "after_prune"] = "after_adc"

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gsbench.errors import InputError
-from gsbench.gaussians.model import NUM_SH_REST, Gaussians
-from gsbench.gaussians.spherical_harmonics import rgb_to_dc
+from gsbench.gaussians.model import NUM_SH_REST, Gaussians, rgb_to_dc
 
 NEIGHBOURS = 3
 MIN_SQUARED_DISTANCE = 1e-7  # world units^2: the floor of the mean squared distance to the neighbours

@@ -60,8 +60,8 @@ class Ply(PlacedCloud):
         return result
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
+        from gsbench.gaussians.model import dc_to_rgb
         from gsbench.gaussians.ply import read_ply
-        from gsbench.gaussians.spherical_harmonics import dc_to_rgb
 
         gaussians = read_ply(self.file)
         colors = (dc_to_rgb(gaussians.sh_dc).clamp(0, 1) * 255).round().byte().numpy()  # [N, 3]

@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gsbench.gaussians.model import Gaussians
-    from gsbench.raster.footprint import Footprint
     from gsbench.scene.camera import Camera
 
 
@@ -29,6 +28,25 @@ class RasterConstants:
 
 
 CONSTANTS = RasterConstants()
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """The pixels of one view that each Gaussian is blended into: those where its alpha is not skipped and that have not
+    stopped before it.
+
+    All are [N] and carry no gradient; where there is no such pixel, all but ``depths`` are 0.
+    """
+
+    pixels: Tensor  # int32, how many
+    depths: Tensor  # view z of the mean, world units
+    values: Tensor  # sum over them of the values that were asked about; 0 where none were
+    distances: Tensor  # sum over them of the distance from the projected mean to the pixel's centre, px
+
+
+def view_depths(gaussians: Gaussians, camera: Camera) -> Tensor:
+    """View z of each mean, [N] world units."""
+    return gaussians.means.detach() @ gaussians.means.new_tensor(camera.rotation[2]) + camera.translation[2]
 
 
 class FootprintOf(Protocol):

@@ -1,6 +1,6 @@
-"""The executors that come with gsbench, as one table of facts that everything asks. Loads no torch.
+"""The executors that come with gsbench, as one table of facts that everything asks, and the setting that picks one.
 
-A rasterizer of your own needs no entry here: ``raster._target_=mine.MyRasterizer`` (docs/rasterizer.md).
+Loads no torch. A rasterizer of your own needs no entry: ``raster._target_=mine.MyRasterizer`` (docs/rasterizer.md).
 """
 
 from __future__ import annotations
@@ -13,7 +13,10 @@ import re
 from dataclasses import dataclass
 
 from gsbench.errors import InputError
+from gsbench.raster import executors
+from gsbench.settings import MISSING, TargetName, check_settings
 from gsbench.system.install import install_command
+from gsbench.words import closest
 
 log = logging.getLogger(__name__)
 
@@ -155,3 +158,17 @@ def _automatic(device_type: str) -> Executor:
     hints = "; ".join(f"{executor.name} needs {executor.package}: {executor.install}" for executor in wanted)
     log.warning("raster=auto: the slow reference rasterizer runs%s", f" ({hints})" if hints else "")
     return find("reference")
+
+
+@dataclass
+class RasterConfig:
+    name: str = MISSING  # auto, or an executor of gsbench.raster.executors
+    _target_: TargetName | None = None  # a class of your own, instead; its options are further keys
+
+    def __post_init__(self) -> None:
+        check_settings(self, "raster")
+        if self._target_ is None and self.name not in executors.names():
+            choices = ", ".join(executors.names())
+            raise InputError(
+                f"raster must be one of {choices}, got {self.name!r}{closest(self.name, executors.names())}"
+            )

@@ -13,10 +13,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.spherical_harmonics import colors
-from gsbench.raster.base import CONSTANTS, RasterConstants, RenderOutput
-from gsbench.raster.footprint import Footprint, view_depths
+from gsbench.gaussians.model import Gaussians, colors
+from gsbench.raster.base import CONSTANTS, Footprint, RasterConstants, RenderOutput, view_depths
 from gsbench.raster.validate import check_inputs
 from gsbench.scene.camera import Camera
 

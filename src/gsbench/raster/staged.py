@@ -11,15 +11,14 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.raster.base import RenderOutput
-from gsbench.raster.footprint import Footprint
+from gsbench.raster.base import Footprint, RenderOutput
 from gsbench.raster.validate import check_settings
 from gsbench.scene.camera import Camera
 
 FrameT = TypeVar("FrameT")
 
 
-class Holder:
+class Lifetime:
     """Lives as long as what was leased for it is needed: pools take memory back when it is freed."""
 
 
@@ -54,8 +53,10 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         """Raise ValueError where the stages cannot use tensors of this type or device."""
 
     @abstractmethod
-    def forward(self, holder: Holder, gaussians: Gaussians, request: Request) -> tuple[Tensor, Tensor, Tensor, FrameT]:
-        """Return image [H, W, 3], alpha [H, W], radii [N], and the frame, whose memory is held by ``holder``."""
+    def forward(
+        self, lifetime: Lifetime, gaussians: Gaussians, request: Request
+    ) -> tuple[Tensor, Tensor, Tensor, FrameT]:
+        """Return image [H, W, 3], alpha [H, W], radii [N], and the frame, whose memory is held by ``lifetime``."""
 
     @abstractmethod
     def backward(
@@ -100,7 +101,7 @@ class _Kept(Generic[FrameT]):
     """State that a render keeps for the backward pass and for its footprint, and the hold on the memory of it."""
 
     frame: FrameT
-    holder: Holder
+    lifetime: Lifetime
 
 
 def _footprint(
@@ -129,8 +130,8 @@ class _Render(torch.autograd.Function):
         *tensors: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         gaussians = Gaussians(*(tensor.contiguous() for tensor in tensors))
-        kept.holder = Holder()
-        image, alpha, radii, kept.frame = rasterizer.forward(kept.holder, gaussians, request)
+        kept.lifetime = Lifetime()
+        image, alpha, radii, kept.frame = rasterizer.forward(kept.lifetime, gaussians, request)
         ctx.rasterizer, ctx.kept, ctx.request = rasterizer, kept, request
         _, _, _, wants_background, *_ = ctx.needs_input_grad
         ctx.save_for_backward(alpha if wants_background else None, *gaussians.tensors().values())

@@ -1,18 +1,60 @@
-"""The journal of a training: loss curves, refinements and histograms of volumes as JSON lines, one file each."""
+"""What a training writes down: its losses, read without making the device wait, and records as JSON lines."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections import deque
 from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from gsbench.densify.volume import log_volume
+from gsbench.densify.volumetric import log_volume
 from gsbench.files import write_text
+from gsbench.raster.readback import Readback
 from gsbench.runs.rows import whole_lines
+
+SMOOTHING = 0.9  # of the loss that is shown
+
+
+class LossLog:
+    """The losses of all iterations so far, in order: those of the latest may still be on their way from the device.
+
+    On the CPU each is there at once. ``smoothed`` is their exponential mean, NaN before the first.
+    """
+
+    def __init__(self) -> None:
+        self.smoothed = math.nan
+        self._under_way: deque[tuple[int, Readback]] = deque()
+        self._latest: dict[str, float] = {}
+
+    def add(self, step: int, loss: Tensor, l1: Tensor, ssim: Tensor, total: Tensor) -> None:
+        """Take the scalars of iteration ``step``; ``total`` is what is differentiated: the loss and a regulariser."""
+        scalars = [scalar.detach().to(loss) for scalar in (loss, l1, ssim, total)]
+        self._under_way.append((step, Readback(torch.stack(scalars))))
+        while self._under_way and self._under_way[0][1].arrived:
+            self._take()
+
+    def settle(self) -> dict[str, float]:
+        """Wait for all; the latest iteration's ``step``, ``loss``, ``l1`` and ``ssim``.
+
+        Raises FloatingPointError, as `add` does, naming the first iteration whose total was not finite.
+        """
+        while self._under_way:
+            self._take()
+        return self._latest
+
+    def _take(self) -> None:
+        step, readback = self._under_way.popleft()
+        loss, l1, ssim, total = readback.values().tolist()
+        if not math.isfinite(total):
+            raise FloatingPointError(f"the loss became {total} at iteration {step}")
+        self.smoothed = loss if math.isnan(self.smoothed) else SMOOTHING * self.smoothed + (1 - SMOOTHING) * loss
+        self._latest = {"step": step, "loss": loss, "l1": l1, "ssim": ssim}
+
 
 LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, a quarter decade each
 

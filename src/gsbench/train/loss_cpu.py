@@ -18,6 +18,7 @@ from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
 from gsbench.raster.cpu.simd import absolute, fma, lane_sums, load, load_numbers, select, splat, store
 from gsbench.raster.cpu.vector import LANES
 from gsbench.raster.cpu.workspace import ArenaPool, ShardRunner, TensorPool
+from gsbench.raster.staged import Lifetime
 from gsbench.system.jit import inlined, kernel
 from gsbench.system.resources import available_cores
 
@@ -243,7 +244,7 @@ class CompiledLoss:
         divisor = BYTE_MAX if target.dtype == torch.uint8 else ONE
         edges = [height * shard // SHARDS for shard in range(SHARDS + 1)]
         sums = np.zeros((SHARDS, 2))
-        holder = _Holder()
+        holder = Lifetime()
         arena = self._arenas.lease(holder)
         padded = -(-width * CHANNELS // LANES) * LANES + 2 * PAD
         derivatives = arena.take("derivatives", (3 * height * padded if differentiate else 0,), np.float32)
@@ -269,10 +270,6 @@ class CompiledLoss:
 
         self._runner.run(SHARDS, differentiate_rows)
         return total_similarity, total_l1, gradient
-
-
-class _Holder:
-    """Lives as long as the arena is needed."""
 
 
 class _Loss(torch.autograd.Function):

@@ -16,9 +16,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
-from gsbench.raster.triton.launch import launch_grid
-from gsbench.raster.triton.toolchain import load_driver
-from gsbench.raster.triton.workspace import WorkspacePool
+from gsbench.raster.staged import Lifetime
+from gsbench.raster.triton.launch import launch_grid, load_driver
+from gsbench.raster.triton.memory import WorkspacePool
 
 STRIP = 128  # numbers of a row that a program takes
 LEAST_ROWS = 8  # that it takes
@@ -231,10 +231,6 @@ class TritonLoss:
         return loss, l1, similarity
 
 
-class _Holder:
-    """Lives as long as the memory is needed."""
-
-
 class _Loss(torch.autograd.Function):
     """The bridge between the kernels and autograd."""
 
@@ -246,7 +242,7 @@ class _Loss(torch.autograd.Function):
         rows = rows_of_program(height, numbers)
         grid = triton.cdiv(numbers, STRIP), triton.cdiv(height, rows)
         scale = 1 / 255 if target.dtype == torch.uint8 else 1.0
-        ctx.holder = _Holder()
+        ctx.holder = Lifetime()
         with torch.cuda.device_of(image):
             memory = loss.pool.lease(ctx.holder, image.device)
             derivatives = memory.take("derivatives", 3 * image.numel() if differentiated else 0, torch.float32)

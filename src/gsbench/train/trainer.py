@@ -27,15 +27,12 @@ from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.scene.types import Scene
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
-from gsbench.train.draws import CameraOrder, generators
-from gsbench.train.journal import append, drop_after, volume_histogram
+from gsbench.train.device import explain_full, free_bytes, room_for_images
+from gsbench.train.journal import LossLog, append, drop_after, volume_histogram
 from gsbench.train.loss import PhotometricLoss
-from gsbench.train.loss_log import LossLog
-from gsbench.train.memory_budget import explain_full, free_bytes, room_for_images
 from gsbench.train.options import TrainConfig
 from gsbench.train.resolution import Pictures, Resolution
-from gsbench.train.targets import Targets
-from gsbench.train.training_views import SceneViews
+from gsbench.train.views import CameraOrder, SceneViews, Targets, generators
 
 log = logging.getLogger(__name__)
 
@@ -188,7 +185,9 @@ class Trainer:
             self._optimize(render.visible)
         self.densifier.after_step(step, self.gaussians, self.rngs["densify"])
         if len(self.gaussians) == 0:
-            raise TrainingError(f"no Gaussian was left after iteration {step}; the pruning thresholds are too high")
+            raise TrainingError(
+                f"no Gaussian was left after iteration {step}; the pruning thresholds or a decay are too high"
+            )
         return event
 
     def render(self, index: int) -> RenderOutput:

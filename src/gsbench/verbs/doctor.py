@@ -156,7 +156,7 @@ def check_packages() -> Iterator[Finding]:
 
 def check_triton() -> Iterator[Finding]:
     """Check the compiler that raster=triton needs at its first run on a GPU."""
-    from gsbench.raster.triton.toolchain import missing_tools
+    from gsbench.raster.triton.launch import missing_tools
 
     installed = _version("triton")
     if installed is None:  # torch for CUDA would have brought it along

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsbench.analysis.results import TrialResult, load_experiment
-from gsbench.densify.volume import log_volume
+from gsbench.densify.volumetric import log_volume
 from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from gsbench.densify.volume import log_volume
+from gsbench.densify.volumetric import log_volume
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.reference import project

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsbench.densify.volume import log_volume
-from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.spherical_harmonics import rgb_to_dc
+from gsbench.densify.volumetric import log_volume
+from gsbench.gaussians.model import Gaussians, rgb_to_dc
 from gsbench.raster.base import Rasterizer
 from gsbench.scene.camera import Camera
 

@@ -1,20 +1,286 @@
-"""The compiled CPU rasterizer as an executor of the contract."""
+"""The compiled CPU rasterizer: its stages in order, forward and backward, shared out among threads."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.raster.base import CONSTANTS
+from gsbench.raster.base import CONSTANTS, Footprint, view_depths
 from gsbench.raster.cpu import layout as at
-from gsbench.raster.cpu.stages import Frame, Workshop, backward, footprint, forward
-from gsbench.raster.cpu.workspace import ArenaPool
-from gsbench.raster.footprint import Footprint
-from gsbench.raster.staged import Gradients, Holder, Request, StagedRasterizer
+from gsbench.raster.cpu.backprojection import backproject_shard
+from gsbench.raster.cpu.binning import (
+    BUCKETS,
+    PASSES,
+    balance_tiles,
+    fill_shard,
+    pair_shard,
+    sort_by_depth,
+    start_tiles,
+)
+from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_backward_tiles, composite_tiles
+from gsbench.raster.cpu.footprint import cover_tiles
+from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, project_shard
+from gsbench.raster.cpu.shuffle import REST
+from gsbench.raster.cpu.workspace import HEADROOM, Arena, ArenaPool, ShardRunner, TensorPool
+from gsbench.raster.staged import Gradients, Lifetime, Request, StagedRasterizer
+from gsbench.raster.validate import raise_for_values
 from gsbench.scene.camera import Camera
 from gsbench.system.resources import available_cores
+
+# Fixed, so that the bits of every result are the same for any number of threads.
+GAUSSIAN_SHARDS = 16
+TILE_SHARDS = 8  # each has its own gradient rows: 64 bytes per Gaussian
+
+
+class Resources:
+    """Threads that the stages run on, and memory for the tensors that they give."""
+
+    def __init__(self, threads: int) -> None:
+        self.runner = ShardRunner(threads)
+        self.tensors = TensorPool()
+        self.pairs_of_shard = 0  # of tile and record: the room that sufficed so far
+
+
+@dataclass
+class Frame:
+    """Results of the forward pass for the backward pass; the arrays belong to ``arena``."""
+
+    view: at.View
+    degree: int
+    visible: NDArray[np.int64]  # [GAUSSIAN_SHARDS] records
+    records: NDArray[np.float32]  # [N * RECORD]
+    starts: NDArray[np.int64]  # [tiles + 1]
+    entries: NDArray[np.int32]  # [pairs] records, by tile, front to back
+    masks: NDArray[np.uint16]  # [pairs] blocks that were blended
+    processed: NDArray[np.int64]  # [tiles] end of the entries that were looked at
+    transmittance: NDArray[np.float32]  # [tiles * TILE_PIXELS]
+    last: NDArray[np.float32]  # [tiles * TILE_PIXELS]
+    bounds: NDArray[np.int64]  # [TILE_SHARDS + 1] tiles
+    tile_shard: NDArray[np.uint8]  # [tiles]
+    background: NDArray[np.float32]  # [3]
+
+
+def _edges(count: int, shards: int) -> list[int]:
+    return [count * shard // shards for shard in range(shards + 1)]
+
+
+def forward(
+    resources: Resources,
+    arena: Arena,
+    gaussians: Gaussians,
+    request: Request,
+    image: Tensor,
+    alpha: Tensor,
+    radii: Tensor,
+) -> Frame:
+    """Project, sort, bin, composite into ``image``, ``alpha`` and ``radii``."""
+    run = resources.runner.run
+    count = len(gaussians)
+    view = at.make_view(request.camera, CONSTANTS)
+    tiles = view.tiles_x * view.tiles_y
+    arrays = _arrays(gaussians)
+    records = arena.take("records", (count * at.RECORD,), np.float32)
+    record_ints = records.view(np.int32)
+    keys = arena.take("keys", (count,), np.uint64)
+    flags = np.zeros((GAUSSIAN_SHARDS, 2), np.int64)
+    edges = _edges(count, GAUSSIAN_SHARDS)
+    radii_array = radii.numpy()
+
+    def project(shard: int) -> None:
+        begin, end = edges[shard], edges[shard + 1]
+        project_shard(
+            at.kernel_memory(),
+            begin,
+            end,
+            *arrays,
+            request.degree,
+            view,
+            records,
+            record_ints,
+            keys,
+            radii_array,
+            flags[shard],
+        )
+
+    run(GAUSSIAN_SHARDS, project)
+    if flags[:, BAD_VALUE].any():
+        raise_for_values(gaussians)
+
+    order = arena.take("order", (int(flags[:, VISIBLE].sum()),), np.uint64)
+    digits = np.empty((PASSES, BUCKETS), np.int64)
+    spare = arena.take("spare", order.shape, np.uint64)
+    sort_by_depth(np.array(edges[:-1]), flags[:, VISIBLE].copy(), keys, order, spare, digits)
+
+    counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
+    starts = arena.take("starts", (tiles + 1,), np.int64)
+    cuts = _edges(len(order), GAUSSIAN_SHARDS)
+    made = np.zeros(GAUSSIAN_SHARDS, np.int64)  # pairs of tile and record
+
+    def pair(shard: int) -> None:
+        made[shard] = pair_shard(
+            cuts[shard],
+            cuts[shard + 1],
+            order,
+            records,
+            record_ints,
+            view.tiles_x,
+            LOG2_ALPHA_MIN,
+            counts[shard],
+            pairs[shard],
+        )
+
+    room = resources.pairs_of_shard
+    pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
+    run(GAUSSIAN_SHARDS, pair)
+    if made.max() > room:  # once in a while, as the scene grows
+        room = resources.pairs_of_shard = int(made.max() * HEADROOM)
+        pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
+        run(GAUSSIAN_SHARDS, pair)
+    start_tiles(counts, starts)
+    total = int(starts[tiles])
+    entries = arena.take("entries", (total,), np.int32)
+    run(GAUSSIAN_SHARDS, lambda shard: fill_shard(made[shard], pairs[shard], counts[shard], entries))
+
+    frame = Frame(
+        view,
+        request.degree,
+        flags[:, VISIBLE],
+        records,
+        starts,
+        entries,
+        arena.take("masks", (total,), np.uint16),
+        arena.take("processed", (tiles,), np.int64),
+        arena.take("transmittance", (tiles * at.TILE_PIXELS,), np.float32),
+        arena.take("last", (tiles * at.TILE_PIXELS,), np.float32),
+        np.empty(TILE_SHARDS + 1, np.int64),
+        arena.take("tile_shard", (tiles,), np.uint8),
+        request.background.numpy(),
+    )
+    balance_tiles(starts, TILE_SHARDS, frame.bounds, frame.tile_shard)
+    image_array, alpha_array = image.numpy().reshape(-1), alpha.numpy().reshape(-1)
+
+    def composite(shard: int) -> None:
+        composite_tiles(*_tiles_of(frame, shard), *_blending_of(frame), image_array, alpha_array)
+
+    run(TILE_SHARDS, composite)
+    return frame
+
+
+def _tiles_of(frame: Frame, shard: int) -> tuple[Any, ...]:
+    """The arguments that all kernels share which walk through the entries of tiles."""
+    return (
+        at.kernel_memory(),
+        int(frame.bounds[shard]),
+        int(frame.bounds[shard + 1]),
+        frame.starts,
+        frame.entries,
+        frame.masks,
+        frame.processed,
+        frame.records,
+        frame.view.width,
+        frame.view.height,
+    )
+
+
+def _blending_of(frame: Frame) -> tuple[Any, ...]:
+    """The further arguments that the two compositing kernels share."""
+    return frame.background, frame.transmittance, frame.last
+
+
+def backward(
+    resources: Resources,
+    arena: Arena,
+    frame: Frame,
+    gaussians: Gaussians,
+    request: Request,
+    g_image: NDArray[np.float32],
+    g_alpha: NDArray[np.float32],
+    want_splitting: bool,
+) -> Gradients:
+    """The gradients, and those in absolute values where ``request`` has room for them; ``g_alpha`` may be empty."""
+    count, absolute = len(gaussians), request.absolute
+    rows = arena.take("rows", (TILE_SHARDS, count * at.ROW), np.float32, zero=True)
+    want_absolute = None if absolute is None else True
+
+    def composite_backward(shard: int) -> None:
+        composite_backward_tiles(
+            *_tiles_of(frame, shard), *_blending_of(frame), g_image, g_alpha, rows[shard], want_absolute
+        )
+
+    resources.runner.run(TILE_SHARDS, composite_backward)
+
+    means, log_scales, quaternions, logits, _, sh_rest = _arrays(gaussians)
+    take = resources.tensors.empty
+    gradients = {name: take(tuple(tensor.shape)) for name, tensor in gaussians.tensors().items()}
+    g_screen = take((count, 2))
+    g_absolute = np.empty((0, 2), np.float32) if absolute is None else absolute.numpy()
+    g_splitting = take((count, 3, 3)) if want_splitting else None
+    edges = _edges(count, GAUSSIAN_SHARDS)
+    common = (
+        means,
+        log_scales,
+        quaternions,
+        logits,
+        sh_rest,
+        frame.degree,
+        frame.view,
+        frame.records.view(np.int32),
+        frame.tile_shard,
+        rows.reshape(-1),
+        gradients["means"].numpy(),
+        gradients["log_scales"].numpy(),
+        gradients["quaternions"].numpy(),
+        gradients["opacity_logits"].numpy().reshape(count, 1),
+        gradients["sh_dc"].numpy(),
+        gradients["sh_rest"].numpy().reshape(-1, REST),
+        g_screen.numpy(),
+        g_absolute,
+        np.empty((0, 9), np.float32) if g_splitting is None else g_splitting.numpy().reshape(-1, 9),
+    )
+
+    def backproject(shard: int) -> None:
+        begin, end, visible = edges[shard], edges[shard + 1], int(frame.visible[shard])
+        backproject_shard(at.kernel_memory(), begin, end, visible, *common)
+
+    resources.runner.run(GAUSSIAN_SHARDS, backproject)
+    return Gradients(list(gradients.values()), g_screen, g_splitting)
+
+
+def _arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:
+    """The six tensors as arrays that share their memory; ``sh_rest`` as [N * 45]."""
+    means, log_scales, quaternions, logits, sh_dc, sh_rest = (t.detach().numpy() for t in gaussians.tensors().values())
+    return means, log_scales, quaternions, logits, sh_dc, sh_rest.reshape(-1)
+
+
+def footprint(
+    resources: Resources, frame: Frame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
+) -> Footprint:
+    """See ``raster.base.RenderOutput``."""
+    count = len(gaussians)
+    covered = np.zeros((TILE_SHARDS, count), np.int32)
+    sums, distances = np.zeros((2, TILE_SHARDS, count), np.float32)
+    asked = np.empty(0, np.float32) if values is None else values.detach().float().contiguous().numpy().reshape(-1)
+
+    def cover(shard: int) -> None:
+        cover_tiles(
+            *_tiles_of(frame, shard),
+            frame.records.view(np.int32),
+            frame.last,
+            asked,
+            covered[shard],
+            sums[shard],
+            distances[shard],
+        )
+
+    resources.runner.run(TILE_SHARDS, cover)
+    totals = (torch.from_numpy(shards.sum(0, dtype=shards.dtype)) for shards in (covered, sums, distances))
+    return Footprint(next(totals), view_depths(gaussians, camera), *totals)
 
 
 class CpuRasterizer(StagedRasterizer[Frame]):
@@ -32,7 +298,7 @@ class CpuRasterizer(StagedRasterizer[Frame]):
         if CONSTANTS.tile != at.TILE:
             raise ValueError(f"the compiled rasterizer has tiles of {at.TILE} px, the contract {CONSTANTS.tile}")
         self.threads = threads or available_cores()
-        self._workshop = Workshop(self.threads)
+        self._resources = Resources(self.threads)
         self._frames = ArenaPool()
         self._scratch = ArenaPool()
 
@@ -42,14 +308,16 @@ class CpuRasterizer(StagedRasterizer[Frame]):
         if means.dtype != torch.float32 or means.device.type != "cpu":
             raise ValueError(f"means: raster=cpu needs float32 on the cpu, got {means.dtype} on {means.device}")
 
-    def forward(self, holder: Holder, gaussians: Gaussians, request: Request) -> tuple[Tensor, Tensor, Tensor, Frame]:
+    def forward(
+        self, lifetime: Lifetime, gaussians: Gaussians, request: Request
+    ) -> tuple[Tensor, Tensor, Tensor, Frame]:
         """See `StagedRasterizer`."""
-        camera, tensors = request.camera, self._workshop.tensors
+        camera, tensors = request.camera, self._resources.tensors
         image = tensors.empty((camera.height, camera.width, 3))
         alpha = tensors.empty((camera.height, camera.width))
         radii = torch.empty(len(gaussians), dtype=torch.int32)
-        arena = self._frames.lease(holder)
-        return image, alpha, radii, forward(self._workshop, arena, gaussians, request, image, alpha, radii)
+        arena = self._frames.lease(lifetime)
+        return image, alpha, radii, forward(self._resources, arena, gaussians, request, image, alpha, radii)
 
     def backward(
         self,
@@ -62,11 +330,11 @@ class CpuRasterizer(StagedRasterizer[Frame]):
     ) -> Gradients:
         """See `StagedRasterizer`."""
         g_alpha_array = np.empty(0, np.float32) if g_alpha is None else g_alpha.numpy().reshape(-1)
-        holder = Holder()
-        arena = self._scratch.lease(holder)
+        lifetime = Lifetime()
+        arena = self._scratch.lease(lifetime)
         try:
             return backward(
-                self._workshop,
+                self._resources,
                 arena,
                 frame,
                 gaussians,
@@ -81,4 +349,4 @@ class CpuRasterizer(StagedRasterizer[Frame]):
 
     def footprint(self, frame: Frame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None) -> Footprint:
         """See ``raster.base.RenderOutput``."""
-        return footprint(self._workshop, frame, gaussians, camera, values)
+        return footprint(self._resources, frame, gaussians, camera, values)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsbench.gaussians.spherical_harmonics import C0, C1, C2, C3
+from gsbench.gaussians.model import C0, C1, C2, C3
 from gsbench.raster.cpu.shuffle import transpose
 from gsbench.raster.cpu.simd import load, splat, store
 from gsbench.raster.cpu.vector import LANES

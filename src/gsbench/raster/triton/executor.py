@@ -1,19 +1,252 @@
-"""The Triton rasterizer as an executor of the contract."""
+"""The Triton rasterizer: its stages in order, forward and backward, and the footprint."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.raster.base import CONSTANTS
-from gsbench.raster.footprint import Footprint
-from gsbench.raster.staged import Gradients, Holder, Request, StagedRasterizer
-from gsbench.raster.triton.layout import TILE
-from gsbench.raster.triton.stages import Frame, backward, footprint, forward
-from gsbench.raster.triton.toolchain import load_driver
-from gsbench.raster.triton.workspace import WorkspacePool
+from gsbench.raster.base import CONSTANTS, Footprint, view_depths
+from gsbench.raster.staged import Gradients, Lifetime, Request, StagedRasterizer
+from gsbench.raster.triton.backprojection import backproject, sum_units
+from gsbench.raster.triton.composite import composite, composite_backward
+from gsbench.raster.triton.footprint import cover, sum_cover
+from gsbench.raster.triton.launch import launch, launch_grid, load_driver
+from gsbench.raster.triton.layout import (
+    BLOCK_PIXELS,
+    BORDER,
+    COLOR_SLOPES,
+    RECORD,
+    ROW,
+    TILE,
+    Grid,
+    View,
+    count_borders,
+    make_grid,
+    make_view,
+)
+from gsbench.raster.triton.lists import Lists, Projected, Units, find_all_units, make_lists
+from gsbench.raster.triton.memory import Workspace, WorkspacePool
+from gsbench.raster.triton.projection import project
 from gsbench.scene.camera import Camera
+
+
+@dataclass
+class Frame:
+    """Results of the forward pass for the backward pass; the memory belongs to a workspace."""
+
+    grid: Grid
+    view: View
+    projected: Projected
+    units: Units
+    lists: Lists
+    transmittance: Tensor  # [blocks * BLOCK_PIXELS]
+    last: Tensor  # [blocks * BLOCK_PIXELS] int32
+    past: Tensor  # [blocks] int32
+    borders: Tensor  # [count_borders(pairs) * BORDER]
+    last_slots: Tensor  # [blocks] int64
+
+
+def forward(
+    memory: Workspace,
+    scratch: Workspace,
+    gaussians: Gaussians,
+    request: Request,
+    image: Tensor,
+    alpha: Tensor,
+    radii: Tensor,
+) -> Frame:
+    """Project, sort, bin, composite into ``image``, ``alpha`` and ``radii``. Raises ValueError for bad values."""
+    grid, view = make_grid(request.camera), make_view(request.camera)
+    count, blocks, background = len(gaussians), grid.blocks, request.background
+    flags = scratch.take("flags", 1, torch.int32).zero_()
+    keys = scratch.take("depth_keys", count, torch.int32)
+    projected = _project(memory, gaussians, view, request.degree, keys, radii, flags)
+    units, owners = find_all_units(memory, scratch, gaussians, projected, grid, keys, flags, background)
+    lists = make_lists(memory, scratch, units, owners, blocks)
+    frame = Frame(
+        grid,
+        view,
+        projected,
+        units,
+        lists,
+        memory.take("transmittance", blocks * BLOCK_PIXELS.value, torch.float32),
+        memory.take("last", blocks * BLOCK_PIXELS.value, torch.int32),
+        memory.take("past", blocks, torch.int32),
+        memory.take("borders", count_borders(units.pairs) * BORDER.value, torch.float32),
+        memory.take("last_slots", blocks, torch.int64),
+    )
+    launch_grid(composite, blocks)(
+        lists.order,
+        lists.starts,
+        lists.entries,
+        projected.records,
+        count,
+        background,
+        grid.width,
+        grid.height,
+        grid.blocks_x,
+        image,
+        alpha,
+        frame.transmittance,
+        frame.last,
+        frame.past,
+        frame.borders,
+        lists.slots,
+        frame.last_slots,
+        num_warps=1,
+    )
+    return frame
+
+
+def _project(
+    memory: Workspace,
+    gaussians: Gaussians,
+    view: View,
+    degree: int,
+    keys: Tensor,
+    radii: Tensor,
+    flags: Tensor,
+) -> Projected:
+    """Project all Gaussians; ``keys`` sort by depth, ``flags`` tell of values that cannot be used."""
+    count = len(gaussians)
+    projected = Projected(
+        memory.take("records", (count + 1) * RECORD.value, torch.float32),
+        memory.take("color_slopes", count * COLOR_SLOPES.value, torch.float32),
+        memory.take("row_counts", count, torch.int32),
+    )
+    parameters = [tensor.detach() for tensor in gaussians.tensors().values()]
+    launch(project, count + 1, 128)(
+        *parameters,
+        count,
+        view,
+        projected.records,
+        projected.records.view(torch.int32),
+        projected.color_slopes,
+        keys,
+        projected.row_counts,
+        radii,
+        flags,
+        DEGREE=degree,
+    )
+    return projected
+
+
+def backward(
+    scratch: Workspace,
+    frame: Frame,
+    gaussians: Gaussians,
+    request: Request,
+    g_image: Tensor,
+    g_alpha: Tensor | None,
+    want_splitting: bool,
+) -> Gradients:
+    """The gradients, and those in absolute values where ``request`` has room for them."""
+    grid, units, lists, count = frame.grid, frame.units, frame.lists, len(gaussians)
+    projected, absolute = frame.projected, request.absolute
+    rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)
+    inner = count_borders(units.pairs)
+    launch_grid(composite_backward, inner + grid.blocks)(
+        lists.order,
+        lists.starts,
+        grid.blocks,
+        inner,
+        lists.entries,
+        lists.slots,
+        projected.records,
+        count,
+        request.background,
+        grid.width,
+        grid.height,
+        grid.blocks_x,
+        frame.transmittance,
+        frame.last,
+        frame.past,
+        frame.borders,
+        g_image,
+        g_image if g_alpha is None else g_alpha,
+        rows,
+        HAS_ALPHA=g_alpha is not None,
+        ABSOLUTE=absolute is not None,
+        num_warps=1,
+    )
+    _sum_units(frame, rows)
+    means, log_scales, quaternions, logits, *_ = gaussians.tensors().values()
+    gradients = [torch.zeros_like(tensor) for tensor in gaussians.tensors().values()]
+    g_screen = torch.zeros_like(means[:, :2])
+    g_splitting = means.new_zeros(count, 3, 3) if want_splitting else None
+    launch(backproject, count, 128)(
+        means,
+        log_scales,
+        quaternions,
+        logits,
+        count,
+        frame.view,
+        projected.records.view(torch.int32),
+        projected.color_slopes,
+        projected.row_counts,
+        units.first,
+        units.pair_ends,
+        units.widths,
+        rows,
+        *gradients,
+        g_screen,
+        g_screen if absolute is None else absolute,
+        g_screen if g_splitting is None else g_splitting,
+        DEGREE=request.degree,
+        ABSOLUTE=absolute is not None,
+        SPLITTING=want_splitting,
+    )
+    return Gradients(gradients, g_screen, g_splitting)
+
+
+def _sum_units(frame: Frame, rows: Tensor) -> None:
+    """Add up the ``rows`` of each unit's pairs, in place."""
+    units = frame.units
+    launch(sum_units, units.number, 32)(
+        units.pair_ends, units.widths, units.blocks, frame.last_slots, units.number, rows
+    )
+
+
+def footprint(
+    scratch: Workspace, frame: Frame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
+) -> Footprint:
+    """See ``raster.base.RenderOutput``."""
+    units, lists, count, device = frame.units, frame.lists, len(gaussians), gaussians.means.device
+    covered = torch.zeros(count, dtype=torch.int32, device=device)
+    sums, distances = torch.zeros(2, count, device=device)
+    asked = sums if values is None else values.detach().float().contiguous()
+    rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)  # ``cover`` fills three of 16
+    launch_grid(cover, frame.grid.blocks)(
+        lists.starts,
+        lists.entries,
+        lists.slots,
+        frame.projected.records,
+        frame.grid.width,
+        frame.grid.height,
+        frame.grid.blocks_x,
+        frame.last,
+        frame.past,
+        asked,
+        rows,
+        HAS_VALUES=values is not None,
+        num_warps=1,
+    )
+    _sum_units(frame, rows)
+    launch(sum_cover, count, 128)(
+        count,
+        frame.projected.row_counts,
+        units.first,
+        units.pair_ends,
+        units.widths,
+        rows,
+        covered,
+        sums,
+        distances,
+    )
+    return Footprint(covered, view_depths(gaussians, camera), sums, distances)
 
 
 class TritonRasterizer(StagedRasterizer[Frame]):
@@ -38,15 +271,17 @@ class TritonRasterizer(StagedRasterizer[Frame]):
         if gaussians.means.device.type == "cuda":
             load_driver()
 
-    def forward(self, holder: Holder, gaussians: Gaussians, request: Request) -> tuple[Tensor, Tensor, Tensor, Frame]:
+    def forward(
+        self, lifetime: Lifetime, gaussians: Gaussians, request: Request
+    ) -> tuple[Tensor, Tensor, Tensor, Frame]:
         """See `StagedRasterizer`."""
         camera, device = request.camera, gaussians.means.device
         image = torch.empty(camera.height, camera.width, 3, dtype=torch.float32, device=device)
         alpha = torch.empty(camera.height, camera.width, dtype=torch.float32, device=device)
         radii = torch.empty(len(gaussians), dtype=torch.int32, device=device)
-        while_drawn = Holder()
+        while_drawn = Lifetime()
         with torch.cuda.device_of(image):
-            memory = self._frames.lease(holder, device)
+            memory = self._frames.lease(lifetime, device)
             scratch = self._scratch.lease(while_drawn, device)
             return image, alpha, radii, forward(memory, scratch, gaussians, request, image, alpha, radii)
 
@@ -60,14 +295,14 @@ class TritonRasterizer(StagedRasterizer[Frame]):
         want_splitting: bool,
     ) -> Gradients:
         """See `StagedRasterizer`."""
-        holder = Holder()
+        lifetime = Lifetime()
         with torch.cuda.device_of(g_image):
-            scratch = self._scratch.lease(holder, g_image.device)
+            scratch = self._scratch.lease(lifetime, g_image.device)
             return backward(scratch, frame, gaussians, request, g_image, g_alpha, want_splitting)
 
     def footprint(self, frame: Frame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None) -> Footprint:
         """See ``raster.base.RenderOutput``."""
-        holder = Holder()
+        lifetime = Lifetime()
         with torch.cuda.device_of(gaussians.means):
-            scratch = self._scratch.lease(holder, gaussians.means.device)
+            scratch = self._scratch.lease(lifetime, gaussians.means.device)
             return footprint(scratch, frame, gaussians, camera, values)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from gsbench.gaussians.model import NUM_SH_REST
-from gsbench.gaussians.spherical_harmonics import C0, C1, C2, C3
+from gsbench.gaussians.model import C0, C1, C2, C3, NUM_SH_REST
 
 F0, F1 = tl.constexpr(C0), tl.constexpr(C1)
 D0, D1, D2, D3, D4 = (tl.constexpr(value) for value in C2)

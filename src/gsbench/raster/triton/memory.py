@@ -1,6 +1,12 @@
-"""The memory that the Triton rasterizer keeps, counted from its buffers' shapes. Loads neither torch nor Triton."""
+"""Device memory of the Triton rasterizer: buffers that are used again, and how many bytes they take."""
 
 from __future__ import annotations
+
+import weakref
+from collections import defaultdict
+
+import torch
+from torch import Tensor
 
 # Bytes that stay from step to step, in the workspaces of `stages` and `lists`.
 BYTES_OF_GAUSSIAN = (
@@ -38,3 +44,47 @@ def render_bytes(gaussians: int, units: int, pairs: int, blocks: int) -> int:
     """
     room = UNITS_AT_FIRST * gaussians
     return workspace_bytes(gaussians, room if units <= room else 2 * units, pairs, blocks) + BYTES_OF_SORTING * pairs
+
+
+class Workspace:
+    """Named one-dimensional tensors that grow by doubling. ``take`` gives a view with what was left there."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self._buffers: dict[str, Tensor] = {}
+
+    def take(self, name: str, count: int, dtype: torch.dtype) -> Tensor:
+        """``count`` numbers of ``dtype``; one name always has one dtype."""
+        if count > self.capacity(name):
+            grown = max(count, 2 * self.capacity(name))
+            self._buffers.pop(name, None)  # before the new one is made
+            with torch.inference_mode(False):  # it will be written to in other modes
+                self._buffers[name] = torch.empty(grown, dtype=dtype, device=self.device)
+        elif name not in self._buffers:
+            return torch.empty(0, dtype=dtype, device=self.device)
+        return self._buffers[name][:count]
+
+    def capacity(self, name: str) -> int:
+        """The number of values that ``take`` gives without growing."""
+        buffer = self._buffers.get(name)
+        return 0 if buffer is None else len(buffer)
+
+
+class WorkspacePool:
+    """Workspaces that outlive the graph of a render: one comes back when its ``holder`` is freed.
+
+    One that comes back is given only to work on the same stream, which waits for what still reads it.
+    """
+
+    def __init__(self) -> None:
+        self._free: defaultdict[tuple[torch.device, int], list[Workspace]] = defaultdict(list)
+
+    def lease(self, holder: object, device: torch.device) -> Workspace:
+        stream = torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
+        free = self._free[device, stream]
+        try:
+            workspace = free.pop()  # atomic
+        except IndexError:
+            workspace = Workspace(device)
+        weakref.finalize(holder, free.append, workspace).atexit = False
+        return workspace

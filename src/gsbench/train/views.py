@@ -1,15 +1,55 @@
-"""The training images as a loss needs them: 8-bit tensors on the device, all at once or one ahead of its use."""
+"""The training views: their random order, their images on the device, and what densifiers see of them."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from gsbench.eval.images import as_unit_range, where_counted
+from gsbench.eval.ssim import ssim_map
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster import Rasterizer, RenderOutput
 from gsbench.scene.types import View
+from gsbench.train.loss import PhotometricLoss
 from gsbench.words import readable_bytes
+
+STREAMS = ("cameras", "densify")  # every random draw of a training belongs to one
+
+
+def generators(seed: int) -> dict[str, torch.Generator]:
+    """A CPU generator for each of `STREAMS`; streams of all seeds are independent."""
+    return {name: generator(seed, stream) for stream, name in enumerate(STREAMS)}
+
+
+def generator(seed: int, stream: int) -> torch.Generator:
+    """A CPU generator for one stream of a trial's randomness; streams of all seeds are independent."""
+    state = np.random.SeedSequence([seed, stream]).generate_state(1, np.uint64)[0]
+    return torch.Generator().manual_seed(int(state >> np.uint64(1)))
+
+
+class CameraOrder:
+    """Training views in random order without replacement, drawn anew when all were used."""
+
+    def __init__(self, num_views: int, rng: torch.Generator) -> None:
+        self.num_views = num_views
+        self.rng = rng
+        self.remaining: list[int] = []
+
+    def next(self) -> int:
+        if not self.remaining:
+            self.remaining = torch.randperm(self.num_views, generator=self.rng).tolist()
+        return self.remaining.pop()
+
+    @property
+    def following(self) -> int | None:
+        """The camera that `next` will give, or None where that is not drawn yet."""
+        return self.remaining[-1] if self.remaining else None
+
 
 BUFFERS = 2  # page-locked, between an image and the device: one is filled while the other is copied
 
@@ -97,3 +137,44 @@ class _Stream:
             current = torch.cuda.current_stream(self._device)
             current.wait_stream(self._stream)
             image.record_stream(current)
+
+
+class SceneViews:
+    """The views of a scene, rendered and measured as the training does it; see `gsbench.densify.scores.TrainingViews`.
+
+    ``sh_degree`` says which degree of harmonics an iteration renders with. Pixels that a mask ignores are rendered as
+    the photograph has them, without error or gradient.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        targets: Targets,
+        rasterizer: Rasterizer,
+        background: Tensor,
+        loss: PhotometricLoss,
+        sh_degree: Callable[[int], int],
+    ) -> None:
+        self._views, self._targets, self._rasterizer = views, targets, rasterizer
+        self._background, self._loss, self._sh_degree = background, loss, sh_degree
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def image(self, index: int) -> Tensor:
+        return self._targets.get(index)
+
+    def render(self, index: int, gaussians: Gaussians, step: int) -> RenderOutput:
+        camera, degree = self._views[index].camera, self._sh_degree(step)
+        render = self._rasterizer.render(gaussians, camera, degree, self._background)
+        mask = self._targets.mask(index)
+        if mask is None:
+            return render
+        return replace(render, image=where_counted(render.image, self._targets.get(index), mask))
+
+    def dissimilarity(self, index: int, image: Tensor) -> Tensor:
+        target = as_unit_range(self._targets.get(index), image.dtype)
+        return (1 - ssim_map(image, target).mean(0)).clamp_min(0)
+
+    def loss(self, index: int, image: Tensor) -> Tensor:
+        return self._loss(image, self._targets.get(index))[0].detach()
