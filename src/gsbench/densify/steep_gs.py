@@ -38,12 +38,12 @@ class Saddles(NamedTuple):
 
 @dataclass
 class SteepGS(ADC):
-    """ADC of the candidates that a split would help, into halves that move apart where it helps most (Wang et al., CVPR 2025).
+    """ADC of the candidates that a split would help, into halves that go apart where it helps (Wang et al., CVPR 2025).
 
     Of arXiv 2505.05587: to second order, two halves that a Gaussian leaves at small distances +-d change the loss by d
     S d / 2, with S the splitting matrix: the sum over pixels of (d loss / d s) times the second derivative of s, the
-    opacity times the density there, by the mean. So only a Gaussian whose S has an eigenvalue below zero gains by a split,
-    most along the eigenvector of the least one; and of all weights of two halves a half each is the best.
+    opacity times the density there, by the mean. So only a Gaussian whose S has an eigenvalue below zero gains by a
+    split, most along the eigenvector of the least one; and of all weights of two halves a half each is the best.
 
     A candidate of ADC grows only if the least eigenvalue of its S, averaged over the iterations in which it was
     visible, is below ``eigenvalue_threshold``, in units of the loss by the squared scene extent (None: no condition).
