@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gsbench.analysis.shipped import facts_of, shipped_arms
+
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "fidelity.md"
 ROW = re.compile(r"^\| `(\w+)` \|.*\| (0|1e-\d+) \|[^|]*\|$", re.MULTILINE)
@@ -60,129 +62,19 @@ class Arm:
     otherwise: str
 
 
-ROUND = "a whole round, pruning included"
-ARMS = {
-    "adc": Arm(
-        "graphdeco-inria/gaussian-splatting 1152adc, `scene/gaussian_model.py` (`densify_and_clone`, "
-        "`densify_and_split`, `densify_and_prune`), `train.py`",
-        f"{ROUND}; the 144 rounds and 4 resets of the schedule",
-        (("test_rounds", "test_adc_round"),),
-        "a cap (theirs has none); pruning by radius on the screen is off, as it never acts there",
-    ),
-    "volumetric": Arm(
-        "arXiv 2508.05187, eq. 5 to 7, Fig. 4; no code was published",
-        f"{ROUND}, in three orders",
-        (
-            ("test_rounds", "test_volumetric_round"),
-            ("test_rounds", "test_volumes_may_be_split_before_the_gradient_rule"),
-            ("test_rounds", "test_volumes_may_be_split_after_pruning"),
-        ),
-        "what the paper leaves open is an option; our choices stand below its table",
-    ),
-    "volumetric_once": Arm(
-        "ours: `volumetric` without splits that would be split again",
-        ROUND,
-        (("test_rounds", "test_volumetric_once_round"),),
-        "",
-    ),
-    "absgrad": Arm(
-        "nerfstudio-project/gsplat, `absgrad` with `grow_grad2d=0.0008`",
-        ROUND,
-        (("test_rounds", "test_absgrad_round"),),
-        "gsplat's own order of a round (`train.step_after_refine=true` has it)",
-    ),
-    "absgs": Arm(
-        "TY424/AbsGS 87d7a5a, `scene/gaussian_model.py:461` and `:260`, `train.py:119`",
-        f"{ROUND}; the ceiling of opacities",
-        (("test_absgs", "test_absgs_round"),),
-        "a cap; pruning by the largest weight, which is off there",
-    ),
-    "revised": Arm(
-        "arXiv 2404.06109, its opacity correction",
-        ROUND,
-        (("test_rounds", "test_revised_round"),),
-        "its error-based growth, its limit of growth",
-    ),
-    "pixelgs": Arm(
-        "zhengzhang01/Pixel-GS 05c9d55, `scene/gaussian_model.py:405`, `train.py:86`",
-        f"{ROUND}, for several depths",
-        (("test_pixel_gs", "test_pixel_gs_round"),),
-        "a cap; the gradients of the optimiser stay as they are near a camera",
-    ),
-    "longaxis": Arm(
-        "XiaoBin2001/Improved-GS d008d11, `scene/gaussian_model.py:425`",
-        f"{ROUND}; the split is theirs, the rest is `adc`'s",
-        (("test_long_axis", "test_long_axis_round"),),
-        "all but the split: `edgeaware` has it",
-    ),
-    "edgeaware": Arm(
-        "XiaoBin2001/Improved-GS d008d11, `train.py:123`, `:129` to `:159`, `:195`, `:205`; "
-        "`scene/gaussian_model.py:367`, `:391`",
-        f"{ROUND}, closing rounds too; scores; growth control; the prunings around",
-        (("test_edge_aware", "test_edge_aware_round"), ("test_edge_aware", "test_the_prunings_of_the_schedule")),
-        "fewer optimiser steps after the window; views are drawn anew; no edges in the outermost pixels",
-    ),
-    "taming": Arm(
-        "humansensinglab/taming-3dgs fd0f7d9, `utils/taming_utils.py:40`, `:100`; `scene/gaussian_model.py:459`",
-        "scores term by term, and a round without its pruning; the pruning by counts",
-        (("test_scores", "test_taming_round"),),
-        "opacities above 1 after the window, `--sh_lower`; scores follow their Gaussians through a round",
-    ),
-    "mcmc": Arm(
-        "ubc-vision/3dgs-mcmc 7b4fc9f, `scene/gaussian_model.py:411`, `:472`, `:503`; `train.py:140`; "
-        "`utils/reloc_utils.py`",
-        "relocation and addition of a round; the noise",
-        (("test_mcmc", "test_mcmc_round"), ("test_mcmc", "test_mcmc_noise")),
-        "moments of the dead, which are kept there; order of the Gaussians",
-    ),
-    "resgs": Arm(
-        "yanzhelyu/ResGS 6f9b2da, `scene/gaussian_model.py:319`, `:464`, `:483`; `train.py:92` to `:202`",
-        f"{ROUND}; the stage at each round of its loop; fading; pauses",
-        (("test_res_gs", "test_res_gs_round"),),
-        "smaller pictures in the first two phases; a cap",
-    ),
-    "fastgs": Arm(
-        "fastgs/FastGS 44e02a5, `utils/fast_utils.py:45`; `scene/gaussian_model.py:468`, `:533`",
-        f"counts and scores; {ROUND}; the final pruning",
-        (
-            ("test_fast_gs", "test_fast_gs_round"),
-            ("test_fast_gs", "test_after_the_window_the_rather_faint_and_those_that_err_most_go"),
-        ),
-        "fewer optimiser steps, its compact box, flags that differ from scene to scene; scores follow their Gaussians",
-    ),
-    "gns": Arm(
-        "XiaoBin2001/GNS 0c8e7dc, `train.py:105` to `:205`; `scene/gaussian_model.py:471`",
-        "growth as `edgeaware`; the pressure with its gradient, its weight over the whole schedule, and the selection "
-        "(by tests of their own, to 1e-9)",
-        (("test_edge_aware", "test_edge_aware_round"),),
-        "as `edgeaware`",
-    ),
-    "mrnf": Arm(
-        "LichtFeld-Studio of April 2026 (th555/lichtfeld-studio 90a8acc), `src/training/strategies/mrnf.cpp:463`, "
-        "`:540`; `src/training/kernels/mrnf_kernels.cu:40`, `:97`; no paper",
-        f"weights, {ROUND}, decay; noise by its spread",
-        (("test_mrnf", "test_mrnf_round"),),
-        "weights of all iterations (views are drawn in the round), Canny's edges, of another number of views; rates "
-        "that follow the cloud; bounds of every fifth round; noise before the step; pruning of quaternions near zero; "
-        "what the version of August 2026 changed (its pull request 1839)",
-    ),
-    "steepgs": Arm(
-        "arXiv 2505.05587, its splitting matrix and halves; facebookresearch/SteepGS 63eee45, `arguments/__init__.py`, "
-        "`scene/gaussian_model.py:530`",
-        f"{ROUND}; the matrix with second derivatives by autograd (`tests/raster/test_splitting.py`, to 1e-9) and with "
-        "what halves do to a loss",
-        (("test_steep_gs", "test_steep_gs_round"),),
-        "the three estimators of the matrix in its code, each of which departs from the paper's formula; there "
-        "opacities stay whole unless asked; its condition of a vanishing gradient, which is off there; a cap",
-    ),
-    "quantile": Arm(
-        "nerfstudio-project/gsplat, pull request 941 (open), its description",
-        ROUND,
-        (("test_quantile", "test_quantile_round"),),
-        "its own constants; opacity resets are `adc`'s",
-    ),
-    "none": Arm("ours", "nothing changes", (), ""),
-}
+def read_arm(name: str) -> Arm:
+    """The row of the arm ``name``, from the facts at the end of its YAML."""
+    facts = facts_of(name)
+    tests = [test.split(".") for test in facts.get("Tests", "").split(", ") if test]
+    return Arm(
+        facts["Source"],
+        facts["Compared"],
+        tuple((module, function) for module, function in tests),
+        facts.get("Otherwise", ""),
+    )
+
+
+ARMS = {name: read_arm(name) for name in shipped_arms()}
 
 
 def calls_of(function: Any) -> Iterator[dict[str, Any]]:

@@ -15,7 +15,6 @@ import yaml
 from gsbench.analysis.attribution import (
     ELSEWHERE,
     NO_RECORD,
-    RULES,
     _under_the_same_settings,
     attribute,
     attribution_sentence,
@@ -26,7 +25,7 @@ from gsbench.analysis.cells import with_variants
 from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import TrialResult, load_experiment
-from gsbench.analysis.shipped import resolved, shipped_arms
+from gsbench.analysis.shipped import departures, resolved, shipped_arms
 from gsbench.analysis.tables import build_table
 from gsbench.runs.hashing import config_hash
 from tests.analysis.synthetic import write_arms
@@ -75,7 +74,7 @@ def test_arms_of_gsbench_differ_in_what_their_files_say(first: str, second: str,
 
 
 def test_every_shipped_class_says_in_what_it_departs_from_adc() -> None:
-    assert {settings["_target_"] for settings in shipped_arms().values()} <= set(RULES)
+    assert {settings["_target_"] for settings in shipped_arms().values()} == set(departures())
 
 
 def test_settings_that_only_name_or_place_a_trial_are_no_ingredient() -> None:

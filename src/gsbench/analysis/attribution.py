@@ -14,7 +14,7 @@ from typing import Any
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import IGNORED_SETTINGS, differing_code
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.shipped import resolved, shipped_arms
+from gsbench.analysis.shipped import departures, resolved, shipped_arms
 from gsbench.words import listed
 
 MOST_NAMED = 6  # ingredients that a headline names before it counts
@@ -23,24 +23,6 @@ ELSEWHERE = "what a training elsewhere did, of which nothing is recorded"
 BY_PROGRAM = "all that the program {} does otherwise"
 TARGET, INIT = "densify._target_", "initial cloud"
 
-# Departures of a class of densifiers from ADC. A class that does not stand here is one ingredient as a whole.
-RULES: dict[str, tuple[str, ...]] = {
-    "gsbench.densify.ADC": (),
-    "gsbench.densify.NoDensifier": ("densification",),
-    "gsbench.densify.AbsGS": ("two gradients", "opacity ceiling"),  # one for clones, one for splits
-    "gsbench.densify.FastGS": ("two gradients", "opacity ceiling", "error score", "last prunings"),
-    "gsbench.densify.LongAxis": ("split",),
-    "gsbench.densify.EdgeAware": ("split", "edge score", "prunings"),
-    "gsbench.densify.GNS": ("split", "edge score", "prunings", "natural selection"),
-    "gsbench.densify.MCMC": ("relocation", "growth by a share", "noise", "regularisation"),
-    "gsbench.densify.MRNF": ("edge score", "growth by a share", "noise", "decay"),
-    "gsbench.densify.PixelGS": ("weights of the gradient",),
-    "gsbench.densify.QuantileADC": ("threshold by a rate", "pruning by a share"),
-    "gsbench.densify.ResGS": ("residual split", "levels", "fading opacity"),
-    "gsbench.densify.SteepGS": ("saddle condition", "split along an eigenvector"),
-    "gsbench.densify.Taming": ("score", "prunings"),
-    "gsbench.densify.Volumetric": ("volume rule",),
-}
 # Settings with one name for several keys. All others are called as their key, without the group of the densifier.
 NAMES = {
     "densify.gradient_threshold": "threshold",
@@ -217,4 +199,4 @@ def _rule_names(config: Mapping[str, Any]) -> tuple[str, ...]:
         return ()
     if target == "gsbench.densify.External":
         return (BY_PROGRAM.format(config.get("densify.name")),)
-    return RULES.get(str(target), (f"rule {target}",))
+    return departures().get(str(target), (f"rule {target}",))

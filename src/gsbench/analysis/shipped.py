@@ -1,7 +1,7 @@
 """The arms that gsbench ships, as ``conf/densify`` states them: read as plain files, without composing.
 
 What an arm's authors wrote, and where gsbench departs from it, stands in the comments of its file: the lines above the
-settings, and ``theirs: VALUE`` beside a setting.
+settings, ``theirs: VALUE`` beside a setting, and facts under fixed keys at the end.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from gsbench.system.install import conf_dir
 GROUP = "densify"
 THEIRS = re.compile(r"^(?P<key>\w+):.*#.*?theirs:? (?P<value>[^;|]+?)\s*$", re.MULTILINE)  # the authors' own value
 PRESET = re.compile(r"\btrain=(\w+)")
+FACTS = ("Source", "Compared", "Tests", "Otherwise", "Departs from adc by")
+FACT = re.compile(rf"^# (?P<key>{'|'.join(FACTS)}): (?P<text>.*(?:\n#   .*)*)$", re.MULTILINE)  # may go on, indented
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")  # the value of another key
 
 
@@ -59,6 +61,25 @@ def notes_of(name: str) -> FileNotes:
     preset = PRESET.search(text)
     theirs = {found["key"]: found["value"].strip() for found in THEIRS.finditer(content)}
     return FileNotes(text, theirs, preset[1] if preset else "")
+
+
+@cache
+def facts_of(name: str) -> dict[str, str]:
+    """The facts at the end of the file of the shipped arm ``name``, by their key (`FACTS`)."""
+    content = (conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8")
+    return {found["key"]: found["text"].replace("\n#   ", " ") for found in FACT.finditer(content)}
+
+
+@cache
+def departures() -> dict[str, tuple[str, ...]]:
+    """Of each shipped class of densifiers, by its import path, the ingredients in which it departs from ADC."""
+    found = {}
+    for name in shipped_arms():
+        content = yaml.load((conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8"), Loader=_LOADER)
+        if "_target_" in content:  # a file built on another one is of the other's class
+            text = facts_of(name).get("Departs from adc by", "")
+            found[content["_target_"]] = tuple(filter(None, text.split(", ")))
+    return found
 
 
 def resolved(settings: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
