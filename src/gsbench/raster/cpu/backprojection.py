@@ -72,30 +72,22 @@ def backproject_shard(
     begin: int,
     end: int,
     visible: int,
-    means: Any,
-    log_scales: Any,
-    quaternions: Any,
-    logits: Any,
-    sh_rest: Any,
+    gaussians: Any,
     degree: int,
-    v: Any,
-    record_ints: Any,
-    tile_shard: Any,
+    frame: Any,
     rows: Any,
-    g_means: Any,
-    g_log_scales: Any,
-    g_quaternions: Any,
-    g_logits: Any,
-    g_sh_dc: Any,
-    g_sh_rest: Any,
+    gradients: Any,
     g_screen: Any,
     g_absolute: Any,
     g_splitting: Any,
 ) -> None:
-    """Write every gradient of the Gaussians ``begin`` to ``end``; reads and clears their ``rows`` [shards * N * 16].
+    """Write all ``gradients`` of the Gaussians ``begin`` to ``end``; reads and clears their ``rows`` [shards * N * 16].
 
     ``g_absolute`` and ``g_splitting`` [N, 9] may be empty.
     """
+    v, record_ints, tile_shard = frame.camera, frame.record_ints, frame.tile_shard
+    g_means, g_log_scales, g_quaternions = gradients.means, gradients.log_scales, gradients.quaternions
+    g_logits, g_sh_dc, g_sh_rest = gradients.logits, gradients.sh_dc, gradients.sh_rest
     unseen = begin  # the first Gaussian whose gradients are not written yet
     for record in range(begin, begin + visible + 1):
         past = end if record == begin + visible else record_ints[record * at.RECORD + at.INDEX]
@@ -118,7 +110,7 @@ def backproject_shard(
     for record in range(begin, begin + visible, LANES):
         count = min(LANES, begin + visible - record)
         _take_rows(record, count, begin + visible, v, record_ints, tile_shard, rows, indices, sums)
-        mean, log_scale = gather_vectors(means, indices), gather_vectors(log_scales, indices)
+        mean, log_scale = gather_vectors(gaussians.means, indices), gather_vectors(gaussians.log_scales, indices)
         offset = from_camera(mean, v)
 
         # Colour; a channel below 0 is clamped and passes nothing.
@@ -132,7 +124,7 @@ def backproject_shard(
             for lane in range(LANES):
                 place = lane * LANES
                 r, g, b = colors[lane], colors[LANES + lane], colors[2 * LANES + lane]
-                by_red, by_green, by_blue = by_channel(load_rest(sh_rest, indices[lane] * REST))
+                by_red, by_green, by_blue = by_channel(load_rest(gaussians.sh_rest, indices[lane] * REST))
                 store(pulled, place, by_red * r + by_green * g + by_blue * b)
                 store_rest(g_sh_rest, indices[lane] * REST, outer_rest(load(basis, place), r, g, b))
         else:
@@ -141,7 +133,7 @@ def backproject_shard(
         through = direction_gradient(degree, to[0], to[1], to[2], pulled)
 
         # The forward geometry once more.
-        quaternion, inverse_norm, _ = gather_quaternions(quaternions, indices)
+        quaternion, inverse_norm, _ = gather_quaternions(gaussians.quaternions, indices)
         qw, qx, qy, qz = quaternion
         matrix = rotation_matrix(qw, qx, qy, qz)
         x, y, z = to_view(offset, v)
@@ -220,7 +212,7 @@ def backproject_shard(
         scatter(g_means, indices, 3, 2, view_x * v.r02 + view_y * v.r12 + view_z * v.r22 + from_z)
 
         # d log(alpha) / d logit = 1 - opacity
-        g_logit = load(sums, at.SUM_H * LANES) / (exponential(gather(logits, indices, 1, 0)) + ONE)
+        g_logit = load(sums, at.SUM_H * LANES) / (exponential(gather(gaussians.logits, indices, 1, 0)) + ONE)
         scatter(g_logits, indices, 1, 0, g_logit)
 
 

@@ -84,27 +84,18 @@ def composite_tiles(
     memory: Any,
     first: int,
     past: int,
-    starts: Any,
-    entries: Any,
-    masks: Any,
-    processed: Any,
-    records: Any,
-    width: int,
-    height: int,
-    background: Any,
-    transmittance: Any,
-    last: Any,
+    frame: Any,
     image: Any,
     alpha: Any,
 ) -> None:
-    """Blend the tiles ``first`` to ``past``.
+    """Blend the tiles ``first`` to ``past`` into ``image`` [H * W * 3] and ``alpha`` [H * W].
 
-    In: ``starts`` [tiles + 1], ``entries`` [pairs], ``records``, ``background`` [3]. Out: ``image`` [H * W * 3],
-    ``alpha`` [H * W]; for the backward pass ``masks`` [pairs] uint16, the blocks that each entry may touch,
-    ``processed`` [tiles], and by tile, block and lane [tiles * 256] the final ``transmittance`` and ``last``, the
-    number of entries before the one that stopped the pixel (`NEVER_STOPPED` where none did, 0 outside the image).
+    Of ``frame`` it fills what the backward pass needs: ``masks``, ``processed``, ``transmittance`` and ``last``, which
+    is `NEVER_STOPPED` where no entry stopped the pixel, and 0 outside the image.
     """
-    tiles_x = (width + at.TILE - 1) // at.TILE
+    entries, masks, records = frame.entries, frame.masks, frame.records
+    transmittance, last = frame.transmittance, frame.last
+    tiles_x, width, height = frame.camera.tiles_x, frame.camera.width, frame.camera.height
     lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
     column, row = lane_x * np.float32(at.BLOCK), lane_y * np.float32(at.BLOCK)
     floats, integers = memory
@@ -132,7 +123,7 @@ def composite_tiles(
         # and stored for every entry that touches it, each store waited for by the next load; so it stays in registers
         # through a batch. The first loop has no branch that depends on a record, so nothing is guessed wrongly there,
         # and it leaves the records in the first-level cache, where the second loop reads them up to 16 times.
-        begin, end = starts[tile], starts[tile + 1]
+        begin, end = frame.starts[tile], frame.starts[tile + 1]
         entry = begin
         while entry < end and alive != 0:
             count = min(BATCH, end - entry)
@@ -195,14 +186,14 @@ def composite_tiles(
                 store(green, place, g)
                 store(blue, place, b)
             entry += count
-        processed[tile] = entry
+        frame.processed[tile] = entry
 
         for block in range(16):
             place = block * LANES
             behind = load(transmittance, state + place)
-            store(red, place, fma(behind, background[0], load(red, place)))
-            store(green, place, fma(behind, background[1], load(green, place)))
-            store(blue, place, fma(behind, background[2], load(blue, place)))
+            store(red, place, fma(behind, frame.background[0], load(red, place)))
+            store(green, place, fma(behind, frame.background[1], load(green, place)))
+            store(blue, place, fma(behind, frame.background[2], load(blue, place)))
         for y in range(top, min(top + at.TILE, height)):
             for x in range(left, min(left + at.TILE, width)):
                 local = place_in_tile(x - left, y - top)
@@ -224,16 +215,7 @@ def composite_backward_tiles(
     memory: Any,
     first: int,
     past: int,
-    starts: Any,
-    entries: Any,
-    masks: Any,
-    processed: Any,
-    records: Any,
-    width: int,
-    height: int,
-    background: Any,
-    transmittance: Any,
-    last: Any,
+    frame: Any,
     g_image: Any,
     g_alpha: Any,
     rows: Any,
@@ -247,7 +229,8 @@ def composite_backward_tiles(
     nothing cancels, and one division a record, that for T, is enough. ``g_alpha`` may be empty for zero.
     ``want_absolute`` is True or None: a value that numba compiles out.
     """
-    tiles_x = (width + at.TILE - 1) // at.TILE
+    entries, masks, records = frame.entries, frame.masks, frame.records
+    tiles_x, width, height = frame.camera.tiles_x, frame.camera.width, frame.camera.height
     floats, _ = memory
     red, green, blue = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :], floats[2 * at.TILE_PIXELS :]
     behind, through = floats[3 * at.TILE_PIXELS :], floats[4 * at.TILE_PIXELS :]  # U, and T behind the current record
@@ -255,7 +238,7 @@ def composite_backward_tiles(
         left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
         tile_x, tile_y = np.float32(left), np.float32(top)
         state = tile * at.TILE_PIXELS
-        begin, end = starts[tile], processed[tile]
+        begin, end = frame.starts[tile], frame.processed[tile]
         if begin == end:
             continue
         for place in range(at.TILE_PIXELS):
@@ -270,10 +253,10 @@ def composite_backward_tiles(
                 if len(g_alpha) > 0:
                     behind[local] = -g_alpha[pixel]
         for place in range(0, at.TILE_PIXELS, LANES):
-            final = load(transmittance, state + place)
-            light = fma(load(red, place), background[0], load(behind, place))
-            light = fma(load(green, place), background[1], light)
-            light = fma(load(blue, place), background[2], light)
+            final = load(frame.transmittance, state + place)
+            light = fma(load(red, place), frame.background[0], load(behind, place))
+            light = fma(load(green, place), frame.background[1], light)
+            light = fma(load(blue, place), frame.background[2], light)
             store(behind, place, light)
             store(through, place, final)
 
@@ -304,7 +287,7 @@ def composite_backward_tiles(
                 dy = load(PIXEL_Y, place) + offset_y
                 t = fma(dy, shear, dx)
                 power = fma(curve_y * dy, dy, fma(curve_t * t, t, log2_opacity))
-                blended = (power >= LOG2_ALPHA_MIN) & (number <= load(last, state + place))
+                blended = (power >= LOG2_ALPHA_MIN) & (number <= load(frame.last, state + place))
                 raw = select(blended, exp2(power), ZERO)
                 opacity = minimum(raw, splat(ALPHA_MAX))
                 before = load(through, place) / (ONE - opacity)

@@ -48,22 +48,12 @@ class Resources:
 
 
 @dataclass
-class Frame:
-    """Results of the forward pass for the backward pass; the arrays belong to ``arena``."""
+class ForwardPass:
+    """What the forward pass leaves; the memory of its arrays belongs to an arena."""
 
-    view: at.View
+    frame: at.Frame
     degree: int
     visible: NDArray[np.int64]  # [GAUSSIAN_SHARDS] records
-    records: NDArray[np.float32]  # [N * RECORD]
-    starts: NDArray[np.int64]  # [tiles + 1]
-    entries: NDArray[np.int32]  # [pairs] records, by tile, front to back
-    masks: NDArray[np.uint16]  # [pairs] blocks that were blended
-    processed: NDArray[np.int64]  # [tiles] end of the entries that were looked at
-    transmittance: NDArray[np.float32]  # [tiles * TILE_PIXELS]
-    last: NDArray[np.float32]  # [tiles * TILE_PIXELS]
-    bounds: NDArray[np.int64]  # [TILE_SHARDS + 1] tiles
-    tile_shard: NDArray[np.uint8]  # [tiles]
-    background: NDArray[np.float32]  # [3]
 
 
 def _edges(count: int, shards: int) -> list[int]:
@@ -78,7 +68,7 @@ def forward(
     image: Tensor,
     alpha: Tensor,
     radii: Tensor,
-) -> Frame:
+) -> ForwardPass:
     """Project, sort, bin, composite into ``image``, ``alpha`` and ``radii``."""
     run = resources.runner.run
     count = len(gaussians)
@@ -98,7 +88,7 @@ def forward(
             at.kernel_memory(),
             begin,
             end,
-            *arrays,
+            arrays,
             request.degree,
             view,
             records,
@@ -147,11 +137,11 @@ def forward(
     entries = arena.take("entries", (total,), np.int32)
     run(GAUSSIAN_SHARDS, lambda shard: fill_shard(made[shard], pairs[shard], counts[shard], entries))
 
-    frame = Frame(
+    frame = at.Frame(
         view,
-        request.degree,
-        flags[:, VISIBLE],
+        request.background.numpy(),
         records,
+        record_ints,
         starts,
         entries,
         arena.take("masks", (total,), np.uint16),
@@ -160,43 +150,26 @@ def forward(
         arena.take("last", (tiles * at.TILE_PIXELS,), np.float32),
         np.empty(TILE_SHARDS + 1, np.int64),
         arena.take("tile_shard", (tiles,), np.uint8),
-        request.background.numpy(),
     )
     balance_tiles(starts, TILE_SHARDS, frame.bounds, frame.tile_shard)
     image_array, alpha_array = image.numpy().reshape(-1), alpha.numpy().reshape(-1)
 
     def composite(shard: int) -> None:
-        composite_tiles(*_tiles_of(frame, shard), *_blending_of(frame), image_array, alpha_array)
+        composite_tiles(*_tiles_of(frame, shard), image_array, alpha_array)
 
     run(TILE_SHARDS, composite)
-    return frame
+    return ForwardPass(frame, request.degree, flags[:, VISIBLE])
 
 
-def _tiles_of(frame: Frame, shard: int) -> tuple[Any, ...]:
+def _tiles_of(frame: at.Frame, shard: int) -> tuple[Any, ...]:
     """The arguments that all kernels share which walk through the entries of tiles."""
-    return (
-        at.kernel_memory(),
-        int(frame.bounds[shard]),
-        int(frame.bounds[shard + 1]),
-        frame.starts,
-        frame.entries,
-        frame.masks,
-        frame.processed,
-        frame.records,
-        frame.view.width,
-        frame.view.height,
-    )
-
-
-def _blending_of(frame: Frame) -> tuple[Any, ...]:
-    """The further arguments that the two compositing kernels share."""
-    return frame.background, frame.transmittance, frame.last
+    return at.kernel_memory(), int(frame.bounds[shard]), int(frame.bounds[shard + 1]), frame
 
 
 def backward(
     resources: Resources,
     arena: Arena,
-    frame: Frame,
+    passed: ForwardPass,
     gaussians: Gaussians,
     request: Request,
     g_image: NDArray[np.float32],
@@ -204,62 +177,46 @@ def backward(
     want_splitting: bool,
 ) -> Gradients:
     """The gradients, and those in absolute values where ``request`` has room for them; ``g_alpha`` may be empty."""
-    count, absolute = len(gaussians), request.absolute
+    count, absolute, frame = len(gaussians), request.absolute, passed.frame
     rows = arena.take("rows", (TILE_SHARDS, count * at.ROW), np.float32, zero=True)
     want_absolute = None if absolute is None else True
 
     def composite_backward(shard: int) -> None:
-        composite_backward_tiles(
-            *_tiles_of(frame, shard), *_blending_of(frame), g_image, g_alpha, rows[shard], want_absolute
-        )
+        composite_backward_tiles(*_tiles_of(frame, shard), g_image, g_alpha, rows[shard], want_absolute)
 
     resources.runner.run(TILE_SHARDS, composite_backward)
 
-    means, log_scales, quaternions, logits, _, sh_rest = _arrays(gaussians)
     take = resources.tensors.empty
-    gradients = {name: take(tuple(tensor.shape)) for name, tensor in gaussians.tensors().items()}
+    gradients = gaussians.map(lambda tensor: take(tuple(tensor.shape)))
     g_screen = take((count, 2))
-    g_absolute = np.empty((0, 2), np.float32) if absolute is None else absolute.numpy()
     g_splitting = take((count, 3, 3)) if want_splitting else None
-    edges = _edges(count, GAUSSIAN_SHARDS)
     common = (
-        means,
-        log_scales,
-        quaternions,
-        logits,
-        sh_rest,
-        frame.degree,
-        frame.view,
-        frame.records.view(np.int32),
-        frame.tile_shard,
+        _arrays(gaussians),
+        passed.degree,
+        frame,
         rows.reshape(-1),
-        gradients["means"].numpy(),
-        gradients["log_scales"].numpy(),
-        gradients["quaternions"].numpy(),
-        gradients["opacity_logits"].numpy().reshape(count, 1),
-        gradients["sh_dc"].numpy(),
-        gradients["sh_rest"].numpy().reshape(-1, REST),
+        _arrays(gradients),
         g_screen.numpy(),
-        g_absolute,
+        np.empty((0, 2), np.float32) if absolute is None else absolute.numpy(),
         np.empty((0, 9), np.float32) if g_splitting is None else g_splitting.numpy().reshape(-1, 9),
     )
+    edges = _edges(count, GAUSSIAN_SHARDS)
 
     def backproject(shard: int) -> None:
-        begin, end, visible = edges[shard], edges[shard + 1], int(frame.visible[shard])
+        begin, end, visible = edges[shard], edges[shard + 1], int(passed.visible[shard])
         backproject_shard(at.kernel_memory(), begin, end, visible, *common)
 
     resources.runner.run(GAUSSIAN_SHARDS, backproject)
-    return Gradients(list(gradients.values()), g_screen, g_splitting)
+    return Gradients(list(gradients.tensors().values()), g_screen, g_splitting)
 
 
-def _arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:
-    """The six tensors as arrays that share their memory; ``sh_rest`` as [N * 45]."""
+def _arrays(gaussians: Gaussians) -> at.Parameters:
     means, log_scales, quaternions, logits, sh_dc, sh_rest = (t.detach().numpy() for t in gaussians.tensors().values())
-    return means, log_scales, quaternions, logits, sh_dc, sh_rest.reshape(-1)
+    return at.Parameters(means, log_scales, quaternions, logits.reshape(-1, 1), sh_dc, sh_rest.reshape(-1, REST))
 
 
 def footprint(
-    resources: Resources, frame: Frame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
+    resources: Resources, passed: ForwardPass, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
 ) -> Footprint:
     """See ``raster.base.RenderOutput``."""
     count = len(gaussians)
@@ -269,9 +226,7 @@ def footprint(
 
     def cover(shard: int) -> None:
         cover_tiles(
-            *_tiles_of(frame, shard),
-            frame.records.view(np.int32),
-            frame.last,
+            *_tiles_of(passed.frame, shard),
             asked,
             covered[shard],
             sums[shard],
@@ -283,7 +238,7 @@ def footprint(
     return Footprint(next(totals), view_depths(gaussians, camera), *totals)
 
 
-class CpuRasterizer(StagedRasterizer[Frame]):
+class CpuRasterizer(StagedRasterizer[ForwardPass]):
     """float32 on the CPU, compiled by numba at first use; the same bits on every run and for any number of ``threads``.
 
     Each render keeps its intermediate results until its graph is freed; memory is kept and used again. Safe to call
@@ -310,7 +265,7 @@ class CpuRasterizer(StagedRasterizer[Frame]):
 
     def forward(
         self, lifetime: Lifetime, gaussians: Gaussians, request: Request
-    ) -> tuple[Tensor, Tensor, Tensor, Frame]:
+    ) -> tuple[Tensor, Tensor, Tensor, ForwardPass]:
         """See `StagedRasterizer`."""
         camera, tensors = request.camera, self._resources.tensors
         image = tensors.empty((camera.height, camera.width, 3))
@@ -321,7 +276,7 @@ class CpuRasterizer(StagedRasterizer[Frame]):
 
     def backward(
         self,
-        frame: Frame,
+        passed: ForwardPass,
         gaussians: Gaussians,
         request: Request,
         g_image: Tensor,
@@ -336,7 +291,7 @@ class CpuRasterizer(StagedRasterizer[Frame]):
             return backward(
                 self._resources,
                 arena,
-                frame,
+                passed,
                 gaussians,
                 request,
                 g_image.numpy().reshape(-1),
@@ -347,6 +302,8 @@ class CpuRasterizer(StagedRasterizer[Frame]):
             arena.drop("rows")  # it must be all zero, and an interrupt may have left sums in it
             raise
 
-    def footprint(self, frame: Frame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None) -> Footprint:
+    def footprint(
+        self, passed: ForwardPass, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
+    ) -> Footprint:
         """See ``raster.base.RenderOutput``."""
-        return footprint(self._resources, frame, gaussians, camera, values)
+        return footprint(self._resources, passed, gaussians, camera, values)

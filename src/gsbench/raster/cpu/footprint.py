@@ -21,15 +21,7 @@ def cover_tiles(
     memory: Any,
     first: int,
     past: int,
-    starts: Any,
-    entries: Any,
-    masks: Any,
-    processed: Any,
-    records: Any,
-    width: int,
-    height: int,
-    record_ints: Any,
-    last: Any,
+    frame: Any,
     values: Any,
     covered: Any,
     sums: Any,
@@ -37,10 +29,11 @@ def cover_tiles(
 ) -> None:
     """Add the tiles ``first`` to ``past`` to ``covered`` [N] int32, ``sums`` and ``distances`` [N], by Gaussian.
 
-    ``values`` [H * W] may be empty for zero; the others are those of the compositing kernels, whose arithmetic decides
-    here too which pixels are blended.
+    ``values`` [H * W] may be empty for zero. The arithmetic of the compositing kernels decides here too which pixels
+    are blended.
     """
-    tiles_x = (width + at.TILE - 1) // at.TILE
+    entries, masks, records = frame.entries, frame.masks, frame.records
+    tiles_x, width, height = frame.camera.tiles_x, frame.camera.width, frame.camera.height
     floats, _ = memory
     one = splat(ONE)
     own, row = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :]
@@ -48,14 +41,14 @@ def cover_tiles(
         left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
         tile_x, tile_y = np.float32(left), np.float32(top)
         state = tile * at.TILE_PIXELS
-        begin = starts[tile]
+        begin = frame.starts[tile]
         for pixel in range(at.TILE_PIXELS):
             own[pixel] = ZERO
         if len(values) > 0:
             for y in range(top, min(top + at.TILE, height)):
                 for x in range(left, min(left + at.TILE, width)):
                     own[place_in_tile(x - left, y - top)] = values[y * width + x]
-        for entry in range(begin, processed[tile]):
+        for entry in range(begin, frame.processed[tile]):
             todo = np.uint64(masks[entry])
             if todo == 0:
                 continue
@@ -74,11 +67,11 @@ def cover_tiles(
                 dy = load(PIXEL_Y, place) + offset_y
                 t = fma(dy, shear, dx)
                 power = fma(curve_y * dy, dy, fma(curve_t * t, t, log2_opacity))
-                blended = (power >= LOG2_ALPHA_MIN) & (number <= load(last, state + place))
+                blended = (power >= LOG2_ALPHA_MIN) & (number <= load(frame.last, state + place))
                 count += select(blended, one, ZERO)
                 total += select(blended, load(own, place), ZERO)
                 reach += select(blended, square_root(fma(dx, dx, dy * dy)), ZERO)
-            index = record_ints[base + at.INDEX]
+            index = frame.record_ints[base + at.INDEX]
             store(row, 0, lane_sums((count, total, reach)))
             covered[index] += np.int32(row[COVERED])
             sums[index] += row[VALUES]

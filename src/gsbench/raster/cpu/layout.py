@@ -84,6 +84,34 @@ class View(NamedTuple):
     log2_alpha_min: float
 
 
+class Parameters(NamedTuple):
+    """The tensors of Gaussians, or their gradients, as arrays that share their memory."""
+
+    means: NDArray[np.float32]  # [N, 3]
+    log_scales: NDArray[np.float32]  # [N, 3]
+    quaternions: NDArray[np.float32]  # [N, 4]
+    logits: NDArray[np.float32]  # [N, 1]
+    sh_dc: NDArray[np.float32]  # [N, 3]
+    sh_rest: NDArray[np.float32]  # [N, 45]
+
+
+class Frame(NamedTuple):
+    """Results of the forward pass, as its later kernels fill them and those of the backward pass read them."""
+
+    camera: View
+    background: NDArray[np.float32]  # [3]
+    records: NDArray[np.float32]  # [N * RECORD]
+    record_ints: NDArray[np.int32]  # the memory of ``records``
+    starts: NDArray[np.int64]  # [tiles + 1] of each tile's entries
+    entries: NDArray[np.int32]  # [pairs] records, by tile, front to back
+    masks: NDArray[np.uint16]  # [pairs] blocks of the tile that may be touched
+    processed: NDArray[np.int64]  # [tiles] end of the entries that were looked at
+    transmittance: NDArray[np.float32]  # [tiles * TILE_PIXELS] at the end, by tile, block and lane
+    last: NDArray[np.float32]  # [tiles * TILE_PIXELS] entries before the one that stopped the pixel
+    bounds: NDArray[np.int64]  # [shards + 1] tiles of each shard
+    tile_shard: NDArray[np.uint8]  # [tiles]
+
+
 def make_view(camera: Camera, constants: RasterConstants) -> View:
     margin_x = constants.fov_margin * camera.width / (2 * camera.fx)
     margin_y = constants.fov_margin * camera.height / (2 * camera.fy)

@@ -71,12 +71,7 @@ def project_shard(
     memory: Any,
     begin: int,
     end: int,
-    means: Any,
-    log_scales: Any,
-    quaternions: Any,
-    logits: Any,
-    sh_dc: Any,
-    sh_rest: Any,
+    gaussians: Any,
     degree: int,
     v: Any,
     records: Any,
@@ -95,10 +90,10 @@ def project_shard(
         count = min(LANES, end - start)
         for lane in range(LANES):
             indices[lane] = min(start + lane, end - 1)
-        mean, log_scale = gather_vectors(means, indices), gather_vectors(log_scales, indices)
-        dc = gather_vectors(sh_dc, indices)
-        quaternion, _, squared_norm = gather_quaternions(quaternions, indices)
-        logit = gather(logits, indices, 1, 0)
+        mean, log_scale = gather_vectors(gaussians.means, indices), gather_vectors(gaussians.log_scales, indices)
+        dc = gather_vectors(gaussians.sh_dc, indices)
+        quaternion, _, squared_norm = gather_quaternions(gaussians.quaternions, indices)
+        logit = gather(gaussians.logits, indices, 1, 0)
         finite = mean[0] * ZERO + mean[1] * ZERO + mean[2] * ZERO
         finite += log_scale[0] * ZERO + log_scale[1] * ZERO + log_scale[2] * ZERO
         finite += dc[0] * ZERO + dc[1] * ZERO + dc[2] * ZERO
@@ -157,7 +152,7 @@ def project_shard(
                 lane = lowest_bit(left)
                 left &= left - np.uint64(1)
                 own = load(basis, lane * np.uint64(LANES))
-                by_red, by_green, by_blue = by_channel(load_rest(sh_rest, (start + np.int64(lane)) * REST))
+                by_red, by_green, by_blue = by_channel(load_rest(gaussians.sh_rest, (start + np.int64(lane)) * REST))
                 store(rows, lane * np.uint64(LANES), own * by_red)
                 store(scratch, lane * np.uint64(LANES), own * by_green)
                 store(scratch, MATRIX + lane * np.uint64(LANES), own * by_blue)
