@@ -30,7 +30,7 @@ import numpy as np
 
 from gsbench.cli import run
 from gsbench.densify import DensifyContext, Volumetric
-from gsbench.densify.volume import log_volume
+from gsbench.densify.volumetric import log_volume
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.ply import read_ply
 from gsbench.init import read_cloud
