@@ -6,8 +6,9 @@ experiment with its verdict.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
-import sys
 from pathlib import Path
 
 import matplotlib
@@ -21,6 +22,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from gsbench.analysis import load_experiment, to_frame
+from gsbench.cli import run
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "demo.jpg"
 BASELINE, IDEA = "adc", "volumetric"
@@ -54,8 +56,16 @@ def initial_cloud(model: Path, view: str, size: tuple[int, int]) -> NDArray[np.f
     return picture
 
 
-def main(runs: Path, verdict: str) -> None:
-    """Write the picture from the experiment ``demo`` of a runs folder; ``verdict`` is its last line."""
+def verdict() -> str:
+    """The note on the verdict that ``gsbench tables demo`` prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        run(["tables", "demo"])
+    notes = [line.removeprefix("- ") for line in printed.getvalue().splitlines() if line.startswith("- Verdict")]
+    return notes[0] if notes else ""
+
+
+def main(runs: Path) -> None:
+    """Write the picture from the experiment ``demo`` of a runs folder."""
     experiment = load_experiment(runs, "demo")
     frame = to_frame(experiment)
     arms = {
@@ -96,10 +106,10 @@ def main(runs: Path, verdict: str) -> None:
     table.scale(0.8, 1.25)
     for cell in table.get_celld().values():
         cell.set_edgecolor("#cccccc")
-    below.text(0.5, -0.02, verdict, ha="center", va="bottom", fontsize=11, transform=below.transAxes)
+    below.text(0.5, -0.02, verdict(), ha="center", va="bottom", fontsize=11, transform=below.transAxes)
     figure.savefig(TARGET, pil_kwargs={"quality": 88})
     print(f"{TARGET}: {TARGET.stat().st_size // 1000} kB")
 
 
 if __name__ == "__main__":
-    main(Path(os.environ.get("GSBENCH_RUNS", "runs")), " ".join(sys.argv[1:]))
+    main(Path(os.environ.get("GSBENCH_RUNS", "runs")))
