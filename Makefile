@@ -52,7 +52,7 @@ lint: $(VENV)/.stamp-dev ## check style and types
 	$(BIN)/mypy
 
 docs: $(VENV)/.stamp-docs ## write the documentation as a site to site/; fails where a link leads nowhere
-	$(BIN)/python scripts/site.py
+	$(BIN)/python scripts/build_site.py
 	$(BIN)/zensical build --clean
 
 notebooks: $(VENV)/.stamp-dev ## run the notebooks and keep their outputs in the .ipynb files
