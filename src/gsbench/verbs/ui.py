@@ -76,9 +76,11 @@ def serve(uri: str, port: int) -> int:
     # uvicorn looks for modules in the current folder first, where a `yaml.py` may lie; MLflow's own place is safe.
     command += ["--uvicorn-opts", f"--app-dir={shlex.quote(str(Path(place.origin).parents[1]))}"]
     with stop_on_signals():
+        # Not `subprocess.run`: it would kill `mlflow ui` alone, whose server then is nobody's child and keeps the port.
+        server = subprocess.Popen(command, env=LEAN | dict(os.environ))
         try:
-            return subprocess.run(command, env=LEAN | dict(os.environ), check=False).returncode
+            return server.wait()
         except KeyboardInterrupt:
             return 0
         finally:
-            end_descendants()  # `mlflow ui` leaves its server behind where it is ended by a signal
+            end_descendants()
