@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsbench.scene.camera import Camera
-from gsbench.view.ellipsoids import Canvas
+from gsbench.view.picture import Canvas
 
 WIDTH, HEIGHT = 90, 60
 

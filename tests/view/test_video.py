@@ -17,9 +17,8 @@ from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import quantize
 from gsbench.scene.camera import Camera
-from gsbench.view.camera_path import ellipse, read_camera_path, through
-from gsbench.view.trials import find_trial, load_viewed
-from gsbench.view.video import check_file, write_video
+from gsbench.view.trials import find_trial, load_viewed, read_causes
+from gsbench.view.video import check_file, ellipse, read_camera_path, through, write_video
 from tests.scene.cameras import looking
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -90,6 +89,8 @@ def test_what_nerfstudio_did_to_the_scene_is_undone(tmp_path: Path) -> None:
         ({"render_width": 0}, "render_width and render_height must be whole"),
         ({"render_height": 1e9}, "render_width and render_height must be whole"),
         ({"render_width": "64"}, "render_width is '64'"),
+        ({"fps": 1e-300}, "fps must be from 1 to 240"),
+        ({"fps": 0}, "fps must be from 1 to 240"),
     ],
 )
 def test_a_path_that_cannot_be_filmed_is_one_line(tmp_path: Path, change: dict[str, Any], said: str) -> None:
@@ -98,6 +99,13 @@ def test_a_path_that_cannot_be_filmed_is_one_line(tmp_path: Path, change: dict[s
         read_camera_path(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no zip", b"no zip at all"])
+def test_a_record_of_causes_that_is_damaged_is_one_line(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "lineage.npz").write_bytes(content)
+    with pytest.raises(InputError, match=r"lineage\.npz cannot be read"):
+        read_causes(tmp_path / "lineage.npz", 1)
 
 
 @pytest.mark.parametrize("make", [through, ellipse])

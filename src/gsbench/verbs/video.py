@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FRAMES, FPS = 120, 30.0
-MAX_FPS = 240.0
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -52,10 +51,9 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
     from gsbench.raster import create_rasterizer
     from gsbench.train.device import select_device
-    from gsbench.view.camera_path import CameraPath, ellipse, read_camera_path, through
     from gsbench.view.picture import TrialPainter
     from gsbench.view.trials import find_trial, load_viewed, placed_cameras
-    from gsbench.view.video import check_file, has_mp4, write_video
+    from gsbench.view.video import CameraPath, check_file, ellipse, has_mp4, read_camera_path, through, write_video
 
     trial = find_trial(options.trial, runs)
     out = options.out or Path(f"{trial.scene}-{trial.densify}{'.mp4' if has_mp4() else '.webp'}")
@@ -96,7 +94,7 @@ def _resized(camera: Camera, width: int, height: int) -> Camera:
 
 
 def _frames(text: str) -> int:
-    from gsbench.view.camera_path import MAX_FRAMES
+    from gsbench.view.video import MAX_FRAMES
 
     if not text.isascii() or not text.isdigit() or not 2 <= int(text) <= MAX_FRAMES:
         raise argparse.ArgumentTypeError(f"must be a whole number from 2 to {MAX_FRAMES}, got {text!r}")
@@ -104,17 +102,19 @@ def _frames(text: str) -> int:
 
 
 def _fps(text: str) -> float:
+    from gsbench.view.video import MAX_FPS, MIN_FPS
+
     try:
         value = float(text)
     except ValueError:
         value = 0.0
-    if not 1 <= value <= MAX_FPS:
-        raise argparse.ArgumentTypeError(f"must be a number from 1 to {MAX_FPS:g}, got {text!r}")
+    if not MIN_FPS <= value <= MAX_FPS:
+        raise argparse.ArgumentTypeError(f"must be a number from {MIN_FPS:g} to {MAX_FPS:g}, got {text!r}")
     return value
 
 
 def _size(text: str) -> tuple[int, int]:
-    from gsbench.view.camera_path import MAX_SIDE
+    from gsbench.view.video import MAX_SIDE
 
     sides = text.split("x")
     if len(sides) != 2 or not all(side.isascii() and side.isdigit() and 16 <= int(side) <= MAX_SIDE for side in sides):

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.events import Cause
@@ -32,6 +33,9 @@ MOVING_HEIGHT = 240  # px while the camera moves
 HEIGHTS = ("270", "540", "810")  # px when it rests
 REST_SECONDS = 0.25  # after the last change the sharp picture is drawn
 DEFAULT_THRESHOLD = math.log10(VOLUME_THRESHOLD)
+MAX_ASPECT = 10.0  # of a page: its width decides how large a picture is made
+MIN_FOV = 1e-3  # radians
+MAX_DISTANCE = 1e9  # world units
 SHARES = (1, 100)  # %, of the Gaussians, the most opaque first
 
 
@@ -199,8 +203,8 @@ class Session:
         if self._stopped.is_set():
             return
         page = self.client.camera
-        camera = page_camera(page.wxyz, page.position, page.fov, page.aspect, height, self._panes())
         try:
+            camera = page_camera(page.wxyz, page.position, page.fov, page.aspect, height, self._panes())
             image = self.viewer.draw(camera, self.viewer.layers(), self.viewer.photograph())
         except ValueError as error:  # a camera that cannot be drawn, such as inside out while the page is being built
             log.debug("view: %s", error)
@@ -222,18 +226,19 @@ def page_camera(
 
     ``wxyz`` turns camera axes (x right, y down, z forward) to the world, ``position`` [3] is in world units,
     ``fov`` the vertical field of view in radians, ``aspect`` the page's width over its height; ``height`` in px.
+    Raises ValueError for what is no camera, or a page too wide to be drawn.
     """
-    w, x, y, z = np.asarray(wxyz, dtype=np.float64) / np.linalg.norm(wxyz)
-    to_world = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    numbers = np.concatenate([np.ravel(wxyz), np.ravel(position), [fov, aspect]]).astype(np.float64)
+    length = float(np.linalg.norm(numbers[:4]))
+    # A page may send anything: each value here decides memory, or a division.
+    if not np.isfinite(numbers).all() or np.abs(numbers).max() > MAX_DISTANCE or length < 1e-6:
+        raise ValueError("the page has no camera")
+    if not (MIN_FOV < fov < math.pi - MIN_FOV and 1 / MAX_ASPECT < aspect < MAX_ASPECT):
+        raise ValueError(f"a page of {aspect:.3g} heights with a view of {fov:.3g} radians is not drawn")
+    world_from_camera = Rotation.from_quat(numbers[[1, 2, 3, 0]]).as_matrix()
     width = max(1, round(height * aspect / panes))
     focal = height / 2 / math.tan(fov / 2)
-    rotation = to_world.T
+    rotation = world_from_camera.T
     return Camera(width, height, focal, focal, width / 2, height / 2, rotation, -rotation @ np.asarray(position))
 
 

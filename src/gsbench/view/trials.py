@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -117,7 +119,7 @@ def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
     try:
         with np.load(path) as lineage:
             causes = lineage["causes"][lineage["ids"]]
-    except (OSError, ValueError, KeyError, IndexError) as error:
+    except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path} cannot be read ({error}): run this trial again") from error
     if len(causes) != num_gaussians:
         raise InputError(f"{path} is of {len(causes)} Gaussians, the model has {num_gaussians}: run this trial again")
