@@ -71,3 +71,26 @@ def test_target_of_the_kernels_is_the_one_that_was_asked_for() -> None:
     assert asked.stdout.startswith("generic")
     if "NUMBA_CPU_NAME" not in os.environ:
         assert not kernel_target().startswith("generic")
+
+
+@pytest.mark.parametrize("variable", ["NUMBA_NUM_THREADS=0", "NUMBA_NUM_THREADS=-1", "NUMBA_DISABLE_JIT=x"])
+def test_a_variable_that_numba_cannot_read_is_one_line(variable: str) -> None:
+    name, _, value = variable.partition("=")
+    code = (
+        "from gsbench.errors import InputError\n"
+        "try:\n    import gsbench.raster.cpu\nexcept InputError as error:\n    print(error)"
+    )
+    changed = dict(os.environ) | {name: value}
+    asked = subprocess.run([sys.executable, "-c", code], env=changed, capture_output=True, text=True, check=True)
+    assert name in asked.stdout
+    assert asked.stdout.count("\n") == 1
+
+
+def test_numba_reads_no_settings_of_the_current_folder(tmp_path: Path) -> None:
+    (tmp_path / ".numba_config.yaml").write_text("disable_jit: 1\nopt: 0\n")
+    code = (
+        "import gsbench.raster.cpu\nfrom numba.core import config\nconfig.reload_config()\n"
+        "print(config.DISABLE_JIT, int(config.OPT))"
+    )
+    asked = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert asked.stdout == "0 3\n"

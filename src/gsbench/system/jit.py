@@ -11,11 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numba
-from numba.core import event
-
 from gsbench.system.imports import PACKAGE, import_closure
-from gsbench.system.machine import numba_target
+from gsbench.system.machine import load_numba, numba_target
+
+numba = load_numba()  # before anything of it is imported by name
+
+from numba.core import event  # noqa: E402
 
 DIGEST_CHARACTERS = 16
 TEMPORARY_PREFIX = "gsbench-numba-"  # of the folder where no other can be written

@@ -7,6 +7,7 @@ docs/reproducibility.md).
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import platform
@@ -15,6 +16,8 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from gsbench.errors import InputError
 
 if TYPE_CHECKING:
     import torch
@@ -29,6 +32,7 @@ X86_LEVELS = {
     "x86-64-v4": ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"),
 }
 SECONDS_FOR_SYSCTL = 10
+LEAST_OF_NUMBA = {"NUMBA_NUM_THREADS": 1, "NUMBA_DISABLE_JIT": 0}  # variables that it reads as whole numbers
 
 
 def describe_machine(device: torch.device) -> dict[str, str]:
@@ -94,11 +98,25 @@ def _windows_name() -> str:
     return os.environ.get("PROCESSOR_IDENTIFIER", "")
 
 
+def load_numba() -> Any:
+    """The module numba. Raises InputError where a variable of its own keeps it from being loaded."""
+    for name, least in LEAST_OF_NUMBA.items():
+        value = os.environ.get(name, str(least))
+        if not value.isascii() or not value.isdigit() or int(value) < least:
+            raise InputError(f"{name}={value}: numba needs a whole number from {least} on: set another, or unset it")
+    # numba takes settings from `.numba_config.yaml` of the current folder, in which a stranger's capture may lie.
+    with contextlib.chdir(Path(__file__).parent):
+        import numba
+        from numba.core import config
+    config._config_fname = ""  # which it reads again at compilations
+    return numba
+
+
 def numba_target() -> tuple[str, str]:
     """The processor that numba compiles for and its features, as LLVM writes them ("+sse2,-avx512f,…")."""
     import llvmlite.binding
-    import numba
 
+    numba = load_numba()
     config: Any = numba.config  # its settings are made at run time
     features = config.CPU_FEATURES
     if features is None:
