@@ -37,8 +37,7 @@ from gsbench.launch.plan import read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.runs.declaration import read_declarations, read_plans
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking.record import TrackedFiles
-from gsbench.tracking.state import read_state
+from gsbench.tracking.trial import TrackedTrial, read_state
 from gsbench.verbs.status import lines_of
 from tests.finished import record_of
 from tests.fuzz.corrupt import corrupt
@@ -247,20 +246,20 @@ def look(runs: Path, places: dict[str, Path]) -> int:
         attempt(lambda folder=folder: TrialFolder(folder).configuration())  # type: ignore[misc]
         attempt(lambda folder=folder: TrialFolder(folder).stage_and_step())  # type: ignore[misc]
         attempt(lambda folder=folder: read_state(folder / "mlflow.json"))  # type: ignore[misc]
-        attempt(lambda folder=folder: _mirror(runs, folder))  # type: ignore[misc]
+        attempt(lambda folder=folder: _mirror(folder))  # type: ignore[misc]
     attempt(lambda: TrialFolder.of(v := values_of(runs, "adc", 0, 0.03)).why_not_done(v))
     return refused
 
 
-def _mirror(runs: Path, folder: Path) -> None:
-    record = TrackedFiles(runs, folder, TrialFolder(folder).configuration())
-    assert record.params()
-    assert record.tags()
-    record.sweep()
-    list(record.curves({}))
-    results = record.results()
+def _mirror(folder: Path) -> None:
+    trial = TrackedTrial(TrialFolder(folder), TrialFolder(folder).configuration())
+    assert trial.params()
+    assert trial.tags()
+    trial.sweep()
+    list(trial.curves({}))
+    results = trial.folder.sound_record()
     if results is not None:
-        record.summary(results, 2, False)
+        trial.summary(results, 2, False)
 
 
 class Noticed(logging.Handler):

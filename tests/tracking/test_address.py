@@ -10,7 +10,7 @@ import pytest
 from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.tracking import connect, mirror_trial
-from gsbench.tracking.address import VARIABLE, untyped_address
+from gsbench.tracking.client import VARIABLE, untyped_address
 from gsbench.tracking.mlflow_sink import STATE
 from tests.tracking.helpers import begin_trial, found_runs, free_port, options, trial_values, write_trial
 
@@ -51,6 +51,23 @@ def test_sync_leaves_a_strange_tracker_alone(
         assert target.is_file()
 
 
+@pytest.mark.parametrize("lacking", ["scene", "densify", "tracking"])
+def test_sync_leaves_out_a_trial_whose_configuration_lacks_a_group(
+    lacking: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    values = trial_values(tmp_path, name="theirs")
+    folder = begin_trial(values)
+    write_trial(folder, values)
+    content = json.loads((folder / "config.yaml").read_text())
+    del content[lacking]
+    (folder / "config.yaml").write_text(json.dumps(content))
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
+    assert run(["sync", "theirs"]) == 0
+    said = capfd.readouterr()
+    assert f"left out: {folder / 'config.yaml'} is damaged: it lacks '{lacking}'" in said.out
+    assert said.err == ""
+
+
 @pytest.mark.parametrize("place", ["http://127.0.0.1:{port}/api", "{outside}", "{runs}/mlartifacts/../../outside"])
 def test_artifacts_go_nowhere_else_than_our_own_folder(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
@@ -64,7 +81,7 @@ def test_artifacts_go_nowhere_else_than_our_own_folder(
     address = place.format(port=free_port(), outside=outside, runs=runs)
     connect(None, runs).create_experiment("theirs", artifact_location=address)
     with pytest.raises(InputError, match="would send artifacts to"):
-        mirror_trial(options(), runs, folder, values)
+        mirror_trial(options(), folder, values)
     assert not list(outside.iterdir())
 
 
@@ -75,7 +92,7 @@ def test_no_link_among_the_artifacts_is_written_through(tmp_path: Path) -> None:
     folder = begin_trial(values)
     write_trial(folder, values)
     client = connect(None, runs)
-    mirror_trial(options(), runs, folder, values)
+    mirror_trial(options(), folder, values)
     (made,) = found_runs(client, "theirs")
     shown = runs / "mlartifacts" / "theirs" / made.info.run_id / "artifacts" / "config.yaml"
     shown.unlink()
@@ -83,5 +100,5 @@ def test_no_link_among_the_artifacts_is_written_through(tmp_path: Path) -> None:
     state = json.loads((folder / STATE).read_text())
     (folder / STATE).write_text(json.dumps(state | {"complete": None}))
     with pytest.raises(InputError, match="does not follow"):
-        mirror_trial(options(), runs, folder, values)
+        mirror_trial(options(), folder, values)
     assert private.read_text() == "secret"

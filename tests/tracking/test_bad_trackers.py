@@ -18,7 +18,7 @@ import psutil
 import pytest
 
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking import connect, mirror_trial, prepare
+from gsbench.tracking import connect, ensure_experiment, mirror_trial
 from gsbench.tracking.client import SETTINGS
 from tests.end_to_end.conftest import SMALL
 from tests.processes import heed_interrupts
@@ -48,7 +48,7 @@ from tests.tracking.helpers import begin_trial, options, trial_values, write_tri
 runs, uri, seed, patience = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), float(sys.argv[4])
 values = trial_values(runs, seed)
 folder = begin_trial(values, uri, patience)
-with Mirror(options(uri, patience), runs, folder):
+with Mirror(options(uri, patience), folder):
     write_trial(folder, values)
 """
 
@@ -199,7 +199,7 @@ def test_a_tracker_may_go_at_any_moment(
     assert seconds != SETTINGS["PGOPTIONS"]
     monkeypatch.setenv("PGOPTIONS", seconds)
     gate, uri = tracker
-    prepare(options(uri, patience=SECONDS), tmp_path, "tracked")
+    ensure_experiment(connect(uri, tmp_path), "tracked", tmp_path)
     gate.passed = 0
     assert "tracking" not in mirror_a_trial(tmp_path, uri, seed=0, patience=SECONDS)
     whole = gate.passed
@@ -208,7 +208,7 @@ def test_a_tracker_may_go_at_any_moment(
         assert "gsbench sync" in mirror_a_trial(tmp_path, uri, seed, patience=PATIENCE)
         gate.mended()
         values = trial_values(tmp_path, seed)
-        mirror_trial(options(uri), tmp_path, TrialFolder.of(values).path, values)
+        mirror_trial(options(uri), TrialFolder.of(values).path, values)
     client = connect(uri, tmp_path)
     found = found_runs(client, "tracked")
     assert sorted(run.data.tags["seed"] for run in found) == [str(seed) for seed in range(4)]

@@ -15,8 +15,8 @@ import pytest
 
 from gsbench.errors import InputError
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking import Mirror, connect, default_uri, mirror_trial, prepare, tracker_uri
-from gsbench.tracking.source import source_tags
+from gsbench.tracking import Mirror, connect, default_uri, ensure_experiment, mirror_trial, tracker_uri
+from gsbench.tracking.client import source_tags
 from gsbench.verbs.ui import address_of
 from tests.tracking.helpers import RECORDS, begin_trial, found_runs, history, options, trial_values, write_trial
 
@@ -29,7 +29,7 @@ SECONDS = 240  # within which what never comes is told from a slow machine
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A runs folder with a database; making one takes MLflow seconds."""
     folder = tmp_path_factory.mktemp("runs")
-    prepare(options(), folder, "tracked")
+    ensure_experiment(connect(None, folder), "tracked", folder)
     return folder
 
 
@@ -39,7 +39,7 @@ def mirrored(runs: Path, seed: int, **more: Any) -> tuple[Any, Any]:
     folder = TrialFolder.of(values).path
     write_trial(folder, values)
     (folder / "point_cloud.ply").write_text("ply\n")
-    assert mirror_trial(options() | more, runs, folder, values)
+    assert mirror_trial(options() | more, folder, values)
     client = connect(None, runs)
     (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == str(seed)]
     return client, run
@@ -63,7 +63,7 @@ def test_a_trial_goes_where_the_environment_says(runs: Path, tmp_path: Path, mon
     monkeypatch.setenv("MLFLOW_TRACKING_URI", default_uri(runs))
     values = trial_values(tmp_path, seed=20)
     folder = begin_trial(values)
-    with Mirror(options(), tmp_path, folder):
+    with Mirror(options(), folder):
         write_trial(folder, values)
     assert not (tmp_path / "mlflow.db").exists()
     (run,) = [run for run in found_runs(connect(None, runs), "tracked") if run.data.tags["seed"] == "20"]
@@ -112,7 +112,7 @@ def test_a_failed_run_holds_its_reason_until_it_is_mended(runs: Path) -> None:
     values = trial_values(runs, seed=22)
     folder = begin_trial(values)
     (folder / "log.txt").write_text("what happened\n")
-    with pytest.raises(RuntimeError), Mirror(options(), runs, folder):  # noqa: PT012
+    with pytest.raises(RuntimeError), Mirror(options(), folder):  # noqa: PT012
         (folder / "failed.json").write_text(json.dumps({"message": "the loss became nan", "traceback": "…"}))
         raise RuntimeError
     client = connect(None, runs)
@@ -121,7 +121,7 @@ def test_a_failed_run_holds_its_reason_until_it_is_mended(runs: Path) -> None:
     assert run.data.tags["error"] == "the loss became nan"
     assert artifacts(client, run) == {"config.yaml", "failed.json", "log.txt"}
     (folder / "failed.json").unlink()
-    with Mirror(options(), runs, folder):
+    with Mirror(options(), folder):
         write_trial(folder, values)
     run = client.get_run(run.info.run_id)
     assert run.info.status == "FINISHED"
@@ -141,7 +141,7 @@ def test_system_metrics_are_logged_if_asked_for(runs: Path, monkeypatch: pytest.
     values = trial_values(runs, seed=25)
     folder = begin_trial(values, system_metrics=True)
     seen: set[str] = set()
-    with Mirror(options(), runs, folder):
+    with Mirror(options(), folder):
         deadline = time.monotonic() + SECONDS
         while not seen and time.monotonic() < deadline:
             time.sleep(0.2)
@@ -159,7 +159,7 @@ def test_a_moved_runs_folder_keeps_its_runs_and_their_files(runs: Path, tmp_path
     try:
         values = trial_values(moved, seed=26)
         folder = TrialFolder.of(values).path
-        assert not mirror_trial(options(), moved, folder, values)  # the same run, and it is known
+        assert not mirror_trial(options(), folder, values)  # the same run, and it is known
         client = connect(None, moved)
         assert "results.json" in artifacts(client, run)
         assert client.get_run(run.info.run_id).info.artifact_uri.startswith(
@@ -168,7 +168,7 @@ def test_a_moved_runs_folder_keeps_its_runs_and_their_files(runs: Path, tmp_path
         values = trial_values(moved, seed=27)
         folder = TrialFolder.of(values).path
         write_trial(folder, values)
-        mirror_trial(options(), moved, folder, values)
+        mirror_trial(options(), folder, values)
         assert not (runs / "mlartifacts").exists()
     finally:
         shutil.copytree(moved / "mlartifacts", runs / "mlartifacts", dirs_exist_ok=True)
@@ -193,7 +193,7 @@ def test_a_rebuilt_mirror_shows_each_trial_once(runs: Path) -> None:
     client, run = mirrored(runs, seed=28)
     client.set_tag(run.info.run_id, "psnr", "meddled")
     values = trial_values(runs, seed=28)
-    assert mirror_trial(options(), runs, TrialFolder.of(values).path, values, anew=True)
+    assert mirror_trial(options(), TrialFolder.of(values).path, values, anew=True)
     (again,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "28"]
     assert again.info.run_id != run.info.run_id
     assert "psnr" not in again.data.tags

@@ -24,7 +24,7 @@ from pathlib import Path
 runs, uri, seed = Path(sys.argv[1]), sys.argv[2] or None, int(sys.argv[3])
 values = trial_values(runs, seed)
 folder = begin_trial(values, uri)
-with Mirror(options(uri), runs, folder):
+with Mirror(options(uri), folder):
     write_trial(folder, values)
 """
 
@@ -43,7 +43,7 @@ def run_jobs(runs: Path, uri: str | None) -> None:
     # A loaded machine may be too slow for the last words of some; sync is what makes up for that, and nothing else is.
     for seed in range(JOBS):
         values = trial_values(runs, seed)
-        mirror_trial(options(uri), runs, TrialFolder.of(values).path, values)
+        mirror_trial(options(uri), TrialFolder.of(values).path, values)
 
 
 def check_jobs(client: Any) -> None:

@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking import Mirror, connect, ensure_experiment, mirror_trial, prepare
+from gsbench.tracking import Mirror, connect, ensure_experiment, mirror_trial
 from gsbench.tracking.mirror import SECONDS_IN_VAIN
 from gsbench.tracking.mlflow_sink import STATE
 from tests.processes import bytes_written
@@ -38,7 +38,7 @@ SECONDS = 240  # within which what never comes is told from a slow machine
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A runs folder with a database; making one takes MLflow seconds."""
     folder = tmp_path_factory.mktemp("runs")
-    prepare(options(), folder, "tracked")
+    ensure_experiment(connect(None, folder), "tracked", folder)
     return folder
 
 
@@ -52,9 +52,9 @@ def _fresh_patience(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_all_that_the_files_say_is_mirrored_once(runs: Path) -> None:
     values = trial_values(runs, seed=1)
     folder = begin_trial(values)
-    with Mirror(options(), runs, folder):
+    with Mirror(options(), folder):
         write_trial(folder, values)
-    assert not mirror_trial(options(), runs, folder, values)
+    assert not mirror_trial(options(), folder, values)
     client = connect(None, runs)
     (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "1"]
     assert run.info.status == "FINISHED"
@@ -74,10 +74,10 @@ def test_a_crash_between_sending_and_noting_it_repeats_nothing(runs: Path) -> No
     values = trial_values(runs, seed=2)
     folder = TrialFolder.of(values).path
     write_trial(folder, values)
-    assert mirror_trial(options(), runs, folder, values)
+    assert mirror_trial(options(), folder, values)
     state = json.loads((folder / STATE).read_text())
     (folder / STATE).write_text(json.dumps(state | {"complete": None, "logged": {"metrics.jsonl": 70}}))
-    assert mirror_trial(options(), runs, folder, values)
+    assert mirror_trial(options(), folder, values)
     client = connect(None, runs)
     (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "2"]
     assert len(history(client, run.info.run_id, "train/loss")) == RECORDS
@@ -88,10 +88,10 @@ def test_results_that_changed_replace_the_run(runs: Path) -> None:
     values = trial_values(runs, seed=3)
     folder = TrialFolder.of(values).path
     write_trial(folder, values)
-    assert mirror_trial(options(), runs, folder, values)
+    assert mirror_trial(options(), folder, values)
     write_trial(folder, values, psnr=33.0)
-    assert mirror_trial(options(), runs, folder, values)
-    assert not mirror_trial(options(), runs, folder, values)
+    assert mirror_trial(options(), folder, values)
+    assert not mirror_trial(options(), folder, values)
     (run,) = [run for run in found_runs(connect(None, runs), "tracked") if run.data.tags["seed"] == "3"]
     assert run.data.metrics["psnr"] == 33.0
 
@@ -110,7 +110,7 @@ def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs: Path) ->
     folder = begin_trial(values)
     client = connect(None, runs)
     for error, status in ((KeyboardInterrupt(), "KILLED"), (RuntimeError("x"), "FAILED")):
-        with pytest.raises(type(error)), Mirror(options(), runs, folder):  # noqa: PT012
+        with pytest.raises(type(error)), Mirror(options(), folder):  # noqa: PT012
             wait_for_run(folder)
             if status == "FAILED":  # as a trial does before anyone beside it is told
                 (folder / "failed.json").write_text(json.dumps({"message": "x"}))
@@ -118,7 +118,7 @@ def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs: Path) ->
         (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "4"]
         assert run.info.status == status
     (folder / "failed.json").unlink()
-    with Mirror(options(), runs, folder):
+    with Mirror(options(), folder):
         write_trial(folder, values)
     (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "4"]
     assert run.info.status == "FINISHED"
@@ -129,7 +129,7 @@ def test_curves_of_a_training_in_progress_are_followed(runs: Path, tmp_path: Pat
     folder = begin_trial(values)
     client = connect(None, runs)
     seen = 0
-    with Mirror(options(), runs, folder):
+    with Mirror(options(), folder):
         (folder / "building.json").write_text(json.dumps({"stage": "train", "folder": str(tmp_path)}))
         (tmp_path / "metrics.jsonl").write_text('{"step": 10, "loss": 0.5}\n{"step": 20, "lo')
         wait_for_run(folder)
@@ -152,8 +152,7 @@ def test_a_broken_tracker_harms_no_trial(uri: str, tmp_path: Path, caplog: pytes
     }[uri]
     values = trial_values(tmp_path)
     folder = begin_trial(values, address)
-    prepare(options(address), tmp_path, "tracked")
-    with Mirror(options(address), tmp_path, folder):
+    with Mirror(options(address), folder):
         write_trial(folder, values)
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert any(text.startswith("tracking: ") and "gsbench sync" in text for text in warnings)
@@ -167,11 +166,10 @@ def test_a_slow_tracker_is_not_waited_for(tmp_path: Path, caplog: pytest.LogCapt
     with Listener() as tracker:
         slow = options(f"http://127.0.0.1:{tracker.port}", patience=0.2)
         folder = begin_trial(values, slow["uri"], patience=0.2)
-        prepare(slow, tmp_path, "tracked")
-        with Mirror(slow, tmp_path, folder):
+        with Mirror(slow, folder):
             write_trial(folder, values)
             mine = threading.active_count() - threads - tracker.threads
-    assert [record.getMessage().split(";")[0] for record in caplog.records] == ["tracking: MLflow is slow"] * 2
+    assert [record.getMessage().split(";")[0] for record in caplog.records] == ["tracking: MLflow is slow"]
     assert mine <= 0  # no thread that the end of the interpreter could hit; one of before may have ended
     assert set(psutil.Process().children()) <= set(others)
 
@@ -193,7 +191,7 @@ def test_patience_is_short_after_it_was_in_vain(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr("gsbench.tracking.mirror.MirrorProcess", Fake)
 
     def trial(patience: float) -> None:
-        with Mirror(options(patience=patience), tmp_path, tmp_path):
+        with Mirror(options(patience=patience), tmp_path):
             pass
 
     trial(30)
@@ -211,7 +209,7 @@ def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(
     for seed in (6, 7):
         values = trial_values(runs, seed)
         folder = begin_trial(values)
-        with Mirror(options(), runs, folder):
+        with Mirror(options(), folder):
             write_trial(folder, values)
             if seed == 6:
                 for child in psutil.Process().children():
@@ -229,10 +227,10 @@ def test_the_trials_process_loads_no_mlflow(runs: Path) -> None:
     folder = begin_trial(values)
     code = (
         "import json, sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror\n"
-        "options, runs, folder = json.loads(sys.argv[1])\n"
-        "with Mirror(options, Path(runs), Path(folder)): pass\nsys.exit('mlflow' in sys.modules)"
+        "options, folder = json.loads(sys.argv[1])\n"
+        "with Mirror(options, Path(folder)): pass\nsys.exit('mlflow' in sys.modules)"
     )
-    words = json.dumps([options(), str(runs), str(folder)])
+    words = json.dumps([options(), str(folder)])
     done = subprocess.run(
         [sys.executable, "-c", code, words], env=child_environment(), capture_output=True, text=True, check=False
     )
@@ -257,9 +255,9 @@ def test_a_database_is_whole_or_absent(tmp_path: Path) -> None:
 
 def test_switched_off_means_no_mlflow(tmp_path: Path) -> None:
     code = (
-        "import sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror, prepare\n"
+        "import sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror\n"
         "o = {'enabled': False, 'uri': None, 'flush_seconds': 1, 'images': 0}\n"
-        "prepare(o, Path('.'), 'x')\nwith Mirror(o, Path('.'), Path('.')): pass\nsys.exit('mlflow' in sys.modules)"
+        "with Mirror(o, Path('.')): pass\nsys.exit('mlflow' in sys.modules)"
     )
     assert (
         subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=child_environment(), check=False).returncode == 0

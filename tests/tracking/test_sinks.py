@@ -16,9 +16,10 @@ from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.preflight import check_trackers
 from gsbench.runs.plan_file import Entry, Sweep, write_entries
-from gsbench.tracking import connect, ensure_experiment, mirror_trial, prepare
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.tracking import connect, ensure_experiment, mirror_trial
 from gsbench.tracking.mlflow_sink import STATE, TRIES, MlflowSink
-from gsbench.tracking.record import TrackedFiles
+from gsbench.tracking.trial import TrackedTrial
 from tests.tracking.helpers import RECORDS, begin_trial, found_runs, history, options, trial_values, write_trial
 
 AT = {"50": {"metrics": {"psnr": 15.0}, "num_gaussians": 7}}
@@ -28,7 +29,7 @@ AT = {"50": {"metrics": {"psnr": 15.0}, "num_gaussians": 7}}
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A runs folder with a database; making one takes MLflow seconds."""
     folder = tmp_path_factory.mktemp("runs")
-    prepare(options(), folder, "tracked")
+    ensure_experiment(connect(None, folder), "tracked", folder)
     return folder
 
 
@@ -52,7 +53,7 @@ def run_of(client: Any, seed: int) -> Any:
 @pytest.mark.slow
 def test_measurements_on_the_way_are_steps_of_the_final_metrics_curve(runs: Path) -> None:
     folder, values = finished_trial(runs, seed=1)
-    mirror_trial(options(), runs, folder, values)
+    mirror_trial(options(), folder, values)
     client = connect(None, runs)
     run = run_of(client, 1)
     assert history(client, run.info.run_id, "psnr") == [(50, 15.0), (RECORDS, 20.0)]
@@ -61,7 +62,7 @@ def test_measurements_on_the_way_are_steps_of_the_final_metrics_curve(runs: Path
 
 def test_test_pictures_are_an_image_grid(runs: Path) -> None:
     folder, values = finished_trial(runs, seed=2)
-    mirror_trial(options(), runs, folder, values)
+    mirror_trial(options(), folder, values)
     client = connect(None, runs)
     run = run_of(client, 2)
     assert run.data.tags["mlflow.loggedImages"] == "True"  # by which the page knows that it has a grid to show
@@ -71,7 +72,7 @@ def test_test_pictures_are_an_image_grid(runs: Path) -> None:
 
 def test_run_names_begin_with_the_seed(runs: Path) -> None:
     folder, values = finished_trial(runs, seed=3)
-    mirror_trial(options(), runs, folder, values)
+    mirror_trial(options(), folder, values)
     assert run_of(connect(None, runs), 3).info.run_name == "seed 3 a_scene a_init-a_densify"
 
 
@@ -94,7 +95,7 @@ def test_the_trials_of_a_sweep_have_one_parent(runs: Path) -> None:
     places = [folder.relative_to(home).as_posix() for folder, _ in trials]
     write_entries(home, dict(zip(places, (swept, swept, alone), strict=True)))
     for folder, values in trials:
-        mirror_trial(options(), runs, folder, values)
+        mirror_trial(options(), folder, values)
     client = connect(None, runs)
     (parent,) = [run for run in found_runs(client, "tracked") if run.data.tags["kind"] == "sweep"]
     assert parent.info.run_name == "sweep of 2 trials"
@@ -126,14 +127,14 @@ def test_a_race_for_a_data_set_is_run_again(text: str, tmp_path: Path, monkeypat
     folder = begin_trial(values)
     write_trial(folder, values)
     sink = object.__new__(MlflowSink)
-    sink._record, sink.run_id = TrackedFiles(tmp_path, folder, values), "x"
+    sink._trial, sink.run_id = TrackedTrial(TrialFolder(folder), values), "x"
     sink.client = rivals = Rivals(TRIES - 1, text)
-    sink._log_datasets(sink._record.results())
+    sink._log_datasets(TrialFolder(folder).sound_record())
     assert rivals.entered == 2
     for times, said in ((TRIES, text), (1, "no such table: datasets")):  # for good, or something else
         sink.client = rivals = Rivals(times, said)
         with pytest.raises(RuntimeError, match="datasets"):
-            sink._log_datasets(sink._record.results())
+            sink._log_datasets(TrialFolder(folder).sound_record())
         assert rivals.entered == 0
 
 

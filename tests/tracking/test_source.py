@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.tracking.source import source_tags
+from gsbench.tracking.client import source_tags
 
 MARK = "#!/bin/sh\ntouch '{mark}'\ncat\n"
 

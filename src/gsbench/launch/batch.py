@@ -52,13 +52,10 @@ def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
 
 def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
     """Do all that precedes the first trial where another launcher will run them, perhaps several at once."""
-    from gsbench.launch.jobs import prepare_tracking
-
     values = trials[0].values
     with storage_errors(checked_runs_folder(values["runs"])):
         _begin(trials, [trial for trial in trials if _why_not_done(trial)])
         drop_parts(trials)  # Hydra composes each of its launcher's trials itself
-        prepare_tracking(values)
 
 
 def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:

@@ -93,7 +93,6 @@ def run_local(trials: Sequence[Trial]) -> list[Outcome]:
 
     executor = submitit.LocalExecutor(job_folder(values))
     executor.update_parameters(timeout_min=values["launch"]["timeout_min"] or 365 * DAYS)
-    prepare_tracking(values)
     return _run(trials, executor, values["launch"]["parallel"])
 
 
@@ -181,10 +180,3 @@ def job_of(trial: Trial) -> TrialJob:
     job = None if trial.job is None else trial.job.for_another_process()
     path = [entry for entry in sys.path if entry]
     return TrialJob(trial.values, trial.yaml, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"), job)
-
-
-def prepare_tracking(values: dict[str, Any]) -> None:
-    """Make the tracker's tables and the experiment once, before many jobs would at the same time."""
-    from gsbench.tracking import prepare
-
-    prepare(values["tracking"], TrialFolder.of(values).runs, values["name"])

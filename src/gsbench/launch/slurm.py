@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsbench.errors import InputError
-from gsbench.launch.jobs import SECONDS_BETWEEN_POLLS, collect, job_folder, job_of, need_submitit, prepare_tracking
+from gsbench.launch.jobs import SECONDS_BETWEEN_POLLS, collect, job_folder, job_of, need_submitit
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.queue import (
     ask_queue,
@@ -41,7 +41,6 @@ def run_slurm(trials: Sequence[Trial]) -> list[Outcome]:
     """
     values = trials[0].values
     executor = make_executor(values["launch"], job_folder(values))
-    prepare_tracking(values)
     with hold(Path(executor.folder) / SUBMIT_LOCK, f"submitting trials of {values['name']}"):
         jobs = _submit(trials, executor)
     array = sorted({job.job_id.split("_")[0] for job in jobs.values()})

@@ -111,7 +111,7 @@ def _run(parts: Parts, config_yaml: str, folder: TrialFolder) -> TrialRecord:
     with _recorded_failures(values, folder):
         parts.complete()
         torch.set_num_threads(parts.threads)
-        mirror = Mirror(values["tracking"], folder.runs, folder.path)
+        mirror = Mirror(values["tracking"], folder.path)
 
         def announce(stage: Stage, place: Path) -> None:
             write_json(folder.path / BUILDING, {"stage": stage.name, "folder": str(place)})

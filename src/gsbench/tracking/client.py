@@ -1,11 +1,12 @@
-"""The tracker: its address, a client of it, and the tables and experiments that many processes want at once."""
+"""MLflow's tracker: its address, a client of it, and the tables and experiments that many processes want at once."""
 
 from __future__ import annotations
 
+import getpass
 import logging
 import os
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,11 +16,12 @@ from filelock import FileLock
 from gsbench.errors import InputError
 from gsbench.files import atomic, require_own
 from gsbench.runs.layout import ARTIFACTS, DATABASE
-from gsbench.tracking.source import user_tags
+from gsbench.system.checkout import checkout_of
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
+VARIABLE = "MLFLOW_TRACKING_URI"
 ADVISORY_LOCK = 0x67736265_6E6368  # "gsbench": the number of our lock in a PostgreSQL database
 KIND = {"mlflow.experimentKind": "custom_model_development"}  # else its page opens as that of a chat program
 SWEEP_TAG = "gsbench.sweep"
@@ -43,7 +45,18 @@ def default_uri(runs: Path) -> str:
 
 def tracker_uri(uri: str | None, runs: Path) -> str:
     """The tracker's address: the configured ``uri``, else MLFLOW_TRACKING_URI, else the database in the runs folder."""
-    return uri or os.environ.get("MLFLOW_TRACKING_URI") or default_uri(runs)
+    return uri or os.environ.get(VARIABLE) or default_uri(runs)
+
+
+def untyped_address(options: Mapping[str, Any], typed: str | None = None) -> str | None:
+    """The tracker's address that the settings ``tracking`` of a file name; None where it may be used.
+
+    That is so where they name none, the one that was ``typed``, or that of the environment.
+    """
+    address = options.get("uri")
+    if not options.get("enabled", True) or not address or address in (typed, os.environ.get(VARIABLE)):
+        return None
+    return str(address)
 
 
 def connect(uri: str | None, runs: Path) -> MlflowClient:
@@ -118,6 +131,26 @@ def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> Non
     if not place.is_relative_to(runs / ARTIFACTS) or ".." in place.parts:
         raise InputError(f"{runs / DATABASE} would send artifacts to {address}: remove it and `gsbench sync --rebuild`")
     require_own(runs, place, below=True)
+
+
+def user_tags() -> dict[str, str]:
+    """The user's name, where the system has one."""
+    try:
+        return {"mlflow.user": getpass.getuser()}
+    except (KeyError, OSError, ImportError):  # a container's nameless user; Windows
+        return {}
+
+
+def source_tags(program: str) -> dict[str, str]:
+    """The name of the ``program``, and commit and dirty flag of the code: of the folder that it runs in, which holds a
+    user's own classes and settings, or else of gsbench's checkout."""
+    tags = {"mlflow.source.type": "LOCAL", "mlflow.source.name": program}
+    for folder in (Path.cwd(), Path(__file__).resolve().parent):
+        checkout = checkout_of(folder)
+        if checkout is not None:
+            dirty = {} if checkout.edited is None else {"mlflow.source.git.dirty": str(checkout.edited).lower()}
+            return tags | {"mlflow.source.git.commit": checkout.commit} | dirty
+    return tags
 
 
 @contextmanager

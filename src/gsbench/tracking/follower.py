@@ -1,4 +1,4 @@
-"""Follower of a trial's files until the trial, or its process, is gone; runs in the mirror's own process.
+"""The mirror's own process: it follows the files of a trial until that has ended, or mirrors all that have.
 
 The files are the truth: what a trial is, how far it has come and how it ended is read there. The end of the input
 says that it has ended.
@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
@@ -21,119 +21,97 @@ from gsbench.errors import InputError
 from gsbench.runs.experiments import places_of_trials
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
-from gsbench.tracking.address import untyped_address
-from gsbench.tracking.client import connect, ensure_experiment
-from gsbench.tracking.process import TRACKER_FAILED
+from gsbench.tracking.client import untyped_address
+from gsbench.tracking.mirror import TRACKER_FAILED
 from gsbench.tracking.sink import name_of
-from gsbench.tracking.tracked_trial import LOCK, TrackedTrial, mirror_trial
+from gsbench.tracking.trial import LOCK, TrackedTrial, TrackerRun, mirror_trial
 from gsbench.words import counted
 
 SECONDS_AFTER_PARENT = 10.0  # to tell the tracker that the trial's process is gone
-
-
-def follow() -> NoReturn:
-    """Mirror the trial that the words of the command name (runs folder, trial's folder, program) until it has ended."""
-    runs, folder, program = Path(sys.argv[2]), Path(sys.argv[3]), sys.argv[4]
-
-    def work(ended: threading.Event, out: TextIO) -> None:
-        values = TrialFolder(folder).configuration()
-        _follow(Follower(values["tracking"], runs, folder, values, program), ended)
-
-    _serve(work, patience=float(TrialFolder(folder).configuration()["tracking"]["patience_seconds"]))
-
-
-def prepare() -> NoReturn:
-    """Create MLflow's tables and an experiment (runs folder, experiment, address, patience in s)."""
-    runs, experiment, uri, patience = Path(sys.argv[2]), sys.argv[3], sys.argv[4] or None, float(sys.argv[5])
-    _serve(lambda ended, out: ensure_experiment(connect(uri, runs), experiment, runs), patience)
-
-
-def sync() -> NoReturn:
-    """Mirror what a tracker missed of all ended trials (runs folder, address, "anew" or "", experiments' folders)."""
-    runs, uri, anew, homes = Path(sys.argv[2]), sys.argv[3] or None, bool(sys.argv[4]), sys.argv[5:]
-
-    def work(ended: threading.Event, out: TextIO) -> None:
-        new = known = 0
-        for folder in (folder for home in homes for folder in sorted(map(Path, places_of_trials(Path(home))))):
-            state = TrialFolder(folder).state()
-            if state == "damaged":
-                print(f"left out: {TrialFolder(folder).label}: damaged, see gsbench status", file=out, flush=True)
-            if state not in ("done", "failed"):
-                continue
-            try:
-                values = TrialFolder(folder).configuration()
-            except InputError as error:
-                print(f"left out: {error}", file=out, flush=True)
-                continue
-            if strange := untyped_address(values["tracking"] | ({"uri": uri} if uri else {}), uri):
-                text = f"its configuration names the tracker {strange}, and --uri {strange} was not typed"
-                print(f"left out: {TrialFolder(folder).label}: {text}", file=out, flush=True)
-                continue
-            if _sync_one(folder, values, runs, uri, anew, out):
-                new += 1
-                print(f"mirrored {TrialFolder(folder).label}", file=out, flush=True)
-            else:
-                known += 1
-        print(f"{counted(new, 'trial')} mirrored, {known} were", file=out)
-
-    _serve(work, patience=0)
-
-
-def _sync_one(folder: Path, values: dict[str, Any], runs: Path, uri: str | None, anew: bool, out: TextIO) -> bool:
-    """Return whether something of the trial was missing. Raises MissedError where the tracker does not take it."""
-    options = values["tracking"] | ({"uri": uri} if uri else {})
-    try:
-        return mirror_trial(options, runs, folder, values, anew)
-    except BusyError:
-        print(f"{TrialFolder(folder).label} is being mirrored by another process", file=out, flush=True)
-        return False
-    except Exception as error:  # whatever the tracker raises
-        raise MissedError(
-            f"{name_of(options)} does not take {TrialFolder(folder).label} ({kind_and_words(error)})"
-        ) from error
 
 
 class MissedError(Exception):
     """A trial that the tracker does not take; the text is the reason."""
 
 
-class Follower:
-    """A trial in progress, mirrored now and then; a tracker that fails is tried again at the next occasion."""
+def follow() -> NoReturn:
+    """Mirror the trial that the words of the command name (its folder, the program that runs it) until it has ended."""
+    folder, program = TrialFolder(Path(sys.argv[2])), sys.argv[3]
+    values = folder.configuration()
+    trial, options = TrackedTrial(folder, values), values["tracking"]
+    _serve(lambda ended, out: _follow(trial, options, program, ended), float(options["patience_seconds"]))
 
-    def __init__(self, options: dict[str, Any], runs: Path, folder: Path, values: dict[str, Any], program: str) -> None:
-        self.seconds_between = float(options["flush_seconds"])
-        self._folder = folder
-        self._open = lambda: TrackedTrial(options, runs, folder, values, program)
-        self._run: TrackedTrial | None = None
-        self._lock = ExitStack()
 
-    def catch_up(self) -> None:
-        """Log what the files have gained. Raises what the tracker raises, BusyError where another process mirrors."""
-        if self._run is None:
-            with ExitStack() as stack:
-                stack.enter_context(hold(self._folder / LOCK, "mirroring", wait=False))
-                self._run = self._open()
-                self._lock = stack.pop_all()
-        self._run.add_curves()
+def sync() -> NoReturn:
+    """Mirror what a tracker missed of all ended trials (address, "anew" or "", experiments' folders)."""
+    uri, anew, homes = sys.argv[2] or None, bool(sys.argv[3]), sys.argv[4:]
 
-    def end(self) -> None:
-        """Log the rest, and that the trial has ended; raises as `catch_up` does."""
+    def work(ended: threading.Event, out: TextIO) -> None:
+        for line in _sync(uri, anew, homes):
+            print(line, file=out, flush=True)
+
+    _serve(work, patience=0)
+
+
+def _follow(trial: TrackedTrial, options: dict[str, Any], program: str, ended: threading.Event) -> None:
+    """Send now and then what the files have gained, and at the end that the trial has ended.
+
+    A tracker that fails is tried again at the next occasion.
+    """
+    run: TrackerRun | None = None
+    with ExitStack() as held:
+
+        def caught_up() -> TrackerRun:
+            nonlocal run
+            if run is None:
+                with ExitStack() as lock:
+                    lock.enter_context(hold(trial.folder.path / LOCK, "mirroring", wait=False))
+                    run = TrackerRun(options, trial, program)
+                    held.push(lock.pop_all())
+            run.add_curves()
+            return run
+
+        pause = 0.0  # the dashboard shows a trial when it begins
+        while not ended.wait(pause):
+            pause = float(options["flush_seconds"])
+            with suppress(Exception):  # what lasts until the end is said then
+                caught_up()
+        with suppress(BusyError):  # another process mirrors it
+            caught_up().end()
+
+
+def _sync(uri: str | None, anew: bool, homes: Sequence[str]) -> Iterator[str]:
+    """Mirror the ended trials of the experiments in ``homes``; yields lines for people."""
+    new = known = 0
+    for folder in [TrialFolder(Path(place)) for home in homes for place in sorted(places_of_trials(Path(home)))]:
+        state = folder.state()
+        if state == "damaged":
+            yield f"left out: {folder.label}: damaged, see gsbench status"
+        if state not in ("done", "failed"):
+            continue
         try:
-            self.catch_up()
-            assert self._run is not None
-            self._run.end()
-        finally:
-            self._lock.close()
-
-
-def _follow(trial: Follower, ended: threading.Event) -> None:
-    pause = 0.0  # the dashboard shows a trial when it begins
-    while not ended.wait(pause):
-        pause = trial.seconds_between
-        with suppress(Exception):  # what lasts until the end is said then
-            trial.catch_up()
-    with suppress(BusyError):  # it is mirrored
-        trial.end()
+            values = folder.configuration()
+        except InputError as error:
+            yield f"left out: {error}"
+            continue
+        options = values["tracking"] | ({"uri": uri} if uri else {})
+        if strange := untyped_address(options, uri):
+            yield (
+                f"left out: {folder.label}: its configuration names the tracker {strange}, and --uri {strange} was "
+                "not typed"
+            )
+            continue
+        try:
+            is_new = mirror_trial(options, folder.path, values, anew)
+        except BusyError:
+            yield f"{folder.label} is being mirrored by another process"
+            continue
+        except Exception as error:  # whatever the tracker raises
+            raise MissedError(f"{name_of(options)} does not take {folder.label} ({kind_and_words(error)})") from error
+        if is_new:
+            yield f"mirrored {folder.label}"
+        new, known = new + is_new, known + (not is_new)
+    yield f"{counted(new, 'trial')} mirrored, {known} were"
 
 
 def _serve(work: Callable[[threading.Event, TextIO], object], patience: float) -> NoReturn:

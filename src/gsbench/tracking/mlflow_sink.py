@@ -16,11 +16,17 @@ from typing import Any
 from gsbench.files import write_json
 from gsbench.runs import layout
 from gsbench.runs.trial_record import TrialRecord
-from gsbench.tracking.client import connect, default_uri, ensure_experiment, ensure_parent, require_own_artifacts
-from gsbench.tracking.record import TrackedFiles
+from gsbench.tracking.client import (
+    connect,
+    default_uri,
+    ensure_experiment,
+    ensure_parent,
+    require_own_artifacts,
+    source_tags,
+    user_tags,
+)
 from gsbench.tracking.sink import Point, Summary
-from gsbench.tracking.source import source_tags, user_tags
-from gsbench.tracking.state import read_state
+from gsbench.tracking.trial import TrackedTrial, read_state
 
 STATE = "mlflow.json"  # in the trial's folder: the run that mirrors it and how far
 OWN_DATABASE = "runs/mlflow.db"
@@ -42,9 +48,9 @@ class MlflowSink:
 
     state_file = STATE
 
-    def __init__(self, options: dict[str, Any], record: TrackedFiles, program: str | None) -> None:
-        self._options, self._record, self._program = options, record, program
-        self.client = connect(options["uri"], record.runs)
+    def __init__(self, options: dict[str, Any], trial: TrackedTrial, program: str | None) -> None:
+        self._options, self._trial, self._program = options, trial, program
+        self.client = connect(options["uri"], trial.folder.runs)
         self.run_id = ""
         self._started = 0  # ms since 1970
         self._monitor: Any = None
@@ -54,7 +60,7 @@ class MlflowSink:
         state = self._known(state, results) or self._create_run()
         self.run_id, self._started = state["run_id"], state["started"]
         address = str(self.client.get_run(self.run_id).info.artifact_uri)
-        require_own_artifacts(self.client, address, self._record.runs)
+        require_own_artifacts(self.client, address, self._trial.folder.runs)
         if state["complete"] is None:
             self.client.update_run(self.run_id, status="RUNNING")
             if self._program is not None and self._options.get("system_metrics"):
@@ -95,8 +101,8 @@ class MlflowSink:
         if reason is not None:
             self.client.set_tag(self.run_id, ERROR_TAG, reason[:MAX_TAG])
             for name in (layout.CONFIG, layout.FAILED, layout.LOG):
-                if (self._record.folder / name).exists():
-                    self.client.log_artifact(self.run_id, str(self._record.folder / name))
+                if (self._trial.folder.path / name).exists():
+                    self.client.log_artifact(self.run_id, str(self._trial.folder.path / name))
         self.client.set_terminated(self.run_id, status)
 
     def remove(self) -> None:
@@ -125,25 +131,25 @@ class MlflowSink:
     def _create_run(self) -> dict[str, Any]:
         from mlflow.entities import Param, RunTag
 
-        record, client = self._record, self.client
+        trial, client = self._trial, self.client
         begun = self._begin()
-        experiment_id = ensure_experiment(client, record.values["name"], record.runs)
-        tags = record.tags() | {TOKEN_TAG: begun["token"]} | user_tags()
+        experiment_id = ensure_experiment(client, trial.values["name"], trial.folder.runs)
+        tags = trial.tags() | {TOKEN_TAG: begun["token"]} | user_tags()
         if self._program is not None:
             tags |= source_tags(self._program)
-        if sweep := record.sweep():
-            tags[PARENT_TAG] = ensure_parent(client, experiment_id, sweep, record.runs)
+        if sweep := trial.sweep():
+            tags[PARENT_TAG] = ensure_parent(client, experiment_id, sweep, trial.folder.runs)
         found = client.search_runs([experiment_id], f"tags.`{TOKEN_TAG}` = '{begun['token']}'", max_results=1)
-        run = found[0] if found else client.create_run(experiment_id, tags=tags, run_name=record.label)
+        run = found[0] if found else client.create_run(experiment_id, tags=tags, run_name=trial.label)
         run_id = run.info.run_id
-        params = [Param(key, value[:MAX_VALUE]) for key, value in record.params().items()]
+        params = [Param(key, value[:MAX_VALUE]) for key, value in trial.params().items()]
         for start in range(0, len(params), MAX_PARAMS):
             client.log_batch(run_id, params=params[start : start + MAX_PARAMS], tags=[RunTag("gsbench", "1")])
         return begun | {"run_id": run_id, "logged": {}, "complete": None}
 
     def _begin(self) -> dict[str, Any]:
         """Note, before a run is created, by what it is found again if nobody hears of its creation."""
-        file = self._record.folder / STATE
+        file = self._trial.folder.path / STATE
         state = read_state(file)
         if state.get("uri") == self._uri() and "token" in state and "run_id" not in state:
             return state
@@ -158,7 +164,7 @@ class MlflowSink:
         digest = results.hashes.get("data")
         if digest is None:
             return
-        scene = self._record.values["scene"]
+        scene = self._trial.values["scene"]
         source = json.dumps({"uri": str(scene.get("path") or scene["name"])})
         views = {"train": results.train_views, "test": results.test_views}
         inputs = [
@@ -197,7 +203,7 @@ class MlflowSink:
     def _uri(self) -> str:
         """Address of the run: the tracker's address, or a word for the runs folder's own, which may move with it."""
         uri = str(self.client.tracking_uri)
-        return OWN_DATABASE if uri == default_uri(self._record.runs) else uri
+        return OWN_DATABASE if uri == default_uri(self._trial.folder.runs) else uri
 
 
 def start_system_metrics(run_id: str, uri: str) -> Any:

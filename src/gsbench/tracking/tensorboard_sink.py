@@ -9,8 +9,8 @@ from typing import Any
 
 from gsbench.files import require_own
 from gsbench.runs.layout import TENSORBOARD
-from gsbench.tracking.record import TrackedFiles
 from gsbench.tracking.sink import Point, Summary
+from gsbench.tracking.trial import TrackedTrial
 
 
 class TensorBoardSink:
@@ -18,9 +18,9 @@ class TensorBoardSink:
 
     state_file = "tensorboard.json"
 
-    def __init__(self, record: TrackedFiles) -> None:
-        self._record = record
-        self._folder = record.runs / TENSORBOARD / record.path
+    def __init__(self, trial: TrackedTrial) -> None:
+        self._trial = trial
+        self._folder = trial.folder.runs / TENSORBOARD / trial.path
         self._started = time.time()
         self._writer: Any = None
 
@@ -30,10 +30,10 @@ class TensorBoardSink:
             return state
         from torch.utils.tensorboard import SummaryWriter
 
-        require_own(self._record.runs, self._folder)
+        require_own(self._trial.folder.runs, self._folder)
         self.remove()
         self._writer = SummaryWriter(str(self._folder))
-        for name, values in (("settings", self._record.params()), ("trial", self._record.tags())):
+        for name, values in (("settings", self._trial.params()), ("trial", self._trial.tags())):
             table = "".join(f"| {key} | {value} |\n" for key, value in values.items())
             self._writer.add_text(name, f"| | |\n|---|---|\n{table}")
         return {"complete": None, "logged": {}}

@@ -9,8 +9,8 @@ from typing import Any
 
 from gsbench.files import require_own
 from gsbench.runs.layout import WANDB
-from gsbench.tracking.record import TrackedFiles
 from gsbench.tracking.sink import Point, Summary
+from gsbench.tracking.trial import TrackedTrial
 
 STEP = "iteration"  # the axis of our curves: their own counter only goes up, and we read two files
 
@@ -20,8 +20,8 @@ class WandbSink:
 
     state_file = "wandb.json"
 
-    def __init__(self, options: dict[str, Any], record: TrackedFiles) -> None:
-        self._record = record
+    def __init__(self, options: dict[str, Any], trial: TrackedTrial) -> None:
+        self._trial = trial
         if options["uri"]:
             os.environ["WANDB_BASE_URL"] = options["uri"]
         self._run: Any = None
@@ -35,18 +35,18 @@ class WandbSink:
         state = state or {"id": uuid.uuid4().hex[:8], "complete": None, "logged": {}}
         import wandb
 
-        record = self._record
-        folder = record.runs / WANDB
-        require_own(record.runs, folder)
+        trial = self._trial
+        folder = trial.folder.runs / WANDB
+        require_own(trial.folder.runs, folder)
         folder.mkdir(exist_ok=True)
         self._run = wandb.init(
-            project=record.values["name"],
-            name=record.label,
+            project=trial.values["name"],
+            name=trial.label,
             id=state["id"],
             resume="allow",
-            group=record.sweep().get("id"),
-            config=record.params(),
-            tags=[record.values["scene"]["name"], record.arm],
+            group=trial.sweep().get("id"),
+            config=trial.params(),
+            tags=[trial.values["scene"]["name"], trial.arm],
             dir=str(folder),
             settings=wandb.Settings(silent=True, console="off"),
         )
@@ -72,7 +72,7 @@ class WandbSink:
         self._run.summary.update({point.key: point.value for point in summary.points if point.step == summary.step})
         self._run.config.update(summary.tags, allow_val_change=True)
         for _, path in summary.files:
-            self._run.save(str(path), base_path=str(self._record.folder), policy="now")
+            self._run.save(str(path), base_path=str(self._trial.folder.path), policy="now")
         self._run.finish(0)
 
     def stop(self, status: str, reason: str | None) -> None:

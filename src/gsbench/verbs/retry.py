@@ -21,7 +21,7 @@ from gsbench.runs.layout import CONFIG
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.own_modules import allow_modules
-from gsbench.tracking.address import VARIABLE, untyped_address
+from gsbench.tracking.client import VARIABLE, untyped_address
 from gsbench.verbs.arguments import ArgumentParser
 
 TRACKER = "tracking.uri"

@@ -8,7 +8,7 @@ from pathlib import Path
 from gsbench.errors import GsbenchError
 from gsbench.runs.experiments import experiment_home, list_experiments
 from gsbench.tracking import sync
-from gsbench.tracking.process import MirrorError
+from gsbench.tracking.mirror import MirrorError
 from gsbench.verbs.arguments import ArgumentParser
 
 
@@ -28,7 +28,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         else [runs / n for n in list_experiments(runs)]
     )
     try:
-        for line in sync(runs, homes, options.uri, options.rebuild):
+        for line in sync(homes, options.uri, options.rebuild):
             print(line, flush=True)
     except (MirrorError, OSError) as error:
         raise GsbenchError(f"{error}; the files are complete: try again") from error

@@ -1,0 +1,255 @@
+"""A trial and its run in a tracker: what its files say in the tracker's terms, and how far that was sent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gsbench.errors import InputError
+from gsbench.files import write_json
+from gsbench.records import Count, Part, read_if_sound
+from gsbench.runs import layout
+from gsbench.runs.hashing import flatten, sha256_of
+from gsbench.runs.plan_file import read_entries
+from gsbench.runs.rows import read_rows
+from gsbench.runs.stages import TRAIN
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.trial_record import TrialRecord
+from gsbench.system.locks import hold
+from gsbench.tracking.sink import DEFAULT, Point, Sink, Summary
+
+LOCK = ".mlflow.lock"  # one process at a time mirrors a trial, to whichever tracker
+FILES = (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS)
+# Of the init's report: is the cloud to be trusted, and what does a volume threshold mean there?
+INIT_FIELDS = ("num_registered", "num_points", "mean_reprojection_error", "mean_track_length", "pose_errors", "gauge")
+CURVES = {layout.CURVES: "train", layout.EVENTS: "events"}
+
+
+@dataclass(frozen=True)
+class TrackedTrial:
+    """A trial in ``folder`` with the configuration ``values``, in the terms of a tracker."""
+
+    folder: TrialFolder
+    values: dict[str, Any]
+
+    @property
+    def arm(self) -> str:
+        """Initialiser and densifier."""
+        return f"{self.values['init']['name']}-{self.values['densify']['name']}"
+
+    @property
+    def label(self) -> str:
+        """The run's name: the seed first, since trackers cut names at their end."""
+        return f"seed {self.values['seed']} {self.values['scene']['name']} {self.arm}"
+
+    @property
+    def path(self) -> str:
+        """The trial's folder as seen from the runs folder."""
+        return self.folder.path.relative_to(self.folder.runs).as_posix()
+
+    def tags(self) -> dict[str, str]:
+        """The tags by which the trial is found."""
+        names = {group: self.values[group]["name"] for group in ("scene", "init", "densify")}
+        return {"kind": "trial", **names, "seed": str(self.values["seed"]), "folder": self.path}
+
+    def params(self) -> dict[str, str]:
+        """The settings that have a value, by their dotted keys; the arm is first in charts."""
+        return {"arm": self.arm} | {key: str(value) for key, value in flatten(self.values).items() if str(value)}
+
+    def sweep(self) -> dict[str, Any]:
+        """The sweep that asked for the trial: its ``id`` and ``count`` of trials; empty for one trial alone."""
+        home = self.folder.home
+        try:
+            entry = read_entries(home).get(self.folder.path.relative_to(home).as_posix())
+        except InputError:  # a damaged plan: who reads it says so
+            entry = None
+        return {} if entry is None or entry.sweep is None else entry.sweep.to_json()
+
+    def results_hash(self) -> str | None:
+        """The hash of the results, by which a mirror knows whether it shows them; None where there are none."""
+        results = self.folder.sound_record()
+        return None if results is None else sha256_of(results.to_json())
+
+    def curves(self, logged: dict[str, int]) -> Iterator[tuple[str, int, list[Point]]]:
+        """Read each file of curves: its name, its newest iteration, and its points after ``logged[name]``."""
+        building = self.folder.building()  # a training in progress writes elsewhere
+        sources = [Path(building.folder)] if building.stage == TRAIN.name else []
+        for name, prefix in CURVES.items():
+            source = next((folder / name for folder in (*sources, self.folder.path) if (folder / name).exists()), None)
+            records = [] if source is None else [r for r in read_rows(source) if r["step"] > logged.get(name, 0)]
+            if records:
+                points = [
+                    Point(f"{prefix}/{key}", float(value), int(record["step"]), _seconds(record))
+                    for record in records
+                    for key, value in record.items()
+                    if key != "step"
+                ]
+                yield name, int(records[-1]["step"]), points
+
+    def summary(self, results: TrialRecord, images: int, with_model: bool) -> Summary:
+        """The summary of the finished trial, with ``images`` test views at most, and the model if ``with_model``."""
+        step, seconds = results.iterations, results.seconds.get("train", results.iterations / 1000)
+        numbers = dict(results.metrics) | {
+            key: value
+            for key in ("num_gaussians", "num_init_points", "peak_memory_mb")
+            if (value := getattr(results, key)) is not None  # not known of renders that another program made
+        }
+        numbers |= {f"seconds_{key}": value for key, value in results.seconds.items()}
+        numbers |= {f"total/{key}": value for key, value in results.events.items()}
+        numbers |= {f"init/{key}": value for key, value in _numbers(results.init_report, INIT_FIELDS)}
+        points = [
+            Point(key, float(value), int(at), seconds * int(at) / max(1, step))
+            for at, measured in results.metrics_at.items()
+            for key, value in measured.metrics.items()
+        ]
+        tags = {"protocol": results.protocol, "raster": results.raster}
+        names = (*FILES, *([layout.POINT_CLOUD] if with_model else []))
+        files = [("", self.folder.path / name) for name in names if (self.folder.path / name).exists()]
+        return Summary(
+            points=points + [Point(key, float(value), step, seconds) for key, value in numbers.items()],
+            tags=tags | {f"hash_{key}": value for key, value in results.hashes.items()},
+            pictures={
+                f"{kind}/{path.stem}": path
+                for kind in (layout.RENDERS, layout.GROUND_TRUTH)
+                for path in self.folder.pictures(kind)[:images]
+            },
+            files=files + [(layout.FIGURES, path) for path in self.folder.pictures(layout.FIGURES)[:images]],
+            results=results,
+            step=step,
+            seconds=seconds,
+        )
+
+
+def _seconds(record: Mapping[str, float]) -> float:
+    """The training time of a record, or else a function of its iteration: the same whenever it is read."""
+    return float(record.get("seconds", record["step"] / 1000))
+
+
+def _numbers(report: dict[str, Any], names: Sequence[str]) -> Iterator[tuple[str, float]]:
+    """The numbers among the fields ``names`` of a report, nested ones included; what is unknown is left out."""
+    for name in names:
+        value = report.get(name)
+        if isinstance(value, dict):
+            yield from _numbers(value, tuple(value))
+        elif isinstance(value, (int, float)) and not isinstance(value, bool):
+            yield name, float(value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MirrorState(Part):
+    """State that any sink keeps: ``complete`` is the hash of the results that it shows, ``logged`` the newest iteration
+    by file; the rest says which run it is, in the sink's own words.
+    """
+
+    complete: str | None = None
+    logged: dict[str, Count] = field(default_factory=dict)
+    uri: str | None = None
+    token: str | None = None
+    started: Count | None = None  # ms since 1970
+    run_id: str | None = None
+    id: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.run_id is not None and self.started is None:
+            raise ValueError("it has a run and no start")
+
+
+def read_state(file: Path) -> dict[str, Any]:
+    """Read the state in ``file``; empty, as if nothing were mirrored yet, where it is absent or damaged."""
+    state = read_if_sound(file, MirrorState)
+    return {} if state is None else {"complete": None, "logged": {}} | state.to_json()
+
+
+class TrackerRun:
+    """The trial's run, opened anew or gone on with."""
+
+    def __init__(self, options: dict[str, Any], trial: TrackedTrial, program: str | None = None) -> None:
+        self.trial = trial
+        self.sink = make_sink(options, trial, program)
+        self._options = options
+        self._file = trial.folder.path / self.sink.state_file
+        self._open()
+
+    def _open(self) -> None:
+        self.state = self.sink.open(read_state(self._file), self.trial.results_hash())
+        self._save()
+
+    @property
+    def is_complete(self) -> bool:
+        """Return whether the run shows the present results."""
+        return self.state["complete"] is not None and self.state["complete"] == self.trial.results_hash()
+
+    def add_curves(self) -> None:
+        """Log the records that were written since the last call."""
+        if self.is_complete:
+            return
+        for name, newest, points in self.trial.curves(self.state["logged"]):
+            self.sink.log(points)
+            self.state["logged"][name] = newest
+        self._save()
+
+    def end(self) -> None:
+        """Log the rest, and close the run as the files say that the trial ended: failed, done, or else killed."""
+        if self.is_complete:
+            return
+        if self.state["complete"] is not None:  # results that were there when it began are replaced by others
+            self._open()
+        self.add_curves()
+        folder = self.trial.folder
+        if folder.has_failed():
+            self.sink.stop("FAILED", folder.failure())
+        elif (results := folder.sound_record()) is None:
+            self.sink.stop("KILLED", None)
+        else:
+            images, with_model = int(self._options["images"]), bool(self._options.get("model"))
+            self.sink.complete(self.trial.summary(results, images, with_model))
+            self.state["complete"] = self.trial.results_hash()
+        self._save()
+
+    def remove(self) -> None:
+        """Delete the run; the files stay."""
+        self.sink.remove()
+        self._file.unlink(missing_ok=True)
+
+    def _save(self) -> None:
+        write_json(self._file, self.state)
+
+
+def mirror_trial(options: dict[str, Any], folder: Path, values: dict[str, Any], anew: bool = False) -> bool:
+    """Mirror what is missing of an ended trial; False if nothing was missing. Raises what the tracker raises.
+
+    With ``anew``, the run that mirrors it so far is deleted, and another made from the files alone.
+    """
+    trial = TrackedTrial(TrialFolder(folder), values)
+    trial.folder.require_own()
+    with hold(folder / LOCK, "mirroring", wait=False):
+        run = TrackerRun(options, trial)
+        if anew:
+            run.remove()
+            run = TrackerRun(options, trial)
+        if run.is_complete:
+            return False
+        run.end()
+    return True
+
+
+def make_sink(options: dict[str, Any], trial: TrackedTrial, program: str | None) -> Sink:
+    """The trial's place in the tracker that ``tracking.sink`` names.
+
+    ``program`` is what runs the trial at this moment; None where the trial has ended.
+    """
+    match options.get("sink", DEFAULT):
+        case "tensorboard":
+            from gsbench.tracking.tensorboard_sink import TensorBoardSink
+
+            return TensorBoardSink(trial)
+        case "wandb":
+            from gsbench.tracking.wandb_sink import WandbSink
+
+            return WandbSink(options, trial)
+        case _:
+            from gsbench.tracking.mlflow_sink import MlflowSink
+
+            return MlflowSink(options, trial, program)
