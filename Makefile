@@ -3,7 +3,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 # Two tests at a time, each worker in a process of its own; one that has nothing left takes tests of the other.
 PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
-PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+INSTALL := $(BIN)/python scripts/install.py
 
 # Each library that chooses its instructions by the processor, told to choose the plainest. Compiled kernels keep a cache
 # for each processor, so the ordinary ones stay.
@@ -68,15 +68,15 @@ lock: $(VENV)/.stamp-run ## bring uv.lock to the versions of constraints.txt
 # What running needs, and no more; development tools come on top.
 $(VENV)/.stamp-run: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "gsbench needs Python 3.11 or newer: make PYTHON=python3.12 ...")'
-	$(PYTHON) -m venv $(VENV)
-	$(PIP) 'pip>=25.1' # the first that knows --group
-	$(PIP) -e .
+	@echo making the environment $(VENV)
+	@$(PYTHON) -m venv $(VENV)
+	@$(INSTALL) -e .
 	@touch $@
 
 $(VENV)/.stamp-dev: $(VENV)/.stamp-run
-	$(PIP) -e . --group dev
+	@$(INSTALL) -e . --group dev
 	@touch $@
 
 $(VENV)/.stamp-docs: $(VENV)/.stamp-run
-	$(PIP) -e . --group docs
+	@$(INSTALL) -e . --group docs
 	@touch $@
