@@ -14,7 +14,7 @@ import pytest
 
 from gsbench.analysis.results import load_experiment
 from gsbench.claims.archive import write_archive
-from gsbench.claims.studies import Wanted, file_mark, read_source, standard_error
+from gsbench.claims.studies import Wanted, _result, file_mark, read_source, standard_error
 from gsbench.cli import run
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, write_runs
@@ -242,3 +242,16 @@ def test_a_metric_that_a_source_lacks_is_named(tmp_path: Path, capsys: pytest.Ca
     assert "can be paired in lpips_alex" in capsys.readouterr().err
     assert run(["pool", str(tmp_path / "lab.zip")]) == 2
     assert "--arm" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", ["[" * 200_000, '{"nb_info": 1}', "text"])
+def test_what_is_no_result_file_of_nerfbaselines_is_one_line(tmp_path: Path, content: str) -> None:
+    good = nerfbaselines_file(tmp_path / "nb", "new", "garden", [1.0])
+    (tmp_path / "nb" / "bad.json").write_text(content)
+    with pytest.raises(InputError, match=r"bad\.json") as caught:
+        _result(tmp_path / "nb" / "bad.json")
+    assert "\n" not in str(caught.value)
+    data = json.loads(good.read_text())
+    good.write_text(json.dumps(data | {"metrics": {"psnr": "high"}}))
+    with pytest.raises(InputError, match="no result file of nerfbaselines"):
+        _result(good)

@@ -24,6 +24,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from lzma import LZMAError
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -171,7 +172,7 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
         raise InputError("it is a folder: give an archive, or a folder of nerfbaselines' result files") from None
     except (json.JSONDecodeError, RecursionError) as error:
         raise InputError(f"its {MANIFEST} is not JSON ({error})") from None
-    except (OSError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+    except (OSError, zipfile.BadZipFile, zlib.error, LZMAError, EOFError, NotImplementedError, RuntimeError) as error:
         raise InputError(f"it is no whole zip archive ({error}): fetch or export it again") from None
     except UnicodeDecodeError:
         raise InputError(f"its {MANIFEST} is not UTF-8") from None

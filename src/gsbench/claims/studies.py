@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import binascii
 import hashlib
-import json
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -28,6 +27,7 @@ from gsbench.analysis.statistics import MIN_SCENES
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.pooling import Study
 from gsbench.errors import InputError
+from gsbench.parsing import DamagedError, read_json, resolved
 from gsbench.runs.hashing import sha256_of
 
 NERFBASELINES = "nerfbaselines"
@@ -223,7 +223,7 @@ def _by_scene(results: Sequence[_Result], names: Sequence[str], folder: Path) ->
 def _result(file: Path) -> _Result:
     """Read and check one file; its means must be those of its raw values, and these those that were hashed."""
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data = read_json(resolved(file))
         about = data["nb_info"]
         dataset = data.get("render_dataset_metadata") or about["dataset_metadata"]
         raw = {name: _floats(text) for name, text in data["metrics_raw"].items()}
@@ -231,11 +231,13 @@ def _result(file: Path) -> _Result:
         scene = f"{dataset.get('id') or dataset['name']}/{dataset['scene']}"
         protocol = f"{NERFBASELINES} {data.get('evaluation_protocol', 'default')}"
         result = _Result(str(about["method"]), scene, protocol, means, file_mark(raw))
+        changed = data.get("metrics_sha256", result.mark) != result.mark
+        for name, value in data.get("metrics", {}).items():
+            changed |= name not in means or not math.isclose(value, means[name], rel_tol=ROUNDED, abs_tol=ROUNDED)
+    except DamagedError:
+        raise
     except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError, AttributeError, binascii.Error) as error:
         raise InputError(f"{file} is no result file of nerfbaselines ({error!r})") from None
-    changed = data.get("metrics_sha256", result.mark) != result.mark
-    for name, value in data.get("metrics", {}).items():
-        changed |= name not in means or not math.isclose(value, means[name], rel_tol=ROUNDED, abs_tol=ROUNDED)
     if changed or not all(map(math.isfinite, means.values())):
         raise InputError(f"{file} was changed: its means are not those of the values that it was written with")
     return result
