@@ -6,6 +6,6 @@ slow, down or read-only never harms a trial; what it missed, ``gsbench sync`` ad
 
 from gsbench.tracking.client import connect, default_uri, ensure_experiment, tracker_uri
 from gsbench.tracking.mirror import Mirror, sync
-from gsbench.tracking.trial import mirror_trial
+from gsbench.tracking.run import mirror_trial
 
 __all__ = ["Mirror", "connect", "default_uri", "ensure_experiment", "mirror_trial", "sync", "tracker_uri"]

@@ -23,8 +23,9 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
 from gsbench.tracking.client import untyped_address
 from gsbench.tracking.mirror import TRACKER_FAILED
+from gsbench.tracking.run import LOCK, TrackerRun, mirror_trial
 from gsbench.tracking.sink import name_of
-from gsbench.tracking.trial import LOCK, TrackedTrial, TrackerRun, mirror_trial
+from gsbench.tracking.trial import TrackedTrial
 from gsbench.words import counted
 
 SECONDS_AFTER_PARENT = 10.0  # to tell the tracker that the trial's process is gone
