@@ -99,6 +99,12 @@ def test_workflows_call_targets_and_files_that_there_are(workflow: Path) -> None
             assert (ROOT / name).exists()
 
 
+def test_the_scripts_that_make_runs_are_there() -> None:
+    assert [
+        name for name in re.findall(r"scripts/\S+", (ROOT / "Makefile").read_text()) if not (ROOT / name).is_file()
+    ] == []
+
+
 def test_every_target_for_tests_is_called_by_a_workflow_and_by_ci() -> None:
     makefile = (ROOT / "Makefile").read_text()
     wanted = {name for name in re.findall(r"^([a-z-]+):.*##", makefile, re.MULTILINE) if name.startswith("test")}
