@@ -165,7 +165,7 @@ def test_every_program_and_variable_of_another_trainer_is_asked_for(words: list[
             check_permissions(values | {"allow_targets": rest})
 
 
-@pytest.mark.parametrize("target", ["gsbench.external.inputs.External", "gsbench.pipeline.parts.External"])
+@pytest.mark.parametrize("target", ["gsbench.external.exchange.External", "gsbench.pipeline.parts.External"])
 def test_the_class_of_another_trainer_has_two_names(target: str) -> None:
     """Permissions are asked for by these; by any other that leads to it, nothing is made."""
     with pytest.raises(InputError):

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.external.inputs import write_test_cameras, write_training_views
+from gsbench.external.exchange import write_test_cameras, write_training_views
 from gsbench.external.placeholders import fill, words_of
 from gsbench.external.program import run_program
 from gsbench.external.settings import External

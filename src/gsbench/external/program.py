@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
@@ -20,15 +18,13 @@ from gsbench.words import readable_time
 
 SECONDS_BETWEEN_LOOKS = 0.5  # at the memory of the program and its children
 FIRST_LOOK = 0.02  # seconds; the pauses double up to the above, so that a short program is seen too
-SECONDS_TO_END = 5.0  # patience with a program that was asked to end
 
 
 @dataclass(frozen=True)
 class Ended:
-    """End of a program: its exit code (negative: by a signal), whether its time was up, and what it took."""
+    """End of a program: its exit code (negative: by a signal; None: its time was up), and what it took."""
 
-    code: int
-    timed_out: bool
+    code: int | None
     seconds: float
     peak_memory_mb: float  # resident, of the program and its children together
 
@@ -50,43 +46,32 @@ def run_program(
         ended = run_isolated(watch, list(command), folder, dict(environment), limit, what=name, log=log)
     except CrashError as error:
         raise TrainingError(f"{error}; log: {log}") from error
-    said = f"its last words: {telling_tail(log)}; log: {log}"
-    if ended.timed_out:
-        assert limit is not None
-        raise TrainingError(f"{name} still ran after {readable_time(limit)} (densify.time_limit_minutes); {said}")
-    if ended.code != 0:
-        raise TrainingError(f"{name} {describe_exit(ended.code)}; {said}")
-    return ended
+    if ended.code == 0:
+        return ended
+    if ended.code is not None:
+        what = describe_exit(ended.code)
+    else:
+        what = f"still ran after {readable_time(limit or 0.0)} (densify.time_limit_minutes)"
+    raise TrainingError(f"{name} {what}; its last words: {telling_tail(log)}; log: {log}")
 
 
 def watch(command: Sequence[str], folder: Path, environment: Mapping[str, str], limit: float | None) -> Ended:
-    """Run ``command`` as a child of this process, which `run_isolated` started, and measure it."""
+    """Run ``command`` as a child of this process, which `run_isolated` started, and measure it.
+
+    What a program that is killed here has started itself, `run_isolated` ends.
+    """
     started = time.monotonic()
     program = subprocess.Popen(command, cwd=folder, env=dict(environment), stdin=subprocess.DEVNULL)
     pause, peak = FIRST_LOOK, 0.0
-    while True:
+    while limit is None or time.monotonic() - started < limit:
         peak = max(peak, resident_mb(program.pid))
-        left = float("inf") if limit is None else limit - (time.monotonic() - started)
-        try:
-            code = program.wait(max(0.0, min(pause, left)))
-            return Ended(code, False, time.monotonic() - started, max(peak, peak_child_mb()))
-        except subprocess.TimeoutExpired:
-            if left <= 0:
-                return Ended(_stop(program), True, time.monotonic() - started, peak)
-            pause = min(2 * pause, SECONDS_BETWEEN_LOOKS)
-
-
-def _stop(program: subprocess.Popen[bytes]) -> int:
-    """Ask the whole group to end; who does not heed it is killed when this process has ended."""
-    if hasattr(os, "killpg"):
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # this process is of the group, and so is its supervisor
-        os.killpg(0, signal.SIGTERM)
-    else:
-        program.terminate()
-    with suppress(subprocess.TimeoutExpired):
-        return program.wait(SECONDS_TO_END)
+        with suppress(subprocess.TimeoutExpired):
+            code = program.wait(pause)
+            return Ended(code, time.monotonic() - started, max(peak, peak_child_mb()))
+        pause = min(2 * pause, SECONDS_BETWEEN_LOOKS)
     program.kill()
-    return program.wait()
+    program.wait()
+    return Ended(None, time.monotonic() - started, peak)
 
 
 def resident_mb(pid: int) -> float:

@@ -18,8 +18,7 @@ import torch
 
 from gsbench.densify import Lineage
 from gsbench.errors import InputError, TrainingError
-from gsbench.external.inputs import write_test_cameras, write_training_views
-from gsbench.external.outputs import take_model, take_renders
+from gsbench.external.exchange import take_model, take_renders, write_test_cameras, write_training_views
 from gsbench.external.placeholders import fill, words_of
 from gsbench.external.program import run_program
 from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS, External
