@@ -12,6 +12,8 @@ import pytest
 import torch
 
 from gsbench.bench import run_bench
+from gsbench.bench.counters import REST, short_name, stages_of_a_step, timed_kernels
+from gsbench.bench.measure import Setting, Stepper
 from gsbench.bench.scenes import (
     SCENES,
     camera_before,
@@ -20,8 +22,6 @@ from gsbench.bench.scenes import (
     skewed_gaussians,
     trained_like_gaussians,
 )
-from gsbench.bench.stages import REST, short_name, stages_of_a_step, timed_kernels
-from gsbench.bench.stepper import Setting, Stepper
 from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
@@ -99,12 +99,6 @@ def test_table_of_a_ply(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     header, line = capsys.readouterr().out.splitlines()
     assert "forward_ms" in header
     assert line.split()[:3] == ["cpu", "40x30", "70"]
-
-
-def test_peer_is_labelled() -> None:
-    pytest.importorskip("gsplat", reason="the peer is gsplat's torch reference")
-    (row,) = run_bench(["gsplat-torch"], [(40, 30)], [50], repeats=1, memory=False)
-    assert "no compositing" in row["note"]
 
 
 @pytest.mark.parametrize("make", [trained_like_gaussians, random_gaussians, skewed_gaussians])

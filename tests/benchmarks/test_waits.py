@@ -10,7 +10,7 @@ import sys
 import pytest
 import torch
 
-from gsbench.bench.waits import counting_waits
+from gsbench.bench.counters import counting_waits
 from gsbench.raster.readback import Readback
 from tests.conftest import ROOT
 

@@ -21,8 +21,8 @@ from unittest import mock
 import numpy as np
 import torch
 
+from gsbench.bench.measure import NEVER, SH_DEGREE, standing_still
 from gsbench.bench.scenes import make_scene
-from gsbench.bench.stepper import NEVER, SH_DEGREE, standing_still
 from gsbench.densify import ADC
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply

@@ -14,9 +14,9 @@ from pathlib import Path
 import torch
 
 import tests.raster.conftest  # noqa: F401 - makes the interpreter quicker
+from gsbench.bench.counters import counting_waits
+from gsbench.bench.measure import NEVER, standing_still
 from gsbench.bench.scenes import make_scene
-from gsbench.bench.stepper import NEVER, standing_still
-from gsbench.bench.waits import counting_waits
 from gsbench.densify import ADC, MCMC
 from gsbench.raster import create_rasterizer, validate
 from gsbench.raster.readback import Readback

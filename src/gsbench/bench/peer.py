@@ -1,4 +1,4 @@
-"""Peers that are no executors: what gsplat offers beside its parts, to measure against."""
+"""A peer that is no executor, to measure against: gsplat's own function."""
 
 from __future__ import annotations
 
@@ -15,37 +15,6 @@ from gsbench.raster.executors import find
 from gsbench.scene.camera import Camera
 
 
-class TorchPeer:
-    """Projection and colours by gsplat's pure-torch reference; its ``image`` is one tensor [N, 9] of these."""
-
-    name = "gsplat-torch"
-    device_type = "cpu"
-    gives_image = False
-    note = "projection and colour only, no compositing: gsplat's torch reference needs CUDA for the rest"
-
-    def __init__(self) -> None:
-        self._definitions = _import("gsplat.cuda._torch_impl", self.name)
-
-    def render(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        sh_degree: int,
-        background: Tensor,
-        absolute_gradient: bool = False,
-    ) -> RenderOutput:
-        definitions = self._definitions
-        pose, intrinsics = _pose_and_intrinsics(camera, gaussians.means)
-        covariances, _ = definitions._quat_scale_to_covar_preci(gaussians.quaternions, gaussians.scales, True, False)
-        radii, means, _, conics, _ = definitions._fully_fused_projection(
-            gaussians.means, covariances, pose, intrinsics, camera.width, camera.height
-        )
-        directions = gaussians.means - torch.tensor(camera.center, dtype=torch.float32)
-        colors = (definitions._spherical_harmonics(sh_degree, directions, _harmonics(gaussians)) + 0.5).clamp_min(0)
-        numbers = torch.cat([means[0], conics[0], colors, gaussians.opacities[:, None]], -1)  # [N, 9]
-        return RenderOutput(numbers, gaussians.opacities, radii[0].amax(-1), torch.zeros_like(means[0]))
-
-
 class RasterizationPeer:
     """gsplat's own ``rasterization``, with the settings of its trainer: what its users run, with its own conventions.
 
@@ -54,7 +23,6 @@ class RasterizationPeer:
 
     name = "gsplat-rasterization"
     device_type = "cuda"
-    gives_image = True
     note = "gsplat's own function with its own conventions; no whole training steps, since it gives no screen gradient"
 
     def __init__(self, library: Any = None) -> None:
@@ -88,9 +56,7 @@ class RasterizationPeer:
         return RenderOutput(images[0], alphas[0, ..., 0], radii, torch.zeros_like(gaussians.means[:, :2]))
 
 
-PEERS: dict[str, type[TorchPeer] | type[RasterizationPeer]] = {
-    kind.name: kind for kind in (TorchPeer, RasterizationPeer)
-}
+PEERS = {RasterizationPeer.name: RasterizationPeer}
 
 
 def _import(module: str, peer: str) -> Any:

@@ -44,8 +44,7 @@ def parser() -> ArgumentParser:
     made.add_argument(
         "--raster",
         default="cpu",
-        help=f"names, comma between: {names}, gsplat-rasterization (its own function), "
-        "gsplat-torch (projection only), or your own, mine.MyRasterizer",
+        help=f"names, comma between: {names}, gsplat-rasterization (its own function), or your own, mine.MyRasterizer",
     )
     made.add_argument("--size", default="500x375", help="image sizes, comma between")
     made.add_argument("--count", default="100000", help="numbers of Gaussians, comma between")
