@@ -98,16 +98,6 @@ def test_commit_and_dirty_flag_are_those_of_the_folder_that_one_works_in(
     assert source_tags("gsbench") == {"mlflow.source.type": "LOCAL", "mlflow.source.name": "gsbench"}
 
 
-def test_the_photographs_are_the_dataset_of_a_run(runs: Path) -> None:
-    _, run = mirrored(runs, seed=21)
-    found = {item.tags[0].value: item.dataset for item in run.inputs.dataset_inputs}
-    assert set(found) == {"train", "test"}
-    for split, views in (("train", 20), ("test", 3)):
-        assert found[split].name == "a_scene"
-        assert found[split].digest == f"0123456789abcdef-{split}"
-        assert json.loads(found[split].profile) == {"views": views, "split": split}
-
-
 def test_a_failed_run_holds_its_reason_until_it_is_mended(runs: Path) -> None:
     values = trial_values(runs, seed=22)
     folder = begin_trial(values)

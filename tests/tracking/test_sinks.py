@@ -16,10 +16,8 @@ from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.preflight import check_trackers
 from gsbench.runs.plan_file import Entry, Sweep, write_entries
-from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, ensure_experiment, mirror_trial
-from gsbench.tracking.mlflow_sink import STATE, TRIES, MlflowSink
-from gsbench.tracking.trial import TrackedTrial
+from gsbench.tracking.mlflow_sink import STATE
 from tests.tracking.helpers import RECORDS, begin_trial, found_runs, history, options, trial_values, write_trial
 
 AT = {"50": {"metrics": {"psnr": 15.0}, "num_gaussians": 7}}
@@ -102,40 +100,6 @@ def test_the_trials_of_a_sweep_have_one_parent(runs: Path) -> None:
     assert parent.info.status == "FINISHED"
     parents = [run_of(client, seed).data.tags.get("mlflow.parentRunId") for seed in (10, 11, 12)]
     assert parents == [parent.info.run_id, parent.info.run_id, None]
-
-
-class Rivals:
-    """A client before whose nose others enter the data set, ``times`` times."""
-
-    def __init__(self, times: int, text: str) -> None:
-        self.times, self.text, self.entered = times, text, 0
-
-    def log_inputs(self, run_id: str, inputs: list[Any]) -> None:
-        if self.times > 0:
-            self.times -= 1
-            raise RuntimeError(self.text)
-        self.entered += len(inputs)
-
-
-@pytest.mark.parametrize("text", [
-    "(sqlite3.IntegrityError) UNIQUE constraint failed: datasets.experiment_id, datasets.name, datasets.digest",
-    'duplicate key value violates unique constraint "datasets_pkey"',
-])  # fmt: skip
-def test_a_race_for_a_data_set_is_run_again(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsbench.tracking.mlflow_sink.SECONDS_BETWEEN_TRIES", 0.0)
-    values = trial_values(tmp_path)
-    folder = begin_trial(values)
-    write_trial(folder, values)
-    sink = object.__new__(MlflowSink)
-    sink._trial, sink.run_id = TrackedTrial(TrialFolder(folder), values), "x"
-    sink.client = rivals = Rivals(TRIES - 1, text)
-    sink._log_datasets(TrialFolder(folder).sound_record())
-    assert rivals.entered == 2
-    for times, said in ((TRIES, text), (1, "no such table: datasets")):  # for good, or something else
-        sink.client = rivals = Rivals(times, said)
-        with pytest.raises(RuntimeError, match="datasets"):
-            sink._log_datasets(TrialFolder(folder).sound_record())
-        assert rivals.entered == 0
 
 
 def test_a_tracker_whose_package_is_missing_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,6 @@ was sent twice. Which run it is stands in the trial's folder, so that none is be
 
 from __future__ import annotations
 
-import json
 import re
 import time
 import uuid
@@ -15,7 +14,6 @@ from typing import Any
 
 from gsbench.files import write_json
 from gsbench.runs import layout
-from gsbench.runs.trial_record import TrialRecord
 from gsbench.tracking.client import (
     connect,
     default_uri,
@@ -34,12 +32,9 @@ TOKEN_TAG = "gsbench.token"
 PARENT_TAG = "mlflow.parentRunId"
 ERROR_TAG = "error"
 MAX_TAG = 5000  # characters of a tag (MLflow's limit)
-DIGEST_CHARACTERS = 16  # of the fingerprint, in a dataset's digest, for which MLflow has 36
 MAX_VALUE = 6000  # characters of a parameter (MLflow's limit)
 MAX_PARAMS = 100  # parameters in a batch
 MAX_METRICS = 1000  # metrics in a batch
-TRIES = 5  # at entering a data set, which rivals may enter at the same moment
-SECONDS_BETWEEN_TRIES = 0.2
 NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-./ ]")  # what MLflow refuses in a picture's name
 
 
@@ -76,14 +71,13 @@ class MlflowSink:
             self.client.log_batch(self.run_id, metrics=metrics[start : start + MAX_METRICS])
 
     def complete(self, summary: Summary) -> None:
-        """Log final metrics, data sets, pictures as a grid and files, and close the run."""
+        """Log final metrics, pictures as a grid and files, and close the run."""
         from mlflow.entities import RunTag
         from PIL import Image
 
         self._end_monitor()
         if ERROR_TAG in self.client.get_run(self.run_id).data.tags:  # an earlier attempt failed
             self.client.delete_tag(self.run_id, ERROR_TAG)
-        self._log_datasets(summary.results)
         self.log(summary.points)
         self.client.log_batch(self.run_id, tags=[RunTag(key, value) for key, value in summary.tags.items()])
         for folder, path in summary.files:
@@ -156,40 +150,6 @@ class MlflowSink:
         begun = {"uri": self._uri(), "token": uuid.uuid4().hex, "started": int(time.time() * 1000)}
         write_json(file, begun)
         return begun
-
-    def _log_datasets(self, results: TrialRecord) -> None:
-        """The photographs, once for each split: MLflow tells data sets apart by name and digest."""
-        from mlflow.entities import Dataset, DatasetInput, InputTag
-
-        digest = results.hashes.get("data")
-        if digest is None:
-            return
-        scene = self._trial.values["scene"]
-        source = json.dumps({"uri": str(scene.get("path") or scene["name"])})
-        views = {"train": results.train_views, "test": results.test_views}
-        inputs = [
-            DatasetInput(
-                Dataset(
-                    name=scene["name"],
-                    digest=f"{digest[:DIGEST_CHARACTERS]}-{split}",
-                    source_type="local",
-                    source=source,
-                    profile=json.dumps({"views": count, "split": split}),
-                ),
-                [InputTag("mlflow.data.context", split)],
-            )
-            for split, count in views.items()
-            if count is not None  # of renders that another program made, the tests alone are known
-        ]
-        for tries_left in reversed(range(TRIES)):
-            try:
-                self.client.log_inputs(self.run_id, inputs)
-                return
-            except Exception as error:  # MLflow's own, or SQLAlchemy's
-                # MLflow looks whether a data set is there and then enters it, which a rival may do in between.
-                if "unique constraint" not in str(error).lower() or tries_left == 0:
-                    raise
-                time.sleep(SECONDS_BETWEEN_TRIES)
 
     def _end_monitor(self) -> None:
         if self._monitor is not None:

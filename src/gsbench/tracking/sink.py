@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from gsbench.runs.trial_record import TrialRecord
-
 DEFAULT = "mlflow"
 NAMES = {DEFAULT: "MLflow", "tensorboard": "TensorBoard", "wandb": "Weights & Biases"}
 
@@ -33,7 +31,6 @@ class Summary:
     tags: dict[str, str]
     pictures: dict[str, Path]
     files: Sequence[tuple[str, Path]]
-    results: TrialRecord
     step: int
     seconds: float
 

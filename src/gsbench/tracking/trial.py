@@ -113,7 +113,6 @@ class TrackedTrial:
                 for path in self.folder.pictures(kind)[:images]
             },
             files=files + [(layout.FIGURES, path) for path in self.folder.pictures(layout.FIGURES)[:images]],
-            results=results,
             step=step,
             seconds=seconds,
         )

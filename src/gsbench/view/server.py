@@ -97,14 +97,15 @@ class Viewer:
         lowest = min(float(painter.trial.log10_volumes.min()) for painter in self.painters)
         highest = max(float(painter.trial.log10_volumes.max()) for painter in self.painters)
         lowest, highest = math.floor(min(lowest, DEFAULT_THRESHOLD)), math.ceil(max(highest, DEFAULT_THRESHOLD))
+        # Closed where it can be: on a narrow page the panel lies over the picture.
         with gui.add_folder("Test views"):
             self._view = gui.add_dropdown("View", (FREE_VIEW, *self.views), initial_value=next(iter(self.views)))
             self._beside = gui.add_checkbox("Photograph beside", True)
             self._cameras = gui.add_checkbox("Cameras", False)
-        with gui.add_folder("Gaussians"):
+        with gui.add_folder("Gaussians", expand_by_default=False):
             self._degree = gui.add_slider("SH degree", 0, 3, 1, 3)
             self._share = gui.add_slider("Most opaque, %", *SHARES, 1, 100)
-        with gui.add_folder("Growth"):
+        with gui.add_folder("Growth", expand_by_default=False):
             self._cloud = gui.add_checkbox("Initial cloud", False)
             self._ellipsoids = gui.add_checkbox("Ellipsoids by cause", False)
             self._threshold = gui.add_slider("log10 volume >", lowest, highest, 0.001, round(DEFAULT_THRESHOLD, 3))
