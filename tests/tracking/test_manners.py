@@ -1,4 +1,4 @@
-"""What people who know MLflow look for: address, user, source, dataset, reasons of failures, files that are found."""
+"""What people who know MLflow look for: address, user, source, reasons of failures, files that are found."""
 
 from __future__ import annotations
 
