@@ -8,6 +8,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from gsbench.raster import create_rasterizer
 from gsbench.system.install import install_command
 from gsbench.verbs import view as verb
 from gsbench.view.picture import Layers, TrialPainter
-from gsbench.view.server import Viewer, check_port, free_port
+from gsbench.view.server import Session, Viewer, check_port, free_port
 from gsbench.view.trials import find_trial, load_viewed, read_causes
 from tests.view.browser import Browser
 
@@ -116,6 +117,30 @@ def test_two_trials_and_their_photograph_share_one_camera(viewer: Viewer, painte
     for place, pane in enumerate(panes):
         shown = picture[12:, place * width + 2 : (place + 1) * width]  # below the label, right of the dividing line
         np.testing.assert_array_equal(shown, pane[12:, 2:])
+
+
+def test_a_page_that_sends_nonsense_ends_no_drawing(viewer: Viewer) -> None:
+    shown: list[np.ndarray] = []
+    page = SimpleNamespace(
+        client_id=0,
+        camera=SimpleNamespace(
+            on_update=lambda _: None, wxyz=(0, 0, 0, 0), position=(np.nan, 0, 0), fov=0.9, aspect=1e6
+        ),
+        scene=SimpleNamespace(set_background_image=lambda image, **_: shown.append(image)),
+    )
+    session = Session(viewer, page)
+    session.start()
+    viewer._degree.value = 10**6
+    session.wake()
+    time.sleep(1)
+    assert not shown
+    page.camera.wxyz, page.camera.position, page.camera.aspect = (1, 0, 0, 0), (0, 0, -3), 1.5
+    session.wake()
+    deadline = time.monotonic() + 60
+    while not shown and time.monotonic() < deadline:
+        time.sleep(0.1)
+    session.stop()
+    assert shown
 
 
 @pytest.mark.browser

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.events import Cause
+from gsbench.gaussians.model import MAX_SH_DEGREE
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
@@ -77,7 +78,7 @@ class Viewer:
     def layers(self) -> Layers:
         """The layers that the controls ask for."""
         return Layers(
-            sh_degree=int(self._degree.value),
+            sh_degree=min(max(int(self._degree.value), 0), MAX_SH_DEGREE),
             ellipsoids=bool(self._ellipsoids.value),
             log10_volume=float(self._threshold.value),
             cloud=bool(self._cloud.value),
@@ -90,7 +91,7 @@ class Viewer:
 
     @property
     def resting_height(self) -> int:
-        return int(self._height.value)
+        return int(self._height.value) if self._height.value in HEIGHTS else int(HEIGHTS[0])
 
     def _add_controls(self) -> None:
         gui = self.server.gui
@@ -207,8 +208,8 @@ class Session:
         try:
             camera = page_camera(page.wxyz, page.position, page.fov, page.aspect, height, self._panes())
             image = self.viewer.draw(camera, self.viewer.layers(), self.viewer.photograph())
-        except ValueError as error:  # a camera that cannot be drawn, such as inside out while the page is being built
-            log.debug("view: %s", error)
+        except Exception as error:  # noqa: BLE001 - a page may send anything, and the next picture is wanted all the same
+            log.debug("view: %r", error)
             return
         if not self._stopped.is_set():
             self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=90)
