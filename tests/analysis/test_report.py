@@ -17,7 +17,7 @@ from gsbench.analysis.errors_by_region import errors_by_region, texture_energy
 from gsbench.analysis.pairing import ViewCache, pair_trials
 from gsbench.analysis.report.build import build_report, trial_figures
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
-from gsbench.analysis.report.crops import choose_crops
+from gsbench.analysis.report.pictures import choose_pictures
 from gsbench.analysis.report.sections import compare_arms, mean_by_step
 from gsbench.analysis.report.sweep_charts import sweep_charts
 from gsbench.analysis.report.volumes import log10_volumes, share_above, volume_histogram
@@ -174,15 +174,24 @@ def test_a_map_sorts_the_errors_where_it_is_at_hand(experiment: Experiment) -> N
 
 
 def test_crops_lie_where_the_arms_differ_most(experiment: Experiment) -> None:
-    gained, lost, faults = choose_crops(pair_trials(experiment.trials, ADC, VOLUMETRIC), 4)
-    assert faults == []
-    assert {crop.scene for crop in gained} == {"courtyard", "garden"}
-    for crop in gained:
+    found = choose_pictures(pair_trials(experiment.trials, ADC, VOLUMETRIC), 4)
+    assert found.faults == ()
+    assert {crop.scene for crop in found.gained} == {"courtyard", "garden"}
+    for crop in found.gained:
         assert crop.box[2] > TEXTURED.start  # reaches into the grass
         assert crop.first_error - crop.second_error > 2
-    for crop in lost:
+    for crop in found.lost:
         assert crop.box[:2] == (0, 0)
         assert crop.second_error - crop.first_error == pytest.approx(20, abs=1.5)
+
+
+def test_whole_views_are_the_worst_the_median_and_the_best(experiment: Experiment) -> None:
+    found = choose_pictures(pair_trials(experiment.trials, ADC, VOLUMETRIC), 0)
+    gains = [view.first_error - view.second_error for view in found.views]
+    assert len(found.views) == 3
+    assert gains == sorted(gains)
+    assert all(view.truth.startswith("data:image/jpeg;base64,") for view in found.views)
+    assert found.gained == found.lost == ()
 
 
 def test_missing_or_damaged_pictures_are_named(tmp_path: Path) -> None:

@@ -129,7 +129,7 @@ def make_cell(trials: Sequence[TrialResult], quantity: Quantity, scenes: Sequenc
     kept = tuple(trials)
     if count == 0:
         reasons = [trial.unavailable[quantity.key] for trial in trials if quantity.key in trial.unavailable]
-        reason = reasons[0] if reasons else "no value" if trials else "no trial"
+        reason = in_brief(reasons[0]) if reasons else "no value" if trials else "no trial"
         return Cell(None, None, 0, expected, len(values), kept, reason)
     mean = statistics.fmean(statistics.fmean(group.values()) for group in values.values())
     shared = set.intersection(*(set(group) for group in values.values()))
@@ -138,12 +138,21 @@ def make_cell(trials: Sequence[TrialResult], quantity: Quantity, scenes: Sequenc
     return Cell(mean, std, count, expected, len(values), kept)
 
 
+def in_brief(reason: str) -> str:
+    """The reason why a metric has no value in a short line, with the command that helps; results.json has it whole."""
+    if reason.startswith("weights not found: "):
+        return f"{reason.partition(' (')[0]}; gsbench doctor says where they come from"
+    return reason
+
+
 def best_cells(cells: Mapping[K, Cell], quantity: Quantity) -> set[K]:
-    """The keys of the best means after rounding to the quantity's decimals; empty where there is nothing to choose."""
+    """The keys of the best means after rounding to the quantity's decimals; empty where all are equal."""
     means = {key: round(cell.mean, quantity.decimals) for key, cell in cells.items() if cell.mean is not None}
     if quantity.cost or quantity.direction == 0 or len(means) < 2:
         return set()
     best = max(means.values()) if quantity.direction > 0 else min(means.values())
+    if len(set(means.values())) == 1:
+        return set()
     return {key for key, mean in means.items() if mean == best}
 
 

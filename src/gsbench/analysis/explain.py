@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import Cell, check_averageable, make_cell, swept_settings
@@ -44,9 +45,7 @@ def explain_cell(address: str, runs: Path) -> str:
     lines += _paper_lines(name, scene, trials[0], shown, cell)
     lines += ["", "Conditions"] + [f"  {key}: {value}" for key, value in trials[0].conditions.items()]
     lines += _baseline_lines(experiment, trials[0])
-    lines += ["", "Trials"]
-    for trial in trials:
-        lines += _trial_lines(trial, shown)
+    lines += _trials_lines(trials, shown)
     left_out = [line for line in experiment.warnings if line.startswith(f"{name}/{scene}/") and arm in line]
     if left_out:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]
@@ -97,33 +96,44 @@ def _baseline_lines(experiment: Experiment, trial: TrialResult) -> list[str]:
     return lines if settings else []
 
 
-def _trial_lines(trial: TrialResult, shown: Quantity) -> list[str]:
-    value = shown.read(trial)
+def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:
+    """What each trial came from; what is the same in all of them stands once, at the end."""
+    origins = [_origin(trial) for trial in trials]
+    labels = list(dict.fromkeys(label for origin in origins for label in origin))
+    shared = [label for label in labels if len({origin.get(label) for origin in origins}) == 1]
+    lines = ["", "Trials"]
+    for trial, origin in zip(trials, origins, strict=True):
+        value = shown.read(trial)
+        own = {label: text for label, text in origin.items() if label not in shared or len(trials) == 1}
+        lines.append(f"  seed {trial.seed}: {'n/a' if value is None else f'{value:.6g}'}")
+        lines += [f"    {label:<9} {text}" for label, text in own.items()]
+    if shared and len(trials) > 1:
+        lines += ["", "The same in all of them", *(f"  {label:<9} {origins[0][label]}" for label in shared)]
+    return lines
+
+
+def _origin(trial: TrialResult) -> dict[str, str]:
+    """The folder of a trial, its counts, hashes, and the programs that made it, each in a line by its label."""
     record = trial.record
-    text = "n/a" if value is None else f"{value:.6g}"
     if trial.from_renders and not trial.program:
         counts = ", ".join(f"{key} {value}" for key, value in record.renders.items())
     elif trial.from_renders:
         counts = "its own renders"
     else:
-        counts = f"{record.num_gaussians or 0:,} Gaussians from {record.num_init_points or 0:,} points"
-    lines = [
-        f"  seed {trial.seed}: {text}",
-        f"    folder    {trial.path}",
-        f"    {'?' if record.test_views is None else record.test_views} test views, raster {record.raster}, {counts}",
-    ]
-    lines += [f"    {key:<9} {value}" for key, value in record.hashes.items()]
+        counts = f"{record.num_gaussians or 0:,} from {record.num_init_points or 0:,} points"
+    origin = {"folder": str(trial.path), "Gaussians": counts}
+    origin["views"] = f"{'?' if record.test_views is None else record.test_views} for testing, raster {record.raster}"
+    origin |= {key: str(value) for key, value in record.hashes.items()}
     if record.trained_by is not None:
-        lines.append(f"    program   {record.trained_by.version}: {' '.join(record.trained_by.command)}")
+        origin["program"] = f"{record.trained_by.version}: {' '.join(record.trained_by.command)}"
     if machine := machine_of(trial):
-        lines.append(f"    machine   {machine}")
+        origin["machine"] = machine
     if trial.code:
-        versions = [f"{part} {short_version(version)}" for part, version in trial.code.items()]
-        lines.append("    code      " + ", ".join(versions))
+        origin["code"] = ", ".join(f"{part} {short_version(version)}" for part, version in trial.code.items())
     if record.code.commit:
-        lines.append(f"    commit    {record.code.commit}{', edited' if record.code.edited else ''}")
+        origin["commit"] = f"{record.code.commit}{', edited' if record.code.edited else ''}"
     files = [name.removeprefix("gsbench's ") for name, state in trial.files.items() if state != AS_RELEASED]
     if files and len(files) < len(trial.files):  # else it was before the first release
-        lines.append(f"    edited    since the last release: {some_of(files)}")
-    lines.append("    versions  " + ", ".join(f"{key} {value}" for key, value in record.versions.items()))
-    return lines
+        origin["edited"] = f"since the last release: {some_of(files)}"
+    origin["versions"] = ", ".join(f"{key} {value}" for key, value in record.versions.items())
+    return origin

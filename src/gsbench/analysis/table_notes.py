@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from gsbench.analysis.caveats import caveats
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import standing
-from gsbench.analysis.pairing import ViewCache, choose_pairs, controls_of
+from gsbench.analysis.pairing import ViewCache, arm_name, choose_pairs, controls_of
 from gsbench.analysis.results import Arm, Experiment, TrialResult
 from gsbench.runs.layout import SEARCH
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
@@ -56,6 +56,27 @@ def caveat_notes(experiment: Experiment) -> list[str]:
     """A line for each pair of arms that differ in more than one ingredient, or of which one was tuned more."""
     trials, pairs = compared_pairs(experiment)
     return [sentence for pair in pairs if (sentence := caveats(trials, *pair))]
+
+
+def equal_notes(experiment: Experiment) -> list[str]:
+    """A line for each pair of arms that are equal to the last bit: what they differ in never acted."""
+    trials, pairs = compared_pairs(experiment)
+    notes = []
+    for first, second in pairs:
+        one, other = (
+            {(trial.scene, trial.seed): outcome(trial) for trial in trials if trial.arm == arm}
+            for arm in (first, second)
+        )
+        shared = one.keys() & other.keys()
+        if shared and all(one[key] == other[key] and one[key][0] for key in shared):
+            names = f"{arm_name(second)} and {arm_name(first)}"
+            notes.append(f"{names} are equal to the last bit in all their trials: what they differ in never acted.")
+    return notes
+
+
+def outcome(trial: TrialResult) -> tuple[dict[str, float], int | None]:
+    """What two trainings share that are one and the same: all metrics, and the number of Gaussians."""
+    return dict(trial.metrics), trial.record.num_gaussians
 
 
 def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:

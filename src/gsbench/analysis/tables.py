@@ -27,7 +27,7 @@ from gsbench.analysis.origins import cloud_notes, held_out_notes, machine_notes,
 from gsbench.analysis.pairing import BASELINE, choose_pairs
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Experiment, TrialResult
-from gsbench.analysis.table_notes import caveat_notes, declared_notes, origin_notes
+from gsbench.analysis.table_notes import caveat_notes, declared_notes, equal_notes, origin_notes
 from gsbench.analysis.translations import translation_notes
 from gsbench.words import counted, signed
 
@@ -135,6 +135,7 @@ def build_table(
     notes += _reading_notes(grid, quantities, expected, "scene" in fields) + origin_notes(trials)
     notes += (
         declared_notes(experiment)
+        + equal_notes(experiment)
         + caveat_notes(experiment)
         + _cost_notes(trials)
         + translation_notes(trials)

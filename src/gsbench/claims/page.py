@@ -13,7 +13,7 @@ from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.origins import cloud_notes, machine_notes
 from gsbench.analysis.report.charts import ForestRow, forest_plot
-from gsbench.analysis.report.crops import Crop, choose_crops
+from gsbench.analysis.report.pictures import Crop, choose_pictures
 from gsbench.analysis.results import TrialResult
 from gsbench.analysis.table_formats import to_html as table_to_html
 from gsbench.analysis.table_formats import to_markdown as table_to_markdown
@@ -237,8 +237,8 @@ def _crops(verdict: Verdict) -> tuple[list[Crop], list[Crop]]:
     pairs = _pairs(verdict.trials)
     if not pairs or verdict.measure.cost:
         return [], []
-    gained, lost, _ = choose_crops(pairs, CROPS)
-    return gained, lost
+    found = choose_pictures(pairs, CROPS)
+    return list(found.gained), list(found.lost)
 
 
 def _pairs(trials: Sequence[TrialResult]) -> list[tuple[TrialResult, TrialResult]]:

@@ -33,6 +33,7 @@ PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsiste
 def main(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
     options = _parser().parse_args(argv)
+    options.format = options.format or _format_of(options.out)
     if options.experiment == PAPER_NOTES and not (runs / PAPER_NOTES).exists():
         print("\n".join(f"- {line}" for line in inconsistencies(load_paper())))
         return 0
@@ -45,6 +46,12 @@ def main(argv: Sequence[str], runs: Path) -> int:
     texts = _trials(trials, options) if options.format == TRIALS else _tables(experiment, trials, options)
     _write(texts, options.out, experiment.name)
     return 0
+
+
+def _format_of(out: Path | None) -> str:
+    """The format that the ending of the file ``out`` stands for, else Markdown."""
+    endings = {f".{suffix}": name for name, (suffix, _) in FORMATS.items()}
+    return endings.get(out.suffix.lower(), "md") if out is not None and not out.is_dir() else "md"
 
 
 def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
@@ -104,9 +111,13 @@ def _parser() -> ArgumentParser:
         "experiment", help="its name; table1, table2 and their _own come in the paper's layout, with its values beside"
     )
     parser.add_argument(
-        "--format", choices=[*FORMATS, TRIALS], default="md", help=f"{TRIALS}: CSV with one row a trial instead"
+        "--format",
+        choices=[*FORMATS, TRIALS],
+        help=f"by default Markdown (md); {TRIALS}: CSV with one row a trial instead",
     )
-    parser.add_argument("--out", type=path, metavar="DIR", help="write into this folder instead of printing")
+    parser.add_argument(
+        "--out", type=path, metavar="PATH", help="write to this file, whose ending says the format, or into this folder"
+    )
     parser.add_argument(
         "--rows", type=names, metavar="A,B", help=f"fields or config keys (default {','.join(DEFAULT_ROWS)})"
     )
@@ -143,12 +154,16 @@ def _is_plain(options: argparse.Namespace) -> bool:
 
 
 def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
-    """Print the texts, or write each into a file of the folder ``out`` that is named after the experiment."""
+    """Print the texts, or write them: to the file ``out`` if it has the ending of the format, else into that folder.
+
+    In a folder each file is named after the experiment; a second table stands beside the file ``out``.
+    """
     if out is None:
         print("\n".join(texts.values()), end="")
         return
     for end, text in texts.items():
-        file = out / f"{name}{end}"
+        is_file = out.suffix == Path(f"x{end}").suffix and not out.is_dir()
+        file = out.with_name(f"{out.stem}{end}") if is_file else out / f"{name}{end}"
         with place_of(file):
             write_text(file, text)
         print(file)

@@ -16,7 +16,7 @@ from gsbench.analysis.origins import cloud_lines
 from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs, controls_of
 from gsbench.analysis.paper import inconsistencies, load_paper
 from gsbench.analysis.paper_tables import layout_of, paper_tables
-from gsbench.analysis.report.crops import data_uri
+from gsbench.analysis.report.pictures import data_uri
 from gsbench.analysis.report.question_charts import question_part
 from gsbench.analysis.report.search_charts import search_part
 from gsbench.analysis.report.sections import (

@@ -14,8 +14,8 @@ from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.origins import machine_of, unlike_clouds
 from gsbench.analysis.pairing import ViewCache, arm_name, pair_trials
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart, short_number
-from gsbench.analysis.report.crops import Crop, choose_crops
 from gsbench.analysis.report.headlines import by_scene_lines, headline, secondary
+from gsbench.analysis.report.pictures import Pictures, choose_pictures
 from gsbench.analysis.report.volumes import share_above, volume_histogram
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.tables import Table, change_words, cost_change
@@ -29,7 +29,6 @@ from gsbench.words import signed
 CROPS = 4  # places of each kind
 COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time"}
 EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)
-EQUAL_COUNTS = 0.02  # relative: arms closer than this have one count, as governed ones do
 CURVES = (  # key of metrics.jsonl, title, y axis
     ("num_gaussians", "Gaussians during training", "Gaussians"),
     ("loss", "Training loss (of single views, averaged over trials)", "loss"),
@@ -52,8 +51,7 @@ class Versus:
     costs: tuple[str, ...]
     forests: tuple[str, ...]
     regions: tuple[tuple[RegionErrors, str], ...]
-    gained: tuple[Crop, ...]
-    lost: tuple[Crop, ...]
+    pictures: Pictures
     notes: tuple[str, ...]
 
     @property
@@ -87,7 +85,7 @@ def compare_arms(
         judged = judge(own, [(first, second)], views)[first, second]
     verdicts, notes = judged.verdicts, list(judged.notes)
     pairs = pair_trials(own, first, second)
-    gained, lost, faults = choose_crops(pairs, CROPS)
+    pictures = choose_pictures(pairs, CROPS)
     regions = []
     without: dict[str, list[str]] = {}  # properties by the reason for which they are not shown
     for name in ("texture", *MAP_PROPERTIES):
@@ -109,9 +107,8 @@ def compare_arms(
         tuple(_costs(own, first, second)),
         tuple(_forest(verdict) for verdict in verdicts),
         tuple(regions),
-        tuple(gained),
-        tuple(lost),
-        tuple(dict.fromkeys([*notes, *unlike_clouds(pairs), *faults])),
+        pictures,
+        tuple(dict.fromkeys([*notes, *unlike_clouds(pairs), *pictures.faults])),
     )
 
 
@@ -238,25 +235,18 @@ def provenance(trials: Sequence[TrialResult]) -> list[dict[str, str]]:
 def _costs(trials: Sequence[TrialResult], first: Arm, second: Arm) -> list[str]:
     arms = [[trial for trial in trials if trial.arm == arm] for arm in (first, second)]
     lines = []
-    for name, key, caution in (
-        ("Gaussians", "gaussians", _unequal_counts),
-        ("Training time", "seconds", _unsteady_times),
-    ):
+    for name, key in (("Gaussians", "gaussians"), ("Training time", "seconds")):
         change = cost_change(arms[0], arms[1], COST_READERS[key])
         if change is not None:
-            lines.append(f"{name} {change_words(*change)}{caution(change[0], arms)}")
+            caution = _unsteady_times(arms) if key == "seconds" else ""
+            lines.append(f"{name} {change_words(*change)}{caution}")
         gap = curve_gap(*(training_curve(own, key, "psnr") for own in arms))
         if gap is not None:
             lines.append(_gap_words(gap, COST_LABELS[key]))
     return lines
 
 
-def _unequal_counts(change: float, _: Sequence[Sequence[TrialResult]]) -> str:
-    unequal = abs(change) > EQUAL_COUNTS
-    return "; so this is no comparison at one count, which densify.cap=governor makes" if unequal else ""
-
-
-def _unsteady_times(_: float, arms: Sequence[Sequence[TrialResult]]) -> str:
+def _unsteady_times(arms: Sequence[Sequence[TrialResult]]) -> str:
     """Say how far the training times of equal trials differ, without which a change of them says little."""
     cells = by_key([trial for arm in arms for trial in arm], lambda trial: (trial.arm, trial.scene)).values()
     times = [[t for trial in cell if (t := COST_READERS["seconds"](trial))] for cell in cells]

@@ -1,4 +1,4 @@
-"""The places where two arms differ most, cut out of their renders and of the ground truth."""
+"""Renders of two arms beside the photograph: whole views, and the places where they differ most."""
 
 from __future__ import annotations
 
@@ -19,6 +19,10 @@ from gsbench.runs.layout import GROUND_TRUTH, RENDERS
 CROP = 128  # px a side, but at most a third of the image
 STRIPE, STRIPES = 4, (110, 150)  # px, grey levels: how ignored pixels are shown
 SHOWN = 288  # px: crops are enlarged to it without smoothing, so that pixels stay pixels
+WIDEST = 1200  # px: whole views are shown at most as wide
+FULL_COLOUR = 32.0  # 8-bit levels: differences of error from here on have the strongest colour
+
+Pair = tuple[TrialResult, TrialResult]
 
 
 @dataclass(frozen=True)
@@ -37,14 +41,43 @@ class Crop:
     striped: bool = False  # some of its pixels, which a mask ignores
 
 
-def choose_crops(
-    pairs: Sequence[tuple[TrialResult, TrialResult]], count: int
-) -> tuple[list[Crop], list[Crop], list[str]]:
-    """Choose up to ``count`` places each where the second arm gains and loses most; also lists what cannot be read.
+@dataclass(frozen=True)
+class WholeView:
+    """One test view: data URIs of the photograph, both renders and their difference, and the mean errors (levels).
 
-    One seed of each scene is looked at, and at most one place in a view is taken for each list.
+    The difference is blue where the second arm is nearer to the photograph, red where the first is.
     """
-    places: list[tuple[float, tuple[TrialResult, TrialResult], str, tuple[int, int, int, int]]] = []
+
+    which: str  # of all views, such as "the view at which it loses most"
+    scene: str
+    view: str
+    seed: int
+    truth: str
+    first: str
+    second: str
+    difference: str
+    first_error: float
+    second_error: float
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Pictures of two arms: whole views, the places of the largest gains and losses, and what could not be read."""
+
+    views: tuple[WholeView, ...]
+    gained: tuple[Crop, ...]
+    lost: tuple[Crop, ...]
+    faults: tuple[str, ...]
+
+
+def choose_pictures(pairs: Sequence[Pair], count: int) -> Pictures:
+    """Choose the worst, the median and the best view of all, and up to ``count`` places of gains and losses each.
+
+    A view's gain is the mean error of the first arm minus that of the second. One seed of each scene is looked at, and
+    at most one place in a view is taken for each list.
+    """
+    places: list[tuple[float, Pair, str, tuple[int, int, int, int]]] = []
+    views: list[tuple[float, Pair, str]] = []
     faults: dict[str, str] = {}  # by scene
     seen: set[str] = set()
     for one, other in pairs:
@@ -54,13 +87,60 @@ def choose_crops(
             names = view_names(one)
             for view in names:
                 images, _ = _read(one, other, view)
-                places += [(gain, (one, other), view, box) for gain, box in _extremes(*images)]
+                gain = absolute_error(images[0], images[2]) - absolute_error(images[1], images[2])  # [H, W]
+                places += [(most, (one, other), view, box) for most, box in _extremes(gain)]
+                views.append((float(gain.mean()), (one, other), view))
             seen.add(one.scene)
         except InputError as error:
             faults.setdefault(one.scene, str(error))
     best = sorted((place for place in places if place[0] > 0), key=lambda place: -place[0])[:count]
     worst = sorted((place for place in places if place[0] < 0), key=lambda place: place[0])[:count]
-    return [_cut(*place[1:]) for place in best], [_cut(*place[1:]) for place in worst], list(faults.values())
+    return Pictures(
+        tuple(_whole(which, *place) for which, place in _worst_median_best(views)),
+        tuple(_cut(*place[1:]) for place in best),
+        tuple(_cut(*place[1:]) for place in worst),
+        tuple(faults.values()),
+    )
+
+
+def _worst_median_best(views: Sequence[tuple[float, Pair, str]]) -> list[tuple[str, tuple[Pair, str]]]:
+    """The views with the least, the median and the largest gain, each once."""
+    ordered = sorted(views, key=lambda entry: (entry[0], entry[1][0].label, entry[2]))
+    if len(ordered) < 2:
+        return [("the only view", entry[1:]) for entry in ordered]
+    chosen = [("the worst view for it", ordered[0]), ("the best view for it", ordered[-1])]
+    if len(ordered) > 2:
+        chosen.insert(1, ("the median view", ordered[len(ordered) // 2]))
+    return [(which, entry[1:]) for which, entry in chosen]
+
+
+def _whole(which: str, pair: Pair, view: str) -> WholeView:
+    (first, second, truth), _ = _read(*pair, view)
+    errors = [absolute_error(image, truth) for image in (first, second)]  # [H, W] each
+    part = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)[..., None]  # [H, W, 1], 1 where the second is nearer
+    white, blue, red = (np.array(colour) for colour in ((255, 255, 255), (33, 102, 172), (178, 24, 43)))
+    colours = white + np.abs(part) * (np.where(part > 0, blue, red) - white)
+    return WholeView(
+        which,
+        pair[0].scene,
+        view,
+        pair[0].seed,
+        truth=_jpeg_uri(truth),
+        first=_jpeg_uri(first),
+        second=_jpeg_uri(second),
+        difference=_jpeg_uri(colours.round().astype(np.uint8)),
+        first_error=float(errors[0].mean()),
+        second_error=float(errors[1].mean()),
+    )
+
+
+def _jpeg_uri(image: NDArray[np.uint8]) -> str:
+    """A JPEG of [H, W, 3] as a data URI: whole pictures as PNG would make the page ten times as large."""
+    picture = Image.fromarray(image)
+    picture.thumbnail((WIDEST, WIDEST))
+    buffer = io.BytesIO()
+    picture.save(buffer, format="JPEG", quality=92, subsampling=0)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 def data_uri(image: NDArray[np.uint8]) -> str:
@@ -89,13 +169,10 @@ def _hatched(image: NDArray[np.uint8], ignored: NDArray[np.bool_]) -> NDArray[np
     return np.where(ignored[..., None], stripes[..., None], image)
 
 
-def _extremes(
-    first: NDArray[np.uint8], second: NDArray[np.uint8], truth: NDArray[np.uint8]
-) -> list[tuple[float, tuple[int, int, int, int]]]:
-    """The boxes of largest and smallest mean gain of the second image in a view."""
+def _extremes(gain: NDArray[np.float64]) -> list[tuple[float, tuple[int, int, int, int]]]:
+    """The boxes of largest and smallest mean in the ``gain`` [H, W] of a view."""
     from skimage.transform import integral_image  # here, since it is slow to import
 
-    gain = absolute_error(first, truth) - absolute_error(second, truth)  # [H, W]
     height = width = max(1, min(CROP, min(gain.shape) // 3))
     sums = np.pad(integral_image(gain), ((1, 0), (1, 0)))  # [H + 1, W + 1]
     boxes = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
@@ -106,7 +183,7 @@ def _extremes(
     return found
 
 
-def _cut(pair: tuple[TrialResult, TrialResult], view: str, box: tuple[int, int, int, int]) -> Crop:
+def _cut(pair: Pair, view: str, box: tuple[int, int, int, int]) -> Crop:
     left, top, right, bottom = box
     whole, ignored = _read(*pair, view)
     images = [image[top:bottom, left:right] for image in whole]
