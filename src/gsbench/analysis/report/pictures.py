@@ -48,7 +48,7 @@ class WholeView:
     The difference is blue where the second arm is nearer to the photograph, red where the first is.
     """
 
-    which: str  # of all views, such as "the view at which it loses most"
+    which: str  # of all views, such as "the view with the least gain"
     scene: str
     view: str
     seed: int
@@ -108,9 +108,9 @@ def _worst_median_best(views: Sequence[tuple[float, Pair, str]]) -> list[tuple[s
     ordered = sorted(views, key=lambda entry: (entry[0], entry[1][0].label, entry[2]))
     if len(ordered) < 2:
         return [("the only view", entry[1:]) for entry in ordered]
-    chosen = [("the worst view for it", ordered[0]), ("the best view for it", ordered[-1])]
+    chosen = [("the view with the least gain", ordered[0]), ("the view with the largest gain", ordered[-1])]
     if len(ordered) > 2:
-        chosen.insert(1, ("the median view", ordered[len(ordered) // 2]))
+        chosen.insert(1, ("the view with the median gain", ordered[len(ordered) // 2]))
     return [(which, entry[1:]) for which, entry in chosen]
 
 
