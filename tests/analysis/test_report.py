@@ -19,7 +19,7 @@ from gsbench.analysis.report.build import build_report, trial_figures
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
 from gsbench.analysis.report.pictures import choose_pictures
 from gsbench.analysis.report.sections import compare_arms, mean_by_step
-from gsbench.analysis.report.sweep_charts import sweep_charts
+from gsbench.analysis.report.setting_charts import sweep_charts
 from gsbench.analysis.report.volumes import log10_volumes, share_above, volume_histogram
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.errors import InputError

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gsbench import cli
-from gsbench.analysis.report.search_charts import search_part
+from gsbench.analysis.report.setting_charts import search_part
 from gsbench.errors import GsbenchError
 from gsbench.launch import serial
 from gsbench.launch.outcome import Outcome, outcome_of_error

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from gsbench.analysis.differences import find_superseded
 from gsbench.analysis.results import TrialResult, read_experiment
-from gsbench.analysis.superseded import find_superseded
 from gsbench.launch.plan import forget, read_plan, remove
 from gsbench.launch.states import TrialState, states_of_experiment
 from gsbench.runs.experiments import experiment_home, list_experiments

@@ -12,7 +12,7 @@ from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.frame import to_frame
 from gsbench.analysis.pairing import arm_name
-from gsbench.analysis.paper import inconsistencies, load_paper
+from gsbench.analysis.paper import load_paper
 from gsbench.analysis.paper_tables import PAPER_TABLES, layout_of, paper_tables
 from gsbench.analysis.published import published_names, published_table
 from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experiment
@@ -35,7 +35,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     options = _parser().parse_args(argv)
     options.format = options.format or _format_of(options.out)
     if options.experiment == PAPER_NOTES and not (runs / PAPER_NOTES).exists():
-        print("\n".join(f"- {line}" for line in inconsistencies(load_paper())))
+        print("\n".join(f"- {line}" for line in load_paper().contradictions))
         return 0
     experiment = load_experiment(runs, options.experiment)
     for warning in experiment.warnings:

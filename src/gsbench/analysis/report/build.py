@@ -14,11 +14,10 @@ from gsbench.analysis.declaration import standing
 from gsbench.analysis.errors_by_region import read_image
 from gsbench.analysis.origins import cloud_lines
 from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs, controls_of
-from gsbench.analysis.paper import inconsistencies, load_paper
+from gsbench.analysis.paper import load_paper
 from gsbench.analysis.paper_tables import layout_of, paper_tables
 from gsbench.analysis.report.pictures import data_uri
 from gsbench.analysis.report.question_charts import question_part
-from gsbench.analysis.report.search_charts import search_part
 from gsbench.analysis.report.sections import (
     compare_arms,
     event_charts,
@@ -26,7 +25,7 @@ from gsbench.analysis.report.sections import (
     training_charts,
     volume_charts,
 )
-from gsbench.analysis.report.sweep_charts import sweep_charts
+from gsbench.analysis.report.setting_charts import search_part, sweep_charts
 from gsbench.analysis.report.tradeoff_charts import tradeoff_charts, tradeoff_gaps
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.table_formats import to_html
@@ -83,7 +82,7 @@ def build_report(
         looked=looked,
         ablation=ablation,
         tables=[to_html(table) for table in tables],
-        contradictions=[] if layout is None else inconsistencies(load_paper()),
+        contradictions=[] if layout is None else load_paper().contradictions,
         search=search,
         questions=questions,
         sweeps=[] if search else sweep_charts(trials),
