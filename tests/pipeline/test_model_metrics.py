@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -22,6 +23,7 @@ from gsbench.pipeline.steps.model_metrics import (
     ModelMetrics,
     measure_flicker,
     measure_geometry,
+    measure_speed,
     nothing_known,
     seen_by_test_alone,
     unused_points,
@@ -133,8 +135,8 @@ def test_every_metric_of_a_model_is_measured_or_has_a_reason(tmp_path: Path) -> 
     found = geometry(model, scene, tmp_path)
     seen = {key for row in found.per_view.values() for key in row} | found.unavailable.keys()
     assert seen == {facts.key for facts in OF_MODELS if facts.setting == GEOMETRY}
-    assert nothing_known(True, False, "why").unavailable.keys() == seen
-    assert nothing_known(False, True, "why").unavailable == {
+    assert nothing_known(["geometry"], "why").unavailable.keys() == seen
+    assert nothing_known(["flicker"], "why").unavailable == {
         facts.key: "why" for facts in OF_MODELS if facts.setting == FLICKER
     }
     for facts in OF_MODELS:
@@ -203,3 +205,16 @@ def test_points_come_from_the_model_of_the_capture_and_only_if_training_had_none
     model.write(seeded.store.path(None) / MODEL_FOLDER)
     with pytest.raises(InputError, match="helped to make the initial cloud"):
         unused_points(seeded)  # type: ignore[arg-type]
+
+
+def test_speed_is_measured_at_the_size_that_is_asked_for() -> None:
+    scene, sizes = a_scene(), []
+
+    class Watched(ReferenceRasterizer):
+        def render(self, gaussians: Gaussians, camera: Camera, *rest: Any) -> Any:
+            sizes.append((camera.width, camera.height))
+            return super().render(gaussians, camera, *rest)
+
+    found = measure_speed(Watched(), discs_on_surfaces(scene).select(torch.arange(20)), scene, torch.zeros(3), [64, 20])
+    assert set(sizes) == {(64, 20)}
+    assert found.per_view[scene.test[0].name]["fps"] > 0

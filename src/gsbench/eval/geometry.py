@@ -81,5 +81,21 @@ def project(points: Array, camera: Camera) -> tuple[NDArray[np.int64], NDArray[n
     return index[inside], row[inside].astype(np.int64), column[inside].astype(np.int64), z[inside]
 
 
+def band_errors(image: Array, truth: Array, camera: Camera, points: Array, counts: NDArray[np.bool_]) -> list[float]:
+    """The mean absolute error of the nearest, the middle and the farthest third of a view's pixels, in their units.
+
+    A pixel of ``image`` [H, W, 3] is as far away as that of ``points`` [P, 3] which is seen nearest to it in the
+    picture, so that all models of one initial cloud are judged on the same pixels. What ``counts`` [H, W] leaves out
+    belongs to no third. Not a number where the view shows none of the points.
+    """
+    _, row, column, z = project(points, camera)
+    if not len(z):
+        return [np.nan] * 3
+    pixels = np.argwhere(counts)  # [Q, 2]
+    depths = z[cKDTree(np.stack([row, column], axis=1)).query(pixels)[1]]  # [Q]
+    errors = np.abs(image - truth).mean(axis=-1)[counts][np.argsort(depths, kind="stable")]
+    return [_mean(third) for third in np.array_split(errors, 3)]
+
+
 def _mean(values: NDArray[np.float64] | NDArray[np.bool_]) -> float:
     return float(values.mean()) if values.size else np.nan

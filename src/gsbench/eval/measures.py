@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsbench.eval import fsim, gmsd, multiscale
 from gsbench.eval.dists import VGG, load_dists
+from gsbench.eval.images import exact
 from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import UnavailableError
 from gsbench.eval.metrics import flip, flip_map, psnr
@@ -51,7 +52,7 @@ class Psnr:
         self._cap = conditions.protocol.psnr_cap
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
-        return min(float(psnr(_exact(image), _exact(truth))), self._cap)
+        return min(float(psnr(exact(image), exact(truth))), self._cap)
 
     def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
         return self.measure(image[mask][None], truth[mask][None])
@@ -64,10 +65,10 @@ class Ssim:
         self._padding = conditions.protocol.ssim_padding
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
-        return float(ssim(_exact(image), _exact(truth), self._padding))
+        return float(ssim(exact(image), exact(truth), self._padding))
 
     def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
-        return float(masked_ssim(_exact(image), _exact(truth), mask, self._padding))
+        return float(masked_ssim(exact(image), exact(truth), mask, self._padding))
 
 
 class LpipsMetric:
@@ -117,7 +118,7 @@ class Structural:
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
         _need_size(image, self.smallest)
-        value = float(type(self).function(_exact(image), _exact(truth)))
+        value = float(type(self).function(exact(image), exact(truth)))
         if not math.isfinite(value):
             raise UnavailableError("a view is flat: it has no structure to compare")
         return value
@@ -158,8 +159,3 @@ def _need_size(image: Tensor, smallest: int) -> None:
     height, width = image.shape[:2]
     if min(height, width) < smallest:
         raise UnavailableError(f"a view is {width}x{height} px, below {smallest} px a side")
-
-
-def _exact(image: Tensor) -> Tensor:
-    """In single precision, SSIM's differences of moments are off by up to 2e-4 where an image is flat."""
-    return image.to(torch.float32 if image.device.type == "mps" else torch.float64)

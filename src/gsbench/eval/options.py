@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
-from annotated_types import Predicate, doc
+from annotated_types import Interval, Len, Predicate, doc
 from pydantic import PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.eval.facts import FLICKER, GEOMETRY, LPIPS, MORE, find, further_keys, known_keys, lpips_variants
+from gsbench.eval.facts import CORRECTED, LPIPS, MORE, OF_MODELS, SPEED, find, further_keys, known_keys, lpips_variants
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.runs.declaration import AT, QUESTIONS, metric_and_question
 from gsbench.settings import MISSING, FolderName, PathName, check_settings
@@ -33,6 +33,8 @@ AT_RULE = "a list of different iterations, at which the test views are measured 
 CONTROLS_RULE = "a mapping {ARM: ARM} of names of densifiers: whom else, beside the baseline, an arm is held against"
 LPIPS_RULE = f"a list of {', '.join(lpips_variants())}, each at most once"
 LpipsVariant = Annotated[str, Predicate(lambda name: name in lpips_variants())]
+FPS_RULE = "two sides in px, width and height, each from 16 to 16384"
+Side = Annotated[int, Interval(ge=16, le=16_384)]
 MORE_RULE = f"a list of {', '.join(further_keys())}, each at most once"
 FurtherMetric = Annotated[str, Predicate(lambda name: name in further_keys())]
 
@@ -54,6 +56,8 @@ class EvalConfig:
     maps: bool = False  # keep maps of depth, volume and distance to the initial cloud: where an arm helps
     geometry: bool = False  # measure depths and surfaces of the model, and what floats in front of them
     flicker: bool = False  # measure how neighbouring renders of a camera path differ
+    bands: bool = False  # measure errors of the near, the middle and the far third of each view
+    fps: Annotated[list[Side], Len(2, 2), doc(FPS_RULE)] | None = None  # [1920, 1080]: speed at this size, px
     weights: PathName | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
     download: bool = True  # fetch missing weights, checked by checksum
 
@@ -74,6 +78,12 @@ class EvalConfig:
             if metric not in self.extra:
                 self._check_primary(metric)
 
+    @property
+    def of_model(self) -> dict[str, Any]:
+        """What is to be measured of a model: the settings by name, those that ask for nothing left out."""
+        settings = {name: getattr(self, name) for name in ("geometry", "flicker", "bands", "fps")}
+        return {name: value for name, value in settings.items() if value}
+
     def _check_primary(self, key: str) -> None:
         """Raise InputError unless one of gsbench's own metrics, which these settings ask for, has this key."""
         facts = find(key)
@@ -85,9 +95,11 @@ class EvalConfig:
             )
         if facts.setting == "eval.flip" and not self.flip:
             raise InputError("eval.primary=flip is not measured with eval.flip=false")
-        for setting, asked in ((GEOMETRY, self.geometry), (FLICKER, self.flicker)):
-            if facts.setting == setting and not asked:
-                raise InputError(f"eval.primary={key} is not measured: add {setting}=true")
+        if facts in OF_MODELS and facts.setting.removeprefix("eval.") not in self.of_model:
+            value = "[1920,1080]" if facts.setting == SPEED else "true"
+            raise InputError(f"eval.primary={key} is not measured: add {facts.setting}={value}")
+        if facts.setting == CORRECTED and PROTOCOLS[self.protocol].color_fit is None:
+            raise InputError(f"eval.primary={key} is not measured: it takes eval=affine or eval=affine_half")
         if facts.setting == MORE and key not in self.more:
             raise InputError(f"eval.primary={key} is not measured: add {key} to eval.more")
         if facts.setting == "eval.lpips" and key.removeprefix(LPIPS) not in self.lpips:

@@ -6,13 +6,14 @@ convention below needs a new version.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from gsbench.errors import InputError
 
 SsimPadding = Literal["zero", "valid", "reflect"]
 Shrinking = Literal["bicubic", "lanczos"]
+ColorFit = Literal["all", "left"]
 
 # Pixels per degree of a 0.7 m wide, 3840 px display seen from 0.7 m: the default viewer of Andersson et al. 2020.
 FLIP_PPD = 67.02
@@ -26,7 +27,9 @@ class Protocol:
     would store them. ``ssim_padding``: see ``gsbench.eval.ssim.ssim``. ``lpips``: the variant that tables show as
     *the* LPIPS of this protocol. ``flip_ppd``: pixels per degree of FLIP's viewer. ``psnr_cap``: dB, reported for pairs
     of higher PSNR; identical images, whose PSNR is infinite and has no number in JSON, get it. ``crop``: pixels
-    left out on each side.
+    left out on each side. ``color_fit``: metrics ``cc_…`` stand beside the others, measured after the colours of each
+    render were fitted to its photograph (`gsbench.eval.correction`): on ``all`` pixels, or on the ``left`` half of the
+    picture, and then everything is measured on its right half.
 
     ``shrinking``: how photographs are made smaller, None where they are taken as they come. ``full_size``: they are
     made smaller from those of the full size even where the data set brings smaller ones. ``source``: where these facts
@@ -44,6 +47,7 @@ class Protocol:
     shrinking: Shrinking | None = None
     full_size: bool = False
     source: str = ""
+    color_fit: ColorFit | None = None
 
     @property
     def id(self) -> str:
@@ -54,7 +58,11 @@ class Protocol:
 PAPER = Protocol("paper", 1, eight_bit=True, ssim_padding="zero", lpips="vgg_raw")
 # The definitions of the metrics' authors: SSIM inside the image only, LPIPS on [-1, 1].
 STANDARD = Protocol("standard", 1, eight_bit=True, ssim_padding="valid", lpips="vgg")
-PROTOCOLS = {protocol.name: protocol for protocol in (PAPER, STANDARD)}
+# Those of `STANDARD`, with metrics after a fit of colours beside the raw ones. Fitted on all pixels as gsplat does it;
+# on one half and measured on the other as NeRF in the Wild (Martin-Brualla et al. 2021, section 4.1) does it.
+AFFINE = replace(STANDARD, name="affine", color_fit="all")
+AFFINE_HALF = replace(STANDARD, name="affine_half", color_fit="left")
+PROTOCOLS = {protocol.name: protocol for protocol in (PAPER, STANDARD, AFFINE, AFFINE_HALF)}
 
 
 # Conventions of others, for renders that are there: a trial is measured by one of the above. All five have SSIM's

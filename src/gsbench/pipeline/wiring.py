@@ -92,9 +92,7 @@ class TrialSteps:
     def _evaluate_step(self, trained: Step) -> Step:
         parts = self.parts
         if parts.program is not None and not parts.program.leaves_model:
-            return measure_step(
-                self.views, trained, parts.evaluator, parts.eval.geometry, parts.eval.flicker, parts.targets
-            )
+            return measure_step(self.views, trained, parts.evaluator, parts.eval.of_model, parts.targets)
         return evaluate_step(
             self.views,
             trained,
@@ -105,8 +103,7 @@ class TrialSteps:
             parts.device,
             parts.measured_earlier,
             made_by_program=parts.program is not None,
-            geometry=parts.eval.geometry,
-            flicker=parts.eval.flicker,
+            of_model=parts.eval.of_model,
             targets=parts.targets,
         )
 

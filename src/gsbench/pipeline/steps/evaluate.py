@@ -28,12 +28,7 @@ from gsbench.pipeline.components import options_of, rasterizer_inputs
 from gsbench.pipeline.steps.code import step_of_code
 from gsbench.pipeline.steps.figures import draw_ellipsoids
 from gsbench.pipeline.steps.maps import view_maps
-from gsbench.pipeline.steps.model_metrics import (
-    ModelMetrics,
-    measure_flicker,
-    measure_geometry,
-    nothing_known,
-)
+from gsbench.pipeline.steps.model_metrics import ModelMetrics, measure_model, nothing_known
 from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
 from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, MAPS, METRICS, PER_VIEW, POINT_CLOUD, RENDERS
@@ -60,14 +55,13 @@ def evaluate_step(
     device: torch.device,
     earlier: Sequence[int] = (),
     made_by_program: bool = False,
-    geometry: bool = False,
-    flicker: bool = False,
+    of_model: Mapping[str, Any] = MappingProxyType({}),
     targets: Mapping[str, str] = MappingProxyType({}),
 ) -> Step:
     """Render and measure the model of ``trained``, and its snapshots of the iterations ``earlier``.
 
-    ``maps`` also keeps what the report needs to say where an arm helps; ``geometry`` and ``flicker`` also measure the
-    model itself (`gsbench.pipeline.steps.model_metrics`). ``targets`` has the import paths by which the configuration
+    ``maps`` also keeps what the report needs to say where an arm helps; ``of_model`` says what is measured of the model
+    itself (`gsbench.eval.options.EvalConfig.of_model`). ``targets`` has the import paths by which the configuration
     names classes, by their places in it. The key of a training by another program
     (``made_by_program``) knows nothing of the rendering, so it is in this step's.
     """
@@ -81,7 +75,7 @@ def evaluate_step(
         inputs["earlier"] = list(earlier)
     if made_by_program:
         inputs |= {"raster": rasterizer_inputs(rasterizer, targets.get("raster")), "background": list(background)}
-    inputs |= _further_metrics(evaluator, targets) | _of_model(geometry, flicker)
+    inputs |= _further_metrics(evaluator, targets) | dict(of_model)
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
@@ -112,11 +106,7 @@ def evaluate_step(
         if maps:
             write_maps(folder / MAPS, scene, views.store.path(views.init), gaussians, rasterizer)
             draw_figures(folder / FIGURES, folder / RENDERS, scene, training, gaussians)
-        found = []
-        if geometry:
-            found.append(measure_geometry(rasterizer, gaussians, views))
-        if flicker:
-            found.append(measure_flicker(rasterizer, gaussians, scene, color))
+        found = measure_model(of_model, rasterizer, gaussians, views, color, folder / RENDERS)
         _write_metrics(folder, evaluator, per_view, found, scene, at)
 
     components = ((rasterizer, targets.get("raster")), *_named(evaluator, targets))
@@ -127,8 +117,7 @@ def measure_step(
     views: Views,
     trained: Step,
     evaluator: Evaluator,
-    geometry: bool = False,
-    flicker: bool = False,
+    of_model: Mapping[str, Any] = MappingProxyType({}),
     targets: Mapping[str, str] = MappingProxyType({}),
 ) -> Step:
     """Measure the renders that another program left in ``trained``, as they are; ``targets`` as for `evaluate_step`."""
@@ -137,7 +126,7 @@ def measure_step(
         "protocol": evaluator.protocol.id,
         "unavailable": sorted(evaluator.unavailable),
     }
-    inputs |= _further_metrics(evaluator, targets) | _of_model(geometry, flicker)
+    inputs |= _further_metrics(evaluator, targets) | dict(of_model)
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
@@ -149,7 +138,7 @@ def measure_step(
                     read_image(folder / RENDERS / png_name(view.name)), view.image, view.mask
                 )
                 report("views", done, len(scene.test))
-        unknown = nothing_known(geometry, flicker, "another program's renders are known, not its model")
+        unknown = nothing_known(of_model, "another program's renders are known, not its model")
         _write_metrics(folder, evaluator, per_view, [unknown], scene)
 
     return step_of_code(EVALUATE, inputs, build, __name__, _named(evaluator, targets))
@@ -165,11 +154,6 @@ def _further_metrics(evaluator: Evaluator, targets: Mapping[str, str]) -> dict[s
     own = {name: options_of("eval", metric, targets.get(f"{EXTRA}.{name}")) for name, metric in evaluator.extra.items()}
     further: dict[str, Any] = {"extra": own, "more": list(evaluator.more)}
     return {name: value for name, value in further.items() if value}
-
-
-def _of_model(geometry: bool, flicker: bool) -> dict[str, bool]:
-    """Measures of the model as they enter a key; nothing where none are."""
-    return {name: True for name, asked in (("geometry", geometry), ("flicker", flicker)) if asked}
 
 
 def _write_metrics(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,9 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.eval.facts import FLICKER, GEOMETRY, OF_MODELS
+from gsbench.eval.facts import OF_MODELS
 from gsbench.eval.flicker import camera_path, flicker
 from gsbench.eval.geometry import (
+    band_errors,
     completeness,
     depth_error,
     floater_share,
@@ -24,6 +27,7 @@ from gsbench.eval.geometry import (
     share_beyond,
 )
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
+from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.steps.maps import paint, surface_depth, unproject
 from gsbench.pipeline.steps.views import Views
@@ -31,6 +35,8 @@ from gsbench.raster import Rasterizer
 from gsbench.scene.camera import Camera
 from gsbench.scene.courtyard.depth import courtyard_depth
 from gsbench.scene.courtyard.render import courtyard_cameras, surface_distance
+from gsbench.scene.images import read_image
+from gsbench.scene.names import png_name
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.types import Scene
 
@@ -42,6 +48,7 @@ PERCENT = 100.0
 TOLERANCE = 0.05  # m: what lies farther from the courtyard's surfaces is off them
 SAME_POSE = 1e-3  # m, and as a difference of matrices: a pose that differs by more was estimated
 MIN_POINTS = 10  # of a test view that no training view sees, below which a median says little
+TIMED_RENDERS = 5  # of each view
 FRAMES = 4  # after the first, of the path from a test view
 STEP = 1 / 32  # of the way to the nearest other camera: about what a slow hand moves in a frame of a film
 
@@ -62,10 +69,70 @@ class ModelMetrics:
             self.per_view.setdefault(view, {})[key] = value
 
 
-def nothing_known(geometry: bool, flickering: bool, reason: str) -> ModelMetrics:
-    """Results that say of everything asked for that it is unavailable, for one reason."""
-    asked = {GEOMETRY: geometry, FLICKER: flickering}
-    return ModelMetrics(unavailable={facts.key: reason for facts in OF_MODELS if asked[facts.setting]})
+def nothing_known(asked: Iterable[str], reason: str) -> ModelMetrics:
+    """Results that say of everything ``asked`` for (names of settings) that it is unavailable, for one reason."""
+    settings = {f"eval.{name}" for name in asked}
+    return ModelMetrics(unavailable={facts.key: reason for facts in OF_MODELS if facts.setting in settings})
+
+
+def measure_model(
+    asked: Mapping[str, Any],
+    rasterizer: Rasterizer,
+    gaussians: Gaussians,
+    views: Views,
+    background: Tensor,
+    renders: Path,
+) -> list[ModelMetrics]:
+    """Everything that ``asked`` (`EvalConfig.of_model`) names; ``renders`` holds the pictures of the test views."""
+    found = []
+    if "geometry" in asked:
+        found.append(measure_geometry(rasterizer, gaussians, views))
+    if "flicker" in asked:
+        found.append(measure_flicker(rasterizer, gaussians, views.scene, background))
+    if "bands" in asked:
+        found.append(measure_bands(views, renders))
+    if "fps" in asked:
+        found.append(measure_speed(rasterizer, gaussians, views.scene, background, asked["fps"]))
+    return found
+
+
+def measure_bands(views: Views, renders: Path) -> ModelMetrics:
+    """Errors of the near, the middle and the far third of each test view, in 8-bit levels."""
+    found = ModelMetrics()
+    points = read_cloud(views.store.path(views.init) / MODEL_FOLDER).points
+    errors = {}
+    for view in views.scene.test:
+        image, truth = read_image(renders / png_name(view.name)).astype(np.float64), view.image.astype(np.float64)
+        counts = np.ones(image.shape[:2], dtype=np.bool_) if view.mask is None else view.mask
+        errors[view.name] = band_errors(image, truth, view.camera, points, counts)
+    for index, key in enumerate(("error_near", "error_middle", "error_far")):
+        values = {name: thirds[index] for name, thirds in errors.items()}
+        found.add(key, values, "a test view shows no point of the initial cloud")
+    return found
+
+
+def measure_speed(
+    rasterizer: Rasterizer, gaussians: Gaussians, scene: Scene, background: Tensor, size: Sequence[int]
+) -> ModelMetrics:
+    """Renders a second of each test view at ``size`` (width, height) px: each rendered once, then timed."""
+    found, speeds = ModelMetrics(), {}
+
+    def now() -> float:
+        if background.device.type == "cuda":  # renders are queued there
+            torch.cuda.synchronize(background.device)
+        return time.perf_counter()
+
+    for view in scene.test:
+        # The whole picture at another size, stretched if need be, so that the same Gaussians are in view.
+        camera = view.camera.resized(*size)
+        with torch.no_grad():
+            rasterizer.render(gaussians, camera, MAX_SH_DEGREE, background)
+            start = now()
+            for _ in range(TIMED_RENDERS):
+                rasterizer.render(gaussians, camera, MAX_SH_DEGREE, background)
+            speeds[view.name] = TIMED_RENDERS / (now() - start)
+    found.add("fps", speeds, "the clock did not move")
+    return found
 
 
 def measure_geometry(rasterizer: Rasterizer, gaussians: Gaussians, views: Views) -> ModelMetrics:
