@@ -15,7 +15,7 @@
 #
 # A **trial** is one scene, one initial cloud, one densifier and one seed, taken through three stages: initialise,
 # train, evaluate. This notebook runs one on the built-in courtyard, which needs no download, and looks at what came
-# out.
+# out. It takes some minutes on a CPU. On Colab or any other Jupyter, run `%pip install gsbench-3dgs` in a cell first.
 
 # %%
 import json
