@@ -37,6 +37,17 @@ class ADC(Budgeted):
 
     Sizes are fractions of the scene extent; ``gradient_threshold`` is in NDC units, averaged over the iterations in
     which a Gaussian was visible.
+
+    Examples:
+        An idea of your own overrides one rule. This one prunes nothing, and needs no other change:
+
+        >>> @dataclass
+        ... class NeverPrune(ADC):
+        ...     def prune(self, refinement):
+        ...         pass
+
+        >>> NeverPrune(interval=50).gradient_threshold
+        0.0002
     """
 
     STATISTICS: ClassVar[Mapping[str, torch.dtype | Statistic]] = {

@@ -106,6 +106,28 @@ class Budgeted(Densifier):
 
     A subclass asks `allowance` for the first four. For ``freeze`` and ``governor`` it says, by ``forecast``, what count
     a round would lead to, and multiplies its own thresholds by ``strictness`` and its opacity cull by ``cull``.
+
+    Examples:
+        Clones what is opaque, under any cap:
+
+        >>> @dataclass
+        ... class CloneOpaque(Budgeted):
+        ...     def opaque(self, refinement):
+        ...         return refinement.gaussians.values.opacities > 0.5 * self.strictness
+        ...
+        ...     def forecast(self, refinement):
+        ...         return len(refinement.gaussians) + int(self.opaque(refinement).sum())
+        ...
+        ...     def rules(self, refinement):
+        ...         return [*self.governing(), self.grow] if self.due(refinement.step) else []
+        ...
+        ...     def grow(self, refinement):
+        ...         opaque = self.opaque(refinement)
+        ...         admitted, _ = admit(opaque, opaque.float(), 1, self.allowance(refinement))
+        ...         refinement.event.cloned += self.clone(refinement, admitted)
+
+        >>> CloneOpaque(cap="governor", max_gaussians=1000).due(600)
+        True
     """
 
     start: NonNegativeInt = 500  # a round where start < step < stop and step % interval == 0

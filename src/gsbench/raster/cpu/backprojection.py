@@ -41,6 +41,7 @@ def _take_rows(
     ``sums`` [16 * 16] gets a row for each place of a row, and ``indices`` [16] the Gaussians; where there are fewer
     than 16, the last one again.
     """
+    # Cleared while they are in the cache: clearing all before each backward pass would go to memory once more.
     shard_rows = len(record_ints)  # a row is as long as a record
     for lane in range(count):
         ahead = min(record + lane + AHEAD, past - 1) * at.RECORD

@@ -33,9 +33,10 @@ from gsbench.raster.validate import raise_for_values
 from gsbench.scene.camera import Camera
 from gsbench.system.resources import available_cores
 
-# Fixed, so that the bits of every result are the same for any number of threads.
+# Fixed, so that the bits of every result are the same for any number of threads: each shard of tiles sums gradients in
+# rows of its own (64 bytes a Gaussian), and another number of shards would add them in another order.
 GAUSSIAN_SHARDS = 16
-TILE_SHARDS = 8  # each has its own gradient rows: 64 bytes per Gaussian
+TILE_SHARDS = 8
 
 
 class Resources:
