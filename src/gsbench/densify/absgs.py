@@ -10,7 +10,7 @@ import torch
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.adc import ADC
+from gsbench.densify.adc import ADC, OPACITY_RESET
 from gsbench.densify.base import NEVER, Refinement, Rule
 from gsbench.densify.budget import admit
 from gsbench.raster.base import RenderOutput
@@ -32,9 +32,7 @@ class AbsGS(ADC):
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
         "opacity_ceiling": Switch({"ceiling_interval": NEVER}, "the ceiling on opacities"),
         "small_split_size": Switch({"split_size": ADC.split_size}, "the smaller size above which a Gaussian is split"),
-        "opacity_reset": Switch(
-            {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
-        ),
+        "opacity_reset": OPACITY_RESET,
     }
 
     split_size: PositiveFloat = 0.001

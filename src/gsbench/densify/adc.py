@@ -20,6 +20,9 @@ from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction, Switch
 
 MOST_CHILDREN = 64  # of one split; more is a slip in the settings, and fills the memory in one round
+OPACITY_RESET = Switch(
+    {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
+)
 LOCKED_ROUNDS = 5  # after an opacity reset the governor does not raise the cull; our choice
 
 
@@ -57,9 +60,7 @@ class ADC(Budgeted):
     }
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "opacity_reset": Switch(
-            {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
-        ),
+        "opacity_reset": OPACITY_RESET,
         "absolute_gradient": Switch({"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"),
         "revised_opacity": Switch({"revised_opacity": False}, "children that share their parent's opacity"),
     }
@@ -189,9 +190,7 @@ class ADC(Budgeted):
         """Remove the faint, and after the first opacity reset the huge."""
         values = refinement.gaussians.values
         faint, huge = self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
-        refinement.event.pruned_opacity += int(faint.sum())
-        refinement.event.pruned_size += int((huge & ~faint).sum())
-        self.edit(refinement, keep=~(faint | huge))
+        self.remove(refinement, faint, huge)
 
     def reset_opacity(self, refinement: Refinement) -> None:
         """Make everything faint, so that what is not needed stays so and is pruned."""

@@ -270,6 +270,14 @@ class Densifier:
         self.edit(refinement, keep=keep, append=new, parents=parents.repeat(children), cause=cause)
         return len(new) - (0 if keep_parent else len(parents))
 
+    def remove(self, refinement: Refinement, faint: Tensor, others: Tensor | None = None) -> None:
+        """Remove the Gaussians at the mask ``faint`` [N], counted as pruned by opacity, and at ``others`` [N], counted
+        as pruned by size; those in both count as faint."""
+        gone = faint if others is None else faint | others
+        refinement.event.pruned_opacity += int(faint.sum())
+        refinement.event.pruned_size += int((gone & ~faint).sum())
+        self.edit(refinement, keep=~gone)
+
     def reset_statistics(self, refinement: Refinement) -> None:
         """The rule that ends a round: gather anew."""
         self.statistics = self._zeros(len(refinement.gaussians), refinement.gaussians.device)

@@ -131,6 +131,4 @@ class EdgeAware(LongAxis):
             self.prune_below(refinement, quantile(opacities.sort().values, self.recovery_share))
 
     def prune_below(self, refinement: Refinement, opacity: float) -> None:
-        faint = refinement.gaussians.values.opacities < opacity  # [N]
-        refinement.event.pruned_opacity += int(faint.sum())
-        self.edit(refinement, keep=~faint)
+        self.remove(refinement, refinement.gaussians.values.opacities < opacity)

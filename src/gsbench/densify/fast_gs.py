@@ -85,14 +85,9 @@ class FastGS(AbsGS):
         removed = refinement.event.split_gradient // (self.split_children - 1)  # parents; those that remain stand first
         known = torch.arange(len(score), device=score.device) < refinement.event.before - removed  # the new: no score
         drawn = draw(known, 1 / (LEAST_WEIGHT + 1 - score), int((faint | huge).sum()) // 2, refinement.rng)
-        self._remove(refinement, faint & drawn, huge & ~faint & drawn)
+        self.remove(refinement, faint & drawn, huge & drawn)
 
     def prune_finally(self, refinement: Refinement) -> None:
         """Remove the rather faint and those that err most."""
         faint = refinement.gaussians.values.opacities < self.final_opacity  # [N]
-        self._remove(refinement, faint, (self.statistics["score"] > self.final_score) & ~faint)
-
-    def _remove(self, refinement: Refinement, faint: Tensor, others: Tensor) -> None:
-        refinement.event.pruned_opacity += int(faint.sum())
-        refinement.event.pruned_size += int(others.sum())
-        self.edit(refinement, keep=~(faint | others))
+        self.remove(refinement, faint, self.statistics["score"] > self.final_score)

@@ -139,9 +139,8 @@ class GNS(EdgeAware):
                 len(opacities),
                 int((~kept).sum()),
             )
-        refinement.event.pruned_opacity += int((~kept).sum())
         if not kept.all():
-            self.edit(refinement, keep=kept)
+            self.remove(refinement, ~kept)
         self.met_at = refinement.step
 
     def raise_rate(self, refinement: Refinement) -> None:

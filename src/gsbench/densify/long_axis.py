@@ -11,8 +11,8 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from gsbench.densify.adc import ADC, Grown
-from gsbench.densify.base import NEVER, Refinement
+from gsbench.densify.adc import ADC, OPACITY_RESET, Grown
+from gsbench.densify.base import Refinement
 from gsbench.densify.operations import faded
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
@@ -33,9 +33,7 @@ class LongAxis(ADC):
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
         "fading": Switch({"opacity_factor": 1.0}, "children fainter than their parent"),
-        "opacity_reset": Switch(
-            {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
-        ),
+        "opacity_reset": OPACITY_RESET,
     }
 
     split_distance: OpenFraction = 0.45

@@ -10,8 +10,7 @@ import torch
 from pydantic import PositiveFloat
 from torch import Tensor
 
-from gsbench.densify.adc import ADC
-from gsbench.densify.base import NEVER
+from gsbench.densify.adc import ADC, OPACITY_RESET
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import Switch
 
@@ -33,9 +32,7 @@ class PixelGS(ADC):
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
         "near_scaling": Switch({"near_fraction": None}, "less growth near the cameras"),
-        "opacity_reset": Switch(
-            {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
-        ),
+        "opacity_reset": OPACITY_RESET,
     }
 
     near_fraction: PositiveFloat | None = 0.37  # of the scene extent; None: f = 1

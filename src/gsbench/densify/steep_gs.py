@@ -11,8 +11,8 @@ import torch
 from annotated_types import Interval, Lt
 from torch import Tensor
 
-from gsbench.densify.adc import ADC, Grown
-from gsbench.densify.base import NEVER, Refinement, Statistic
+from gsbench.densify.adc import ADC, OPACITY_RESET, Grown
+from gsbench.densify.base import Refinement, Statistic
 from gsbench.densify.budget import admit
 from gsbench.densify.operations import faded, standard_normal
 from gsbench.events import Cause
@@ -61,9 +61,7 @@ class SteepGS(ADC):
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
         "saddle": Switch({"eigenvalue_threshold": None}, "the condition that a split lowers the loss"),
         "halving": Switch({"opacity_factor": 1.0}, "halves of half the opacity"),
-        "opacity_reset": Switch(
-            {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
-        ),
+        "opacity_reset": OPACITY_RESET,
     }
 
     eigenvalue_threshold: Annotated[float, Lt(0)] | None = -1e-6

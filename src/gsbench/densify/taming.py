@@ -105,6 +105,4 @@ class Taming(ADC):
         faint, huge = self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
         budget = int((faint | huge).sum()) // 2
         drawn = draw(score > 0, 1 / score, budget, refinement.rng)
-        refinement.event.pruned_opacity += int((faint & drawn).sum())
-        refinement.event.pruned_size += int((huge & ~faint & drawn).sum())
-        self.edit(refinement, keep=~((faint | huge) & drawn))
+        self.remove(refinement, faint & drawn, huge & drawn)
