@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import ADC, MCMC, DensifyContext, NoDensifier
+from gsbench.densify import ADC, MCMC, MRNF, DensifyContext, NoDensifier, Volumetric
 from gsbench.densify.budget import limit_at
 from gsbench.densify.mcmc import shared_opacity
 from gsbench.densify.operations import revised_logits
@@ -179,3 +179,23 @@ def test_mcmc_shares_an_opacity_among_fifty_at_most() -> None:
     assert MCMC(max_copies=3).max_copies == 3
     with pytest.raises(InputError, match=r"densify\.max_copies"):
         MCMC(max_copies=52)
+
+
+@pytest.mark.parametrize(
+    ("kind", "setting", "value"),
+    [(ADC, "split_children", 65), (Volumetric, "volume_children", 10**9), (MRNF, "opacity_decay", 1)],
+)
+def test_values_that_would_empty_or_fill_the_memory_are_refused(kind: type, setting: str, value: int) -> None:
+    with pytest.raises(InputError, match=rf"densify\.{setting} must be"):
+        kind(**{setting: value})
+
+
+def test_mrnf_takes_an_empty_model() -> None:
+    """A decay that took all of it: the trainer then says that no Gaussian was left."""
+    densifier, rng = MRNF(), torch.Generator()
+    gaussians = TrainableGaussians(random_gaussians(3, seed=1), LearningRates(), 1.0)
+    densifier.begin(gaussians.values, DensifyContext(1.0))
+    densifier.statistics = {"seen": torch.zeros(0, dtype=torch.bool)}
+    gaussians.edit(torch.zeros(3, dtype=torch.bool))
+    densifier.after_step(1, gaussians, rng)
+    assert len(gaussians) == 0

@@ -30,6 +30,18 @@ class RasterConstants:
 CONSTANTS = RasterConstants()
 
 
+def slope_limits(camera: Camera, constants: RasterConstants = CONSTANTS) -> tuple[float, float, float, float]:
+    """The limits of x/z (least, most) and of y/z in the Jacobian of a projection (`RasterConstants.fov_margin`)."""
+    margin_x = constants.fov_margin * camera.width / (2 * camera.fx)
+    margin_y = constants.fov_margin * camera.height / (2 * camera.fy)
+    return (
+        -camera.cx / camera.fx - margin_x,
+        (camera.width - camera.cx) / camera.fx + margin_x,
+        -camera.cy / camera.fy - margin_y,
+        (camera.height - camera.cy) / camera.fy + margin_y,
+    )
+
+
 @dataclass(frozen=True)
 class Footprint:
     """The pixels of one view that each Gaussian is blended into: those where its alpha is not skipped and that have not

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from gsbench.gaussians.model import Gaussians, colors
-from gsbench.raster.base import CONSTANTS, Footprint, RasterConstants, RenderOutput, view_depths
+from gsbench.raster.base import CONSTANTS, Footprint, RasterConstants, RenderOutput, slope_limits, view_depths
 from gsbench.raster.validate import check_inputs
 from gsbench.scene.camera import Camera
 
@@ -164,10 +164,8 @@ def _to_image(
     rotation = gaussians.means.new_tensor(camera.rotation)  # [3, 3]
     translation = gaussians.means.new_tensor(camera.translation)  # [3]
     x, y, z = (gaussians.means @ rotation.T + translation).unbind(-1)  # each [M]
-    margin_x = constants.fov_margin * camera.width / (2 * camera.fx)
-    margin_y = constants.fov_margin * camera.height / (2 * camera.fy)
-    slope_x = (x / z).clamp(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
-    slope_y = (y / z).clamp(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)
+    left, right, top, bottom = slope_limits(camera, constants)
+    slope_x, slope_y = (x / z).clamp(left, right), (y / z).clamp(top, bottom)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         [

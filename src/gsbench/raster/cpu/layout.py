@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.raster.base import RasterConstants
+from gsbench.raster.base import RasterConstants, slope_limits
 from gsbench.raster.cpu.simd import SUM_LANES
 from gsbench.raster.cpu.vector import LANES
 from gsbench.scene.camera import Camera
@@ -113,17 +113,12 @@ class Frame(NamedTuple):
 
 
 def make_view(camera: Camera, constants: RasterConstants) -> View:
-    margin_x = constants.fov_margin * camera.width / (2 * camera.fx)
-    margin_y = constants.fov_margin * camera.height / (2 * camera.fy)
     numbers = [
         camera.fx,
         camera.fy,
         camera.cx - 0.5,
         camera.cy - 0.5,
-        -camera.cx / camera.fx - margin_x,
-        (camera.width - camera.cx) / camera.fx + margin_x,
-        -camera.cy / camera.fy - margin_y,
-        (camera.height - camera.cy) / camera.fy + margin_y,
+        *slope_limits(camera, constants),
         *camera.rotation.ravel(),
         *camera.translation,
         *camera.center,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import triton.language as tl
 
-from gsbench.raster.base import CONSTANTS, RasterConstants
+from gsbench.raster.base import CONSTANTS, RasterConstants, slope_limits
 from gsbench.scene.camera import Camera
 
 # A block is what one program of one warp composites: half a tile of 3DGS, four pixels a lane. Lane l has the row
@@ -119,8 +119,6 @@ def make_grid(camera: Camera) -> Grid:
 
 def make_view(camera: Camera, constants: RasterConstants = CONSTANTS) -> View:
     grid = make_grid(camera)
-    margin_x = constants.fov_margin * camera.width / (2 * camera.fx)
-    margin_y = constants.fov_margin * camera.height / (2 * camera.fy)
     numbers = [
         grid.width,
         grid.height,
@@ -132,10 +130,7 @@ def make_view(camera: Camera, constants: RasterConstants = CONSTANTS) -> View:
         camera.fy,
         camera.cx - 0.5,
         camera.cy - 0.5,
-        -camera.cx / camera.fx - margin_x,
-        (camera.width - camera.cx) / camera.fx + margin_x,
-        -camera.cy / camera.fy - margin_y,
-        (camera.height - camera.cy) / camera.fy + margin_y,
+        *slope_limits(camera, constants),
         *camera.rotation.ravel(),
         *camera.center,
     ]
