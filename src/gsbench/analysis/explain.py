@@ -90,10 +90,13 @@ def _baseline_lines(experiment: Experiment, trial: TrialResult) -> list[str]:
         return []
     base = next((other for other in others if other.seed == trial.seed), others[0])
     settings = differing_settings([base, trial])
-    lines = ["", f"Settings that differ from {base.init}-{base.densify}"]
-    for key in settings:
-        lines.append(f"  {key}: {base.config.get(key, '(absent)')} -> {trial.config.get(key, '(absent)')}")
-    return lines if settings else []
+    both = [key for key in settings if key in base.config and key in trial.config]
+    lines = [f"  {key}: {base.config[key]} -> {trial.config[key]}" for key in both]
+    for one, other in ((trial, base), (base, trial)):
+        own = [f"{key} {one.config[key]}" for key in settings if key in one.config and key not in other.config]
+        if own:
+            lines.append(f"  of {one.init}-{one.densify} alone: {', '.join(own)}")
+    return ["", f"Settings that differ from {base.init}-{base.densify}", *lines] if lines else []
 
 
 def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:
@@ -122,8 +125,8 @@ def _origin(trial: TrialResult) -> dict[str, str]:
     else:
         counts = f"{record.num_gaussians or 0:,} from {record.num_init_points or 0:,} points"
     origin = {"folder": str(trial.path), "Gaussians": counts}
-    origin["views"] = f"{'?' if record.test_views is None else record.test_views} for testing, raster {record.raster}"
-    origin |= {key: str(value) for key, value in record.hashes.items()}
+    origin["views"] = f"{'?' if record.test_views is None else record.test_views} for testing"
+    origin |= {key: str(value) for key, value in record.hashes.items() if key not in trial.conditions}
     if record.trained_by is not None:
         origin["program"] = f"{record.trained_by.version}: {' '.join(record.trained_by.command)}"
     if machine := machine_of(trial):
