@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from gsbench import cli
-from gsbench.app.hydra_app import compose_trials
+from gsbench.app.command import compose_trials
 from gsbench.config.compose import compose_one
 from gsbench.errors import GsbenchError, InputError
 from gsbench.gaussians.model import Gaussians, colors

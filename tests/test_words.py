@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gsbench import cli
-from gsbench.app.hydra_app import compose_trials
+from gsbench.app.command import compose_trials
 from gsbench.config.compose import compose_values
 from gsbench.config.schema import GROUP_SCHEMAS, check_values, plain
 from gsbench.errors import InputError
@@ -52,7 +52,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "-m hydra/launcher=basic launch=local seed=0,1": "two launchers",
     "-m hydra/launcher=basic train.iterations=2.5": "a whole number of at least 0, got 2.5",
     "hydra/sweeper=nosuch": "choose: basic, gsbench",
-    "-m hydra.verbose=true,false": "Sweeping over Hydra's configuration",
+    "-m hydra.verbose=true,false": "one for all trials",
     "hydra.sweeper.parms=1": "did you mean params?",
     "hydra.nosuch=1": "hydra.nosuch is not a setting",
     "+hydra.sweeper.params.seed=1": "add -m",
@@ -67,6 +67,15 @@ REFUSED = {  # command line: a part of the line that refuses it
     "~train.iterations": "cannot be taken away",
     "tabels x": "did you mean tables?",
     # choices
+    "train": "train is a group: choose one by train=NAME (7k, ",
+    "photos": "did you mean scene=photos?",
+    "--scene photos": "a setting has no dashes: scene=…",
+    "path=/x": "did you mean scene.path?",
+    "densify=adc densify.volume_threshold=1": "it belongs to densify=volumetric",
+    f"+densify.x={'[' * 50}": "more than 40 brackets within each other",
+    f"seed={'1' * 5000}": "is not a setting like key=value",
+    "+experiment=typo --config-dir conf": "train.iteration is not a setting in experiment/typo.yaml; did you mean it",
+    "+experiment=bomb --config-dir bombs": "its aliases stand for more than 100,000 values",
     "densify=null": "choose one by its name",
     "scene=[courtyard]": "choose one by its name",
     "densify=vol": "densify=vol does not exist",
@@ -80,7 +89,17 @@ REFUSED = {  # command line: a part of the line that refuses it
     "seed=1,2": "add -m",
     "-m seed=range(0,0)": "lists no value",
     "-m seed=range(0,3,0)": "must not be zero",
-    "-m seed=interval(0,1)": "a sweep is a list of values",
+    "-m seed=interval(0,1)": "of what all arms are measured by",
+    "-m densify.volume_threshold=interval(nan,1)": "from a number to a larger one",
+    "-m densify.volume_threshold=interval(0,inf)": "from a number to a larger one",
+    "-m densify=adc densify.volume_threshold=interval(0,1)": "it belongs to densify=volumetric",
+    "-m hydra.sweeper.tune.seed=-1 densify.volume_threshold=interval(0,1)": "seed must be a whole number in [0,",
+    "-m hydra.sweeper.tune.points=0 densify.volume_threshold=interval(0,1)": "searches nothing",
+    "-m hydra.sweeper.tune.at_onec=2 seed=0,1": "did you mean at_once?",
+    "-m hydra/sweeper=optuna seed=0,1": "a search is an interval and hydra.sweeper.tune.points",
+    "-m hydra.sweeper.params=x seed=0,1": "must map settings to their values",
+    "hydra.sweeper.params.seed=1": "type seed=… itself, with -m",
+    "-m hydra.sweep.subdir=/proc/nosuch seed=0,1": "/proc/nosuch cannot be made",
     "-m seed=0,-1": "seed must be a whole number",
     "-m device=cpu,cuda": "makes no other trial",
     "-m launch=serial,local": "makes no other trial",
@@ -185,6 +204,10 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (experiments / "calls.yaml").write_text(
         "# @package _global_\nhydra:\n  callbacks:\n    x:\n      _target_: os.system\n"
     )
+    (experiments / "typo.yaml").write_text("# @package _global_\ntrain: {iteration: 300}\n")
+    bomb = ["a0: &a0 [x]", *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10))]
+    (tmp_path / "bombs" / "experiment").mkdir(parents=True)
+    (tmp_path / "bombs" / "experiment" / "bomb.yaml").write_text("\n".join(["# @package _global_", *bomb]) + "\n")
     for module in ("own", "broken"):
         monkeypatch.delitem(sys.modules, module, raising=False)
     return tmp_path
@@ -197,6 +220,25 @@ def test_what_is_not_understood_is_refused(command: str, place: Path, capsys: py
     assert line.startswith("gsbench: ")
     assert REFUSED[command] in line
     assert not (place / "runs").exists()  # nothing was begun
+
+
+@pytest.mark.parametrize("command", ["", "-m", "--multirun"])
+def test_no_setting_is_a_question(command: str, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(shlex.split(command)) == 0
+    assert "gsbench --help" in capsys.readouterr().out
+    assert not (place / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "check {} --dry-run allow_targets=[x]",
+        "check --dry-run allow_targets=[x] {}",
+    ],
+)
+def test_permission_counts_wherever_it_stands(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(shlex.split(command.format("nosuch.yaml"))) == 2
+    assert "nosuch.yaml cannot be read" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["seed=1", "status", "tables x"])

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from gsbench.app.hydra_app import compose_trials
+from gsbench.app.command import compose_trials
 from gsbench.scene.colmap import write_frames
 from gsbench.scene.prepare import CameraModel
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.app.hydra_app import compose_trials
+from gsbench.app.command import compose_trials
 from gsbench.claims.file import read_claims
 
 FINDINGS = Path(__file__).parents[1]

@@ -92,8 +92,10 @@ def runs_dir() -> Path:
 
 def _verb(name: str, argv: list[str]) -> int:
     if name not in VERBS:
+        from gsbench.config.command_words import hint_for
+
         raise InputError(
-            f"{name!r} is neither a verb nor a setting like key=value{closest(name, list(VERBS))} "
+            f"{name!r} is neither a verb nor a setting like key=value{hint_for(name) or closest(name, list(VERBS))} "
             f"(verbs: {', '.join(VERBS)})"
         )
     main_function: Callable[[list[str], Path], int] = importlib.import_module(VERBS[name][0]).main
@@ -102,9 +104,25 @@ def _verb(name: str, argv: list[str]) -> int:
         return main_function(argv, runs)
 
 
+USAGE = """\
+gsbench tests whether an idea helps 3D Gaussian Splatting.
+
+  gsbench scene=courtyard init=sfm densify=volumetric seed=0     one trial
+  gsbench -m densify=adc,volumetric seed=0,1,2                   a sweep
+  gsbench +experiment=demo                                       a sweep from a file
+  gsbench scene=photos scene.path=/my/photos                     your own photographs
+  gsbench +experiment=table1 --dry-run                           list the trials and their state; run nothing
+  gsbench --cfg job [settings]                                   show the configuration
+  gsbench --version                                              say which gsbench this is
+"""
+
+
 def _trials(argv: list[str]) -> int:
     from gsbench.verbs.queries import QUERIES, ask_hydra
 
+    if not argv or argv in (["-m"], ["--multirun"]):
+        print(USAGE + "\nEverything: gsbench --help")
+        return DONE
     if any(word.split("=")[0] in QUERIES for word in argv):
         return ask_hydra(argv)
     from gsbench.app.command import launch
@@ -117,16 +135,7 @@ def _help(words: list[str]) -> int:
     from gsbench.config.compose import options_text
 
     folders = searched_folders(parse(words)[0])  # whose choices are listed too
-    print("gsbench tests whether an idea helps 3D Gaussian Splatting.\n")
-    print("  gsbench scene=courtyard init=sfm densify=volumetric seed=0     one trial")
-    print("  gsbench -m densify=adc,volumetric seed=0,1,2                   a sweep")
-    print("  gsbench +experiment=demo                                       a sweep from a file")
-    print("  gsbench scene=photos scene.path=/my/photos                     your own photographs")
-    print(
-        "  gsbench +experiment=table1 --dry-run                           list the trials and their state; run nothing"
-    )
-    print("  gsbench --cfg job [settings]                                   show the configuration")
-    print("  gsbench --version                                              say which gsbench this is\n")
+    print(USAGE)
     print("Verbs (gsbench VERB --help):")
     for name, (_, text) in VERBS.items():
         print(f"  {name:<10} {text}")

@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 from gsbench import cli
-from gsbench.app.hydra_app import compose_trials
-from gsbench.config.hydra_guard import check_search_path
+from gsbench.app.command import compose_trials
+from gsbench.config.command_words import check_search_path
 from gsbench.errors import InputError
 from gsbench.launch import serial
 
@@ -67,7 +67,6 @@ def test_else_there_is_no_record_of_hydras(runs: Path) -> None:
         (["-m", "seed=0,1", "name=x-${hydra:runtime.output_dir}"], "it is known in a job only"),
         (["-m", "densify=glob([av]*)"], """'densify=glob("[av]*")'"""),
         (["-m", "densify=choice([av,b)"], "is not a setting like key=value"),
-        (["-m", "hydra/sweeper=optuna", "hydra.sweeper.trals=3"], "hydra.sweeper has: metric, direction, n_trials"),
         (["-m", "hydra/launcher=joblib", "seed=0,1", "hydra.launcher.jobs=3"], "n_jobs"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,

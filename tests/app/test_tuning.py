@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gsbench.analysis.report.search_charts import search_part
 
 from gsbench import cli
 from gsbench.analysis.cells import with_variants
@@ -52,8 +53,8 @@ BEST = {"adc": 3e-4, "volumetric": 0.01}
 class Fake:
     """Made-up results in the place of trained ones, best at `BEST`; ``stops`` and ``fails`` are numbers of trials."""
 
-    def __init__(self, stops: int | None = None, fails: Sequence[int] = ()) -> None:
-        self.stops, self.fails = stops, fails
+    def __init__(self, stops: int | None = None, fails: Sequence[int] = (), own_metric: bool = False) -> None:
+        self.stops, self.fails, self.own_metric = stops, fails, own_metric
         self.trained: list[Trial] = []
         self.batches: list[int] = []
 
@@ -74,6 +75,8 @@ class Fake:
             arm, values = trial.values["densify"]["name"], trial.values
             error = abs(np.log(values["densify"][KEYS[arm]] / BEST[arm])) if arm in KEYS else 0.0
             views = {"psnr": 26.0 - error + 0.01 * values["seed"] + np.arange(3.0)}
+            if self.own_metric:
+                views["mine"] = views["psnr"]
             data = trial_data(Plan(experiment=values["name"]), "courtyard", "random", arm, values["seed"], views)
             write_trial(trial.files.runs, data, views, trial.folder.name.partition("-")[0])
             (trial.folder / CONFIG).write_text(trial.yaml)
@@ -250,6 +253,34 @@ def test_a_dry_run_says_what_will_be_tuned_and_trains_nothing(
     assert not runs.exists()
 
 
+def test_an_interval_searches_one_arm(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search is the tuning of one arm: its best is trained with the seeds of the command."""
+    fake = Fake()
+    monkeypatch.setattr("gsbench.app.command.run_batch", fake)
+    words = ["-m", *WORDS[:-1], "densify=volumetric", "name=fair", "seed=0,1", "hydra.sweeper.tune.at_once=2"]
+    searched = ["densify.volume_threshold=tag(log, interval(1e-3, 1e-1))", "hydra.sweeper.tune.points=3"]
+    assert cli.run([*words, *searched]) == 0
+    assert fake.batches == [2, 1, 2]
+    part = search_part(runs / "fair-tune-random-volumetric")
+    assert part is not None
+    assert "no test view was looked at" in part.line
+    assert len(part.charts) == 2
+    best = chosen(runs, "volumetric")["densify.volume_threshold"]
+    assert {trial.values["densify"]["volume_threshold"] for trial in fake.judged()} == {best}
+
+
+@pytest.mark.parametrize(("direction", "best"), [("minimize", min), ("maximize", max)])
+def test_a_metric_of_ones_own_is_made_best_in_the_direction_that_is_given(
+    direction: str, best: Any, sweep: Sweep, runs: Path
+) -> None:
+    words = ["hydra.sweeper.tune.metric=mine", f"hydra.sweeper.tune.direction={direction}"]
+    assert sweep(Fake(own_metric=True), *words, "hydra.sweeper.tune.points=2") == 0
+    search = tuning(runs).arms["random-adc"].search
+    assert search is not None
+    assert search.direction == (1 if direction == "maximize" else -1)
+    assert search.best == best(search.points, key=lambda point: point.value)
+
+
 # --- what is printed
 
 
@@ -314,6 +345,9 @@ def test_trials_from_before_the_tuning_and_with_other_values_are_named(sweep: Sw
 MISTAKES = [
     (FILE, "hydra.sweeper.tune.point=3", "did you mean points?"),
     (FILE, "hydra.sweeper.tune.metric=psnrr", "did you mean psnr?"),
+    (FILE, "hydra.sweeper.tune.direction=minimize", "PSNR is better the other way"),
+    (FILE, "hydra.sweeper.tune.direction=up", "'maximize' or 'minimize' or null"),
+    (FILE, "hydra.sweeper.tune.metric=mine", "for a metric of your own give hydra.sweeper.tune.direction, too"),
     (FILE, "hydra.sweeper.tune.seed='1,2'", "tune.seed: 1 is a seed of the sweep, too"),
     (FILE, "hydra.sweeper.tune.seed=one", "must list whole numbers"),
     (FILE, "densify.stop=300", "is tuned and given as well"),

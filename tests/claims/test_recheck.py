@@ -18,7 +18,7 @@ from gsbench.claims.recheck import recheck
 from gsbench.claims.sweep import prepare, run_looks
 from gsbench.claims.verdict import Verdict
 from gsbench.cli import run
-from gsbench.config.compose import Composed
+from gsbench.config.compose import TrialConfig
 from gsbench.errors import InputError
 from gsbench.launch.declare import declare_plan
 from gsbench.runs.layout import CONFIG, DECLARED
@@ -37,7 +37,7 @@ MISSING = "the folder /labs/one/own does not exist"
 class Runner(FakeRunner):
     """Writes results of any scene, with the configuration that the trial was asked for."""
 
-    def __call__(self, trials: Sequence[Composed]) -> None:
+    def __call__(self, trials: Sequence[TrialConfig]) -> None:
         super().__call__(trials)
         for trial in trials:
             folder, scene = TrialFolder.of(trial.values).path, trial.values["scene"]["name"]

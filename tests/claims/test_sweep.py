@@ -15,8 +15,8 @@ from gsbench.claims.file import parse_claims
 from gsbench.claims.page import make_page, to_html, to_markdown
 from gsbench.claims.sweep import Check, prepare, run_looks
 from gsbench.cli import run
-from gsbench.config.compose import Composed
-from gsbench.config.sweep_jobs import with_seed
+from gsbench.config.compose import TrialConfig
+from gsbench.config.jobs import with_seed
 from gsbench.errors import InputError
 from gsbench.runs.declaration import DeclaredPlan, read_plans
 from gsbench.runs.trial_folder import TrialFolder
@@ -45,7 +45,7 @@ class FakeRunner:
         self.noise, self.fails = noise, fails
         self.batches: list[int] = []
 
-    def __call__(self, trials: Sequence[Composed]) -> None:
+    def __call__(self, trials: Sequence[TrialConfig]) -> None:
         import numpy as np
 
         self.batches.append(len(trials))
@@ -62,7 +62,7 @@ class FakeRunner:
             write_trial(folder.runs, data, views, folder.path.name.partition("-")[0])
 
 
-def ready(trial: Composed) -> bool:
+def ready(trial: TrialConfig) -> bool:
     return (TrialFolder.of(trial.values).path / "results.json").exists()
 
 

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from gsbench import cli
-from gsbench.app.hydra_app import compose_trials
+from gsbench.app.command import compose_trials
 from gsbench.config.compose import compose_one
 from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError

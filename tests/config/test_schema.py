@@ -11,7 +11,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from gsbench.app.hydra_app import compose_trials
+from gsbench.app.command import compose_trials
 from gsbench.config.schema import check, plain, register_schemas
 from gsbench.config.trust import check_target
 from gsbench.errors import InputError

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from gsbench.app.hydra_app import compose_trials
+from gsbench.app.command import compose_trials
 from gsbench.config.compose import compose_one
-from gsbench.config.hydra_guard import GuardedLoader
-from gsbench.config.sweep_jobs import _plain_values
+from gsbench.config.jobs import HydraJob, _plain_values
 from gsbench.errors import InputError
 
 ARMS = "densify=adc,volumetric"
@@ -31,13 +30,13 @@ SWEEPS = {  # words, and how often Hydra composes for them
 def compositions(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """The words of each of Hydra's compositions of a job."""
     asked: list[list[str]] = []
-    compose = GuardedLoader.load_sweep_config
+    compose = HydraJob.composed
 
-    def counted(self, master, words):  # type: ignore[no-untyped-def]
-        asked.append(words)
-        return compose(self, master, words)
+    def counted(self):  # type: ignore[no-untyped-def]
+        asked.append(self.words)
+        return compose(self)
 
-    monkeypatch.setattr(GuardedLoader, "load_sweep_config", counted)
+    monkeypatch.setattr(HydraJob, "composed", counted)
     return asked
 
 

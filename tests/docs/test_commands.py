@@ -20,7 +20,6 @@ import pytest
 import yaml
 
 from gsbench.config.command_words import GROUPS, OPTIONS, options
-from gsbench.config.old_names import RENAMED
 from gsbench.config.schema import ComponentConfig, LaunchConfig, TrackingConfig
 from gsbench.eval.options import EvalConfig
 from gsbench.external.settings import External
@@ -87,7 +86,7 @@ def fault_of_setting(word: str) -> str:
     if group == "hydra":
         return ""
     if not rest and key in GROUPS:
-        choices = {*options(key), *(old.removeprefix(f"{key}/") for old in RENAMED), *OWN}
+        choices = {*options(key), *OWN}
         given = [choice for choice in re.split(r"[,|]", value.replace("\\", "")) if VERBATIM.match(choice)]
         missing = sorted(set(given) - choices)
         return f"{key} has no choice {', '.join(missing)}" if missing else ""

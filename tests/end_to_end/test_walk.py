@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
 
 import gsbench
 from gsbench import settings
 from gsbench.cli import run
-from gsbench.config import sweep_jobs
+from gsbench.config import jobs
 from gsbench.densify import Volumetric
 from gsbench.gaussians.trainable import TrainableGaussians
 from tests.end_to_end.conftest import SMALL
@@ -84,20 +83,20 @@ def test_from_the_yaml_to_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(owner, name, watched)
 
     compositions = 0
-    compose_job = ConfigLoaderImpl.load_sweep_config
+    compose_job = jobs.HydraJob.composed
 
-    def counted(*given: Any) -> Any:
+    def counted(job: jobs.HydraJob) -> Any:
         nonlocal compositions
         compositions += 1
-        return compose_job(*given)
+        return compose_job(job)
 
-    monkeypatch.setattr(ConfigLoaderImpl, "load_sweep_config", counted)
-    watch(sweep_jobs, "settle")
+    monkeypatch.setattr(jobs.HydraJob, "composed", counted)
+    watch(jobs, "settle")
     watch(settings, "_converted", lambda value, field, cls, key: key == KEY)
     watch(Volumetric, "split_by_volume")
     watch(TrainableGaussians, "edit", lambda *given: calls["split_by_volume"] > 0)
     assert run(["-m", *TRIAL, f"runs={tmp_path}"]) == 0
-    assert compositions == calls["settle"] == 1
+    assert (compositions, calls["settle"]) == (2, 1)  # before the sweep, and by Hydra when the job begins
     assert calls["_converted"] == 1  # one build, one check
     assert len(stacks) == 4
     passed = way(stacks)

@@ -17,10 +17,9 @@ from typing import Any
 import pytest
 
 from gsbench import cli
-from gsbench.app.command import launch, run_trials
-from gsbench.app.hydra_app import compose_trials
+from gsbench.app.command import compose_trials, launch, run_trials
 from gsbench.config.command_words import GROUPS, options, parse
-from gsbench.config.compose import Composed, compose_one
+from gsbench.config.compose import TrialConfig, compose_one
 from gsbench.config.trust import check_target
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError, explain_storage
@@ -51,7 +50,7 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @cache
-def _composed(*words: str) -> Composed:
+def _composed(*words: str) -> TrialConfig:
     return compose_one(words)
 
 
@@ -98,7 +97,7 @@ def finish(
 
 @cache
 def experiment(name: str) -> list[Trial]:
-    """Composed once: the paper's tables take seconds."""
+    """TrialConfig once: the paper's tables take seconds."""
     return compose_trials([f"+experiment={name}"])
 
 

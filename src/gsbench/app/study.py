@@ -7,6 +7,7 @@ study that was killed goes on where it stopped.
 from __future__ import annotations
 
 import logging
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 
-from gsbench.app.task import grid
+from gsbench.app.sweep import grid
 from gsbench.config.command_words import check_makes_trials
 from gsbench.errors import InputError
 from gsbench.eval.facts import find, known_keys
@@ -44,15 +45,13 @@ Ranges = Mapping[str, "BaseDistribution"]  # of what is searched, by key
 class Goal:
     """Measure of a good point: ``metric``, better where there is more of it (``sign`` 1) or less (-1).
 
-    ``points`` are all that are proposed, ``at_once`` of them before the next result is known; ``seed`` is that of the
-    sampler.
+    ``points`` are all that are proposed, ``at_once`` of them before the next result is known.
     """
 
     metric: str
     sign: int
     points: int
     at_once: int = 1
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -68,8 +67,7 @@ class Study:
     ranges: Ranges
     first: Values | None = None
     seeds: int = field(default=1, kw_only=True)  # trials of each scene that a point is judged by: the record says so
-    arm: str = field(default="", kw_only=True)  # INIT-DENSIFY that is searched, where it is one
-    unseen: bool = field(default=False, kw_only=True)  # whether no point saw a test view
+    arm: str = field(default="", kw_only=True)  # INIT-DENSIFY that is searched
 
     def next_points(self) -> dict[int, Values]:
         """Values by the number of the point: those that a killed search left unjudged, else the next; none at the end.
@@ -94,7 +92,7 @@ class Study:
         while len(known) + len(points) < goal.points and len(points) < goal.at_once:
             number = len(known) + len(points)
             # A sampler for each point, so that what it proposes does not hang on how many it has proposed before.
-            study.sampler = TPESampler(seed=goal.seed + number, constant_liar=goal.at_once > 1)
+            study.sampler = TPESampler(seed=number, constant_liar=goal.at_once > 1)
             asked = study.ask(dict(self.ranges))
             points[asked.number] = asked.params
         return points
@@ -133,7 +131,7 @@ class Study:
             direction=1 if self.goal.sign > 0 else -1,
             wanted=self.goal.points,
             seeds=self.seeds,
-            validation=self.unseen,
+            validation=True,  # as all points of a tuning
             arm=self.arm,
             log=[key for key, one in self.ranges.items() if isinstance(one, numbers) and one.log],
             points=[
@@ -171,7 +169,7 @@ def check_installed() -> None:
     try:
         import optuna  # noqa: F401
     except ImportError:
-        raise InputError(f"hydra/sweeper=optuna and tuning need Optuna: {install_command('search')}") from None
+        raise InputError(f"a search needs Optuna: {install_command('search')}") from None
 
 
 def sign_of(metric: str, direction: str | None, place: str) -> int:
@@ -204,6 +202,10 @@ def distribution(override: Override) -> BaseDistribution:
             assert low is not None
             assert high is not None
             log_scale = "log" in sweep.tags
+            if not -math.inf < low < high < math.inf:
+                raise ValueError("an interval goes from a number to a larger one")
+            if log_scale and low <= 0:
+                raise ValueError("on a logarithmic scale an interval begins above 0")
             if isinstance(sweep.start, int) and isinstance(sweep.end, int) and "int" in sweep.tags:
                 return IntDistribution(sweep.start, sweep.end, log=log_scale)
             return FloatDistribution(float(low), float(high), log=log_scale)

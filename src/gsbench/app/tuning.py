@@ -10,13 +10,11 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hydra.plugins.launcher import Launcher
-from hydra.types import HydraContext
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
-from gsbench.app.study import Values, arm_of, best_words, check_installed, lie_in, words_of_values
-from gsbench.app.task import Task, launch_trials, trials_of_jobs
-from gsbench.app.tuning_plan import PLACE, Plan, TuneSettings, make_plan
+from gsbench.app.study import Values, arm_of, best_words, lie_in, words_of_values
+from gsbench.app.sweep import Sweep
+from gsbench.app.tuning_plan import DEFAULT_POINTS, PLACE, Plan, TuneSettings, make_plan
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.launch.declare import declare_plan
@@ -31,34 +29,36 @@ log = logging.getLogger(__name__)
 
 
 def tuned_jobs(
-    task: Task,
-    context: HydraContext,
-    master: DictConfig,
-    launcher: Launcher,
+    begun: Sweep,
     settings: Any,
     jobs: Sequence[Sequence[str]],
+    searched: Sequence[Mapping[str, str]],
 ) -> list[list[str]]:
-    """The jobs of a sweep with the values to which ``settings`` (``hydra.sweeper.tune``) have each arm tuned first.
+    """The jobs of a sweep with the values to which each arm is tuned first: in the intervals that are ``searched`` for
+    each job, and as ``settings`` (``hydra.sweeper.tune``) say.
 
     A tuning that is done already is taken from its record. Raises InputError for settings that fit no arm, and
     GsbenchError where no point of an arm could be judged.
     """
     given: Any = OmegaConf.to_container(settings) if OmegaConf.is_config(settings) else dict(settings)
-    wanted = TuneSettings(**given)
+    if any(searched) and given.get("points") is None:
+        given["points"] = DEFAULT_POINTS
+    wanted = TuneSettings(**given, intervals=any(searched))
     if not wanted.points:
+        if any(searched):
+            raise InputError(f"{PLACE}.points={wanted.points} searches nothing: give a value in place of each interval")
         return [list(job) for job in jobs]
-    if not master.launch.wait:
+    if not begun.config.launch.wait:
         raise InputError(f"{PLACE} learns from results, so launch.wait must be true")
-    check_installed()
-    plan = make_plan(context, master, wanted, jobs)
+    plan = make_plan(begun, wanted, jobs, searched)
     record = _done(plan)
-    if task.look_only:
+    if begun.task.look_only:
         print(plan.describe() + ("" if record is None else "; done"))
         if record is None:
             print("what it will choose is not known yet: the arms are listed as they are")
             return [list(job) for job in jobs]
-    record = _search(task, context, master, launcher, plan, len(jobs)) if record is None else record
-    return _with_chosen(context, master, jobs, record)
+    record = _search(begun, plan, len(jobs)) if record is None else record
+    return _with_chosen(begun, jobs, record)
 
 
 def _done(plan: Plan) -> TuningRecord | None:
@@ -80,9 +80,7 @@ def _done(plan: Plan) -> TuningRecord | None:
     return record
 
 
-def _search(
-    task: Task, context: HydraContext, master: DictConfig, launcher: Launcher, plan: Plan, first: int
-) -> TuningRecord:
+def _search(begun: Sweep, plan: Plan, first: int) -> TuningRecord:
     """Search every arm's ranges, one point of each arm at a time; ``first`` is the number of the first job."""
     make_runs_folder(checked_runs_folder(str(plan.home.parent)))
     declare_plan(plan.home, plan.to_record(), plan.hash)
@@ -94,9 +92,9 @@ def _search(
         while batch := {name: points for name, study in studies.items() if (points := study.next_points())}:
             asked = [(name, number, values) for name, points in batch.items() for number, values in points.items()]
             words = [by_name[name].trials(values, plan.seeds) for name, _, values in asked]
-            trials = trials_of_jobs(context, master, [job for jobs in words for job in jobs], first)
+            trials = begun.trials([job for jobs in words for job in jobs], first)
             first += len(trials)
-            launch_trials(task, master, launcher, trials)
+            begun.launch(trials)
             for (name, number, _), jobs in zip(asked, words, strict=True):
                 studies[name].judge(number, trials[: len(jobs)])
                 studies[name].write_record()
@@ -125,10 +123,8 @@ def _record(plan: Plan, found: Mapping[str, SearchRecord]) -> TuningRecord:
     )
 
 
-def _with_chosen(
-    context: HydraContext, master: DictConfig, jobs: Sequence[Sequence[str]], record: TuningRecord
-) -> list[list[str]]:
-    trials = trials_of_jobs(context, master, jobs)
+def _with_chosen(begun: Sweep, jobs: Sequence[Sequence[str]], record: TuningRecord) -> list[list[str]]:
+    trials = begun.trials(jobs)
     names = [arm_of(trial) for trial in trials]
     return [[*job, *words_of_values(_chosen(record, name) or {})] for job, name in zip(jobs, names, strict=True)]
 

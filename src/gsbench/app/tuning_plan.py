@@ -1,8 +1,8 @@
 """Plan of a tuning: the arms of a sweep, what is searched of each, by which metric, views and seeds.
 
-What is tuned stands below ``hydra.sweeper.tune``: the number of points and, for each arm, the ranges of its settings.
-Each arm has a search of its own, in an experiment of its own, so that no table holds its trials; its first point is the
-arm as it is, where that lies in the ranges.
+What is tuned is given as intervals among the words of the sweep, or below ``hydra.sweeper.tune``: the number of points
+and, for each arm, the ranges of its settings. A search is the tuning of one arm. Each arm's points are trained in an
+experiment of its own, so that no table holds them; the first is the arm as it is, where that lies in the ranges.
 """
 
 from __future__ import annotations
@@ -12,23 +12,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.types import HydraContext
-from omegaconf import DictConfig
-from pydantic import NonNegativeInt
+from pydantic import NonNegativeInt, PositiveInt
 
 from gsbench.app.study import (
     Goal,
     Ranges,
     Study,
     Values,
+    check_installed,
     distribution,
     lowest,
     sign_of,
     text_of,
     words_of_values,
 )
-from gsbench.app.task import grid, trials_of_jobs
+from gsbench.app.sweep import Sweep, grid
 from gsbench.config.command_words import parse_word
 from gsbench.errors import InputError
 from gsbench.launch.trial import Trial
@@ -40,6 +38,7 @@ from gsbench.words import closest, counted, listed
 
 PLACE = "hydra.sweeper.tune"
 DEFAULT_METRIC = "psnr"
+DEFAULT_POINTS = 20  # of intervals on the command line
 SEED = "seed"
 MEASURED_ON = ("scene", "eval", "launch", "tracking", "hydra")  # groups that no arm may tune: they say how it is judged
 REPLACED = (SEED, "name", "scene.validation", "eval.primary")  # words of a job that a point's trials have otherwise
@@ -50,20 +49,23 @@ class TuneSettings:
     """Settings of a tuning. ``points`` are those of each arm; 0 and None: nothing is tuned.
 
     ``ranges`` maps an arm (``adc`` or ``sfm-adc``) to its settings, each with its values as on the command line;
-    ``seed`` are the seeds of a point's trials, none of which the sweep may have.
+    ``seed`` are the seeds of a point's trials, none of which the sweep may have. ``intervals``: the sweep's words have
+    ranges as well.
     """
 
     points: NonNegativeInt | None = None
+    at_once: PositiveInt = 1  # points of an arm that are chosen before the next result is known
     metric: str | None = None  # None: eval.primary, else PSNR
     direction: Literal["maximize", "minimize"] | None = None
     seed: int | str = 100
     ranges: dict[str, dict[str, Any]] = field(default_factory=dict)
+    intervals: bool = False
 
     def __post_init__(self) -> None:
         check_settings(self, PLACE)
         if self.ranges and self.points is None:
             raise InputError(f"{PLACE}.ranges are given: say how many points each arm gets ({PLACE}.points=6; 0: none)")
-        if self.points and not self.ranges:
+        if self.points and not self.ranges and not self.intervals:
             raise InputError(
                 f"{PLACE}.points={self.points}, and no ranges to search: give them by arm, as "
                 f"{PLACE}.ranges.adc={{densify.gradient_threshold: 'tag(log, interval(1e-4, 4e-4))'}}, best in a file"
@@ -122,7 +124,7 @@ class Plan:
         ranges = {key: repr(one) for key, one in arm.ranges.items()}
         name = sha256_of([self.identity[arm.name], self.goal.metric, self.goal.sign, ranges, list(self.seeds)])[:16]
         home = self.home.parent / arm.experiment
-        return Study(home, name, self.goal, arm.ranges, arm.as_it_is, seeds=len(self.seeds), arm=arm.name, unseen=True)
+        return Study(home, name, self.goal, arm.ranges, arm.as_it_is, seeds=len(self.seeds), arm=arm.name)
 
     def describe(self) -> str:
         """A line that a dry run prints of the search."""
@@ -136,10 +138,13 @@ class Plan:
         )
 
 
-def make_plan(context: HydraContext, master: DictConfig, wanted: TuneSettings, jobs: Sequence[Sequence[str]]) -> Plan:
-    """The plan of the tuning that ``wanted`` asks for of the arms of a sweep's jobs; raises InputError where it fits
-    none."""
-    trials = trials_of_jobs(context, master, jobs)
+def make_plan(
+    begun: Sweep, wanted: TuneSettings, jobs: Sequence[Sequence[str]], searched: Sequence[Mapping[str, str]]
+) -> Plan:
+    """The plan of the tuning that ``wanted`` asks for of the arms of a sweep's jobs, and the intervals ``searched`` for
+    each; raises InputError where it fits none."""
+    check_installed()
+    trials = begun.trials(jobs)
     homes = {trial.files.home for trial in trials}
     if len(homes) > 1:
         raise InputError(f"{PLACE}: all trials of the sweep need one name, got {listed(sorted(h.name for h in homes))}")
@@ -147,12 +152,12 @@ def make_plan(context: HydraContext, master: DictConfig, wanted: TuneSettings, j
         raise InputError(f"{PLACE} searches on validation views by itself: leave scene.validation out")
     (home,) = homes
     metric = wanted.metric or _primary(trials) or DEFAULT_METRIC
-    goal = Goal(metric, sign_of(metric, wanted.direction, PLACE), wanted.points or 0)
+    goal = Goal(metric, sign_of(metric, wanted.direction, PLACE), wanted.points or 0, wanted.at_once)
     seeds = _seeds(wanted, trials)
-    arms = tuple(_arms(context, wanted, jobs, trials))
+    arms = tuple(_arms(begun, wanted, jobs, searched, trials))
     identity = {}
     for arm in arms:
-        first = trials_of_jobs(context, master, arm.trials(lowest(arm.ranges), seeds)) if arm.ranges else []
+        first = begun.trials(arm.trials(lowest(arm.ranges), seeds)) if arm.ranges else []
         identity[arm.name] = sha256_of([config_hash(trial.values) for trial in first])[:16]
     scenes = tuple(dict.fromkeys(trial.values["scene"]["name"] for trial in trials))
     return Plan(home, goal, seeds, scenes, arms, identity)
@@ -175,7 +180,11 @@ def _seeds(wanted: TuneSettings, trials: Sequence[Trial]) -> tuple[int, ...]:
 
 
 def _arms(
-    context: HydraContext, wanted: TuneSettings, jobs: Sequence[Sequence[str]], trials: Sequence[Trial]
+    begun: Sweep,
+    wanted: TuneSettings,
+    jobs: Sequence[Sequence[str]],
+    searched: Sequence[Mapping[str, str]],
+    trials: Sequence[Trial],
 ) -> list[Arm]:
     names = [(str(trial.values["init"]["name"]), str(trial.values["densify"]["name"])) for trial in trials]
     known = {name for init, densify in names for name in (densify, f"{init}-{densify}")}
@@ -187,16 +196,17 @@ def _arms(
     arms = []
     for pair in dict.fromkeys(names):
         name = "-".join(pair)
-        given = wanted.ranges.get(name, wanted.ranges.get(pair[1]))
+        places = [place for place, own in enumerate(names) if own == pair]
+        typed = {key: text for place in places for key, text in searched[place].items()}
+        given = wanted.ranges.get(name, wanted.ranges.get(pair[1], typed or None))
         if given is None:
             raise InputError(
                 f"{PLACE}.ranges say nothing of {pair[1]}: give what is tuned of it, or {pair[1]}: {{}} to leave it "
                 "as it is, which each verdict will say"
             )
-        places = [place for place, own in enumerate(names) if own == pair]
-        texts = {str(key): str(value) for key, value in given.items()}
+        texts = {str(key): str(value) for key, value in given.items()} | typed
         own = [tuple(word for word in jobs[place] if _key(word) not in REPLACED) for place in places]
-        ranges = _ranges(context, name, texts, [word for place in places for word in jobs[place]])
+        ranges = _ranges(begun, name, texts, [word for place in places for word in jobs[place]])
         first = _as_it_is(trials[places[0]].values, ranges) if ranges else None
         experiment = f"{trials[places[0]].values['name']}-tune-{name}"
         arms.append(Arm(name, experiment, texts, ranges, tuple(dict.fromkeys(own)), first))
@@ -205,7 +215,7 @@ def _arms(
     return arms
 
 
-def _ranges(context: HydraContext, arm: str, texts: Mapping[str, str], words: Sequence[str]) -> Ranges:
+def _ranges(begun: Sweep, arm: str, texts: Mapping[str, str], words: Sequence[str]) -> Ranges:
     given = {_key(word) for word in words}
     found = {}
     for key, text in texts.items():
@@ -218,7 +228,7 @@ def _ranges(context: HydraContext, arm: str, texts: Mapping[str, str], words: Se
             parse_word(f"{key}={text}")
         except InputError as error:
             raise InputError(f"{PLACE}.ranges of {arm}: {error}") from None
-        (override,) = OverridesParser.create(context.config_loader).parse_overrides([f"{key}={text}"])
+        (override,) = begun.parse([f"{key}={text}"])
         if not override.is_sweep_override():
             raise InputError(f"{PLACE}.ranges: {key}={text} is one value: give an interval or a list of values")
         found[key] = distribution(override)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
-from gsbench.config.compose import Composed
+from gsbench.config.compose import TrialConfig
 from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS
 
@@ -20,13 +20,13 @@ class Here:
     have to be fetched count as missing.
     """
 
-    def __init__(self, folders: Callable[[Sequence[Composed]], Sequence[str]], download: bool) -> None:
+    def __init__(self, folders: Callable[[Sequence[TrialConfig]], Sequence[str]], download: bool) -> None:
         self._folders, self._download = folders, download
         self._init = cache(self._missing_weights)
         self._metrics = cache(self._missing_metrics)
         self._photographs = cache(self._read_photographs)
 
-    def __call__(self, trial: Composed, metric: str) -> str:
+    def __call__(self, trial: TrialConfig, metric: str) -> str:
         """Return why the trial cannot be run here or lacks the metric, in one line; "" where nothing is missing."""
         if missing := self._folders([trial]):
             return missing[0]
@@ -37,7 +37,7 @@ class Here:
             return self._metrics(_frozen(values["eval"])).get(metric, "")
         return ""
 
-    def fingerprint(self, trial: Composed) -> str | None:
+    def fingerprint(self, trial: TrialConfig) -> str | None:
         """The fingerprint of the trial's photographs, as its results would hold it; None of those still to be made."""
         return self._photographs(_frozen(trial.values["scene"]))
 

@@ -22,11 +22,11 @@ from gsbench.claims.shares import (
 )
 from gsbench.claims.sweep import Check, Find, Question, prepare
 from gsbench.claims.verdict import Verdict
-from gsbench.config.compose import Composed
+from gsbench.config.compose import TrialConfig
 from gsbench.errors import InputError
 from gsbench.runs.declaration import DeclaredPlan
 
-Fingerprint = Callable[[Composed], str | None]  # None: nobody knows it yet
+Fingerprint = Callable[[TrialConfig], str | None]  # None: nobody knows it yet
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from gsbench.claims.file import Claim
 from gsbench.claims.sequential import FIRST_LOOK, Design, plan_looks
 from gsbench.claims.sweep import Question, T
 from gsbench.claims.verdict import Pair, PairKey, Verdict, judge_claim
-from gsbench.config.compose import Composed
+from gsbench.config.compose import TrialConfig
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find
 from gsbench.runs.declaration import STOPPING, DeclaredPlan, read_plans
@@ -225,7 +225,7 @@ def headline(verdict: Verdict) -> str:
     )
 
 
-def _expected(trial: Composed) -> TrialResult:
+def _expected(trial: TrialConfig) -> TrialResult:
     """The trial as if it had run: it has a configuration and no results."""
     values, folder = trial.values, TrialFolder.of(trial.values).path
     record = TrialRecord(

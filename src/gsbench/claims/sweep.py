@@ -20,8 +20,8 @@ from gsbench.claims.measures import is_measurable, same_in_pictures
 from gsbench.claims.sequential import plan_looks
 from gsbench.claims.shares import same_training
 from gsbench.claims.verdict import Pair, PairKey, Verdict, judge_claim
-from gsbench.config.compose import Composed, compose_one
-from gsbench.config.sweep_jobs import with_seed
+from gsbench.config.compose import TrialConfig, compose_one
+from gsbench.config.jobs import with_seed
 from gsbench.errors import InputError
 from gsbench.records import read_if_sound
 from gsbench.runs.declaration import DeclaredPlan
@@ -33,9 +33,9 @@ from gsbench.words import closest, counted, some_of, without_places
 
 log = logging.getLogger(__name__)
 
-T = TypeVar("T", bound=Composed)
-Lacking = Callable[[Composed, str], str]  # (trial, metric) -> why it cannot be had here, or ""
-Find = Callable[[Composed], TrialResult | None]  # the trial with these settings and seed, where it is done
+T = TypeVar("T", bound=TrialConfig)
+Lacking = Callable[[TrialConfig, str], str]  # (trial, metric) -> why it cannot be had here, or ""
+Find = Callable[[TrialConfig], TrialResult | None]  # the trial with these settings and seed, where it is done
 HERE = "here"  # name of the runs folder among the sources of trials
 
 
@@ -63,7 +63,7 @@ class PlannedPair(NamedTuple):
     claim: str
     scene: str
     seed: int
-    trials: tuple[Composed, Composed]
+    trials: tuple[TrialConfig, TrialConfig]
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Check:
     file: ClaimsFile
     runs: Path
     questions: tuple[Question, ...]
-    first: dict[tuple[str, str, str], Composed]  # by claim, scene, arm
+    first: dict[tuple[str, str, str], TrialConfig]  # by claim, scene, arm
     run_here: frozenset[tuple[str, str]]
     elsewhere: tuple[tuple[str, Find], ...] = ()
 
@@ -119,11 +119,11 @@ class Check:
         asked = {(question.claim.id, scene) for question in self.questions for scene in question.scenes}
         return asked <= self.run_here
 
-    def trials(self, questions: Sequence[Question], seeds: int) -> list[Composed]:
+    def trials(self, questions: Sequence[Question], seeds: int) -> list[TrialConfig]:
         """The trials to be run here that the questions need for their first ``seeds`` seeds; one that several need
         stands once.
         """
-        found: dict[Path, Composed] = {}
+        found: dict[Path, TrialConfig] = {}
         for pair in sorted(self._planned_pairs(questions, seeds), key=lambda pair: pair.seed):
             if (pair.claim, pair.scene) in self.run_here and not self._is_shared(pair):
                 for trial in pair.trials:
@@ -153,7 +153,7 @@ class Check:
         """The number of pairs of trials that others' shares hold whole."""
         return sum(map(self._is_shared, self._planned_pairs(self.questions, self.looks[-1])))
 
-    def planned(self) -> Iterator[tuple[str, str, Composed]]:
+    def planned(self) -> Iterator[tuple[str, str, TrialConfig]]:
         """(claim, scene, trial) for all that the plan may come to need, here or elsewhere."""
         for pair in self._planned_pairs(self.questions, self.looks[-1]):
             for trial in pair.trials:
@@ -225,8 +225,8 @@ def prepare(
             raise InputError(f"{file.name} has no scene {scene}{near} (it has {', '.join(file.scenes)})")
     here: set[tuple[str, str]] = set()
     questions: list[Question] = []
-    first: dict[tuple[str, str, str], Composed] = {}
-    known: dict[tuple[str, ...], Composed] = {}
+    first: dict[tuple[str, str, str], TrialConfig] = {}
+    known: dict[tuple[str, ...], TrialConfig] = {}
     for claim in file.claims:
         scenes: list[str] = []
         missing: dict[str, list[str]] = {}  # scenes by reason
@@ -331,15 +331,15 @@ def _is_final(verdict: Verdict) -> bool:
     return verdict.decision is not None and verdict.decision.final
 
 
-def _composed(words: Sequence[str], runs: Path, where: str) -> Composed:
+def _composed(words: Sequence[str], runs: Path, where: str) -> TrialConfig:
     try:
         trial = compose_one(words)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    return Composed(trial.values | {"runs": str(runs.resolve())}, trial.yaml, trial.overrides)
+    return TrialConfig(trial.values | {"runs": str(runs.resolve())}, trial.overrides)
 
 
-def _check_different(claim: Claim, scenes: Sequence[str], first: dict[tuple[str, str, str], Composed]) -> None:
+def _check_different(claim: Claim, scenes: Sequence[str], first: dict[tuple[str, str, str], TrialConfig]) -> None:
     """Raise InputError where both arms are one and the same trial."""
     for scene in scenes:
         one, other = (TrialFolder.of(first[claim.id, scene, arm].values).path for arm in (claim.baseline, claim.arm))

@@ -5,13 +5,16 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 from gsbench.config.schema import COMPONENTS
+from gsbench.config.trust import PACKAGE, PERMISSIONS, is_allowed, to_type
 from gsbench.errors import InputError
 from gsbench.runs.hashing import DECLARED, NOT_HASHED, WITHOUT_EFFECT
 from gsbench.system.install import conf_dir
@@ -21,6 +24,7 @@ GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "la
 EXTERNAL_FOLDER = "external"  # below a group: choices that are no arms of gsbench's own, which glob(*) leaves out
 NAMED_APART = ("name", "seed")  # not hashed, and yet each of their values has a trial of its own
 OPTIONS = ("-m", "--multirun", "--dry-run", "--config-dir", "--cfg", "--info", "--help", "--version")
+MOST_BRACKETS = 40
 KEY = re.compile(r"[+~]*\w+([./]\w+)*")
 
 
@@ -38,8 +42,12 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
         elif word.split("=")[0] in ("--config-dir", "-cd"):
             folders.append(Path(word.partition("=")[2] or next(words, "")))
         elif word.startswith("-"):
+            group = word.lstrip("-").partition("=")[0]
+            near = (
+                f"; a setting has no dashes: {group}=…" if group.partition(".")[0] in GROUPS else closest(word, OPTIONS)
+            )
             raise InputError(
-                f"{word} is not an option{closest(word, OPTIONS)} "
+                f"{word} is not an option{near} "
                 "(there are -m, --dry-run, --config-dir FOLDER, --cfg job, --info, --help)"
             )
         else:
@@ -69,8 +77,9 @@ def check_words(words: Sequence[str]) -> None:
     for word in words:
         override = parse_word(word)
         key = override.get_key_element().lstrip("+~")
-        if key.startswith(("hydra.", "hydra/")):
-            continue  # Hydra's own settings: what of them cannot be is said of the whole (app/hydra_app.py)
+        if key.startswith(("hydra.", "hydra/")):  # what of these cannot be is said of the whole (app/command.py)
+            if override.is_sweep_override():
+                raise InputError(f"{word}: Hydra's own settings are one for all trials, so choose one value")
         elif key == "experiment" or key.startswith(("experiment/", "experiment@", "experiment.")):
             _check_experiment_word(word, override)
         elif "@" in key:
@@ -81,18 +90,78 @@ def check_words(words: Sequence[str]) -> None:
             raise InputError(f"{word!r}: choose one by its name: {key}={', '.join(options(key))}")
 
 
+def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
+    """The names that a command line allows: those of ``allow_targets=[…]``, the last if it stands there twice."""
+    found: tuple[str, ...] = ()
+    for word in words:
+        override = parse_word(word)
+        if override.get_key_element().lstrip("+~") != PERMISSIONS or override.is_sweep_override():
+            continue
+        names: Any = override.value()
+        if not isinstance(names, list) or not all(isinstance(name, str) and name and "$" not in name for name in names):
+            raise InputError(f"{word}: {PERMISSIONS} is a list of names, such as {PERMISSIONS}=[mine]")
+        found = tuple(names)
+    return found
+
+
+def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> None:
+    """Refuse a place of configurations that Hydra would import while it composes: ``hydra.searchpath=[pkg://package]``.
+
+    Hydra 1.4 takes ``hydra[searchpath]`` and ``extend_list(pkg://package)`` as well.
+    """
+    for word in words:
+        override = parse_word(word)
+        key = override.get_key_element().lstrip("+~").replace("[", ".").replace("]", "")
+        if key != "hydra.searchpath" or override.is_sweep_override():
+            continue
+        value: Any = override.value()
+        for place in value if isinstance(value, list) else getattr(value, "values", ()):
+            scheme, colon, path = str(place).partition("://")
+            if not colon or scheme == "file":
+                continue
+            package = path.replace("/", ".")
+            if scheme != "pkg":
+                raise InputError(f"hydra.searchpath: {place} is neither a folder (file://…) nor a package (pkg://…)")
+            if not is_allowed(package, (PACKAGE, *allowed)):
+                advice = to_type([package.split(".")[0]], allowed)
+                raise InputError(f"hydra.searchpath: {place} imports a package; if you trust it, {advice}")
+
+
+@cache
 def parse_word(word: str) -> Override:
     """A word as Hydra reads it. Raises InputError where it is no ``key=value``."""
     if "=" not in word and not word.startswith("~"):
         raise InputError(f"{word!r} is not a setting like key=value")
+    if brackets(word) > MOST_BRACKETS:
+        raise InputError(f"{word[:40]!r}… opens more than {MOST_BRACKETS} brackets within each other")
     try:
         override = OverridesParser.create().parse_override(word)
+    except ValueError as error:  # such as a number of more digits than Python converts
+        raise InputError(f"{word[:40]!r}… is not a setting like key=value ({error})") from None
     except HydraException as error:
         reason = re.sub(r",? expecting .*", "", str(error).splitlines()[0])
         raise InputError(f"{word!r} is not a setting like key=value ({reason}){_quoted(word)}") from error
     if not override.key_or_group.strip():
         raise InputError(f"{word!r} names no setting")
     return override
+
+
+def brackets(word: str) -> int:
+    """How many brackets are open at once at most: Hydra's parser goes down by recursion."""
+    depth = deepest = 0
+    for letter in word:
+        depth += (letter in "[{(") - (letter in "]})")
+        deepest = max(deepest, depth)
+    return deepest
+
+
+def hint_for(word: str) -> str:
+    """``; did you mean scene=photos?`` for a word that is a choice of some groups, and what a group's name needs."""
+    if word in GROUPS:
+        return f"; {word} is a group: choose one by {word}=NAME ({', '.join(options(word))})"
+    groups = [group for group in GROUPS if word in options(group)]
+    meant = [f"{'+' * (group == 'experiment')}{group}={word}" for group in groups]
+    return f"; did you mean {' or '.join(meant)}?" if meant else ""
 
 
 def _quoted(word: str) -> str:
@@ -126,7 +195,7 @@ def check_sweep(override: Override) -> None:
         key = override.get_key_element().lstrip("+~")
         raise InputError(
             f"{override.input_line}: a sweep is a list of values, such as {key}=1,2,3; "
-            "intervals are for hydra/sweeper=optuna"
+            "intervals are for gsbench's own sweeper, which searches in them (docs/search.md)"
         )
     check_makes_trials(override)
 

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Sequence
 from typing import Any
 
-import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.plugins.completion_plugin import DefaultCompletionPlugin
 from omegaconf import DictConfig, OmegaConf
 
-from gsbench.config.command_words import parse
-from gsbench.config.compose import composing
-from gsbench.config.hydra_internals import VERSION_BASE
-from gsbench.config.hydra_job import CONFIG_NAME
-from gsbench.config.schema import register_schemas
+from gsbench.config.command_words import check_search_path, parse, searched_folders, typed_permissions
+from gsbench.config.compose import check_files
+from gsbench.config.hydra_entry import CONFIG_NAME, hydra_ready, run_main
 from gsbench.errors import InputError
-from gsbench.system.install import conf_dir
 
 NOT_TYPED = ("experiment", "experiment=", "hydra", "hydra.", "schema/")  # Hydra offers them, and gsbench refuses them
 
@@ -29,13 +24,7 @@ def answer(argv: Sequence[str]) -> None:
     def task(config: Any) -> None:
         raise AssertionError("Hydra was asked a question, and ran the task instead")
 
-    register_schemas()
-    saved = sys.argv
-    sys.argv = ["gsbench", *argv]
-    try:
-        hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=CONFIG_NAME)(task)()
-    finally:
-        sys.argv = saved
+    run_main(task, argv)
 
 
 def has_part(config: DictConfig, key: str) -> bool:
@@ -49,10 +38,12 @@ def settings_like(words: Sequence[str], word: str) -> list[str]:
     key = head.partition("=")[0] + "=" if comma else ""
     try:
         overrides, _, _ = parse(words)
+        check_search_path(overrides, typed_permissions(overrides))  # Hydra would import a package to look into it
+        check_files(searched_folders(overrides))
     except InputError:
         return []
     first_values = [re.sub(r"^(\w+=[\w-]+),.*", r"\1", override) for override in overrides]  # Hydra: one at a time
-    with composing():
+    with hydra_ready():
         plugin = DefaultCompletionPlugin(GlobalHydra.instance().config_loader())
         try:
             found = plugin._query(CONFIG_NAME, " ".join([*first_values, key + last]))

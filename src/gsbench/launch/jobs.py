@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gsbench.config.hydra_job import HydraJob
+from gsbench.config.jobs import HydraJob
 from gsbench.errors import InputError
 from gsbench.files import require_own
 from gsbench.launch.outcome import Outcome, outcome_of_results
@@ -47,7 +47,6 @@ class TrialJob:
     """The callable that submitit runs; submitit asks ``checkpoint`` for what to requeue when time is up."""
 
     values: dict[str, Any]
-    yaml: str
     path: list[str]  # sys.path of the submitting process
     own: dict[str, str]  # the user's modules that it may import, and where they lie
     visible_gpus: str | None  # its CUDA_VISIBLE_DEVICES
@@ -69,7 +68,7 @@ class TrialJob:
                 assign_threads(self.values["threads"], launch["parallel"])
                 from gsbench.launch.serial import run_one
 
-                outcome = run_one(Trial(self.values, self.yaml, (), self.job), wait=True)
+                outcome = run_one(Trial(self.values, (), self.job), wait=True)
                 if launch["name"] == "slurm":
                     with suppress(OSError):
                         forget_submission(outcome.folder)
@@ -177,6 +176,5 @@ class _Outcomes(pickle.Unpickler):
 
 def job_of(trial: Trial) -> TrialJob:
     """The trial as a job of the environment that this process has."""
-    job = None if trial.job is None else trial.job.for_another_process()
     path = [entry for entry in sys.path if entry]
-    return TrialJob(trial.values, trial.yaml, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"), job)
+    return TrialJob(trial.values, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"), trial.job)

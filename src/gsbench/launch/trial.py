@@ -10,20 +10,20 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gsbench.config.compose import Composed
+from gsbench.config.compose import TrialConfig
 from gsbench.runs.trial_folder import TrialFolder
 
 if TYPE_CHECKING:
     from gsbench.pipeline.parts import Parts
 
 
-class Trial(Composed):
+class Trial(TrialConfig):
     """A composed trial: it knows where its files lie, and keeps its parts from the first check until it has run."""
 
     @classmethod
-    def of(cls, composed: Composed) -> Trial:
+    def of(cls, composed: TrialConfig) -> Trial:
         """The trial of a composition."""
-        return cls(composed.values, composed.yaml, composed.overrides, composed.job, composed.recorded)
+        return cls(composed.values, composed.overrides, composed.job, composed.recorded)
 
     @cached_property
     def files(self) -> TrialFolder:

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 
 from gsbench.analysis.results import read_experiment
+from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
-from gsbench.config.hydra_guard import typed_permissions
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize

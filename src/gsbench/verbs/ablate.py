@@ -9,8 +9,7 @@ from typing import Any
 
 import yaml
 
-from gsbench.app.command import run_trials
-from gsbench.app.hydra_app import compose_trials
+from gsbench.app.command import compose_trials, run_trials
 from gsbench.claims.switches import (
     Record,
     choose_switches,
@@ -106,7 +105,7 @@ def _switch(text: str) -> tuple[str, Switch]:
 
 def _trials(words: Sequence[str]) -> list[Trial]:
     """The trials of a sweep's words, without what Hydra knows of them as jobs of one command."""
-    trials = [Trial(trial.values, trial.yaml, trial.overrides) for trial in compose_trials(words, multirun=True)]
+    trials = [Trial(trial.values, trial.overrides) for trial in compose_trials(words, multirun=True)]
     if trials[0].values["launch"]["stop_when_decided"]:
         raise InputError("ablate needs all seeds of all runs: leave launch.stop_when_decided out")
     return trials

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -10,13 +11,23 @@ from gsbench.errors import InputError
 from gsbench.words import closest, is_path
 
 MAX_PORT = 65535
+SETTING = re.compile(r"[+~]*[a-z_]\w*([./]\w+)*=")
 
 
 class ArgumentParser(argparse.ArgumentParser):
     """An argparse parser that raises InputError for what it does not understand; ``--help`` prints and exits."""
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
-        found, unknown = self.parse_known_args(args, namespace)
+        words = list(args or [])
+        typed = [word for word in words if word.lstrip("+").startswith("allow_targets=")]
+        found, unknown = self.parse_known_args([word for word in words if word not in typed], namespace)
+        takers = [action.dest for action in self._actions if not action.option_strings and "=" in str(action.metavar)]
+        if takers:  # settings count wherever they stand: argparse takes them in one row alone, or for an option's value
+            typed += [word for word in unknown if SETTING.match(word)]
+            setattr(found, takers[0], [*getattr(found, takers[0]), *typed])
+            unknown = [word for word in unknown if not SETTING.match(word)]
+        else:
+            unknown += typed
         if unknown:
             options = [option for action in self._actions for option in action.option_strings]
             nears = (closest(word.partition("=")[0], options) for word in unknown if word.startswith("--"))

@@ -11,7 +11,7 @@ from gsbench.claims.here import Here
 from gsbench.claims.recheck import check_can_go_on, judged, recheck, with_shares
 from gsbench.claims.shares import Shares, check_plan_keeps, read_shares
 from gsbench.claims.sweep import Check, prepare, run_looks
-from gsbench.config.compose import Composed
+from gsbench.config.compose import TrialConfig
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, place_of, write_text
@@ -170,10 +170,10 @@ def _run(check: Check, archives: Sequence[Path], shares: Shares | None, all_seed
         plans = sorted((*plans, *shares.plans), key=lambda plan: plan.time)
         declared = standing_plan(plans)
 
-    def is_done(trial: Composed) -> bool:
+    def is_done(trial: TrialConfig) -> bool:
         return not TrialFolder.of(trial.values).why_not_done(trial.values)
 
-    def run(trials: Sequence[Composed]) -> None:
+    def run(trials: Sequence[TrialConfig]) -> None:
         run_batch([Trial.of(trial) for trial in trials])
 
     if all_seeds and (left := [one for one in check.trials(check.questions, check.looks[-1]) if not is_done(one)]):

@@ -31,7 +31,7 @@ TRITON_CAPABILITY = (8, 0)  # "NVIDIA GPUs (Compute Capability 8.0+)", in Triton
 OPTIONAL = {  # module -> what needs it, and the extra that brings it
     "transformers": ("init=dim", "dim"),
     "gsplat": ("raster=gsplat", "gsplat"),
-    "optuna": ("hydra/sweeper=optuna", "search"),
+    "optuna": ("searches (hydra.sweeper.tune)", "search"),
     "submitit": ("launch=local and launch=slurm", "slurm"),
     "tensorboard": ("tracking=tensorboard", "tensorboard"),
     "viser": ("gsbench view", "view"),

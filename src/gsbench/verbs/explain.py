@@ -36,12 +36,13 @@ def _stale(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument(
         "trial",
         nargs="+",
+        metavar="FOLDER or KEY=VALUE",
         help="a trial's folder, with allow_targets=[mine] where it has code of yours; or the settings of one "
         "(scene=... densify=...)",
     )
     words = parser.parse_args(argv).trial
-    from gsbench.app.hydra_app import compose_trials
-    from gsbench.config.hydra_guard import typed_permissions
+    from gsbench.app.command import compose_trials
+    from gsbench.config.command_words import typed_permissions
     from gsbench.config.trust import PERMISSIONS
     from gsbench.pipeline.parts import Parts
     from gsbench.pipeline.wiring import TrialSteps

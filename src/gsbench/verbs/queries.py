@@ -7,9 +7,8 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
-from gsbench.config.command_words import check_single, parse_word, search_path
+from gsbench.config.command_words import check_search_path, check_single, parse_word, search_path, typed_permissions
 from gsbench.config.compose import compose_values
-from gsbench.config.hydra_guard import check_search_path, typed_permissions
 from gsbench.config.questions import answer, has_part
 from gsbench.errors import InputError
 from gsbench.verbs.arguments import ArgumentParser
@@ -53,7 +52,7 @@ def _check_typed(line: str) -> None:
 
 def _parser() -> ArgumentParser:
     parser = ArgumentParser(prog="gsbench", add_help=False, allow_abbrev=False)
-    parser.add_argument("overrides", nargs="*")
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
     parser.add_argument("--cfg", "-c", choices=["job", "hydra", "all"])
     parser.add_argument("--resolve", action="store_true")
     parser.add_argument("--package", "-p")

@@ -7,11 +7,9 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-import yaml
-
-from gsbench.config.compose import Composed, compose_one
-from gsbench.config.hydra_guard import typed_permissions
-from gsbench.config.trust import PERMISSIONS, check_permissions
+from gsbench.config.command_words import typed_permissions
+from gsbench.config.compose import TrialConfig, compose_one
+from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
@@ -103,7 +101,7 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
             raise InputError(
                 f"{' '.join(changes)} would make other trials than those of the plan: give the sweep's own command"
             )
-        found = Trial(trial.values | {"runs": str(runs)}, trial.yaml, trial.overrides)
+        found = Trial(trial.values | {"runs": str(runs)}, trial.overrides)
         # A plan without words may be of a trial that was read from its record, whose settings are not the defaults.
         if planned.overrides or found.folder == folder or not (folder / CONFIG).exists():
             return found
@@ -116,8 +114,7 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
     values = files.configuration() | {"runs": str(runs), PERMISSIONS: list(allowed)}
     if values["densify"].get("evaluated_from") == FROM_RENDERS:
         raise InputError(f"{files.label} was entered from renders: give the command of `gsbench evaluate` again")
-    check_permissions(values)
-    return Trial(values, yaml.safe_dump(values, sort_keys=False), (), recorded=True)
+    return Trial(values, (), recorded=True)
 
 
 def key_of(word: str) -> str:
@@ -125,7 +122,7 @@ def key_of(word: str) -> str:
     return word.split("=")[0].lstrip("+~")
 
 
-def _identity(trial: Composed) -> Path:
+def _identity(trial: TrialConfig) -> Path:
     """The trial's place within any runs folder."""
     folder = TrialFolder.of(trial.values)
     return folder.path.relative_to(folder.runs)
