@@ -339,7 +339,7 @@ def test_any_value_of_any_setting(composed: Any, key: tuple[str, str], value: An
 HASHES = {
     (): "bf148151b94b1fcf1ad46dd0a85a483d07b64a2bd931e48b21548a37655edb11",
     ("scene=photos", "scene.path=/data/p", "scene.max_size=800", "densify=adc", "train=paper", "eval=standard"):
-        "dbe8912bbcb5e4d4e166210e4f356a0b7067161e9c9110a41414dcdb567e13ed",
+        "d36c6f23403bea4685a10e8dd643060a0206053efdd09247cb1f864a85d1d3a6",
     ("train.opacity=1", "train.max_seconds=60", "train.background=[1,1,1]", "densify.prune_size=1", "eval.lpips=[vgg]",
      "train.volume_histogram=[]", "init.peak_threshold=1"):
         "e11ce2833dc8968c88fb3b2426bdbb5fe7a4988d3f70aa2fcb728d5a15af18f8",

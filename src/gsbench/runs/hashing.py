@@ -27,6 +27,7 @@ LATER: dict[str, dict[str, Any]] = {
     },
     "init": {"points_from": "all"},
     "train": {"resolution_schedule": "none"},
+    "eval": {"bands": False, "fps": None},
 }
 BEFORE = {f"{group}.{name}": value for group, values in LATER.items() for name, value in values.items()}
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
