@@ -18,6 +18,7 @@ from gsbench.datasets.archive import (
     extract,
     holds,
     members_of,
+    open_archive,
     open_local,
     open_remote,
 )
@@ -134,8 +135,8 @@ class Fetcher:
             pinned = archive.sha256.get("archive")
             if pinned not in (None, sha256):
                 raise InputError(f"{where} has sha256 {sha256}, not {pinned}: give another --mirror")
-            if not zipfile.is_zipfile(temporary):
-                raise InputError(f"{where} is no whole zip archive: give another address with --mirror")
+            with temporary.open("rb") as file:
+                open_archive(file, where).close()
 
     def _plan(self, archive: Archive, opened: zipfile.ZipFile, files: SceneFiles) -> ScenePlan:
         """Sort the scene's members by where they are.
