@@ -38,7 +38,7 @@ HYDRA = {"hydra", "omegaconf"}
 ONLY = {
     ("analysis", "eval"): {"gsbench.eval.facts", "gsbench.eval.protocol"},  # tables of facts, which load no torch
     ("config", "train"): {"gsbench.train.options"},
-    ("config", "external"): {"gsbench.external.placeholders"},
+    ("config", "external"): {"gsbench.external.settings"},
 }
 
 Graph = Mapping[str, set[str]]

@@ -16,9 +16,8 @@ from PIL import Image
 
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.exchange import write_test_cameras, write_training_views
-from gsbench.external.placeholders import fill, words_of
 from gsbench.external.program import run_program
-from gsbench.external.settings import External
+from gsbench.external.settings import External, fill, words_of
 from gsbench.init.base import PointCloud
 from gsbench.runs.hashing import config_hash
 from gsbench.scene.camera import Camera

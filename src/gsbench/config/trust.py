@@ -21,7 +21,7 @@ from omegaconf.errors import GrammarParseError, OmegaConfBaseException
 from omegaconf.grammar_parser import parse
 
 from gsbench.errors import InputError
-from gsbench.external.placeholders import program_of
+from gsbench.external.settings import program_of
 from gsbench.system.own_modules import allowed_modules
 from gsbench.words import closest
 

@@ -1,13 +1,16 @@
 """Another program as an arm: the settings of what trains in place of gsbench.
 
-It is chosen in the group ``densify``, because an arm of a table is an initialiser and a densifier.
+It is chosen in the group ``densify``, because an arm of a table is an initialiser and a densifier. In its command
+``{name}`` stands for what is known when it runs. Loads no torch.
 """
 
 from __future__ import annotations
 
 import os
+import re
+import shlex
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from tempfile import TemporaryDirectory
@@ -17,8 +20,8 @@ from annotated_types import MinLen, Predicate, doc
 from pydantic import PositiveFloat
 
 from gsbench.errors import InputError
-from gsbench.external.placeholders import fill, names_in, program_of, words_of
 from gsbench.settings import MISSING, check_settings
+from gsbench.words import closest
 
 # Placeholders of a command beside the options of its YAML.
 DATA = "data"  # folder of the training views: images/ and the COLMAP model sparse/0
@@ -30,6 +33,42 @@ MODEL_SUFFIX = ".ply"
 
 Text = Annotated[str, MinLen(1), Predicate(lambda text: text != MISSING and bool(text.strip())), doc("a text")]
 CommandLine = Annotated[list[str] | str, doc("a list of words, or a text that is split as a shell would")]
+PLACEHOLDER = re.compile(r"\{(\w+)\}")
+Command = str | Sequence[str]  # one text is split as a shell would; none is run
+
+
+def words_of(command: Command, key: str) -> list[str]:
+    """A command's words; the setting ``key`` is named in errors. Raises InputError for an empty one, or open quotes."""
+    try:
+        words = shlex.split(command) if isinstance(command, str) else [str(word) for word in command]
+    except ValueError as error:
+        raise InputError(f"{key} cannot be split into words ({error}): write it as a list") from error
+    if not words or not words[0]:
+        raise InputError(f"{key} is empty: name the program to run")
+    return words
+
+
+def program_of(command: Command, options: Mapping[str, object], key: str = "densify.command") -> str:
+    """The program that the setting ``key`` runs: its first word, in which ``options`` may stand."""
+    return fill(words_of(command, key)[0], options, key)
+
+
+def names_in(texts: Iterable[str]) -> set[str]:
+    """The placeholders that stand in ``texts``."""
+    return {name for text in texts for name in PLACEHOLDER.findall(text)}
+
+
+def fill(text: str, values: Mapping[str, object], key: str) -> str:
+    """``text`` with every placeholder replaced once. Raises InputError, naming ``key``, for one that is not known."""
+
+    def value(match: re.Match[str]) -> str:
+        name = match[1]
+        if name not in values:
+            there = ", ".join(f"{{{known}}}" for known in values)
+            raise InputError(f"{key}: nothing is known as {{{name}}}{closest(name, values)} (there are {there})")
+        return str(values[name])
+
+    return PLACEHOLDER.sub(value, text)
 
 
 def check_pattern(pattern: str) -> None:

@@ -19,9 +19,8 @@ import torch
 from gsbench.densify import Lineage
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.exchange import take_model, take_renders, write_test_cameras, write_training_views
-from gsbench.external.placeholders import fill, words_of
 from gsbench.external.program import run_program
-from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS, External
+from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS, External, fill, words_of
 from gsbench.files import write_json
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
