@@ -26,8 +26,8 @@ from gsbench.cli import run
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "demo.jpg"
 BASELINE, IDEA = "adc", "volumetric"
-COLUMNS = {"psnr": "PSNR (dB) ↑", "ssim": "SSIM ↑", "lpips_squeeze": "LPIPS ↓", "num_gaussians": "Gaussians"}
-FORMATS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips_squeeze": "{:.3f}", "num_gaussians": "{:,.0f}"}
+COLUMNS = {"psnr": "PSNR (dB) ↑", "ssim": "SSIM ↑", "flip": "FLIP ↓", "num_gaussians": "Gaussians"}
+FORMATS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "flip": "{:.3f}", "num_gaussians": "{:,.0f}"}
 
 
 def pixels(path: Path) -> NDArray[np.float64]:
