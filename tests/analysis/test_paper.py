@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from gsbench.analysis.cells import Cell
-from gsbench.analysis.choices import read_setup
 from gsbench.analysis.explain import explain_cell
-from gsbench.analysis.paper import TABLE1_QUANTITIES, Printed, load_paper
+from gsbench.analysis.paper import TABLE1_QUANTITIES, Printed, load_paper, read_setup
 from gsbench.analysis.paper_tables import Agreement, agreement, paper_tables, t_half_width
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.table_formats import to_html, to_latex, to_markdown

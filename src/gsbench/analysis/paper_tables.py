@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from enum import Enum
 
 from gsbench.analysis.cells import Cell
-from gsbench.analysis.choices import choice_lines
 from gsbench.analysis.paper import (
     ARM_NAMES,
     INIT_NAMES,
@@ -16,6 +15,7 @@ from gsbench.analysis.paper import (
     TABLE1_QUANTITIES,
     TABLE2_ARMS,
     Printed,
+    choice_lines,
     load_paper,
 )
 from gsbench.analysis.quantities import Quantity, quantity

@@ -11,8 +11,7 @@ from importlib.resources import files
 import yaml
 
 from gsbench.analysis.cells import by_key, check_averageable, make_cell
-from gsbench.analysis.choices import PaperChoice, choice_lines, read_setup
-from gsbench.analysis.paper import Printed
+from gsbench.analysis.paper import PaperChoice, Printed, choice_lines, read_setup
 from gsbench.analysis.paper_tables import Agreement, compare_with_printed, legend
 from gsbench.analysis.quantities import quantity
 from gsbench.analysis.results import TrialResult
