@@ -22,10 +22,10 @@ from gsbench.analysis.attribution import (
     representatives,
 )
 from gsbench.analysis.cells import with_variants
+from gsbench.analysis.configurations import departures, resolved, shipped_arms
 from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import TrialResult, load_experiment
-from gsbench.analysis.shipped import departures, resolved, shipped_arms
 from gsbench.analysis.tables import build_table
 from gsbench.runs.hashing import config_hash
 from tests.analysis.synthetic import write_arms
@@ -222,7 +222,8 @@ def test_naming_a_control_makes_no_other_trial() -> None:
 def test_experiments_list_the_control_of_every_mixed_arm() -> None:
     """Where an experiment holds an arm that isolates an ingredient of another, it says so."""
     checked = 0
-    for file in sorted((ROOT / "conf" / "experiment").glob("*.yaml")):
+    folders = (ROOT / "conf" / "experiment", ROOT / "findings" / "experiment")
+    for file in sorted(file for folder in folders for file in folder.glob("*.yaml")):
         content = yaml.safe_load(file.read_text(encoding="utf-8"))
         arms = str(content.get("hydra", {}).get("sweeper", {}).get("params", {}).get("densify", "")).split(",")
         controls = content.get("eval", {}).get("controls", {})

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from gsbench.analysis.cells import with_variants
+from gsbench.analysis.configurations import notes_of, shipped_arms
 from gsbench.analysis.fairness import UNLIKE, default_lines, fairness_table
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
-from gsbench.analysis.shipped import notes_of, shipped_arms
 from gsbench.analysis.table_formats import to_latex
 from gsbench.analysis.tables import Table
 from gsbench.analysis.tuning import NOTHING

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from gsbench.analysis.cells import by_key
+from gsbench.analysis.configurations import departures, resolved, shipped_arms
 from gsbench.analysis.differences import IGNORED_SETTINGS, differing_code
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.shipped import departures, resolved, shipped_arms
 from gsbench.words import listed
 
 MOST_NAMED = 6  # ingredients that a headline names before it counts

@@ -1,17 +1,29 @@
-"""The settings of trials, with dotted keys, each configuration of an experiment read once for all that share it."""
+"""The settings of trials and of the arms that gsbench ships, with dotted keys.
+
+Each configuration of an experiment is read once for all trials that share it. The shipped arms are read as plain files
+of ``conf/densify``, without composing: what an arm's authors wrote, and where gsbench departs from it, stands in the
+comments of its file: lines above the settings, ``theirs: VALUE`` beside one, and facts under fixed keys at the end.
+"""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from gsbench.parsing import DamagedError
 from gsbench.runs.hashing import NOT_HASHED, flatten
 from gsbench.runs.layout import CONFIG
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.system.install import conf_dir
 
 ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
 GROUPS = ("scene", "init", "densify")  # of a configuration: what every trial has
@@ -72,3 +84,88 @@ def canonical(value: object) -> str:
     if type(value) is int or (type(value) is float and math.isfinite(value)):
         return repr(value)  # as JSON writes it; most settings are such
     return ENCODER.encode(value)
+
+
+GROUP = "densify"
+THEIRS = re.compile(r"^(?P<key>\w+):.*#.*?theirs:? (?P<value>[^;|]+?)\s*$", re.MULTILINE)  # the authors' own value
+PRESET = re.compile(r"\btrain=(\w+)")
+FACTS = ("Source", "Compared", "Tests", "Otherwise", "Departs from adc by")
+FACT = re.compile(rf"^# (?P<key>{'|'.join(FACTS)}): (?P<text>.*(?:\n#   .*)*)$", re.MULTILINE)  # may go on, indented
+REFERENCE = re.compile(r"\$\{([\w.]+)\}")  # the value of another key
+
+
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+@cache
+def shipped_arms() -> dict[str, Mapping[str, Any]]:
+    """The settings of each densifier of gsbench by its name; programs of others are none."""
+    return {path.stem: _read(path.stem) for path in sorted((conf_dir() / GROUP).glob("*.yaml"))}
+
+
+def shipped_name(config: Mapping[str, Any]) -> str | None:
+    """The shipped arm that a trial's configuration is made from: of its name, else of its class; None of neither."""
+    target, name = config.get(f"{GROUP}._target_"), config.get(f"{GROUP}.name")
+    same = [arm for arm, settings in shipped_arms().items() if settings["_target_"] == target]
+    return str(name) if name in same else next(iter(sorted(same, key=len)), None)
+
+
+@dataclass(frozen=True)
+class FileNotes:
+    """Notes of a shipped arm's file on its authors: its first lines, their values where they are others, and the
+    preset of `train` that goes with it ("" for none).
+    """
+
+    text: str
+    theirs: Mapping[str, str]
+    preset: str
+
+
+@cache
+def notes_of(name: str) -> FileNotes:
+    """The comments of the file of the shipped arm ``name``."""
+    content = (conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8")
+    lines = itertools.takewhile(lambda line: line.startswith("#"), content.splitlines())
+    text = " ".join(line.removeprefix("#").strip() for line in lines)
+    preset = PRESET.search(text)
+    theirs = {found["key"]: found["value"].strip() for found in THEIRS.finditer(content)}
+    return FileNotes(text, theirs, preset[1] if preset else "")
+
+
+@cache
+def facts_of(name: str) -> dict[str, str]:
+    """The facts at the end of the file of the shipped arm ``name``, by their key (`FACTS`)."""
+    content = (conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8")
+    return {found["key"]: found["text"].replace("\n#   ", " ") for found in FACT.finditer(content)}
+
+
+@cache
+def departures() -> dict[str, tuple[str, ...]]:
+    """Of each shipped class of densifiers, by its import path, the ingredients in which it departs from ADC."""
+    found = {}
+    for name in shipped_arms():
+        content = yaml.load((conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8"), Loader=_LOADER)
+        if "_target_" in content:  # a file built on another one is of the other's class
+            text = facts_of(name).get("Departs from adc by", "")
+            found[content["_target_"]] = tuple(filter(None, text.split(", ")))
+    return found
+
+
+def resolved(settings: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
+    """``settings`` of a densifier with dotted keys, as they would be in a trial with the configuration ``config``.
+
+    What refers to a key that ``config`` lacks stays as it is written.
+    """
+    found = {}
+    for key, value in settings.items():
+        named = REFERENCE.fullmatch(value) if isinstance(value, str) else None
+        found[f"{GROUP}.{key}"] = value if named is None else config.get(named[1], value)
+    return found
+
+
+@cache
+def _read(name: str) -> dict[str, Any]:
+    """An arm's own settings above those of the arms that its list of defaults names."""
+    content = yaml.load((conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8"), Loader=_LOADER)
+    parents = [parent for parent in content.pop("defaults", []) if parent != "_self_"]
+    return {key: value for parent in parents for key, value in _read(parent).items()} | content

@@ -16,12 +16,11 @@ from gsbench.analysis.attribution import (
     differing_keys,
     representatives,
 )
-from gsbench.analysis.configurations import canonical
+from gsbench.analysis.configurations import REFERENCE, canonical, notes_of, resolved, shipped_arms, shipped_name
 from gsbench.analysis.differences import CODE, short_version
 from gsbench.analysis.origins import cloud_of, machine_of
 from gsbench.analysis.pairing import arm_name, pair_trials
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.shipped import REFERENCE, notes_of, resolved, shipped_arms, shipped_name
 from gsbench.analysis.tables import Column, Entry, Row, Table
 from gsbench.analysis.tuning import tuning_lines
 from gsbench.runs.trial_record import TrialRecord

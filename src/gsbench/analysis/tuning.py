@@ -9,10 +9,9 @@ from typing import Any
 
 from gsbench.analysis.attribution import TARGET, differing_keys
 from gsbench.analysis.cells import by_key
-from gsbench.analysis.configurations import canonical
+from gsbench.analysis.configurations import canonical, resolved, shipped_arms, shipped_name
 from gsbench.analysis.declaration import measured
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.shipped import resolved, shipped_arms, shipped_name
 from gsbench.records import read_if_sound
 from gsbench.runs.declaration import TUNED, read_plans
 from gsbench.runs.layout import SEARCH, TUNING
