@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
+from gsbench.app.tuning_plan import TuneSettings
 from gsbench.errors import GsbenchError
 from gsbench.launch.declare import declare, declared_metrics, planned_trials
 from gsbench.launch.outcome import Outcome, outcome_of_error, outcome_of_results
@@ -26,6 +28,7 @@ from gsbench.runs.declaration import read_plans
 from gsbench.runs.layout import CONFIG, RESULTS
 from gsbench.runs.trial_record import record_from
 from gsbench.runs.tuning_record import TuningRecord, read_tuning
+from hydra_plugins.gsbench import TUNE
 from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.launch.test_declare import TINY
 
@@ -378,3 +381,11 @@ def test_mistakes_are_one_line_before_any_work(
     assert part in line
     assert not fake.batches
     assert not runs.exists()
+
+
+def test_hydra_shows_the_defaults_of_the_class() -> None:
+    defaults = {
+        field.name: field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+        for field in dataclasses.fields(TuneSettings)
+    }
+    assert defaults == {**TUNE, "intervals": False}
