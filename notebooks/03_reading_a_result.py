@@ -24,12 +24,12 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from gsbench.analysis.power import seeds_needed
 from IPython.display import Markdown
 
 from gsbench.analysis import load_experiment, to_frame
 from gsbench.analysis.errors_by_region import errors_by_region
 from gsbench.analysis.pairing import ViewCache, pair_arms
-from gsbench.analysis.power import seeds_needed
 from gsbench.analysis.statistics import compare
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table

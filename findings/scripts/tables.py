@@ -20,9 +20,8 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from gsbench.claims.check import ClaimVerdict, recheck
 from gsbench.claims.file import read_claims
-from gsbench.claims.recheck import recheck
-from gsbench.claims.verdict import Verdict
 from gsbench.words import counted, signed
 
 FINDINGS = Path(__file__).parents[1]
@@ -114,23 +113,25 @@ def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 @functools.cache
-def verdicts(name: str) -> dict[str, Verdict]:
+def verdicts(name: str) -> dict[str, ClaimVerdict]:
     """The verdicts on the claims ``NAME.yaml`` by the trials of ``NAME.zip``, by claim."""
     with tempfile.TemporaryDirectory() as folder:
         file = read_claims(FINDINGS / "claims" / f"{name}.yaml")
-        found = recheck(file, [ARCHIVES / f"{name}.zip"], Path(folder)).verdicts
+        found, _, _ = recheck(file, [ARCHIVES / f"{name}.zip"], Path(folder))
     return {verdict.claim.id: verdict for verdict in found}
 
 
-def verdict_cells(verdict: Verdict) -> list[str]:
+def verdict_cells(one: ClaimVerdict) -> list[str]:
     """The difference with the interval over all looks, the verdict, and what it rests on."""
-    decision = verdict.decision
-    if decision is None or decision.mean is None or decision.interval is None:
-        return ["", f"**{verdict.word}**", ""]
-    shown = f"{verdict.shown(decision.mean)} ({verdict.shown_interval(decision.interval)})"
-    level = f"{100 * (1 - verdict.design.alpha):.3g} %" if verdict.design else ""
-    on = f"{counted(len(verdict.by_scene), 'scene')}, {counted(decision.seeds, 'seed')}, {level}"
-    return [shown, f"**{verdict.word}**", on]
+    verdict, answer = one.verdict, one.verdict.answer
+    if answer is None or answer.interval is None:
+        return ["", f"**{one.word}**", ""]
+    shown = f"{verdict.shown(answer.mean)} ({verdict.shown_interval(answer.interval)})"
+    level = f"{100 * (1 - answer.level):.3g} %"
+    on = f"{counted(len(verdict.scenes), 'scene')}, {counted(verdict.pairs.seeds, 'seed')}, {level}"
+    if verdict.like_these is not None:
+        on += f"; lower in {verdict.like_these.helped} of {verdict.like_these.scenes}"
+    return [shown, f"**{one.word}**", on]
 
 
 def answers() -> str:

@@ -53,8 +53,8 @@ def test_what_the_page_says_of_seeds_is_so() -> None:
     assert of("full", "volumetric_once", "bonsai", cap="soft")[1] < 0
     clouds = tables.differences(tables.read_trials("initialisers"), "sfm", "random", tables.LPIPS)
     assert (clouds < 0).all()
-    assert not tables.verdicts("full_count")["once_at_as_many"].beforehand
-    assert all(verdict.beforehand for verdict in tables.verdicts("volume").values())
+    assert tables.verdicts("full_count")["once_at_as_many"].verdict.late
+    assert not any(one.verdict.late for one in tables.verdicts("volume").values())
 
 
 def test_what_the_page_names_is_there() -> None:

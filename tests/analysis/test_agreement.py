@@ -15,6 +15,7 @@ from gsbench.analysis.agreement import agreements, cloud_distance, image_psnr, r
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
+from gsbench.runs.declaration import Arm
 from tests.analysis.synthetic import Plan, write_runs
 
 
@@ -66,7 +67,7 @@ def test_trainings_a_known_way_apart(tmp_path: Path) -> None:
         for view in (path / "renders").glob("*.png"):
             Image.fromarray(np.full((20, 30, 3), 100 + 10 * seed, np.uint8)).save(view)
     (found,) = agreements(load_experiment(tmp_path, "exp").trials)
-    assert (found.scene, found.arm, found.pairs, found.faults) == ("garden", ("sfm", "adc"), 1, ())
+    assert (found.scene, found.arm, found.pairs, found.faults) == ("garden", Arm("sfm", "adc"), 1, ())
     assert found.psnr == pytest.approx(20 * math.log10(255 / 10))
     assert found.distance == pytest.approx(0.01, rel=0.01)
     first, second = load_experiment(tmp_path, "exp").trials

@@ -27,6 +27,7 @@ from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.analysis.tables import build_table
+from gsbench.runs.declaration import Arm
 from gsbench.runs.hashing import config_hash
 from tests.analysis.synthetic import write_arms
 from tests.conftest import ROOT
@@ -52,7 +53,7 @@ def trials_of(runs: Path, arms: dict[str, dict[str, Any]], **settings: Any) -> l
 
 
 def sentence(trials: list[TrialResult], first: str, second: str) -> str:
-    pair = ("sfm", first), ("sfm", second)
+    pair = Arm("sfm", first), Arm("sfm", second)
     return attribution_sentence(attribute(trials, *pair), *pair)
 
 
@@ -207,7 +208,7 @@ def test_controls_are_held_against_their_arms(tmp_path: Path) -> None:
     against = [(first[1], second[1]) for first, second in pairs]
     assert against == [("adc", "absgrad"), ("adc", "longaxis"), ("absgrad", "longaxis")]
     assert "sfm-longaxis against sfm-absgrad" in build_report(load_experiment(tmp_path, "exp"))
-    varied = [("sfm", f"{name} cap={cap}") for name in ("absgrad", "adc", "longaxis") for cap in (1, 2)]
+    varied = [Arm("sfm", name, (("cap", str(cap)),)) for name in ("absgrad", "adc", "longaxis") for cap in (1, 2)]
     assert choose_pairs(varied, controls={"longaxis": "absgrad"})[-2:] == [
         (varied[0], varied[4]),
         (varied[1], varied[5]),
@@ -239,7 +240,7 @@ def test_experiments_list_the_control_of_every_mixed_arm() -> None:
 
 
 def test_the_pair_that_stands_for_two_arms_is_as_alike_as_there_is() -> None:
-    arms = ("sfm", "a"), ("sfm", "b")
+    arms = Arm("sfm", "a"), Arm("sfm", "b")
     generator = random.Random(0)
     for _ in range(200):
         trials = [
@@ -255,4 +256,4 @@ def test_the_pair_that_stands_for_two_arms_is_as_alike_as_there_is() -> None:
         assert found[0] is expected[0]
         assert found[1] is expected[1]
     with pytest.raises(ValueError, match="no trial of sfm-c"):
-        representatives(trials, arms[0], ("sfm", "c"))  # type: ignore[arg-type]
+        representatives(trials, arms[0], Arm("sfm", "c"))  # type: ignore[arg-type]

@@ -20,15 +20,16 @@ from gsbench.analysis.table_formats import to_latex
 from gsbench.analysis.tables import Table
 from gsbench.analysis.tuning import NOTHING
 from gsbench.errors import InputError
+from gsbench.runs.declaration import Arm
 from gsbench.verbs import tables
 from tests.analysis.synthetic import write_arms
 from tests.analysis.test_attribution import densifier
 
-LEFT, RIGHT = ("sfm", "adc"), ("sfm", "longaxis")
+LEFT, RIGHT = Arm("sfm", "adc"), Arm("sfm", "longaxis")
 
 
 def sheet(runs: Path, second: str = "longaxis", first: str = "adc") -> Table:
-    return fairness_table(with_variants(load_experiment(runs, "exp").trials), ("sfm", first), ("sfm", second))
+    return fairness_table(with_variants(load_experiment(runs, "exp").trials), Arm("sfm", first), Arm("sfm", second))
 
 
 def shown(table: Table) -> dict[str, tuple[str, str, str]]:

@@ -6,12 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gsbench.analysis.explain import explain_cell
+from gsbench.analysis.judgement import pair_trials
 from gsbench.analysis.origins import cloud_lines, unlike_clouds
-from gsbench.analysis.pairing import ViewCache, pair_trials
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.report.sections import compare_arms
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.tables import build_table
+from gsbench.runs.declaration import Arm
 from tests.analysis.test_tables import one_trial
 
 Make = Callable[..., Experiment]
@@ -64,17 +65,17 @@ def test_compared_arms_with_unlike_clouds_are_named(tmp_path: Path) -> None:
         for densify, cloud in zip(("adc", "volumetric"), clouds, strict=True):
             one_trial(tmp_path, 0, psnr=27.0, _densify=densify, _scene=scene, _hashes=hashes(cloud))
     trials = load_experiment(tmp_path, "exp").trials
-    arms = (("sfm", "adc"), ("sfm", "volumetric"))
+    arms = (Arm("sfm", "adc"), Arm("sfm", "volumetric"))
     expected = "garden: the arms started from different clouds (aaaaaaaa and bbbbbbbb)"
     assert unlike_clouds(pair_trials(trials, *arms)) == [expected]
-    assert expected in compare_arms(trials, *arms, ViewCache()).notes
+    assert expected in compare_arms(trials, *arms).notes
 
 
 def test_without_recorded_clouds_the_stage_result_tells_them_apart(tmp_path: Path) -> None:
     one_trial(tmp_path, 0, psnr=27.0, _hashes=hashes(None, "init1"))
     one_trial(tmp_path, 0, psnr=27.0, _densify="volumetric", _hashes=hashes(None, "init2"))
     trials = load_experiment(tmp_path, "exp").trials
-    assert len(unlike_clouds(pair_trials(trials, ("sfm", "adc"), ("sfm", "volumetric")))) == 1
+    assert len(unlike_clouds(pair_trials(trials, Arm("sfm", "adc"), Arm("sfm", "volumetric")))) == 1
 
 
 def test_the_report_shows_the_clouds(make_experiment: Make) -> None:

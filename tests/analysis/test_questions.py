@@ -23,6 +23,7 @@ from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdicts import declared_lines, judge
 from gsbench.errors import InputError
 from gsbench.eval.options import EvalConfig
+from gsbench.runs.declaration import Arm
 from gsbench.runs.hashing import BEFORE
 from tests.analysis.synthetic import BASE, METRICS, Plan, trial_data, write_trial
 
@@ -77,9 +78,9 @@ def test_an_order_that_turns_is_found_with_both_intervals(tmp_path: Path) -> Non
     }  # fmt: skip
     assert turns["flip"].word in (OPEN, UNSURE)
     psnr = turns["psnr"]
-    assert (psnr.first, psnr.second) == (("sfm", "adc"), ("sfm", "volumetric"))
-    assert psnr.interpolation.comparison.interval.low > 0  # type: ignore[union-attr]
-    assert psnr.extrapolation.comparison.interval.high < 0  # type: ignore[union-attr]
+    assert (psnr.first, psnr.second) == (Arm("sfm", "adc"), Arm("sfm", "volumetric"))
+    assert psnr.interpolation.verdict.interval.low > 0  # type: ignore[union-attr]
+    assert psnr.extrapolation.verdict.interval.high < 0  # type: ignore[union-attr]
     assert psnr.change == pytest.approx(-1.0, abs=0.1)
     assert psnr.interval is not None
     assert psnr.interval.low < -1.0 < psnr.interval.high or psnr.interval.high < 0
@@ -155,7 +156,7 @@ def test_a_declared_question_makes_the_verdict_and_the_other_is_secondary(tmp_pa
     declared = standing(experiment.folder, trials)
     assert declared is not None
     assert (declared.metric, declared.question) == ("psnr", "extrapolation")
-    judged = judge(trials, choose_pairs(sorted({trial.arm for trial in trials})), ViewCache(), declared)
+    judged = judge(trials, choose_pairs(sorted({trial.arm for trial in trials})), declared)
     roles = {
         next(t for t in trials if t.arm == pair[0]).question: {v.quantity.key: v.role for v in own.verdicts}
         for pair, own in judged.items()
@@ -163,7 +164,7 @@ def test_a_declared_question_makes_the_verdict_and_the_other_is_secondary(tmp_pa
     assert roles["extrapolation"]["psnr"] == "declared"
     assert roles["interpolation"]["psnr"] == "secondary"
     assert {role for question in roles.values() for key, role in question.items() if key != "psnr"} == {"secondary"}
-    sizes = {v.role: v.comparison.family for own in judged.values() for v in own.verdicts}
+    sizes = {v.role: v.verdict.family for own in judged.values() for v in own.verdicts}
     assert sizes == {"declared": 1, "secondary": 7}
     lines = declared_lines(declared, judged)
     assert lines[0].startswith("PSNR (dB) at extrapolation was declared beforehand")

@@ -14,7 +14,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from gsbench.analysis.errors_by_region import errors_by_region, texture_energy
-from gsbench.analysis.pairing import ViewCache, pair_trials
+from gsbench.analysis.judgement import pair_trials
 from gsbench.analysis.report.build import build_report, trial_figures
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
 from gsbench.analysis.report.pictures import choose_pictures
@@ -23,10 +23,11 @@ from gsbench.analysis.report.setting_charts import sweep_charts
 from gsbench.analysis.report.volumes import log10_volumes, share_above, volume_histogram
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.errors import InputError
+from gsbench.runs.declaration import Arm
 from gsbench.verbs import report
 from tests.analysis.synthetic import TEXTURED, Plan, trial_data, write_runs, write_trial
 
-ADC, VOLUMETRIC = ("sfm", "adc"), ("sfm", "volumetric")
+ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +116,7 @@ def test_it_can_be_read_without_eyes_and_used_without_a_mouse(page: str) -> None
 def test_the_verdict_comes_first(page: str) -> None:
     headings = re.findall(r"<h2[^>]*>([^<]+)", page)
     assert headings[:2] == ["Verdict", "Tables"]
-    assert "sfm-volumetric against sfm-adc, on these scenes: better in LPIPS VGG raw; no evidence" in page
+    assert "sfm-volumetric against sfm-adc, on these scenes: better in LPIPS VGG raw; " in page
     verdicts = page.split('aria-label="Verdicts, ')[1].split("</table>")[0]
     assert "LPIPS VGG raw" in verdicts
     assert "LPIPS Alex" not in verdicts  # not run: no row
@@ -143,7 +144,7 @@ def test_every_trial_is_traceable(experiment: Experiment, page: str) -> None:
 def test_errors_are_sorted_by_texture(experiment: Experiment) -> None:
     """The made-up renders of "volumetric" are sharper in the grass and wrong in a smooth corner."""
     found = errors_by_region(experiment.trials, ADC, VOLUMETRIC)
-    verdicts = [comparison.verdict for comparison in found.comparisons]
+    verdicts = [word for _, word in found.changes]
     assert verdicts[0] == "worse"
     assert verdicts[-1] == "better"
     assert found.second[-1] < 0.6 * found.first[-1]
@@ -166,7 +167,7 @@ def test_a_map_sorts_the_errors_where_it_is_at_hand(experiment: Experiment) -> N
         for view in range(3):
             np.savez(trial.path / "maps" / f"view{view:03d}.npz", depth=depth)
     found = errors_by_region(experiment.trials, ADC, VOLUMETRIC, "depth", bins=2)
-    assert [comparison.verdict for comparison in found.comparisons] == ["worse", "better"]
+    assert [word for _, word in found.changes] == ["worse", "better"]
     with pytest.raises(InputError, match=r"view000\.npz has no map 'volume'"):
         errors_by_region(experiment.trials, ADC, VOLUMETRIC, "volume")
     with pytest.raises(InputError, match="unknown property 'hue'"):
@@ -367,8 +368,8 @@ def test_scenes_that_disagree_are_named_under_a_verdict_that_their_mean_leaves_o
     write_runs(tmp_path, Plan(scenes=("garden",), effect={"psnr": -2.0}, views=3))
     write_runs(tmp_path, Plan(scenes=("stump",), views=3))
     trials = load_experiment(tmp_path, "exp").trials
-    versus = compare_arms(trials, ADC, VOLUMETRIC, ViewCache())
-    assert "no evidence of a difference in PSNR" in versus.headline
+    versus = compare_arms(trials, ADC, VOLUMETRIC)
+    assert "undecided in PSNR" in versus.headline
     line = next(line for line in versus.by_scene if line.startswith("PSNR"))
     assert (
         line
@@ -379,7 +380,7 @@ def test_scenes_that_disagree_are_named_under_a_verdict_that_their_mean_leaves_o
 
 def test_no_scene_is_named_where_none_is_decided(tmp_path: Path) -> None:
     write_runs(tmp_path, Plan(trial_noise=0, residual_noise=0, views=3))
-    assert compare_arms(load_experiment(tmp_path, "exp").trials, ADC, VOLUMETRIC, ViewCache()).by_scene == ()
+    assert compare_arms(load_experiment(tmp_path, "exp").trials, ADC, VOLUMETRIC).by_scene == ()
 
 
 def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> None:

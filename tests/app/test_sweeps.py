@@ -11,13 +11,13 @@ import pytest
 
 from gsbench import cli
 from gsbench.analysis.declaration import standing
+from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.results import read_experiment
-from gsbench.claims.stopping import standing_verdicts
 from gsbench.launch.declare import declare, declared_metrics, planned_trials
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
 from gsbench.launch.trial import Trial
-from gsbench.runs.declaration import read_plans
+from gsbench.runs.declaration import read_declarations
 from gsbench.runs.layout import CONFIG, RESULTS
 from gsbench.runs.trial_record import record_from
 from tests.analysis.synthetic import Plan, trial_data, write_trial
@@ -89,9 +89,8 @@ def test_a_clear_difference_ends_at_the_first_look(sweep: Callable[..., int], ru
     fake = Fake(clear)
     assert sweep(fake) == 0
     assert fake.batches == [[("adc", 0), ("volumetric", 0), ("adc", 1), ("volumetric", 1)]]
-    (verdict,) = standing_verdicts(runs / "stop")
-    assert verdict.decision is not None
-    assert (verdict.decision.outcome, verdict.decision.seeds, verdict.beforehand) == ("for", 2, True)
+    (verdict,) = verdicts_of(runs)
+    assert (verdict.outcome, verdict.pairs.seeds, verdict.late) == ("supported", 2, 0)
 
 
 def test_a_decided_sweep_given_again_runs_nothing(
@@ -105,13 +104,18 @@ def test_a_decided_sweep_given_again_runs_nothing(
     assert "4 of 8 trials were not needed" in caplog.text
 
 
+def verdicts_of(runs: Path) -> list[Verdict]:
+    """The verdicts of the sweep by what was last declared for it."""
+    return judge(read_experiment(runs / "stop").trials, read_declarations(runs / "stop")[-1])
+
+
 def test_noise_gets_all_seeds_and_each_trial_is_launched_once(sweep: Callable[..., int], runs: Path) -> None:
     fake = Fake(noise)
     assert sweep(fake) == 0
     assert [len(batch) for batch in fake.batches] == [4, 2, 2]
     assert len({trial for batch in fake.batches for trial in batch}) == 8
-    (verdict,) = standing_verdicts(runs / "stop")
-    assert verdict.word == "undecided"
+    (verdict,) = verdicts_of(runs)
+    assert verdict.outcome == "undecided"
 
 
 @pytest.mark.parametrize("psnr", [noise, clear], ids=lambda function: function.__name__)
@@ -125,7 +129,7 @@ def test_seeds_of_planned_looks_are_declared_at_once_and_cost_the_metric_nothing
     assert (found.beforehand, found.added) == (True, ())
     missing = 0 if psnr is noise else 4
     assert any(f"{missing} of the 8 declared trials are not there" in line for line in found.sentences("PSNR"))
-    assert any("that take the number of seeds as fixed are too sure" in line for line in found.sentences("PSNR"))
+    assert any("Seeds come in planned looks" in line for line in found.sentences("PSNR"))
 
 
 def test_a_decided_pair_gets_no_seeds_and_the_pairs_share_the_error_rate(
@@ -136,27 +140,27 @@ def test_a_decided_pair_gets_no_seeds_and_the_pairs_share_the_error_rate(
         assert sweep(fake, "densify=adc,volumetric,mcmc") == 0
     assert [len(batch) for batch in fake.batches] == [6, 2, 2]
     assert {arm for arm, _ in fake.batches[1]} == {"adc", "mcmc"}
-    assert [v.design.alpha for v in standing_verdicts(runs / "stop") if v.design] == [0.025, 0.025]
+    assert [v.answer.level for v in verdicts_of(runs) if v.answer] == [0.025, 0.025]
     assert "2 of 12 trials were not needed" in caplog.text
 
 
 def test_stopped_at_any_trial_it_goes_on_with_the_same_plan(sweep: Callable[..., int], runs: Path) -> None:
     assert sweep(Fake(noise, stops_at=2)) == cli.INTERRUPTED
-    (plan,) = read_plans(runs / "stop")
+    (plan,) = read_declarations(runs / "stop")
     fake = Fake(noise)
     assert sweep(fake) == 0
     assert [len(batch) for batch in fake.batches] == [4, 2, 2]  # what is done is handed over, and skipped there
-    assert read_plans(runs / "stop") == [plan]
-    assert all(verdict.beforehand for verdict in standing_verdicts(runs / "stop"))
+    assert read_declarations(runs / "stop") == [plan]
+    assert not any(verdict.late for verdict in verdicts_of(runs))
 
 
 def test_a_failed_seed_ends_the_looks_and_its_return_decides(sweep: Callable[..., int], runs: Path) -> None:
     assert sweep(Fake(clear, fails=1)) == 1
-    (verdict,) = standing_verdicts(runs / "stop")
-    assert "waits for courtyard" in verdict.reason
+    (verdict,) = verdicts_of(runs)
+    assert not verdict.final
     assert sweep(Fake(clear)) == 0
-    (verdict,) = standing_verdicts(runs / "stop")
-    assert verdict.word == "supported"
+    (verdict,) = verdicts_of(runs)
+    assert verdict.outcome == "supported"
 
 
 def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(sweep: Callable[..., int], runs: Path) -> None:
@@ -164,10 +168,9 @@ def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(sweep: Cal
     for file in (runs / "stop").glob("*/*/*/results.json"):  # measured long before the second plan
         file.write_text(file.read_text().replace('"raster"', '"measured": "2020-01-01T00:00:00Z", "raster"'))
     assert sweep(Fake(noise), "seed=0,1,2,3,4,5") == 0
-    assert len(read_plans(runs / "stop")) == 2
-    (verdict,) = standing_verdicts(runs / "stop")
-    assert not verdict.beforehand
-    assert "had been measured before this plan" in verdict.notes[0]
+    assert len(read_declarations(runs / "stop")) == 2
+    (verdict,) = verdicts_of(runs)
+    assert verdict.late
 
 
 def test_another_launcher_of_hydras_gets_one_look_at_a_time(sweep: Callable[..., int]) -> None:
@@ -183,17 +186,20 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(
     """Arms that differ in a setting alone are told apart as in the report."""
     fake = Fake(clear)
     assert sweep(fake, "densify=adc,volumetric", "densify.max_gaussians=1000,2000", "launch.least_difference=0.5") == 0
-    verdicts = standing_verdicts(runs / "stop")
-    assert [(v.claim.baseline, v.claim.arm, v.claim.least) for v in verdicts] == [
+    verdicts = verdicts_of(runs)
+    assert [(str(v.question.baseline), str(v.question.arm), v.question.least) for v in verdicts] == [
         (f"random-adc max_gaussians={count}", f"random-volumetric max_gaussians={count}", 0.5) for count in (1000, 2000)
     ]
     assert cli.run(["report", "stop"]) == 0
     text = (runs / "stop" / "report.html").read_text()
-    assert "random-volumetric max_gaussians=1000 against random-adc max_gaussians=1000: better in PSNR" in text
+    assert (
+        "random-volumetric max_gaussians=1000 against random-adc max_gaussians=1000: better in PSNR (dB) on this scene"
+        in text
+    )
     assert "launch.stop_when_decided" in text
     capsys.readouterr()
     assert cli.run(["tables", "stop"]) == 0
-    assert "as fixed are too sure" in capsys.readouterr().out
+    assert "Seeds come in planned looks" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -229,13 +235,3 @@ def test_a_dry_run_says_when_it_looks_and_writes_nothing(runs: Path, capsys: pyt
     assert cli.run([*SWEEP, "--dry-run"]) == 0
     assert "looks at 2, 3, 4 seeds, 4 trials until the first, 8 at most" in capsys.readouterr().out
     assert not runs.exists()
-
-
-def test_a_damaged_plan_is_named_in_one_line(
-    sweep: Callable[..., int], runs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert sweep(Fake(clear)) == 0
-    file = runs / "stop" / "declared.jsonl"
-    file.write_text(file.read_text().replace('"pairs"', '"pears"'))
-    assert cli.run(["report", "stop"]) == 2
-    assert "damaged" in capsys.readouterr().err

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -97,32 +96,22 @@ def test_the_nearer_setting_counts() -> None:
     assert [word for word in words if "max_gaussians" in word] == ["densify.max_gaussians=3"]
 
 
-def test_the_plan_changes_with_what_decides_and_not_with_words() -> None:
-    plan = parse_claims(GOOD).plan_hash
-    for path, value in (
-        (("claims", 0, "least"), 0.006),
-        (("claims", 0, "direction"), "higher"),
-        (("claims", 0, "metric"), "psnr"),
-        (("claims", 0, "refuted_if"), "never"),
-        (("claims", 0, "budget"), {"densify.cap": "hard"}),
-        (("claims", 0, "split"), {"scene.test_every": 4}),
-        (("claims", 0, "scenes"), ["courtyard"]),
-        (("seeds",), 5),
-        (("error_rate",), 0.1),
-        (("settings", "scene.max_size"), 200),
-        (("arms", "volumetric", "densify.volume_threshold"), 0.1),
-    ):
-        assert parse_claims(changed(*path, to=value)).plan_hash != plan, path
-    for path, text in ((("claims", 0, "says"), "mended"), (("claims", 0, "where"), "page 2"), (("paper",), "B")):
-        assert parse_claims(changed(*path, to=text)).plan_hash == plan, path
-    assert parse_claims(changed("claims", 0, "scenes", to=["courtyard", "own"])).plan_hash == plan
+def test_the_question_has_what_decides_and_no_words() -> None:
+    file = parse_claims(GOOD)
+    keys = ("garden/sfm-adc/0a", "garden/sfm-volumetric/0b")
+    question = file.question(file.claims[0], {"courtyard": keys})
+    assert (question.metric, question.sign, question.least, question.relative) == ("lpips_squeeze", -1, 0.005, False)
+    assert (str(question.baseline), question.seeds) == ("adc densify=adc", tuple(range(file.seeds)))
+    assert question.planned == dict.fromkeys(keys, question.seeds)
+    other = parse_claims(changed("claims", 0, "says", to="in other words"))
+    assert other.question(other.claims[0], {"courtyard": keys}) == question
 
 
 def test_effects_are_differences_or_parts() -> None:
     absolute = parse_claims(GOOD).claims[0].effect
     relative = parse_claims(changed("claims", 0, "least", to="10%")).claims[0].effect
-    assert (absolute.margin, str(absolute)) == (0.005, "0.005")
-    assert (relative.margin, str(relative)) == (pytest.approx(math.log(1.1)), "10 %")
+    assert (absolute.size, str(absolute)) == (0.005, "0.005")
+    assert (relative.size, str(relative)) == (pytest.approx(0.1), "10 %")
 
 
 BAD: list[tuple[str, Callable[[], Any], str]] = [

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsbench.claims.ablation import Run
+from gsbench.analysis.shares import Run
 from gsbench.claims.switches import (
     Record,
     ablation_part,
@@ -48,11 +48,11 @@ def on(*names: str) -> Run:
 
 
 def test_what_acts_within_another_is_trained_only_where_that_is_on() -> None:
-    runs = runs_to_train(NESTED, fractional=False)
+    runs = runs_to_train(NESTED)
     assert runs == [on("rule", "shrink", "once"), on("once", "rule"), on("rule", "shrink"), on("rule"), on()]
     assert effective(on("shrink", "once"), NESTED) == on()
     alone = {"shrink": NESTED["shrink"]}  # where the rule is not asked about it stays as it is: on
-    assert runs_to_train(alone, fractional=False) == [on("shrink"), on()]
+    assert runs_to_train(alone) == [on("shrink"), on()]
     assert words_of(on("rule"), NESTED) == {"of": 1, "b": 2}
     assert words_of(on("rule", "shrink", "once"), NESTED) == {}
 
@@ -60,9 +60,9 @@ def test_what_acts_within_another_is_trained_only_where_that_is_on() -> None:
 def test_switches_within_each_other_are_refused() -> None:
     circle = {"a": Switch({"x": 1}, within="b"), "b": Switch({"y": 1}, within="a")}
     with pytest.raises(InputError, match="circle"):
-        runs_to_train(circle, fractional=False)
+        runs_to_train(circle)
     chain = {"a": Switch({"x": 1}), "b": Switch({"y": 1}, within="a"), "c": Switch({"z": 1}, within="b")}
-    assert [sorted(found) for found in runs_to_train(chain, fractional=False)] == [
+    assert [sorted(found) for found in runs_to_train(chain)] == [
         ["a", "b", "c"],
         ["a", "b"],
         ["a"],
@@ -114,7 +114,7 @@ def test_a_name_that_is_no_switch_is_named_with_the_nearest() -> None:
 def write_ablation(home: Path, gains: Mapping[str, float], seeds: int = 3) -> Record:
     """Trials in which each part of `NESTED` adds its gain in PSNR, where it acts."""
     runs = []
-    for number, chosen in enumerate(runs_to_train(NESTED, fractional=False)):
+    for number, chosen in enumerate(runs_to_train(NESTED)):
         folders = []
         for seed in range(seeds):
             noise = 0.001 * np.random.default_rng([number, seed]).normal()
@@ -123,7 +123,7 @@ def write_ablation(home: Path, gains: Mapping[str, float], seeds: int = 3) -> Re
             path = write_trial(home.parent, data, views, f"{number:08x}")
             folders.append(path.relative_to(home).as_posix())
         runs.append((chosen, tuple(folders)))
-    record = Record("volumetric", NESTED, tuple(runs), fractional=False)
+    record = Record("volumetric", NESTED, tuple(runs))
     write_record(home, record)
     return record
 

@@ -116,7 +116,7 @@ def test_renders_stand_in_the_table_with_a_verdict(
     assert report.returncode == 0, report.stderr
     text = (runs / "small" / "report.html").read_text()
     # Two seeds decide nothing among three metrics, however much better these renders are.
-    assert "random-theirs against random-adc, on this scene: no evidence of a difference in PSNR" in text
+    assert "random-theirs against random-adc, on this scene: undecided in PSNR" in text
     assert "by what a training elsewhere did, of which nothing is recorded" in text
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     for words in (["status", "small"], ["explain", "small:courtyard:psnr:theirs"], ["sync", "small"]):

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.claims.test_sweep import content
+from tests.claims.test_check import content
 from tests.end_to_end.conftest import SMALL, SWEEP, Run, results_of, start
 from tests.launch.test_declare import TINY
 from tests.processes import bytes_written

@@ -1,4 +1,5 @@
-"""A check that two machines share, trained for real: each has a copy of the photographs, at a place of its own."""
+"""A check that two machines share, trained for real: each runs a scene, and one runs folder is copied into the
+other."""
 
 from __future__ import annotations
 
@@ -8,16 +9,15 @@ from pathlib import Path
 
 import pytest
 import yaml
-from PIL import Image
 
 from gsbench.cli import run
 from gsbench.scene.courtyard.render import render_courtyard
-from tests.claims.test_sweep import content
+from tests.claims.test_check import content
 from tests.launch.test_declare import TINY
 
 pytestmark = pytest.mark.slow
 
-SEEDS, SCENES = 3, ("near", "far")
+SCENES = ("near", "far")
 
 
 def trained(runs: Path) -> set[tuple[str, int]]:
@@ -26,12 +26,13 @@ def trained(runs: Path) -> set[tuple[str, int]]:
     return {(one["scene"], one["seed"]) for one in found}
 
 
-def test_two_machines_with_photographs_at_places_of_their_own(
+def test_copying_one_runs_folder_into_the_other_is_enough(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    render_courtyard(tmp_path / "first" / "near", views=6, width=64, height=48)
-    for folder in (Path("first", "far"), Path("second", "near"), Path("second", "far")):
-        shutil.copytree(tmp_path / "first" / "near", tmp_path / folder)
+    data = tmp_path / "data"  # at one place on both machines
+    render_courtyard(data / "near", views=6, width=64, height=48)
+    shutil.copytree(data / "near", data / "far")
+    monkeypatch.setenv("GSBENCH_DATA", str(data))
     settings = {key: yaml.safe_load(value) for key, value in (word.split("=", 1) for word in TINY)}
     settings = {key: value for key, value in settings.items() if not key.startswith("scene")} | {"tracking": "none"}
     scenes = {
@@ -40,49 +41,28 @@ def test_two_machines_with_photographs_at_places_of_their_own(
     }
     arms = {"few": {"init.count": 200}, "many": {"init.count": 300}}
     claim = content()["claims"][0] | {"baseline": "few", "arm": "many"}
-    plan = {"settings": settings, "scenes": scenes, "arms": arms, "claims": [claim], "seeds": SEEDS}
-    claims, share = tmp_path / "claims.yaml", tmp_path / "share.zip"
+    claims = tmp_path / "claims.yaml"
+    plan = {"settings": settings, "scenes": scenes, "arms": arms, "claims": [claim], "seeds": 2}
     claims.write_text(json.dumps(content() | plan))
-
-    def on(machine: str) -> Path:
-        monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / machine))
-        monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / f"{machine}_runs"))
-        return tmp_path / f"{machine}_runs"
-
-    first = on("first")
-    assert run(["check", str(claims), "--scene", "near"]) == 0
-    assert "waits for far" in capsys.readouterr().out
-    assert trained(first) == {("near", 0), ("near", 1)}
-    assert run(["check", str(claims), "--scene", "near", "--all-seeds"]) == 0
-    assert "waits for far" in capsys.readouterr().out
-    assert trained(first) == {("near", seed) for seed in range(SEEDS)}
-    assert run(["export", "--results", "check_it", "--out", str(share)]) == 0
-
-    second = on("second")
-    assert run(["check", str(claims), "--with", str(share)]) == 0
-    assert trained(second) == {("far", 0), ("far", 1)}  # .1 dB apart: refuted at the first look, where .3 dB matter
-    said = (second / "check_it" / "claims.md").read_text()
-    assert "Trials from share.zip count beside those that were run here" in said
-    assert "2 scenes, 2 seeds" in said
-    assert "had been measured before this plan" not in said
-    assert run(["export", "--results", "check_it", "--with", str(share), "--out", str(tmp_path / "all.zip")]) == 0
-    page = tmp_path / "again.md"
-    assert run(["check", str(claims), "--from", str(tmp_path / "all.zip"), "--out", str(page)]) == 0
-    again = page.read_text()
-    assert [line for line in again.splitlines() if "lpips: " in line] == [
-        line for line in said.splitlines() if "lpips: " in line
-    ]
-
-    shutil.rmtree(second)
-    photograph = next((tmp_path / "second" / "near" / "images").iterdir())
-    Image.new("RGB", (64, 48)).save(photograph)
-    half = tmp_path / "half"  # of the first machine's share one seed: the other would be run here
-    shutil.copytree(first, half)
-    for trial in (half / "check_it" / "near").glob("*/*-seed1"):
-        shutil.rmtree(trial)
-    monkeypatch.setenv("GSBENCH_RUNS", str(half))
-    assert run(["export", "--results", "check_it", "--out", str(tmp_path / "half.zip")]) == 0
-    on("second")
-    assert run(["check", str(claims), "--with", str(tmp_path / "half.zip")]) == 2
-    assert "near: photographs or their model are not those of" in capsys.readouterr().err
-    assert run(["check", str(claims), "--with", str(tmp_path / "half.zip"), "--scene", "far", "--dry-run"]) == 0
+    for machine, scene in zip(("first", "second"), SCENES, strict=True):
+        monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / machine))
+        assert run(["check", str(claims), "--scene", scene, "--all-seeds"]) == 0
+        assert "the next look waits" in capsys.readouterr().out
+        assert trained(tmp_path / machine) == {(scene, 0), (scene, 1)}
+    shutil.copytree(tmp_path / "first" / "check_it", tmp_path / "second" / "check_it", dirs_exist_ok=True)
+    capsys.readouterr()
+    assert run(["check", str(claims), "--dry-run"]) == 0
+    assert run(["check", str(claims)]) == 0
+    said = capsys.readouterr().out
+    assert "the next look waits" not in said
+    page = (tmp_path / "second" / "check_it" / "claims.md").read_text()
+    assert "2 scenes, 2 seeds" in page
+    assert "had been measured before" not in page
+    for machine in ("first", "second"):
+        monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / machine))
+        assert run(["export", "--results", "check_it", "--out", str(tmp_path / f"{machine}.zip")]) == 0
+    monkeypatch.chdir(tmp_path)
+    assert run(["check", str(claims), "--from", "second.zip", "--out", "again.md"]) == 0
+    lines = [[one for one in text.splitlines() if "lpips" in one] for text in (page, Path("again.md").read_text())]
+    assert lines[0] == lines[1]
+    assert run(["check", str(claims), "--from", "first.zip", "second.zip"]) == 0

@@ -35,7 +35,7 @@ from gsbench.launch import queue
 from gsbench.launch.experience import Experience
 from gsbench.launch.plan import read_plan
 from gsbench.launch.states import states_of_experiment
-from gsbench.runs.declaration import read_declarations, read_plans
+from gsbench.runs.declaration import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking.trial import TrackedTrial, read_state
 from gsbench.verbs.status import lines_of
@@ -240,7 +240,7 @@ def look(runs: Path, places: dict[str, Path]) -> int:
     attempt(lambda: "\n".join(lines_of(states_of_experiment(home), everything=True)).encode())
     attempt(lambda: read_plan(home))
     attempt(lambda: Experience(runs).estimate(values_of(runs, "adc", 0, 0.03)))
-    attempt(lambda: (read_declarations(home), read_plans(home)))
+    attempt(lambda: read_declarations(home))
     attempt(lambda: search_part(home))
     for folder in {path.parent for path in places.values()} - {home}:
         attempt(lambda folder=folder: TrialFolder(folder).configuration())  # type: ignore[misc]

@@ -9,14 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.analysis.declaration import measured, standing
+from gsbench.analysis.declaration import standing
+from gsbench.analysis.judgement import measured
 from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
-from gsbench.launch.declare import declare, declare_plan, declared_metrics, planned_trials
+from gsbench.launch.declare import declare, declare_questions, declared_metrics, planned_trials
 from gsbench.launch.trial import Trial
-from gsbench.runs.declaration import read_declarations, read_plans
+from gsbench.runs.declaration import Declaration, Question, read_declarations
 from tests.end_to_end.conftest import SMALL
 
 # later words win: a trial of seconds
@@ -78,19 +79,23 @@ def test_one_command_cannot_declare_two(tmp_path: Path, capsys: pytest.CaptureFi
     assert "eval.primary makes no other trial" in capsys.readouterr().err
 
 
-def test_a_plan_of_claims_is_kept_beside_declared_metrics(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_claims_are_kept_beside_declared_metrics(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     home = tmp_path / "exp"
-    first = declare_plan(home, {"claims": []}, "aaaa")
-    assert declare_plan(home, {"claims": []}, "aaaa") == first  # said again: it stands, with its time
+
+    def claims(metric: str, moment: str) -> Declaration:
+        return Declaration(time=moment, questions=(Question(metric=metric, name="claim"),))
+
+    first = declare_questions(home, claims("psnr", "2020-01-01T00:00:00Z"))
+    assert declare_questions(home, claims("psnr", "2021-01-01T00:00:00Z")) == first  # it stands, with its time
     declared = [composed(tmp_path, "eval.primary=psnr")]
     declare(declared_metrics(declared), planned_trials(declared))
     assert not caplog.text
     with caplog.at_level(logging.WARNING):
-        declare_plan(home, {"claims": [1]}, "bbbb")
-    assert "another plan was declared before" in caplog.text
-    assert {plan.hash for plan in read_plans(home)} == {"aaaa", "bbbb"}
-    assert [one.metric for one in read_declarations(home)] == ["psnr"]
-    assert next(plan for plan in read_plans(home) if plan.hash == "bbbb").plan == {"claims": [1]}
+        declare_questions(home, claims("ssim", "2022-01-01T00:00:00Z"))
+    assert "other questions were declared before" in caplog.text
+    every = read_declarations(home)
+    assert [one.primary for one in every if one.of_claims] == ["psnr", "ssim"]
+    assert [one.primary for one in every if not one.of_claims] == ["psnr"]
 
 
 @pytest.mark.slow
@@ -101,12 +106,12 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path: 
     before = file.read_bytes()
     results = json.loads(before)
     (declared,) = read_declarations(tmp_path / "exp")
-    assert results["declared"] == {"metric": "psnr", "time": declared.to_record()["time"]}
+    assert results["declared"] == {"metric": "psnr", "time": declared.time}
     experiment = load_experiment(tmp_path, "exp")
     found = standing(experiment.folder, experiment.trials)
     assert found is not None
     assert found.beforehand
-    assert measured(experiment.trials[0]) >= declared.time
+    assert measured(experiment.trials[0]) >= declared.moment
 
     time.sleep(1.1)  # moments are kept in whole seconds
     store = {path: path.stat().st_mtime_ns for path in tmp_path.glob("store/*/*")}
@@ -115,7 +120,7 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path: 
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("store/*/*")} == store
     found = standing(experiment.folder, load_experiment(tmp_path, "exp").trials)
     assert found is not None
-    assert (found.metric, len(found.seen), [one.metric for one in found.earlier]) == ("ssim", 1, ["psnr"])
+    assert (found.metric, len(found.seen), [one.primary for one in found.earlier]) == ("ssim", 1, ["psnr"])
 
     # another name gets the same numbers from the store: they were there before, and are known to have been
     assert run([*words, "name=again", "eval.primary=ssim"]) == 0

@@ -106,8 +106,8 @@ def test_options_of_ones_own_class_have_an_effect_whatever_they_are_called(home:
 
 def test_a_part_that_no_trial_has_counts_where_ones_own_class_asks_for_it(home: Path) -> None:
     for text in (
-        "from gsbench.analysis.statistics import holm",
-        "import gsbench.analysis\ndef f():\n    return gsbench.analysis.statistics.holm",
+        "from gsbench.analysis.statistics import student",
+        "import gsbench.analysis\ndef f():\n    return gsbench.analysis.statistics.student",
         "from gsbench import analysis as a\nf = lambda: a.statistics.holm",
     ):
         (home / "mine.py").write_text(f"{text}\n{METRIC.format(1)}")

@@ -99,7 +99,7 @@ def attribute(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Attribu
     for arm, group in by_key(trials, lambda trial: trial.arm).items():
         if arm not in (first, second):
             pair = representatives([*group, *(trial for trial in trials if trial.arm == second)], arm, second)
-            _note(isolating, found, _ingredients_of(*pair), f"{arm[0]}-{arm[1]}, which is here")
+            _note(isolating, found, _ingredients_of(*pair), f"{arm}, which is here")
     for name, settings in shipped_arms().items():
         alike = _under_the_same_settings(resolved(settings, other.config), one.config, other.config)
         _note(isolating, found, ingredients(alike, other.config), f"densify={name}")
@@ -116,7 +116,7 @@ def attribution_sentence(found: Attribution, first: Arm, second: Arm) -> str:
     named = list(found.ingredients[:MOST_NAMED])
     if more := len(found.ingredients) - len(named):
         named.append(f"{more} more")
-    text = f"{'-'.join(second)} differs from {'-'.join(first)} by {listed(named)}"
+    text = f"{second} differs from {first} by {listed(named)}"
     if len(found.ingredients) == 1:
         return f"{text}."
     ways = [f"isolate {name} with {arm}" for name, arm in found.isolating.items()]
@@ -130,7 +130,7 @@ def representatives(trials: Iterable[TrialResult], first: Arm, second: Arm) -> t
     """
     by_arm = by_key(trials, lambda trial: trial.arm)
     if missing := [arm for arm in (first, second) if arm not in by_arm]:
-        raise ValueError(f"no trial of {'-'.join(missing[0])}")
+        raise ValueError(f"no trial of {missing[0]}")
     likenesses: tuple[Callable[[TrialResult], object], ...] = (
         lambda trial: (trial.scene, trial.seed),
         lambda trial: trial.scene,

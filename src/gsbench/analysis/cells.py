@@ -112,10 +112,7 @@ def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
     swept = swept_settings(trials)
     if not swept:
         return list(trials)
-    return [
-        replace(trial, variant=" ".join(f"{key.rpartition('.')[2]}={setting(trial.config, key)}" for key in swept))
-        for trial in trials
-    ]
+    return [replace(trial, variant=tuple((key, str(setting(trial.config, key))) for key in swept)) for trial in trials]
 
 
 def make_cell(trials: Sequence[TrialResult], quantity: Quantity, scenes: Sequence[str], expected: int) -> Cell:

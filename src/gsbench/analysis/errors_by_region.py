@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from gsbench.analysis.cells import by_key
-from gsbench.analysis.pairing import Paired, pair_trials
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import Comparison, compare_family
+from gsbench.analysis.statistics import answer_family
 from gsbench.errors import InputError
 from gsbench.runs.layout import GROUND_TRUTH, MAPS, MASKS, RENDERS
 from gsbench.scene.masks import read_mask
@@ -41,14 +40,14 @@ MAP_PROPERTIES = {
 class RegionErrors:
     """Mean absolute errors (8-bit levels) of two arms in bins of a property, from its lowest values to its highest.
 
-    ``edges`` are the inner edges of each scene's bins; ``comparisons`` are second arm minus first, one for each bin,
-    adjusted for their number.
+    ``edges`` are the inner edges of each scene's bins; ``changes`` are second arm minus first with a word for each bin:
+    better, worse or undecided, adjusted for their number.
     """
 
     property: str
     first: tuple[float, ...]
     second: tuple[float, ...]
-    comparisons: tuple[Comparison, ...]
+    changes: tuple[tuple[float, str], ...]
     edges: dict[str, tuple[float, ...]]
 
 
@@ -80,6 +79,8 @@ def errors_by_region(
     The maps are those of the first arm's trials, so that both arms are sorted alike. Raises ``InputError``, saying what
     is missing, where renders or maps are absent.
     """
+    from gsbench.analysis.judgement import pair_trials  # here, since it reads measures that this module makes
+
     pairs = pair_trials(trials, first, second)
     if not pairs:
         raise InputError("no trials of the two arms share a scene, a seed and their conditions")
@@ -102,12 +103,12 @@ def errors_by_region(
         if not kept:
             raise InputError(f"{property_name}: bin {index + 1} of {bins} is empty in every scene; ask for fewer bins")
         means.append(np.mean([array.mean(axis=(0, 1)) for _, array in kept], axis=0))  # [2]
-        differences = tuple(array[:, :, 1] - array[:, :, 0] for _, array in kept)
-        name = f"error in {property_name} bin {index + 1}"
-        paired = Paired(name, tuple(scene for scene, _ in kept), differences, float(means[-1][0]), ())
-        differing.append((paired, -1))
+        seeds = min(len(array) for _, array in kept)
+        differing.append(np.array([(array[:seeds, :, 1] - array[:seeds, :, 0]).mean(axis=1) for _, array in kept]))
     first_means, second_means = (tuple(float(mean[place]) for mean in means) for place in (0, 1))
-    return RegionErrors(property_name, first_means, second_means, tuple(compare_family(differing)), edges)
+    words = {"supported": "better", "refuted": "worse"}
+    changes = [(one.mean, words.get(one.outcome(-1, None), "undecided")) for one in answer_family(differing)]
+    return RegionErrors(property_name, first_means, second_means, tuple(changes), edges)
 
 
 def view_names(trial: TrialResult) -> list[str]:

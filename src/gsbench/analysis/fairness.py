@@ -18,8 +18,9 @@ from gsbench.analysis.attribution import (
 )
 from gsbench.analysis.configurations import REFERENCE, canonical, notes_of, resolved, shipped_arms, shipped_name
 from gsbench.analysis.differences import CODE, short_version
+from gsbench.analysis.judgement import pair_trials
 from gsbench.analysis.origins import cloud_of, machine_of
-from gsbench.analysis.pairing import arm_name, pair_trials
+from gsbench.analysis.pairing import arm_name
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.tables import Column, Entry, Row, Table
 from gsbench.analysis.tuning import tuning_lines

@@ -44,7 +44,7 @@ def paper_tables(
     """The measured table in the paper's layout and the table of differences from the printed numbers."""
     trials = list(experiment.trials if trials is None else trials)
     arms, notes = _arms(name, trials)
-    trials = [trial for trial in trials if trial.arm in arms]
+    trials = [trial for trial in trials if (trial.init, trial.densify) in arms]
     if not trials:
         needed = ", ".join(f"init={init} densify={densify}" for init, densify in arms)
         raise InputError(f"experiment {experiment.name!r} has no trial for {name} ({needed}); use --layout plain")

@@ -16,7 +16,7 @@ from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import Interval, t_interval
-from gsbench.analysis.verdicts import ArmVerdicts, Pair, Verdict
+from gsbench.analysis.verdicts import ArmVerdict, ArmVerdicts, Pair
 from gsbench.runs.declaration import EXTRAPOLATION, INTERPOLATION
 from gsbench.runs.splits import setting
 
@@ -40,8 +40,8 @@ class Turn:
     first: Arm
     second: Arm
     split: str  # of the extrapolation, such as "sector 0 of 8"
-    interpolation: Verdict
-    extrapolation: Verdict
+    interpolation: ArmVerdict
+    extrapolation: ArmVerdict
     change: float | None
     interval: Interval | None
     word: str
@@ -70,8 +70,8 @@ def without_split(trials: Sequence[TrialResult]) -> dict[str, Arm]:
     swept = [key for key in swept_settings(trials) if key not in SPLIT_SETTINGS]
     arms = {}
     for trial in trials:
-        variant = " ".join(f"{key.rpartition('.')[2]}={setting(trial.config, key)}" for key in swept)
-        arms[str(trial.path)] = trial.init, f"{trial.densify} {variant}".strip()
+        variant = tuple((key, str(setting(trial.config, key))) for key in swept)
+        arms[str(trial.path)] = Arm(trial.init, trial.densify, variant)
     return arms
 
 
@@ -120,13 +120,17 @@ def find_gaps(trials: Sequence[TrialResult]) -> list[Gap]:
 
 
 def _turn(
-    base: Pair, near: Verdict, far: Verdict, near_arms: Pair, far_arms: Pair, by_arm: Mapping[Arm, list[TrialResult]]
+    base: Pair,
+    near: ArmVerdict,
+    far: ArmVerdict,
+    near_arms: Pair,
+    far_arms: Pair,
+    by_arm: Mapping[Arm, list[TrialResult]],
 ) -> Turn:
     gains = [by_seed_differences(by_arm[pair[0]], by_arm[pair[1]], near.quantity) for pair in (near_arms, far_arms)]
     change, interval = difference_over_seeds(*gains)
-    words = (near.comparison.verdict, far.comparison.verdict)
-    decided = "no evidence" not in words
-    same = near.comparison.mean * far.comparison.mean > 0
+    decided = all(one.verdict.interval is not None and one.verdict.interval.excludes_zero() for one in (near, far))
+    same = (near.verdict.mean or 0.0) * (far.verdict.mean or 0.0) > 0
     word = (HOLDS if same else TURNS) if decided else (OPEN if same else UNSURE)
     return Turn(*base, by_arm[far_arms[0]][0].split, near, far, change, interval, word)
 

@@ -20,6 +20,7 @@ from gsbench.errors import InputError
 from gsbench.files import require_own
 from gsbench.parsing import DamagedError, one_line
 from gsbench.runs.declaration import QUESTIONS
+from gsbench.runs.declaration import Arm as Arm
 from gsbench.runs.experiments import experiment_home, places_of_trials
 from gsbench.runs.layout import CONFIG, FAILED, RESULTS, SEED
 from gsbench.runs.splits import split_text
@@ -30,8 +31,6 @@ from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError
 log = logging.getLogger(__name__)
 
 TRIAL_FOLDER = re.compile(rf"(?P<hash>[0-9a-f]{{8}}){SEED}(?P<seed>\d+)")
-
-Arm = tuple[str, str]  # initialiser, densifier
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class TrialResult:
     path: Path
     config_hash: str
     record: TrialRecord = field(repr=False)
-    variant: str = ""  # the swept settings that tell this trial from others of its initialiser and densifier
+    variant: tuple[tuple[str, str], ...] = ()  # swept settings that tell the arm from others of the same two names
     settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
     translation: Translation | None = None  # of the metrics, where they are those of another protocol
     translated_from: str = ""  # the trial's own protocol then
@@ -81,8 +80,8 @@ class TrialResult:
 
     @cached_property
     def arm(self) -> Arm:
-        """The name of the compared arm: the initialiser, and the densifier with its variant."""
-        return self.init, f"{self.densify} {self.variant}".strip()
+        """The compared arm that the trial is of."""
+        return Arm(self.init, self.densify, self.variant)
 
     @property
     def label(self) -> str:

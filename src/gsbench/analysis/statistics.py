@@ -1,14 +1,13 @@
-"""Comparison of two arms: paired differences by scene and seed, with one test that respects what is repeated.
+"""Tests of paired differences: of these scenes, and of scenes like these.
 
-The views of one trial share its training, so they are no independent repetitions of it: a trial is the smallest unit
-that a test here counts. Three questions are kept apart. *This scene*: do the differences of its trials, paired by seed,
-differ from zero? *These scenes*: the same for the mean over the scenes at hand. *Scenes like these*: is the mean over
-scenes different from zero when scenes are the units (asked from ``MIN_SCENES`` on, and beside the question before it,
-never in its place)?
+Differences are matrices [S, K]: of S scenes, each with K pairs of trainings. The views of a trial share its training,
+so a trial is the smallest unit that counts.
 
-Each is answered by Student's t, whatever the numbers of scenes, trials and questions: with few trials nothing else can
-answer, and a change of method by their number would let a verdict become surer with less data. p and interval are two
-readings of one test: an interval leaves zero out exactly where its p is below 5 %.
+*These scenes*: the mean over the scenes at hand, each with the same weight; scenes are fixed, the units are pairs
+within them, and each scene has a variance of its own (Welch 1947; Satterthwaite 1946). *Scenes like these*, from
+``MIN_SCENES`` on: in how many of them it helps, by the sign test, with the exact interval of the median effect. It
+assumes nothing about the shape of the effects; no test of their mean could stand one scene that differs much from seven
+others.
 """
 
 from __future__ import annotations
@@ -16,18 +15,27 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from gsbench.analysis.pairing import Paired
+from gsbench.runs.declaration import ERROR_RATE
 
-ALPHA = 0.05
-MIN_SCENES = 6  # scenes of which a statement about scenes like these is made
+ALPHA = ERROR_RATE
+MIN_SCENES = 6  # of which a statement about scenes like these is made
+SUPPORTED, REFUTED, TOO_SMALL, UNDECIDED = "supported", "refuted", "too small to matter", "undecided"
+Outcome = Literal["supported", "refuted", "too small to matter", "undecided"]
 
-NOT_REPEATED = "none, since no trial was repeated with another seed or scene"
-THESE_SCENES, THIS_SCENE = "these scenes", "this scene"
+# Satterthwaite's degrees of freedom are twice too many where one scene is noisier than the others and seeds are two to
+# four, as simulations show (docs/verdict.md): its own deviation comes out too small as often as too large.
+DEGREES = 0.5
+SPENDING_POWER = 1.5
+DRAWS = 100_000
+FIRST_LOOK = 2  # seeds: one training of each arm says nothing of how trainings differ
+EACH_UP_TO = 12  # seeds up to which every seed is a look; beyond, a look costs little patience and a bound's precision
 
 Array = NDArray[np.floating]
 
@@ -47,7 +55,7 @@ class StudentT:
 
     mean: float
     error: float
-    degrees: int
+    degrees: float
 
     @property
     def p(self) -> float:
@@ -62,203 +70,97 @@ class StudentT:
         return Interval(self.mean - half, self.mean + half)
 
 
-@dataclass(frozen=True)
-class SceneComparison:
-    """One scene: the mean of its trials' differences, with p and interval of Student's t over them.
+def student(differences: Array) -> StudentT | None:
+    """The test of the mean over scenes of ``differences`` [S, K]; None of a single pair.
 
-    ``p`` is of this test alone; ``p_family`` and ``interval`` are adjusted (Holm) for the family of all scenes in all
-    comparisons that were made together. ``better_views`` is the share of views (averaged over trials) in which the
-    second arm is better.
+    With one pair a scene, the spread of the scenes stands for that of trainings: it is never too small in the mean.
+    """
+    scenes, seeds = differences.shape
+    if differences.size < 2:
+        return None
+    if seeds == 1:
+        return StudentT(float(differences.mean()), float(differences.std(ddof=1)) / math.sqrt(scenes), scenes - 1)
+    variances = differences.var(axis=1, ddof=1)
+    error, degrees = _error_and_degrees(variances[None], seeds)
+    return StudentT(float(differences.mean()), float(error[0]), float(degrees[0]))
+
+
+def _error_and_degrees(variances: Array, seeds: int) -> tuple[Array, Array]:
+    """Standard error and degrees of freedom [D] of the mean over scenes, from the scenes' variances [D, S]."""
+    total, squares = variances.sum(axis=1), (variances**2).sum(axis=1)
+    satterthwaite = np.divide(total**2 * (seeds - 1), squares, out=np.full_like(total, seeds - 1.0), where=squares > 0)
+    return np.sqrt(total / seeds) / variances.shape[1], np.maximum(seeds - 1, DEGREES * satterthwaite)
+
+
+def t_interval(values: Array) -> Interval | None:
+    """Student's 95 % interval of the mean of ``values`` [n]; None of a single one."""
+    test = student(values[None])
+    return None if test is None else test.interval()
+
+
+def outcome_of(interval: Interval, sign: int, least: float | None) -> Outcome:
+    """The one of four outcomes that an interval of the difference makes of "it has this sign, and matters".
+
+    Supported where the interval lies wholly on the claimed side of zero, refuted on the other; too small to matter
+    where it lies within ± ``least``, whichever its sign. Of "there is no difference to speak of" (sign 0): supported
+    within ± ``least``, refuted beyond it.
+    """
+    within = least is not None and max(-interval.low, interval.high) < least
+    if not sign:
+        beyond = least is not None and max(interval.low, -interval.high) > least
+        return "supported" if within else "refuted" if beyond else "undecided"
+    if within:
+        return "too small to matter"
+    if not interval.excludes_zero():
+        return "undecided"
+    return "supported" if sign * interval.low > 0 or sign * interval.high > 0 else "refuted"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A mean difference with its test as one of a family whose error rate is ``level``.
+
+    ``p`` is adjusted for the family, and so is ``interval``, at the error rate ``rate``: it leaves zero out exactly
+    where ``p`` is below ``level``. What is too small is told at ``equal_rate``, a member's equal part of ``level``. Of
+    a single pair there is no test.
     """
 
-    scene: str
     mean: float
-    deviation: float | None  # of the trials' differences
-    trials: int
-    views: int
-    interval: Interval | None
-    p: float | None
-    p_family: float | None
-    better_views: float
-
-
-@dataclass(frozen=True)
-class BeyondScenes:
-    """Test of whether the finding holds for scenes like these: the same mean, with scenes as units.
-
-    ``p`` is the larger one of that test and of the one about these scenes, since the narrower statement must hold
-    first; ``p_family`` is adjusted for the family, and ``holds`` where it is below 5 %.
-    """
-
-    scenes: int
-    p: float
-    p_family: float
+    test: StudentT | None
+    level: float
+    rate: float
+    equal_rate: float
+    p: float | None = None
 
     @property
-    def holds(self) -> bool:
-        return self.p_family < ALPHA
+    def interval(self) -> Interval | None:
+        return None if self.test is None or not self.rate else self.test.interval(self.rate)
+
+    def outcome(self, sign: int, least: float | None) -> Outcome:
+        if self.test is None or self.interval is None:
+            return "undecided"
+        found = outcome_of(self.test.interval(self.equal_rate), sign, least)
+        return found if found == TOO_SMALL or not sign else outcome_of(self.interval, sign, None)
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Second arm minus first in one metric, averaged over scenes.
+def answer_family(members: Sequence[Array], level: float = ALPHA) -> list[Answer]:
+    """Test each of ``members`` [S, K] as one of a family, by Holm's method (1979).
 
-    ``p`` is of this comparison alone. ``p_family`` is adjusted by Holm for the ``family`` of comparisons that it was
-    one of, and ``interval`` is as wide as that asks: it leaves zero out exactly where ``p_family`` is below 5 %. Of a
-    single comparison it is the usual 95 % interval. ``scope`` is what the verdict speaks of ("these scenes" or "this
-    scene"), ``test`` what gave ``p``; ``beyond`` says whether it holds for scenes like these, None with too few.
-    ``effect_size`` is the mean difference in deviations of the pairs of trials (Cohen's d for pairs), ``deviation``
-    their deviation; None with fewer than two. ``verdict`` is better, worse or "no evidence".
+    The chance that any sign which is told is false is at most ``level``, and so it is for what is called too small.
     """
-
-    metric: str
-    mean: float
-    relative: float
-    interval: Interval | None
-    p: float | None
-    test: str
-    scope: str
-    effect_size: float | None
-    verdict: str
-    scenes: tuple[SceneComparison, ...]
-    deviation: float | None
-    left_out: tuple[str, ...]
-    p_family: float | None
-    beyond: BeyondScenes | None = None
-    family: int = 1
-
-
-def compare(paired: Paired, direction: int) -> Comparison:
-    """Compare two arms; ``direction`` is +1 where more of the metric is better, -1 where less is.
-
-    The verdict is better or worse where the test's p is below 5 %, and so where the interval leaves zero out.
-    """
-    return compare_family([(paired, direction)])[0]
-
-
-def compare_family(members: Sequence[tuple[Paired, int]]) -> list[Comparison]:
-    """Compare each of ``members`` (pairs of arms in one metric, direction) as one of a family of questions.
-
-    The chance that any verdict of the family is false is held at 5 %, by Holm's method. What is said of single scenes
-    is a family of its own, and so is what is said of scenes like these.
-    """
-    per_trial = [[matrix.mean(axis=1) for matrix in paired.differences] for paired, _ in members]  # [K] for each scene
-    tests = [student(values) for values in per_trial]
-    adjusted = adjust(tests)
-    by_scene = [[student([values]) for values in one] for one in per_trial]
-    several = iter(adjust([test for tests in by_scene if len(tests) > 1 for test in tests]))
-    of_scenes = [
-        [next(several) for _ in tests] if len(tests) > 1 else [whole]  # one scene is the whole: one answer
-        for tests, whole in zip(by_scene, adjusted, strict=True)
-    ]
-    beyond = _beyond_scenes(per_trial, tests)
+    tests = [student(member) for member in members]
+    factors = holm_factors([None if test is None else test.p for test in tests])
+    equal = level / max(1, sum(test is not None for test in tests))
     return [
-        _comparison(paired, direction, values, answer, scenes, wider, len(members))
-        for (paired, direction), values, answer, scenes, wider in zip(
-            members, per_trial, adjusted, of_scenes, beyond, strict=True
-        )
-    ]
-
-
-@dataclass(frozen=True)
-class Adjusted:
-    """A test as one of a family; None where there is nothing to test."""
-
-    p: float | None
-    p_family: float | None
-    interval: Interval | None
-
-
-def adjust(tests: Sequence[StudentT | None]) -> list[Adjusted]:
-    """The tests as one family: each p times Holm's factor, each interval at the level divided by the same."""
-    p_values = [None if test is None else test.p for test in tests]
-    return [
-        Adjusted(None, None, None)
+        Answer(float(member.mean()), None, level, level, level)
         if test is None or factor is None
-        else Adjusted(test.p, min(1.0, factor * test.p), test.interval(ALPHA / factor))
-        for test, factor in zip(tests, holm_factors(p_values), strict=True)
-    ]
-
-
-def _comparison(
-    paired: Paired,
-    direction: int,
-    per_trial: Sequence[Array],
-    answer: Adjusted,
-    scenes: Sequence[Adjusted],
-    beyond: BeyondScenes | None,
-    family: int,
-) -> Comparison:
-    mean = float(np.mean([values.mean() for values in per_trial]))
-    pairs = np.concatenate(list(per_trial))  # [n]
-    decided = answer.p_family is not None and answer.p_family < ALPHA
-    return Comparison(
-        metric=paired.metric,
-        mean=mean,
-        relative=mean / paired.baseline_mean if paired.baseline_mean else math.nan,
-        interval=answer.interval,
-        p=answer.p,
-        test=NOT_REPEATED if answer.p is None else f"Student's t over {len(pairs)} pairs of trials",
-        scope=THESE_SCENES if len(per_trial) > 1 else THIS_SCENE,
-        effect_size=_standardised(pairs),
-        verdict="no evidence" if not decided else "better" if mean * direction > 0 else "worse",
-        scenes=_scene_comparisons(paired, per_trial, scenes, direction),
-        deviation=float(pairs.std(ddof=1)) if len(pairs) > 1 else None,
-        left_out=paired.left_out,
-        p_family=answer.p_family,
-        beyond=beyond,
-        family=family,
-    )
-
-
-def student(per_trial: Sequence[Array]) -> StudentT | None:
-    """The test of the mean of scenes' means, whose units are the pairs of trials ([K] for each scene); None of one.
-
-    Their plain deviation, between scenes and within, makes the standard error, as in `claims.sequential`: scenes that
-    disagree make a verdict rarer, and not false.
-    """
-    pairs = np.concatenate(list(per_trial))  # [n]
-    if len(pairs) < 2:
-        return None
-    weights = np.concatenate([np.full(len(values), 1 / len(values)) for values in per_trial]) / len(per_trial)  # [n]
-    error = float(pairs.std(ddof=1)) * math.sqrt(float((weights**2).sum()))
-    return StudentT(float(weights @ pairs), error, len(pairs) - 1)
-
-
-def _beyond_scenes(per_trial: Sequence[Sequence[Array]], tests: Sequence[StudentT | None]) -> list[BeyondScenes | None]:
-    """For each member with scenes enough: whether it holds for scenes like these.
-
-    The two statements are tested in a fixed order (Maurer, Hothorn and Lehmacher 1995): about these scenes first. So
-    each keeps its own 5 %, and leaving out a scene never makes a verdict of what is none with it by their number alone.
-    """
-    p_values: list[float | None] = []
-    for scenes, test in zip(per_trial, tests, strict=True):
-        over = student([np.array([values.mean() for values in scenes])]) if len(scenes) >= MIN_SCENES else None
-        p_values.append(None if over is None or test is None else max(over.p, test.p))
-    return [
-        None if p is None or p_family is None else BeyondScenes(len(scenes), p, p_family)
-        for p, p_family, scenes in zip(p_values, holm(p_values), per_trial, strict=True)
-    ]
-
-
-def pooled_deviation(per_trial: Sequence[Array]) -> float | None:
-    """Deviation of paired differences between trials of one scene, pooled over scenes; None without a repetition."""
-    degrees = sum(len(values) - 1 for values in per_trial)
-    if degrees == 0:
-        return None
-    return math.sqrt(sum(float(((values - values.mean()) ** 2).sum()) for values in per_trial) / degrees)
-
-
-def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Holm's step-down adjustment, which holds the chance of any false finding; None stays None and is not counted."""
-    return [
-        None if p is None or factor is None else min(1.0, factor * p)
-        for p, factor in zip(p_values, holm_factors(p_values), strict=True)
+        else Answer(test.mean, test, level, level / factor, equal, min(1.0, factor * test.p))
+        for member, test, factor in zip(members, tests, factors, strict=True)
     ]
 
 
 def holm_factors(p_values: Iterable[float | None]) -> list[float | None]:
-    """The factor by which Holm's method (1979) multiplies each p, at least 1; None for None, which is not counted.
+    """The factor by which Holm's method multiplies each p, at least 1; None for None, which is not counted.
 
     The smallest of m by m, the next by m - 1, and so on, but none below the one before it.
     """
@@ -272,33 +174,114 @@ def holm_factors(p_values: Iterable[float | None]) -> list[float | None]:
     return factors
 
 
-def t_interval(values: Array) -> Interval | None:
-    """Student's 95 % interval of the mean of ``values`` [n]; None of a single one."""
-    test = student([values])
-    return None if test is None else test.interval()
+@dataclass(frozen=True)
+class LikeThese:
+    """What scenes say of scenes like them: in how many of ``scenes`` the arm has the sign that is asked for.
+
+    ``beyond`` of them have it by the least that matters, None where that is not known. ``share`` is the exact interval
+    (Clopper and Pearson 1934) of the share of such scenes with the sign, ``median`` that of their median effect, from
+    the order of the scenes; None with too few scenes for ``level``. ``p`` is that of the sign test.
+    """
+
+    scenes: int
+    helped: int
+    beyond: int | None
+    share: Interval
+    median: Interval | None
+    p: float
+    level: float
+    outcome: Outcome
+
+    @property
+    def needed(self) -> int | None:
+        """The number of scenes that must agree before it can be said; None where all of them would not suffice."""
+        return sign_test_needs(self.scenes, self.level)
+
+    def power(self, share: float = 0.9) -> float:
+        """The chance to say it where it helps in this share of scenes like these."""
+        if self.needed is None:
+            return 0.0
+        return float(special.bdtrc(self.needed - 1, self.scenes, share))
 
 
-def _scene_comparisons(
-    paired: Paired, per_trial: Sequence[Array], answers: Sequence[Adjusted], direction: int
-) -> tuple[SceneComparison, ...]:
-    rows = zip(paired.scenes, per_trial, paired.differences, answers, strict=True)
-    return tuple(
-        SceneComparison(
-            scene=scene,
-            mean=float(values.mean()),
-            deviation=float(values.std(ddof=1)) if len(values) > 1 else None,
-            trials=len(values),
-            views=matrix.shape[1],
-            interval=answer.interval,
-            p=answer.p,
-            p_family=answer.p_family,
-            better_views=float(np.mean(direction * matrix.mean(axis=0) > 0)),
-        )
-        for scene, values, matrix, answer in rows
+def like_these(means: Array, sign: int, least: float | None, level: float = ALPHA) -> LikeThese | None:
+    """The statement about scenes like these from the scenes' ``means`` [S]; None below `MIN_SCENES`."""
+    count = len(means)
+    if count < MIN_SCENES:
+        return None
+    toward = means * (sign or 1)
+    helped, hurt = int((toward > 0).sum()), int((toward < 0).sum())
+    median = median_interval(means, level)
+    return LikeThese(
+        count,
+        helped,
+        None if least is None else int((toward >= least).sum()),
+        _share_interval(helped, count, level),
+        median,
+        _sign_p(max(helped, hurt), count),
+        level,
+        "undecided" if median is None else outcome_of(median, sign, least),
     )
 
 
-def _standardised(units: Array) -> float | None:
-    if len(units) < 2 or units.std(ddof=1) == 0:
+def median_interval(values: Array, level: float) -> Interval | None:
+    """The exact interval of the median that ``values`` [n] are drawn with, from order statistics; None of too few."""
+    count = len(values)
+    outer = [k for k in range(count // 2) if 2 * float(special.bdtr(k, count, 0.5)) <= level]
+    if not outer:
         return None
-    return float(units.mean() / units.std(ddof=1))
+    ordered = np.sort(values)
+    return Interval(float(ordered[outer[-1]]), float(ordered[count - 1 - outer[-1]]))
+
+
+def sign_test_needs(scenes: int, level: float) -> int | None:
+    """The number of ``scenes`` with one sign from which on the sign test is below ``level``; None where none is."""
+    return next((agree for agree in range(scenes // 2 + 1, scenes + 1) if _sign_p(agree, scenes) <= level), None)
+
+
+def _sign_p(agree: int, count: int) -> float:
+    """Two-sided p of the sign test where ``agree`` of ``count`` have one sign."""
+    return min(1.0, 2 * float(special.bdtrc(agree - 1, count, 0.5))) if agree else 1.0
+
+
+def _share_interval(found: int, count: int, level: float) -> Interval:
+    low = float(special.betaincinv(found, count - found + 1, level / 2)) if found else 0.0
+    high = float(special.betaincinv(found + 1, count - found, 1 - level / 2)) if found < count else 1.0
+    return Interval(low, high)
+
+
+def plan_looks(maximum: int) -> tuple[int, ...]:
+    """The looks of at most ``maximum`` seeds: each seed from the second on, later every fourth."""
+    early = range(FIRST_LOOK, min(maximum, EACH_UP_TO) + 1)
+    return tuple(dict.fromkeys([*early, *range(EACH_UP_TO, maximum, 4), maximum]))
+
+
+@cache
+def look_levels(scenes: int, looks: tuple[int, ...], alpha: float) -> tuple[float, ...]:
+    """The error rate of the interval at each look, such that all intervals together err in ``alpha``.
+
+    Repeated confidence intervals (Jennison and Turnbull 1989): whichever look one stops at, and why, the chance of a
+    false word is at most ``alpha``. How much of it is used up by a look with the share t of all seeds is fixed
+    beforehand, ``alpha t^1.5`` (Lan and DeMets 1983; Kim and DeMets 1987). That the looks share trials is made use of:
+    the rates come from `DRAWS` sequences of trainings in which scenes are equally noisy, and no look has more than has
+    been used up by then, which holds however noisy scenes are.
+    """
+    rng = np.random.default_rng(0)
+    totals, squares = np.zeros((DRAWS, scenes)), np.zeros((DRAWS, scenes))
+    inside = np.ones(DRAWS, dtype=bool)
+    found: list[float] = []
+    before = 0
+    for seeds in looks:
+        new = seeds - before
+        added = rng.normal(0, math.sqrt(new), totals.shape)
+        totals += added
+        squares += added**2 / new + (rng.chisquare(new - 1, totals.shape) if new > 1 else 0.0)
+        error, degrees = _error_and_degrees((squares - totals**2 / seeds) / (seeds - 1), seeds)
+        p = 2 * special.stdtr(degrees, -np.abs(totals.mean(axis=1) / seeds / error))
+        spent = alpha * (seeds / looks[-1]) ** SPENDING_POWER
+        more = round(spent * DRAWS) - int(np.count_nonzero(~inside))
+        level = min(spent, float(np.partition(p[inside], more)[more])) if more > 0 else 0.0
+        inside &= p >= level
+        found.append(level)
+        before = seeds
+    return tuple(found)

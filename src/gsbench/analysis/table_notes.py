@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from gsbench.analysis.caveats import caveats
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import standing
-from gsbench.analysis.pairing import ViewCache, arm_name, choose_pairs, controls_of
+from gsbench.analysis.pairing import arm_name, choose_pairs, controls_of
 from gsbench.analysis.results import Arm, Experiment, TrialResult
 from gsbench.runs.layout import SEARCH
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
@@ -49,7 +49,7 @@ def declared_notes(experiment: Experiment) -> list[str]:
     from gsbench.analysis.verdicts import declared_lines, judge  # here, for a quick start of what needs no test
 
     trials, pairs = compared_pairs(experiment)
-    return declared_lines(declared, judge(trials, pairs, ViewCache(), declared))
+    return declared_lines(declared, judge(trials, pairs, declared))
 
 
 def caveat_notes(experiment: Experiment) -> list[str]:

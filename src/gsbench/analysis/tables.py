@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from gsbench.analysis.cells import (
@@ -271,16 +271,19 @@ def _cost_notes(trials: Sequence[TrialResult]) -> list[str]:
     arms = by_key(with_variants(trials), lambda trial: trial.arm)
     notes = []
     for first, second in choose_pairs(sorted(arms)):
-        (baseline, _, one), (name, _, other) = (arm[1].partition(" ") for arm in (first, second))
+        baseline, name = first.densify, second.densify
+        one, other = (str(replace(arm, init="", densify="")).strip() for arm in (first, second))
         together = by_key([*arms[first], *arms[second]], lambda trial: trial.scene).values()
         if baseline != BASELINE or name == BASELINE or any(map(differing_conditions, together)):
             continue
         shared = f", {other}" if other and one == other else ""
-        names = (name, baseline) if one == other else (second[1], first[1])
+        names = (name, baseline) if one == other else (str(replace(second, init="")), str(replace(first, init="")))
         for what, read in _COSTS.items():
             change = cost_change(arms[first], arms[second], read)
             if change is not None:
-                notes.append(f"{what}, {' against '.join(names)} (init {second[0]}{shared}): {change_words(*change)}.")
+                notes.append(
+                    f"{what}, {' against '.join(names)} (init {second.init}{shared}): {change_words(*change)}."
+                )
     return notes
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.quantities import Quantity
-from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.results import TrialResult
 
 GRID = 200  # points at which two curves are compared
 
@@ -41,12 +41,12 @@ class CurveGap:
     high: float
 
 
-def family_curve(trials: Sequence[TrialResult], family: Arm, quality: Quantity, cost: str) -> Curve:
+def family_curve(trials: Sequence[TrialResult], family: tuple[str, str], quality: Quantity, cost: str) -> Curve:
     """One point for each variant of a densifier (init, densify): means over seeds, then over scenes."""
     read = COST_READERS[cost]
     own = [trial for trial in trials if (trial.init, trial.densify) == family]
     points = []
-    for variant, group in by_key(own, lambda trial: trial.variant).items():
+    for variant, group in by_key(own, lambda trial: str(trial.arm)).items():
         cost_mean = _mean_of_scenes(group, read)
         quality_mean = _mean_of_scenes(group, quality.read)
         if cost_mean and quality_mean is not None:

@@ -10,10 +10,9 @@ from typing import Any
 from gsbench.analysis.attribution import TARGET, differing_keys
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.configurations import canonical, resolved, shipped_arms, shipped_name
-from gsbench.analysis.declaration import measured
-from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.judgement import measured
+from gsbench.analysis.results import Arm, TrialResult, read_experiment
 from gsbench.records import read_if_sound
-from gsbench.runs.declaration import TUNED, read_plans
 from gsbench.runs.layout import SEARCH, TUNING
 from gsbench.runs.search_record import Point, SearchRecord, is_value
 from gsbench.runs.tuning_record import TunedArm, TuningRecord
@@ -61,7 +60,7 @@ def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
     budgets = [_budget(next(trial for trial in trials if trial.arm == arm)) for arm in pair]
     if len(set(budgets)) < 2:
         return ""
-    said = listed([f"{'-'.join(arm)} {budget}" for arm, budget in zip(pair, budgets, strict=True)])
+    said = listed([f"{arm} {budget}" for arm, budget in zip(pair, budgets, strict=True)])
     return f"Their tuning was unequal: {said}."
 
 
@@ -109,7 +108,7 @@ def _tuned_here(own: Sequence[TrialResult]) -> list[str]:
     seeds = ", ".join(map(str, record.seeds))
     line = (
         f"{name}: {chosen} is the best of {points} by {record.metric} of {_views(search)} ({where}; seed {seeds}), "
-        f"{_when(own, record)}. "
+        f"{_when(own, tuned)}. "
         f"Searched: {listed([f'{key}={text}' for key, text in tuned.ranges.items()])}; "
         f"{'the first point was the arm as it is' if tuned.as_it_is else 'the arm as it is was no point'}. "
         f"Tried: {_points(search)}."
@@ -120,14 +119,14 @@ def _tuned_here(own: Sequence[TrialResult]) -> list[str]:
     return [line]
 
 
-def _when(own: Sequence[TrialResult], record: TuningRecord) -> str:
-    """Say when the tuning was declared, and whether that was before these trials were measured."""
-    plans = [plan for plan in read_plans(_home(own[0]), TUNED) if plan.hash == record.hash]
-    if not plans:
-        return "of which no declaration is left"
-    before = sum(measured(trial) < plans[0].time for trial in own)
-    what = f"when {before} of these {len(own)} trials had been measured" if before else "before any of these trials"
-    return f"declared {plans[0].when}, {what}"
+def _when(own: Sequence[TrialResult], tuned: TunedArm) -> str:
+    """Say whether the tuning's own trials were measured before these, by their files."""
+    home = _home(own[0]).parent / (tuned.experiment or "")
+    times = [measured(trial) for trial in read_experiment(home).trials] if tuned.experiment and home.is_dir() else []
+    if not times:
+        return "whose own trials are not there"
+    later = sum(measured(trial) < max(times) for trial in own)
+    return f"ended when {later} of these {len(own)} trials had been measured" if later else "before any of these trials"
 
 
 def _points(search: SearchRecord) -> str:
@@ -152,7 +151,7 @@ def _tried_here(trials: Sequence[TrialResult], own: TrialResult) -> list[str]:
     if not values:
         return []
     return [
-        f"{'-'.join(own.arm)}: {counted(len(choices), 'choice')} of its settings were run here, which differ "
+        f"{own.arm}: {counted(len(choices), 'choice')} of its settings were run here, which differ "
         f"in {listed(values)}, all measured on the held-out views that the verdict uses, too."
     ]
 
@@ -172,7 +171,7 @@ def _searched(own: TrialResult) -> list[str]:
             continue
         place = "the best" if point == search.best else "one"
         lines.append(
-            f"{'-'.join(own.arm)}: {listed(_settings(point))} is {place} of {counted(len(search.points), 'point')} of "
+            f"{own.arm}: {listed(_settings(point))} is {place} of {counted(len(search.points), 'point')} of "
             f"the search {name}, by {search.metric} of {_views(search)}"
             f"{', none of which is held out' if search.validation else ''}."
         )

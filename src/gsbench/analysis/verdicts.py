@@ -1,49 +1,66 @@
-"""The verdicts of an experiment: each pair of arms in each metric, in families that hold the chance of a false one.
+"""The verdicts of a sweep: every two arms that are compared, in every metric that has a direction, as one declaration.
 
 Where nothing was declared (``eval.primary``), all metrics of all pairs are one family, adjusted by Holm (1979). Where a
-metric was declared, two questions are kept apart, each with its own 5 % for the chance that any answer is false:
+metric was declared, at one question if one was named (``psnr@extrapolation``), two families are kept apart, each with
+its own 5 %: the declared metric, one test for each pair of arms, as Demšar (2006, section 3.2.2) adjusts comparisons of
+many methods with one control; and all other metrics of all pairs, called secondary.
 
-- the declared metric, at one question if one was named (``psnr@extrapolation``), one test for each pair of arms: of a
-  single pair it is tested as it is, of several adjusted by Holm, as Demšar (2006, section 3.2.2) adjusts comparisons of
-  many methods with one control;
-- all other metrics of all pairs, called secondary and adjusted by Holm for their whole number.
-
-There is no gate between the two, though one would hold both under a single 5 % (Dmitrienko and Tamhane 2007): where the
-declared metric shows nothing, a secondary one that got worse must still be seen. A metric that was declared when
-results were there, or to which seeds or arms were added then, has no place of its own: then all are one family.
+There is no gate between the two: where the declared metric shows nothing, a secondary one that got worse must still be
+seen. A metric that was declared when results were there, or to which seeds or arms were added then, has no place of
+its own: then all are one family.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
+from gsbench.analysis import judgement
+from gsbench.analysis.cells import by_key
 from gsbench.analysis.declaration import ActiveDeclaration
-from gsbench.analysis.pairing import Paired, ViewCache, arm_name, pair_arms
-from gsbench.analysis.power import seeds_needed
+from gsbench.analysis.judgement import folder_key
+from gsbench.analysis.planning import seeds_needed
 from gsbench.analysis.quantities import Quantity, choose_quantities, metric_quantity
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import Comparison, compare_family
-from gsbench.errors import InputError
-from gsbench.words import counted, signed
+from gsbench.analysis.statistics import TOO_SMALL, Outcome
+from gsbench.runs.declaration import Declaration, Question
+from gsbench.words import counted, signed, some_of
 
 Role = Literal["declared", "secondary", "one of all"]
 Pair = tuple[Arm, Arm]
+WORDS: dict[Outcome, str] = {
+    "supported": "better",
+    "refuted": "worse",
+    "too small to matter": "too small to matter",
+    "undecided": "undecided",
+}
+SYMBOLS: dict[Outcome, str] = {"supported": "▲", "refuted": "▼", "too small to matter": "≈", "undecided": "●"}
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """One metric's comparison with what it takes to read it, and the family that it is one of."""
+class ArmVerdict:
+    """The verdict on two arms in one metric, with what it takes to read it and the family that it is one of."""
 
     quantity: Quantity
-    comparison: Comparison
-    seeds: int | None  # that would resolve the worthwhile difference; None: unknown or beyond reach
+    verdict: judgement.Verdict
     role: Role = "one of all"
 
     @property
+    def word(self) -> str:
+        """Better, worse, too small to matter, or undecided."""
+        return WORDS[self.verdict.outcome]
+
+    @property
     def symbol(self) -> str:
-        return {"better": "▲", "worse": "▼"}.get(self.comparison.verdict, "●")
+        return SYMBOLS[self.verdict.outcome]
+
+    @property
+    def seeds(self) -> int | None:
+        """The number of seeds that would resolve the worthwhile difference; None: unknown or beyond reach."""
+        if self.verdict.deviation is None or self.quantity.worthwhile is None:
+            return None
+        return seeds_needed(self.verdict.deviation, len(self.verdict.scenes), self.quantity.worthwhile)
 
 
 @dataclass(frozen=True)
@@ -53,57 +70,79 @@ class ArmVerdicts:
     ``missing`` says, of a declared metric that has no verdict here, why.
     """
 
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[ArmVerdict, ...]
     notes: tuple[str, ...]
     declared: Quantity | None = None
     missing: str = ""
 
 
-@dataclass(frozen=True)
-class _Question:
-    pair: Pair
-    quantity: Quantity
-    paired: Paired
-    asks: str  # interpolation, extrapolation, or "" for neither
-
-
 def judge(
-    trials: Sequence[TrialResult], pairs: Sequence[Pair], views: ViewCache, declared: ActiveDeclaration | None = None
+    trials: Sequence[TrialResult], pairs: Sequence[Pair], declared: ActiveDeclaration | None = None
 ) -> dict[Pair, ArmVerdicts]:
-    """Compare each pair of arms in every metric that has a direction, in the families that ``declared`` makes."""
+    """Judge each pair of arms in every metric that has a direction, in the families that ``declared`` makes."""
+    by_arm = by_key(trials, lambda trial: trial.arm)
     primary = None if declared is None else declared_quantity(trials, declared)
-    questions: list[_Question] = []
-    faults: dict[Pair, dict[str, str]] = {pair: {} for pair in pairs}
-    quantities = {}
+    asked: list[tuple[Pair, Quantity]] = []
     for pair in pairs:
-        own = [trial for trial in trials if trial.arm in pair]
+        own = [trial for arm in pair for trial in by_arm.get(arm, [])]
         shown = [one for one in choose_quantities(own) if not one.cost and one.direction != 0]
         if primary is not None:
             shown = [primary, *(one for one in shown if one.key != primary.key)]
-        quantities[pair] = shown
-        for one in shown:
-            try:
-                if one.direction == 0:
-                    raise InputError("whether more of it is better is not known")
-                paired = pair_arms(own, *pair, one.key, views)
-                questions.append(_Question(pair, one, paired, own[0].question))
-            except InputError as error:
-                reasons = [trial.unavailable[one.key] for trial in own if one.key in trial.unavailable]
-                faults[pair][one.key] = reasons[0] if reasons else str(error)
-    verdicts = _answer(questions, declared)
+        asked += [(pair, one) for one in shown if one.direction]
+    questions = [_question(by_arm, pair, one, declared) for pair, one in asked]
+    answers = judgement.judge(trials, _declaration(questions, declared))
     judged = {}
     for pair in pairs:
-        own_verdicts = tuple(verdict for question, verdict in verdicts if question.pair == pair)
-        compared = {verdict.quantity.key: verdict for verdict in own_verdicts}
-        notes = []
-        for one in quantities[pair]:
-            if one.key in compared:
-                notes += [f"{one.name}: {line}" for line in compared[one.key].comparison.left_out]
-            else:
-                notes.append(f"{one.name}: {faults[pair][one.key]}")
-        missing = faults[pair].get(primary.key, "") if primary is not None else ""
-        judged[pair] = ArmVerdicts(own_verdicts, tuple(notes), primary, missing)
+        found, notes, missing = [], list[str](), ""
+        for (arms, one), answer in zip(asked, answers, strict=True):
+            if arms != pair:
+                continue
+            if answer.pairs.rows:
+                found.append(ArmVerdict(one, answer, _role(answer.question, declared)))
+                notes += [f"{one.name}: {line}" for line in answer.notes]
+                continue
+            own = [trial for arm in pair for trial in by_arm.get(arm, [])]
+            reasons = [trial.unavailable[one.key] for trial in own if one.key in trial.unavailable]
+            reason = (*reasons, *answer.notes, f"no trials of {pair[0]} and {pair[1]} can be paired")[0]
+            notes.append(f"{one.name}: {reason}")
+            missing = reason if primary is not None and one.key == primary.key else missing
+        if primary is not None and not primary.direction:
+            missing = "whether more of it is better is not known"
+            notes.append(f"{primary.name}: {missing}")
+        judged[pair] = ArmVerdicts(tuple(found), tuple(notes), primary, missing)
     return judged
+
+
+def _question(
+    by_arm: Mapping[Arm, Sequence[TrialResult]], pair: Pair, one: Quantity, declared: ActiveDeclaration | None
+) -> Question:
+    """The question of two arms in one metric; of a sweep in looks, about the trials that were planned."""
+    baseline, arm = pair
+    question = Question(metric=one.key, sign=one.direction, least=one.worthwhile, baseline=baseline, arm=arm)
+    if declared is None or not declared.beforehand:
+        return question
+    asks = next((trial.question for trial in by_arm.get(baseline, [])), "")
+    primary = declared.question in ("", asks) and one.key == declared.metric
+    for planned in declared.declaration.questions:
+        keys = [{folder_key(trial) for trial in by_arm.get(side, [])} for side in pair]
+        if planned.scenes and all(a in keys[0] and b in keys[1] for a, b in planned.scenes.values()):
+            question = replace(question, scenes=planned.scenes, seeds=planned.seeds)
+            question = replace(question, least=planned.least) if primary else question
+    return replace(question, secondary=not primary)
+
+
+def _declaration(questions: Sequence[Question], declared: ActiveDeclaration | None) -> Declaration:
+    if declared is None or not declared.beforehand:
+        return Declaration(time="1970-01-01T00:00:00Z", questions=tuple(questions))
+    one = declared.declaration
+    looks = one.looks if all(question.seeds for question in questions) else ()
+    return Declaration(time=one.time, questions=tuple(questions), error_rate=one.error_rate, looks=looks)
+
+
+def _role(question: Question, declared: ActiveDeclaration | None) -> Role:
+    if declared is None or not declared.beforehand:
+        return "one of all"
+    return "secondary" if question.secondary else "declared"
 
 
 def declared_quantity(trials: Sequence[TrialResult], declared: ActiveDeclaration) -> Quantity:
@@ -116,11 +155,11 @@ def declared_lines(declared: ActiveDeclaration, judged: dict[Pair, ArmVerdicts])
     quantity = next(iter(judged.values())).declared if judged else None
     lines = declared.sentences(declared.metric if quantity is None else quantity.name)
     for (first, second), one in judged.items():
-        against = f"{arm_name(second)} against {arm_name(first)}"
+        against = f"{second} against {first}"
         found = [verdict for verdict in one.verdicts if verdict.quantity.key == declared.metric]
         if found and found[0].role == "secondary":
             continue  # the other question
-        lines += [f"Verdict, {against}: {_in_words(verdict)}." for verdict in found]
+        lines += [f"Verdict, {against}: {in_words(verdict)}." for verdict in found]
         if not found:
             lines.append(f"Verdict, {against}: none, since {declared.metric} has no value: {one.missing}.")
     return lines
@@ -129,16 +168,19 @@ def declared_lines(declared: ActiveDeclaration, judged: dict[Pair, ArmVerdicts])
 def families(judged: Sequence[ArmVerdicts]) -> list[str]:
     """Lines that say how many tests each family had, and how it was adjusted."""
     sizes: dict[Role, int] = {}
+    looks = False
     for one in judged:
-        sizes |= {verdict.role: verdict.comparison.family for verdict in one.verdicts}
+        for verdict in one.verdicts:
+            sizes[verdict.role] = max(sizes.get(verdict.role, 0), verdict.verdict.family)
+            looks |= bool(verdict.verdict.question.seeds)
     lines = []
     if "declared" in sizes:
         how = "tested as it is" if sizes["declared"] == 1 else f"adjusted by Holm for {sizes['declared']} pairs of arms"
-        lines.append(f"The declared metric is {how}.")
+        lines.append(f"The declared metric is {'judged at each planned look' if looks else how}.")
     if "secondary" in sizes:
+        how = "sharing 5 % equally at each look" if looks else f"{sizes['secondary']} tests adjusted by Holm"
         lines.append(
-            f"Secondary: all other metrics of all pairs of arms, {sizes['secondary']} tests adjusted by Holm among "
-            "themselves; they do not make the verdict."
+            f"Secondary: all other metrics of all pairs of arms, {how} among themselves; they do not make the verdict."
         )
     if "one of all" in sizes:
         number = counted(sizes["one of all"], "test")
@@ -148,53 +190,61 @@ def families(judged: Sequence[ArmVerdicts]) -> list[str]:
     return lines
 
 
-def _answer(questions: Sequence[_Question], declared: ActiveDeclaration | None) -> list[tuple[_Question, Verdict]]:
-    """Every question's verdict, in the order of ``questions``."""
-    answers: dict[int, Verdict] = {}
-    roles: list[Role] = [_role(one, declared) for one in questions]
-    for role in set(roles):
-        places = [place for place, found in enumerate(roles) if found == role]
-        members = [(questions[place].paired, questions[place].quantity.direction) for place in places]
-        for place, comparison in zip(places, compare_family(members), strict=True):
-            answers[place] = _verdict(questions[place].quantity, comparison, role)
-    return [(one, answers[place]) for place, one in enumerate(questions)]
-
-
-def _role(question: _Question, declared: ActiveDeclaration | None) -> Role:
-    if declared is None or not declared.beforehand:
-        return "one of all"
-    asked = declared.question in ("", question.asks)
-    return "declared" if asked and question.quantity.key == declared.metric else "secondary"
-
-
-def _verdict(quantity: Quantity, comparison: Comparison, role: Role) -> Verdict:
-    seeds = None
-    if comparison.deviation is not None and quantity.worthwhile is not None:
-        seeds = seeds_needed(comparison.deviation, len(comparison.scenes), quantity.worthwhile)
-    return Verdict(quantity, comparison, seeds, role)
-
-
-def _in_words(verdict: Verdict) -> str:
+def in_words(one: ArmVerdict) -> str:
     """``better in LPIPS VGG raw on these scenes: −0.0123 (95 % interval −0.0200 to −0.0046), p 0.012``"""
-    one, spec = verdict.comparison, f".{verdict.quantity.decimals + 1}f"
+    verdict, spec = one.verdict, f".{one.quantity.decimals + 1}f"
+    word = f"{one.word} in" if one.word in ("better", "worse") else f"{one.word}, in"
+    text = f"{word} {one.quantity.name} on {scope(verdict)}: {signed(verdict.mean or 0.0, spec)}"
+    if verdict.interval is None:
+        return f"{text}, no test: no trial was repeated with another seed or scene"
+    text += f" (interval {signed(verdict.interval.low, spec)} to {signed(verdict.interval.high, spec)}"
+    if verdict.p is not None:
+        text += f", p {p_text(verdict.p)}"
+    text += f", adjusted for {verdict.family} tests)" if verdict.family > 1 else ")"
+    return "; ".join([text, *beyond_words(verdict), *outlying_words(verdict)])
 
-    word = "no evidence of a difference in" if one.verdict == "no evidence" else f"{one.verdict} in"
-    text = f"{word} {verdict.quantity.name} on {one.scope}: {signed(one.mean, spec)}"
-    if one.interval is not None:
-        text += f" (interval {signed(one.interval.low, spec)} to {signed(one.interval.high, spec)})"
-    if one.p is None or one.p_family is None:
-        return f"{text}, no test: {one.test}"
-    adjusted = f", both adjusted for {one.family} tests" if one.family > 1 else ""
-    return f"{text}, p {p_text(one.p_family)}{adjusted}{beyond_words(one)}"
+
+def scope(verdict: judgement.Verdict) -> str:
+    """The scenes that the verdict speaks of."""
+    return "these scenes" if len(verdict.pairs.rows) > 1 else "this scene"
 
 
-def beyond_words(comparison: Comparison) -> str:
-    """``; it holds for scenes like these (p 0.012)`` of a difference that was found in scenes enough, else nothing."""
-    beyond = comparison.beyond
-    if beyond is None or comparison.verdict == "no evidence":
+def sign_words(verdict: judgement.Verdict) -> str:
+    """``, and better`` of a difference that is too small to matter and whose sign is known."""
+    known = verdict.outcome == TOO_SMALL and verdict.interval is not None and verdict.interval.excludes_zero()
+    if not known or verdict.mean is None or not verdict.question.sign:
         return ""
-    word = "it holds" if beyond.holds else "not shown"
-    return f"; {word} for scenes like these (p {p_text(beyond.p_family)} over {beyond.scenes} scenes)"
+    return f", though {'better' if verdict.mean * verdict.question.sign > 0 else 'worse'}"
+
+
+def beyond_words(verdict: judgement.Verdict) -> list[str]:
+    """``it helps in 7 of 8 scenes (p 0.070; 8 would suffice)``: what is said of scenes like these, if anything."""
+    one = verdict.like_these
+    if one is None:
+        return []
+    needed = "no count would" if one.needed is None else f"{one.needed} would"
+    power = f"{needed} suffice, which is seen in {one.power():.0%} where it helps in nine of ten".replace("%", " %")
+    share = f"{one.share.low:.0%} to {one.share.high:.0%}".replace("%", " %")
+    beyond = "" if one.beyond is None else f", in {one.beyond} by the least that matters"
+    median = ""
+    if one.median is not None:
+        median = f"; median effect {verdict.shown(one.median.low)} to {verdict.shown(one.median.high)}"
+    return [
+        f"scenes like these: {WORDS[one.outcome]}, it helps in {one.helped} of {one.scenes}{beyond} (p "
+        f"{p_text(one.p)}; {share} "
+        f"of such scenes{median}; {power})"
+    ]
+
+
+def outlying_words(verdict: judgement.Verdict) -> list[str]:
+    """``far outside the other seeds: garden/sfm-adc/…-seed3; without it: undecided``."""
+    if not verdict.outlying:
+        return []
+    labels = some_of([trial.label for trial in verdict.outlying])
+    words = (
+        f"far outside the other seeds of its scene and arm: {labels}; without: {WORDS[verdict.without or 'undecided']}"
+    )
+    return [words]
 
 
 def p_text(p: float) -> str:

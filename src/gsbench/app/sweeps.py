@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,10 @@ from hydra.core.utils import JobReturn
 
 from gsbench.app.sweep import Sweep, checked_grids, grid, intervals_of, is_interval, words_of_grids
 from gsbench.app.tuning import tuned_jobs
+from gsbench.claims.looks import Planned, run_looks
 from gsbench.claims.stopping import headline, plan_sweep
-from gsbench.claims.sweep import run_looks
 from gsbench.files import checked_runs_folder, make_runs_folder
-from gsbench.launch.declare import declare, declare_plan, declared_metrics, planned_trials
+from gsbench.launch.declare import declare_questions
 from gsbench.launch.trial import Trial
 from gsbench.runs.layout import RESULTS
 
@@ -55,17 +56,17 @@ def run_until_decided(begun: Sweep, trials: Sequence[Trial]) -> Sequence[JobRetu
         print(stopping.describe())
         return begun.launch(trials)
     make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
-    declared = declare_plan(stopping.home, stopping.plan.to_record(), stopping.hash)
-    declare(declared_metrics(trials), planned_trials(trials))  # all at once: what a look adds was planned
+    stopping = replace(stopping, declaration=declare_questions(stopping.home, stopping.declaration))
     returned: list[JobReturn] = []
     launched: set[Path] = set()
 
-    def run(batch: Sequence[Trial]) -> None:
+    def run(planned: Sequence[Planned]) -> None:
+        batch = [trial for key in planned if (trial := stopping.trials[key]).folder not in launched]
         launched.update(trial.folder for trial in batch)
-        returned.extend(begun.launch(batch, first=len(returned)))
+        if batch:
+            returned.extend(begun.launch(batch, first=len(returned)))
 
-    verdicts = run_looks(stopping, declared, run, lambda trial: trial.folder in launched)
-    for verdict in verdicts:
+    for verdict in run_looks(stopping.declaration, stopping.judged, run):
         log.info("%s", headline(verdict))
     spared = [trial for trial in trials if trial.folder not in launched and not (trial.folder / RESULTS).exists()]
     log.info("%d of %d trials were not needed", len(spared), len(trials))

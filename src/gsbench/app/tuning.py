@@ -17,7 +17,6 @@ from gsbench.app.sweep import Sweep
 from gsbench.app.tuning_plan import DEFAULT_POINTS, PLACE, Plan, TuneSettings, make_plan
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
-from gsbench.launch.declare import declare_plan
 from gsbench.parsing import DamagedError
 from gsbench.runs.experiments import make_home
 from gsbench.runs.layout import TUNING
@@ -83,7 +82,6 @@ def _done(plan: Plan) -> TuningRecord | None:
 def _search(begun: Sweep, plan: Plan, first: int) -> TuningRecord:
     """Search every arm's ranges, one point of each arm at a time; ``first`` is the number of the first job."""
     make_runs_folder(checked_runs_folder(str(plan.home.parent)))
-    declare_plan(plan.home, plan.to_record(), plan.hash)
     studies = {arm.name: plan.study(arm) for arm in plan.tuned}
     by_name = {arm.name: arm for arm in plan.arms}
     for study in studies.values():

@@ -30,7 +30,7 @@ from gsbench.app.sweep import Sweep, grid
 from gsbench.config.command_words import parse_word
 from gsbench.errors import InputError
 from gsbench.launch.trial import Trial
-from gsbench.runs.declaration import TUNED, metric_and_question
+from gsbench.runs.declaration import metric_and_question
 from gsbench.runs.hashing import config_hash, sha256_of
 from gsbench.runs.search_record import is_value
 from gsbench.settings import check_settings
@@ -114,7 +114,7 @@ class Plan:
             "views": "validation",
             "arms": arms,
         }
-        return {TUNED: plan}
+        return {"tuning": plan}
 
     @property
     def hash(self) -> str:

@@ -31,14 +31,14 @@ from typing import Any
 import yaml
 
 from gsbench import __version__
+from gsbench.analysis.measures import REGIONS, FromPixels, textured_error
 from gsbench.analysis.per_view import read_views
 from gsbench.analysis.results import Experiment, TrialResult, read_experiment
 from gsbench.claims.crate import crate_metadata
-from gsbench.claims.measures import REGIONS, FromPixels, textured_error
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_bytes, read_yaml
-from gsbench.runs.declaration import DeclaredPlan, read_plans
+from gsbench.runs.declaration import Declaration, read_declarations
 from gsbench.runs.layout import CONFIG, DECLARED, FROM_PIXELS, PER_VIEW, RESULTS
 from gsbench.settings import is_folder_name
 from gsbench.words import without_places
@@ -83,7 +83,7 @@ def write_archive(experiment: Experiment, out: Path) -> list[str]:
         ),
         PER_VIEW: _table(rows),
     } | ({DECLARED: read_bytes(declared)} if declared.is_file() else {})
-    if any(claim.get("metric") in REGIONS for plan in read_plans(experiment.folder) for claim in _claims(plan)):
+    if any(metric in REGIONS for one in read_declarations(experiment.folder) for metric in _metrics(one)):
         contents[PIXELS] = _json_lines(_measured_in_pictures(kept))
     manifest = {
         "format": FORMAT,
@@ -102,9 +102,11 @@ def write_archive(experiment: Experiment, out: Path) -> list[str]:
     return left_out
 
 
-def _claims(plan: DeclaredPlan) -> list[dict[str, Any]]:
-    claims = plan.plan.get("claims")
-    return [claim for claim in claims if isinstance(claim, dict)] if isinstance(claims, list) else []
+def _metrics(declared: Declaration) -> list[str]:
+    """The metrics that it asks about."""
+    claims = declared.plan.get("claims")
+    published = [str(one.get("metric")) for one in claims if isinstance(one, dict)] if isinstance(claims, list) else []
+    return [question.metric for question in declared.questions] + published
 
 
 def _measured_in_pictures(trials: Sequence[TrialResult]) -> Iterator[dict[str, Any]]:

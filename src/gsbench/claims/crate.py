@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gsbench import __version__
-from gsbench.analysis.declaration import measured
+from gsbench.analysis.judgement import measured
 from gsbench.analysis.results import TrialResult
 
 SPECIFICATION = "https://w3id.org/ro/crate/1.1"

@@ -31,21 +31,20 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Interval, MinLen, Predicate, doc
 
-from gsbench.analysis.statistics import ALPHA
-from gsbench.claims.measures import find_measure, measure_names
-from gsbench.claims.sequential import FIRST_LOOK, MOST_ALPHA, Design, plan_looks
+from gsbench.analysis.measures import find_measure, measure_names
+from gsbench.analysis.statistics import ALPHA, FIRST_LOOK, plan_looks
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.eval.facts import find
 from gsbench.parsing import read_yaml, resolved
-from gsbench.runs.hashing import sha256_of
+from gsbench.runs.declaration import Arm, Question
 from gsbench.settings import checked
 from gsbench.words import closest
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,60}")
 KEY = re.compile(r"[+]?\w+([./]\w+)*")  # of a setting
 GIVEN_BY_CHECK = ("name", "seed", "runs", "eval.primary")  # settings that the plan sets by itself
-UNTOUCHED = ("says", "where")  # of a claim: words that may be mended without another plan
+MOST_ALPHA = 0.2
 NO_SIZE = "the whole of a claim hangs on it: 0.005, or 10% of the baseline's value"
 DIRECTIONS = {"higher": 1, "lower": -1, "same": 0}
 
@@ -60,11 +59,6 @@ class Least:
 
     size: float
     relative: bool
-
-    @property
-    def margin(self) -> float:
-        """The margin in the scale in which trials are compared: the metric's own, or logarithms."""
-        return math.log1p(self.size) if self.relative else self.size
 
     def __str__(self) -> str:
         return f"{100 * self.size:g} %" if self.relative else f"{self.size:g}"
@@ -127,29 +121,27 @@ class ClaimsFile:
         chosen = self.settings | self.scenes[scene] | self.arms[arm] | claim.split | claim.budget
         return [f"{key}={_text(value)}" for key, value in chosen.items()]
 
-    def design(self, claim: Claim, scenes: int, sharing: int) -> Design:
-        """The looks of a claim over so many scenes, with its part of the error rate that ``sharing`` tests share."""
-        return Design(scenes, plan_looks(self.seeds), self.error_rate / sharing)
-
-    def plan(self) -> dict[str, Any]:
-        """The declared plan: all that decides about the verdicts, as plain values, written down before trials run."""
-        questions = []
-        for claim in self.claims:
-            kept = {entry.name: getattr(claim, entry.name) for entry in fields(Claim) if entry.name not in UNTOUCHED}
-            questions.append(kept | {"scenes": list(self.scenes_of(claim))})
-        return {
-            "claims": questions,
-            "settings": self.settings,
-            "scenes": self.scenes,
-            "arms": self.arms,
-            "error_rate": self.error_rate,
-            "looks": list(plan_looks(self.seeds)),
-        }
-
     @property
-    def plan_hash(self) -> str:
-        """sha256 of the plan: another one is another plan. Words that are mended change nothing."""
-        return sha256_of(self.plan())
+    def looks(self) -> tuple[int, ...]:
+        """The numbers of seeds after which a claim may be decided."""
+        return plan_looks(self.seeds)
+
+    def question(self, claim: Claim, scenes: Mapping[str, tuple[str, str]]) -> Question:
+        """The claim as a question about trials in these folders, baseline and arm by scene."""
+        return Question(
+            metric=claim.metric,
+            sign=claim.sign,
+            least=claim.effect.size,
+            relative=claim.effect.relative,
+            baseline=self._arm(claim.baseline),
+            arm=self._arm(claim.arm),
+            scenes=dict(scenes),
+            seeds=tuple(range(self.seeds)),
+            name=claim.id,
+        )
+
+    def _arm(self, name: str) -> Arm:
+        return Arm("", name, tuple((key, _text(value)) for key, value in self.arms[name].items()))
 
 
 def read_claims(path: Path) -> ClaimsFile:

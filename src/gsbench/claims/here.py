@@ -1,4 +1,4 @@
-"""Conditions of this machine for a claim's trials: captures and weights that are missing, and which photographs."""
+"""Conditions of this machine for a claim's trials: captures and weights that are missing."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ class Here:
         self._folders, self._download = folders, download
         self._init = cache(self._missing_weights)
         self._metrics = cache(self._missing_metrics)
-        self._photographs = cache(self._read_photographs)
 
     def __call__(self, trial: TrialConfig, metric: str) -> str:
         """Return why the trial cannot be run here or lacks the metric, in one line; "" where nothing is missing."""
@@ -36,21 +35,6 @@ class Here:
         if metric.startswith(LPIPS):
             return self._metrics(_frozen(values["eval"])).get(metric, "")
         return ""
-
-    def fingerprint(self, trial: TrialConfig) -> str | None:
-        """The fingerprint of the trial's photographs, as its results would hold it; None of those still to be made."""
-        return self._photographs(_frozen(trial.values["scene"]))
-
-    def _read_photographs(self, scene: str) -> str | None:
-        from gsbench.pipeline.steps.capture import CaptureSource, masked_step
-        from gsbench.scene.options import SceneConfig
-
-        options = SceneConfig(**_thawed(scene))
-        source = CaptureSource(options)
-        if source.step is not None:
-            return None
-        taken = source.read(None)
-        return taken.fingerprint if masked_step(taken, options.transparent) is None else None
 
     def _missing_weights(self, init: str, allowed: tuple[str, ...]) -> str:
         values = _thawed(init)

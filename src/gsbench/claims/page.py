@@ -15,25 +15,27 @@ from gsbench.analysis.origins import cloud_notes, machine_notes
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.report.pictures import Crop, choose_pictures
 from gsbench.analysis.results import TrialResult
+from gsbench.analysis.statistics import plan_looks
 from gsbench.analysis.table_formats import to_html as table_to_html
 from gsbench.analysis.table_formats import to_markdown as table_to_markdown
 from gsbench.analysis.tables import Table
+from gsbench.analysis.verdicts import outlying_words, p_text
+from gsbench.claims.check import NOT_TESTABLE, ClaimVerdict
 from gsbench.claims.file import ClaimsFile
-from gsbench.claims.verdict import NOT_TESTABLE, Verdict, Word
-from gsbench.runs.declaration import DeclaredPlan
+from gsbench.runs.declaration import Declaration
 from gsbench.runs.layout import SEED
 from gsbench.words import counted
 
 LARGE = 1000.0  # numbers from here on are counts or seconds, and shown whole
 CROPS = 2  # pictures each for and against an arm
-SYMBOLS: dict[Word, str] = {"supported": "✔", "refuted": "✘", "undecided": "?", "not testable here": "–"}
+SYMBOLS = {"supported": "✔", "refuted": "✘", "too small to matter": "≈", "undecided": "?", NOT_TESTABLE: "–"}
 
 
 @dataclass(frozen=True)
 class Section:
     """One claim, ready to be written."""
 
-    verdict: Verdict
+    verdict: ClaimVerdict
     headline: str
     evidence: tuple[str, ...]
     scenes: tuple[tuple[str, str], ...]
@@ -52,30 +54,27 @@ class Page:
 
 def make_page(
     file: ClaimsFile,
-    verdicts: Sequence[Verdict],
-    declared: DeclaredPlan,
-    plans: Sequence[DeclaredPlan],
-    shares: Sequence[str] = (),
+    verdicts: Sequence[ClaimVerdict],
+    declared: Declaration,
+    every: Sequence[Declaration],
 ) -> Page:
-    """The content of the page: the plan that was ``declared``, of all ``plans`` under this name, and its verdicts.
-
-    ``shares`` are the names of archives whose trials count beside those of this machine.
-    """
+    """The content of the page: what was ``declared``, of ``every`` declaration under this name, and the verdicts."""
     counts = {word: sum(verdict.word == word for verdict in verdicts) for word in SYMBOLS}
-    tested = sum(verdict.word != "not testable here" for verdict in verdicts)
+    tested = sum(one.word != NOT_TESTABLE for one in verdicts)
     lines = [
         f"{file.paper}. " + ", ".join(f"{count} {word}" for word, count in counts.items() if count) + ".",
-        _declared_line(declared, plans),
-        *([f"Trials from {', '.join(shares)} count beside those that were run here."] if shares else []),
+        _declared_line(declared, every),
     ]
     if tested:
         lines.insert(
             1,
             f"The chance that any of the {counted(tested, 'verdict')} is false is at most {100 * file.error_rate:g} %, "
-            "which they share equally, each over all its looks at the trials (docs/verdict.md). A verdict is about "
-            f"{_scope(verdicts)} at this size.",
+            "which they share equally, each over all its looks at the trials, where trainings differ about normally "
+            "(docs/verdict.md). A verdict is about these scenes at this size; what six scenes and more say of scenes "
+            "like "
+            "these stands beside it, with an error rate of its own.",
         )
-    judged = list({trial.path: trial for verdict in verdicts for trial in verdict.trials}.values())
+    judged = list({trial.path: trial for one in verdicts for trial in one.verdict.pairs.trials}.values())
     lines += [*_size_line(file, judged), *_origin_lines(judged)]
     return Page(f"{file.name}: claims and verdicts", tuple(lines), tuple(map(_section, verdicts)))
 
@@ -85,22 +84,13 @@ def _origin_lines(trials: Sequence[TrialResult]) -> list[str]:
     return [*machine_notes(trials), *cloud_notes(trials)]
 
 
-def _scope(verdicts: Sequence[Verdict]) -> str:
-    """Return the scenes that the verdicts speak of: from six on they are the units, and so stand for others."""
-    tested = (verdict for verdict in verdicts if verdict.word != NOT_TESTABLE)
-    by_scene = {verdict.design.by_scene for verdict in tested if verdict.design is not None}
-    if by_scene == {True}:
-        return "scenes like these, which are its units,"
-    return "these scenes" if by_scene == {False} else "these scenes (from six on, scenes like these)"
-
-
 def to_text(page: Page) -> str:
     """The page's lines and headlines, for a terminal."""
     verdicts = []
     for section in page.sections:
         one = section.verdict
-        verdicts.append(f"{one.word:<17}  {one.claim.id}: {section.headline}")
-        verdicts += [f"{'':<17}  {line}" for line in [_judged_on(one)] if line]
+        verdicts.append(f"{one.word:<19}  {one.claim.id}: {section.headline}")
+        verdicts += [f"{'':<19}  {line}" for line in [_judged_on(one), *_like_these(one)] if line]
     return "\n".join([page.title, *page.lines, *verdicts]) + "\n"
 
 
@@ -137,72 +127,99 @@ def to_html(page: Page) -> str:
     return template.render(page=page, sections=shown, symbols=SYMBOLS, style=style)
 
 
-def _section(verdict: Verdict) -> Section:
-    claim, decision = verdict.claim, verdict.decision
+def _section(one: ClaimVerdict) -> Section:
+    claim, verdict, answer = one.claim, one.verdict, one.verdict.answer
     evidence = [f"what would refute it: {claim.refuted_if}"]
-    headline = verdict.reason
-    if decision is not None and decision.mean is not None and decision.interval is not None:
-        assert verdict.design is not None
-        level = f"{100 * (1 - verdict.design.alpha):.3g} %"
+    headline = one.reason
+    if answer is not None and answer.interval is not None:
         headline = (
-            f"{verdict.measure.name} of {claim.arm} against {claim.baseline}: {verdict.shown(decision.mean)} "
-            f"({level} interval {verdict.shown_interval(decision.interval)}); {verdict.reason}"
+            f"{verdict.measure.name} of {claim.arm} against {claim.baseline}: {verdict.shown(answer.mean)} "
+            f"({100 * (1 - answer.level):.3g} % interval {verdict.shown_interval(answer.interval)}); {one.reason}"
         )
         evidence += [
-            f"least effect that matters: {claim.effect}; baseline's mean {_number(verdict.baseline)}",
-            _judged_on(verdict),
+            f"least effect that matters: {claim.effect}; baseline's mean {_number(verdict.pairs.baseline)}",
+            _judged_on(one),
+            *_like_these(one),
         ]
-    if decision is not None and decision.outcome == "undecided" and not verdict.measure.cost:
-        evidence.append(f"how many seeds and scenes would decide, where the trials are: {_plan_words(verdict)}")
-    evidence += verdict.notes
-    fairness, mixed = _fairness(verdict)
+    if verdict.final and one.word == "undecided" and not verdict.measure.cost:
+        evidence.append(f"how many seeds and scenes would decide, where the trials are: {_plan_words(one)}")
+    evidence += [*outlying_words(verdict), *_late_words(one), *one.missing, *verdict.notes]
+    fairness, mixed = _fairness(one)
     if mixed:
         headline += f". {mixed}"
     return Section(
-        verdict,
+        one,
         headline,
         tuple(evidence),
-        tuple((scene, verdict.shown(value)) for scene, value in verdict.by_scene),
+        tuple((scene.scene, verdict.shown(scene.mean)) for scene in verdict.scenes),
         fairness,
-        _folders(verdict.trials),
+        _folders(verdict.pairs.trials),
     )
 
 
-def _judged_on(verdict: Verdict) -> str:
+def _judged_on(one: ClaimVerdict) -> str:
     """``judged on 8 trials: 2 scenes, 2 seeds, two arms; ...``; "" where no mean is known."""
-    decision, design = verdict.decision, verdict.design
-    if decision is None or decision.mean is None or decision.interval is None or design is None:
+    verdict = one.verdict
+    if verdict.answer is None:
         return ""
-    unit = "scenes" if design.by_scene else "pairs of trials"
-    planned = ", ".join(map(str, design.looks))
+    planned = ", ".join(str(seeds) for seeds in plan_looks(len(verdict.question.seeds)))
     return (
-        f"judged on {counted(decision.trials, 'trial')}: {counted(len(verdict.by_scene), 'scene')}, "
-        f"{decision.seeds} seeds, two arms; looks planned at {planned} seeds; units are {unit}"
+        f"judged on {counted(len(verdict.pairs.trials), 'trial')}: {counted(len(verdict.scenes), 'scene')}, "
+        f"{verdict.pairs.seeds} seeds, two arms; looks planned at {planned} seeds"
     )
 
 
-def _plan_words(verdict: Verdict) -> str:
+def _like_these(one: ClaimVerdict) -> list[str]:
+    """What the scenes say of scenes like these, where they are enough."""
+    verdict, found = one.verdict, one.verdict.like_these
+    if found is None:
+        return []
+    word = one.claim.direction if one.claim.sign else "higher"
+    least = "" if found.beyond is None else f", by the least that matters in {found.beyond}"
+    median = "" if found.median is None else f"; median effect {verdict.shown_interval(found.median)}"
+    needed = "no number of them would" if found.needed is None else f"{found.needed} of them would"
+    seen = (
+        f"; were it {word} in nine of ten, {100 * found.power():.0f} % of checks would see it" if found.needed else ""
+    )
+    return [
+        f"scenes like these: {found.outcome}; it is {word} in {found.helped} of {found.scenes}{least} (sign test p "
+        f"{p_text(found.p)}, {100 * found.share.low:.0f} to {100 * found.share.high:.0f} % of such scenes{median}); "
+        f"{needed} "
+        f"suffice at {100 * (1 - found.level):.3g} %{seen}"
+    ]
+
+
+def _late_words(one: ClaimVerdict) -> list[str]:
+    if not one.verdict.late:
+        return []
+    return [
+        f"{counted(one.verdict.late, 'trial')} had been measured before this was declared: the metric is one of "
+        "those that "
+        "could have been chosen, which share the error rate"
+    ]
+
+
+def _plan_words(one: ClaimVerdict) -> str:
     """``gsbench plan NAME --metric psnr --difference 0.1``"""
-    least, baseline = verdict.claim.effect.size, abs(verdict.baseline or 0.0)
-    difference = least * baseline if verdict.claim.effect.relative else least
-    name = verdict.trials[0].record.experiment if verdict.trials else "NAME"
-    return f"gsbench plan {name} --metric {verdict.claim.metric} --difference {difference:.3g}"
+    least, trials = one.claim.effect.size, one.verdict.pairs.trials
+    difference = least * abs(one.verdict.pairs.baseline) if one.claim.effect.relative else least
+    return f"gsbench plan {trials[0].record.experiment} --metric {one.claim.metric} --difference {difference:.3g}"
 
 
-def _fairness(verdict: Verdict) -> tuple[tuple[Table, ...], str]:
+def _fairness(one: ClaimVerdict) -> tuple[tuple[Table, ...], str]:
     """The fairness sheets of a claim's arms, and what else than the idea may have made a difference (`caveats`)."""
-    trials = with_variants(verdict.trials)
-    both = dict.fromkeys((one.arm, other.arm) for one, other in _pairs(trials))
-    arms = [(one, other) for one, other in both if one != other]
+    trials = with_variants(one.verdict.pairs.trials)
+    both = dict.fromkeys((before.arm, after.arm) for before, after in _pairs(trials))
+    arms = [(before, after) for before, after in both if before != after]
     sentences = dict.fromkeys(caveats(trials, *two) for two in arms)
     return tuple(fairness_table(trials, *two) for two in arms), " ".join(filter(None, sentences))
 
 
-def _declared_line(declared: DeclaredPlan, plans: Sequence[DeclaredPlan]) -> str:
-    line = f"The plan {declared.hash[:12]} was declared {declared.when}; a claim says where trials were there before."
-    earlier = [plan for plan in plans if plan.hash != declared.hash and plan.kind == declared.kind]
+def _declared_line(declared: Declaration, every: Sequence[Declaration]) -> str:
+    line = f"Claims were declared {declared.when}; a claim says where trials were there before."
+    earlier = {one.hash for one in every if one.of_claims and one.moment < declared.moment}
     if earlier:
-        line += f" Before it, {counted(len(earlier), 'other plan')} had been declared under this name."
+        line += f" Before, {counted(len(earlier), 'other declaration')} had been made under this name."
     return line
 
 
@@ -221,21 +238,21 @@ def _size_line(file: ClaimsFile, trials: Sequence[TrialResult]) -> list[str]:
     return [f"Here: {here}. The paper: {file.size}."]
 
 
-def _chart(verdict: Verdict) -> str:
-    decision = verdict.decision
-    if decision is None or decision.interval is None or decision.mean is None:
+def _chart(one: ClaimVerdict) -> str:
+    verdict, answer = one.verdict, one.verdict.answer
+    if answer is None or answer.interval is None:
         return ""
-    rows = [ForestRow(scene, value, None, None) for scene, value in verdict.by_scene]
-    rows.append(ForestRow("all", decision.mean, decision.interval.low, decision.interval.high))
-    unit = "log ratio" if verdict.claim.effect.relative else "difference"
-    title = f"{verdict.claim.arm} against {verdict.claim.baseline}"
-    return forest_plot(title, rows, f"{verdict.measure.name}, {unit}", verdict.claim.sign)
+    rows = [ForestRow(scene.scene, scene.mean, None, None) for scene in verdict.scenes]
+    rows.append(ForestRow("all", answer.mean, answer.interval.low, answer.interval.high))
+    unit = "log ratio" if one.claim.effect.relative else "difference"
+    title = f"{one.claim.arm} against {one.claim.baseline}"
+    return forest_plot(title, rows, f"{verdict.measure.name}, {unit}", one.claim.sign)
 
 
-def _crops(verdict: Verdict) -> tuple[list[Crop], list[Crop]]:
+def _crops(one: ClaimVerdict) -> tuple[list[Crop], list[Crop]]:
     """Places where the arm is closer to the photographs, and where the baseline is."""
-    pairs = _pairs(verdict.trials)
-    if not pairs or verdict.measure.cost:
+    pairs = _pairs(one.verdict.pairs.trials)
+    if not pairs or one.verdict.measure.cost:
         return [], []
     found = choose_pictures(pairs, CROPS)
     return list(found.gained), list(found.lost)
@@ -255,9 +272,9 @@ def _folders(trials: Sequence[TrialResult]) -> tuple[tuple[str, str], ...]:
     )
 
 
-def _number(value: float | None) -> str:
+def _number(value: float) -> str:
     """Four digits, and none of powers of ten in large counts."""
-    return "unknown" if value is None else f"{value:,.0f}" if abs(value) >= LARGE else f"{value:.4g}"
+    return f"{value:,.0f}" if abs(value) >= LARGE else f"{value:.4g}"
 
 
 def _pipe(text: str) -> str:

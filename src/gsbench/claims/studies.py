@@ -1,7 +1,7 @@
 """Studies for a meta-analysis, out of what others hand over: archives of gsbench, and result files of nerfbaselines.
 
-A study is one source's mean difference of two arms in one metric with its standard error, over pairs of trials of one
-scene and seed, or from six scenes on over scenes (docs/verdict.md). Results of nerfbaselines
+A study is one source's mean difference of two arms in one metric, over the pairs of trials of each scene, as every
+difference here (docs/verdict.md). Results of nerfbaselines
 (https://github.com/nerfbaselines/nerfbaselines, ``*.json`` of its ``evaluate``) have no seeds, so its pairs are scenes.
 """
 
@@ -13,7 +13,7 @@ import hashlib
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 
 from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.fairness import budget_words
-from gsbench.analysis.pairing import ViewCache, arm_name, pair_arms
+from gsbench.analysis.judgement import Pairs, pair
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import MIN_SCENES
+from gsbench.analysis.statistics import student, t_interval
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.pooling import Study
 from gsbench.errors import InputError
 from gsbench.parsing import DamagedError, read_json, resolved
+from gsbench.runs.declaration import Question
 from gsbench.runs.hashing import sha256_of
 
 NERFBASELINES = "nerfbaselines"
@@ -68,36 +69,33 @@ def read_source(path: Path, wanted: Wanted, name: str = "") -> Found:
     return read(path, wanted, name or path.stem)
 
 
-def standard_error(differences: Sequence[Array]) -> tuple[float, float]:
-    """(mean, standard error) of differences [K] by scene: over pairs, or from `MIN_SCENES` scenes on over scenes.
-
-    The error is nan where there is one unit.
-    """
-    units = np.array([d.mean() for d in differences]) if len(differences) >= MIN_SCENES else np.concatenate(differences)
-    error = float(units.std(ddof=1)) / math.sqrt(len(units)) if len(units) > 1 else math.nan
-    return float(units.mean()), error
-
-
 def _read_archive(path: Path, wanted: Wanted, name: str) -> Found:
     with tempfile.TemporaryDirectory() as folder:
         every = unpack_archive(path, Path(folder)).trials
         trials = with_variants(select_trials(every, wanted.where))
-        views = ViewCache()
         studies, notes = [], []
         protocols = sorted({trial.record.protocol for trial in trials})
         for protocol in protocols:
             own = [trial for trial in trials if trial.record.protocol == protocol]
             groups = _groups(own, _pairs(own, wanted, path))
             for pairs in groups:
-                told_apart = [protocol] * (len(protocols) > 1) + [pairs[0][0][0]] * (len(groups) > 1)
+                told_apart = [protocol] * (len(protocols) > 1) + [pairs[0][0].init] * (len(groups) > 1)
                 label = f"{name} ({', '.join(told_apart)})" if told_apart else name
-                found = [pair_arms(own, first, second, wanted.metric, views) for first, second in pairs]
-                effect = standard_error([matrix.mean(axis=1) for paired in found for matrix in paired.differences])
-                studies.append(Study(label, *effect, _conditions(protocol, wanted.metric), _budgets(own, pairs)))
+                found = [
+                    pair(own, Question(metric=wanted.metric, baseline=first, arm=second)) for first, second in pairs
+                ]
+                together = Pairs(tuple(row for one in found for row in one.rows))
+                if not together.rows:
+                    raise InputError(
+                        f"{path}: {(*(line for one in found for line in one.left_out), 'nothing is paired')[0]}"
+                    )
+                test = student(together.differences)
+                mean, interval = float(together.differences.mean()), None if test is None else test.interval()
+                studies.append(Study(label, mean, interval, _conditions(protocol, wanted.metric), _budgets(own, pairs)))
                 for (first, second), paired in zip(pairs, found, strict=True):
-                    count = sum(len(matrix) for matrix in paired.differences)
+                    count = sum(len(row.seeds) for row in paired.rows)
                     notes.append(
-                        f"{label}: {arm_name(second)} against {arm_name(first)}, {count} pairs of trials on "
+                        f"{label}: {second} against {first}, {count} pairs of trials on "
                         f"{', '.join(paired.scenes)}; {_size(own)}"
                     )
                     notes += [f"{label}: left out, {line}" for line in paired.left_out]
@@ -116,15 +114,16 @@ def _pairs(trials: Sequence[TrialResult], wanted: Wanted, path: Path) -> list[tu
     arms = sorted({trial.arm for trial in trials})
 
     def named(init: str, names: Sequence[str]) -> list[Arm]:
-        return [arm for arm in arms if arm[0] == init and {arm[1], arm[1].partition(" ")[0], arm_name(arm)} & {*names}]
+        own = [arm for arm in arms if arm.init == init]
+        return [arm for arm in own if {str(replace(arm, init="")), arm.densify, str(arm)} & {*names}]
 
     found = []
-    for init in sorted({init for init, _ in arms}):
+    for init in sorted({arm.init for arm in arms}):
         ones, others = named(init, wanted.baseline), named(init, wanted.arm)
         if len(ones) > 1 or len(others) > 1:
             several = ones if len(ones) > 1 else others
             raise InputError(
-                f"{path}: {' and '.join(arm_name(arm) for arm in several)} go by one name: choose trials with --where "
+                f"{path}: {' and '.join(map(str, several))} go by one name: choose trials with --where "
                 "KEY=VALUE, or give the whole name of one"
             )
         if ones and others:
@@ -132,7 +131,7 @@ def _pairs(trials: Sequence[TrialResult], wanted: Wanted, path: Path) -> list[tu
     if not found:
         raise InputError(
             f"{path} has no pair of {' or '.join(wanted.arm)} and {' or '.join(wanted.baseline)} (there are "
-            f"{', '.join(map(arm_name, arms))})"
+            f"{', '.join(map(str, arms))})"
         )
     return found
 
@@ -193,10 +192,12 @@ def _read_nerfbaselines(folder: Path, wanted: Wanted, name: str) -> Found:
         scenes = [s for s in sorted(sides[0].keys() & sides[1].keys()) if all(key in side[s].metrics for side in sides)]
         if not scenes:
             continue
-        differences = [np.array([sides[1][scene].metrics[key] - sides[0][scene].metrics[key]]) for scene in scenes]
+        differences = np.array([sides[1][scene].metrics[key] - sides[0][scene].metrics[key] for scene in scenes])
         several = len({one.protocol for one in results}) > 1
         label = f"{name} ({protocol})" if several else name
-        studies.append(Study(label, *standard_error(differences), _conditions(protocol, wanted.metric)))
+        studies.append(
+            Study(label, float(differences.mean()), t_interval(differences), _conditions(protocol, wanted.metric))
+        )
         notes.append(f"{label}: {len(scenes)} scenes ({', '.join(scenes)}), one training each; {protocol}")
     if not studies:
         reason = f"; {notes[0]}" if notes else ""

@@ -12,6 +12,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gsbench.analysis.quantities import metric_keys, metric_quantity
 from gsbench.analysis.report.build import AblationPart
 from gsbench.analysis.report.charts import ForestRow, forest_plot
@@ -40,7 +43,6 @@ class Record:
     densify: str
     switches: Mapping[str, Switch]
     runs: tuple[tuple[Run, tuple[str, ...]], ...]
-    fractional: bool
 
 
 def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> dict[str, Switch]:
@@ -90,7 +92,7 @@ def _acts(name: str, run: Run, switches: Mapping[str, Switch]) -> bool:
     return within not in switches or (within in run and _acts(within, run, switches))
 
 
-def runs_to_train(switches: Mapping[str, Switch], fractional: bool) -> list[Run]:
+def runs_to_train(switches: Mapping[str, Switch]) -> list[Run]:
     """The runs of the design, each once, all switches on first; raises InputError for switches within each other."""
     for name in switches:
         seen, place = [name], switches[name].within
@@ -98,7 +100,7 @@ def runs_to_train(switches: Mapping[str, Switch], fractional: bool) -> list[Run]
             if place in seen:
                 raise InputError(f"the switches {', '.join(seen)} stand within each other in a circle")
             seen, place = [*seen, place], switches[place].within
-    runs = [effective(run, switches) for run in plan_runs(tuple(switches), fractional)]
+    runs = [effective(run, switches) for run in plan_runs(tuple(switches))]
     return sorted(dict.fromkeys(runs), key=lambda run: (-len(run), sorted(run)))
 
 
@@ -119,7 +121,6 @@ def write_record(home: Path, record: Record) -> None:
             "version": VERSION,
             "densify": record.densify,
             "switches": {name: asdict(switch) for name, switch in record.switches.items()},
-            "fractional": record.fractional,
             "runs": [{"on": sorted(run), "trials": list(trials)} for run, trials in record.runs],
         },
     )
@@ -135,7 +136,7 @@ def read_record(home: Path) -> Record | None:
             raise InputError(f"{home / ABLATION} is of version {content['version']}: update gsbench")
         runs = tuple((frozenset(run["on"]), tuple(map(str, run["trials"]))) for run in content["runs"])
         switches = {name: Switch(**values) for name, values in content["switches"].items()}
-        return Record(str(content["densify"]), switches, runs, bool(content["fractional"]))
+        return Record(str(content["densify"]), switches, runs)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{home / ABLATION} is damaged ({error!r}): give the command of the ablation again") from None
 
@@ -143,23 +144,31 @@ def read_record(home: Path) -> Record | None:
 def shares_of(record: Record, home: Path, metric: str) -> Ablation:
     """The shares in a metric; raises InputError where trials are missing or lack it."""
     by_folder = read_experiment(home).by_folder
-    trained: dict[Run, list[float]] = {}
+    trained: dict[Run, NDArray[np.float64]] = {}
     for run, folders in record.runs:
         values = [by_folder[folder].metrics.get(metric) if folder in by_folder else None for folder in folders]
         missing = [folder for folder, value in zip(folders, values, strict=True) if value is None]
         if missing:
             raise InputError(f"{counted(len(missing), 'trial')} of the ablation lack {metric}, such as {missing[0]}")
-        trained[run] = [value for value in values if value is not None]
+        trained[run] = _by_scene(folders, [value for value in values if value is not None])
     names = tuple(record.switches)
-    design = plan_runs(names, record.fractional)
-    return ablate(names, {run: trained[effective(run, record.switches)] for run in design})
+    return ablate(names, {run: trained[effective(run, record.switches)] for run in plan_runs(names)})
+
+
+def _by_scene(folders: Sequence[str], values: Sequence[float]) -> NDArray[np.float64]:
+    """The values [S, K], a row a scene; a sweep has all seeds of all scenes."""
+    scenes: dict[str, list[float]] = {}
+    for folder, value in zip(folders, values, strict=True):
+        scenes.setdefault(folder.split("/")[0], []).append(value)
+    seeds = min(map(len, scenes.values()))
+    return np.array([own[:seeds] for own in scenes.values()])
 
 
 def table(found: Ablation, metric: str) -> list[str]:
     """The shares as lines of a Markdown table."""
     digits = f".{metric_quantity(metric, ()).decimals + 1}f"
     lines = [
-        f"| part | share of {metric} | 95 % interval | part of the gain | alone | last |",
+        f"| part | share of {metric} | interval | part of the gain | alone | last |",
         "|---|---|---|---|---|---|",
     ]
     for share in found.shares:
@@ -177,9 +186,12 @@ def ablation_part(home: Path) -> AblationPart | None:
     if record is None:
         return None
     trials = [one for one in read_experiment(home).by_folder.values() if one.densify == record.densify]
-    design = "a fraction of the factorial, pairs' interactions included" if record.fractional else "the full factorial"
     count = counted(len(record.switches), "part")
-    lines = [f"{record.densify}: {design} of {count}, {len(record.runs)} trainings for each scene and seed."]
+    lines = [
+        f"{record.densify}: all combinations of {count}, {len(record.runs)} trainings for each scene and seed. "
+        "Intervals of "
+        "shares are adjusted for the number of parts."
+    ]
     lines += [f"{name}: {switch.words}." for name, switch in record.switches.items() if switch.words]
     charts = []
     for metric in metric_keys(trials):

@@ -1,24 +1,20 @@
-"""Writing down the metric with its trials, or the plan, that a command declares before trials run. Loads no torch."""
+"""Writing down what a command declares before its trials run. Loads no torch."""
 
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
 
 from gsbench.errors import InputError
 from gsbench.files import write_text
 from gsbench.launch.trial import Trial
 from gsbench.runs.declaration import (
     Declaration,
-    DeclaredPlan,
     Planned,
-    kind_of_plan,
+    declared_now,
+    open_question,
     read_declarations,
-    read_plans,
     record_text,
     trial_key,
     united,
@@ -67,19 +63,21 @@ def declare(metrics: Mapping[Path, str | None], planned: Mapping[Path, Planned])
     for home, given in metrics.items():
         make_home(home)
         with hold(home / f".{DECLARED}.lock", "the declarations"):
-            known = read_declarations(home)
+            every = read_declarations(home)
+            known = [one for one in every if not one.of_claims]
             standing = known[-1] if known else None
-            metric = standing.metric if given is None and standing is not None else given
+            metric = standing.primary if given is None and standing is not None else given
             if metric is None:
                 continue
             if given is None and standing is not None:
-                log.info("%s: %s stays declared, since %s", home.name, standing.metric, standing.when)
-            before = standing.trials if standing is not None else {}
-            together = None if before is None else united(before, planned[home])
-            same = standing is not None and standing.metric == metric
-            if same and (together is None or together == before):
+                log.info("%s: %s stays declared, since %s", home.name, standing.primary, standing.when)
+            before = {} if standing is None else standing.planned
+            together = united(before, planned[home])
+            same = standing is not None and standing.primary == metric
+            if same and together == before:
                 continue
-            _write(home, [*known, Declaration(int(time.time()), metric, together)], read_plans(home))
+            added = declared_now(questions=(open_question(metric),), trials=dict(together))
+            _write(home, [*every, added])
         if same:
             log.warning(
                 "%s: trials are added to those declared with %s; where results were there before, it loses its place",
@@ -91,32 +89,30 @@ def declare(metrics: Mapping[Path, str | None], planned: Mapping[Path, Planned])
                 "%s: the verdict is from now on about %s, and the report will say that %s was declared before",
                 home.name,
                 metric,
-                standing.metric,
+                standing.primary,
             )
 
 
-def declare_plan(
-    home: Path, plan: Mapping[str, Any], plan_hash: str, missing: Mapping[str, Sequence[str]] = MappingProxyType({})
-) -> DeclaredPlan:
-    """Add a plan (of claims, a sweep's looks or its tuning) to the record of the experiment in ``home``; what stands.
+def declare_questions(home: Path, asked: Declaration) -> Declaration:
+    """Add questions that name their trials (a file of claims, a sweep in looks) to the record; the one that stands.
 
-    One that is the latest of its kind there already stands with its time. ``missing`` is that of a `DeclaredPlan`.
+    One that is the latest of its kind there already stands with its time.
     """
     make_home(home)
     with hold(home / f".{DECLARED}.lock", "the declarations"):
-        every = read_plans(home)
-        known = [one for one in every if one.kind == kind_of_plan(plan)]
-        if known and known[-1].hash == plan_hash:
+        every = read_declarations(home)
+        known = [one for one in every if one.of_claims == asked.of_claims]
+        if known and known[-1].hash == asked.hash:
             return known[-1]
-        declared = DeclaredPlan(int(time.time()), plan_hash, dict(plan), missing)
-        _write(home, read_declarations(home), [*every, declared])
+        _write(home, [*every, asked])
     if known:
         log.warning(
-            "%s: another plan was declared before: trials that were measured under it count as looked at", home.name
+            "%s: other questions were declared before: trials that were measured under them count as looked at",
+            home.name,
         )
-    return declared
+    return asked
 
 
-def _write(home: Path, metrics: Sequence[Declaration], plans: Sequence[DeclaredPlan]) -> None:
+def _write(home: Path, declarations: Sequence[Declaration]) -> None:
     """The whole record."""
-    write_text(home / DECLARED, record_text(metrics, plans))
+    write_text(home / DECLARED, record_text(declarations))

@@ -136,7 +136,11 @@ def _declared(values: dict[str, Any]) -> Declared | None:
     """The metric that the verdict was declared to be about when the trial was run, and since when; else nothing."""
     home = TrialFolder.of(values).home
     metric = values["eval"].get("primary")
-    said = [declaration for declaration in read_declarations(home) if declaration.metric == metric]
+    said = [
+        declaration
+        for declaration in read_declarations(home)
+        if not declaration.of_claims and declaration.primary == metric
+    ]
     return said[-1].summary() if said else None
 
 

@@ -1,8 +1,9 @@
-"""The record of the metric that an experiment's verdict was declared to be about (``eval.primary``): trials and time.
+"""The record of what an experiment was declared to be about: ``<runs>/<experiment>/declared.jsonl``.
 
-Every change of the declaration is a line of ``<runs>/<experiment>/declared.jsonl``, written when a command is given; a
-trial's ``results.json`` repeats what stood when it was run. Plans of claims stand in the same file, each a line of its
-own. `gsbench.analysis.declaration` judges by it.
+Every line is one `Declaration`, written when a command is given and before its trials run. ``eval.primary``, a file of
+claims and ``launch.stop_when_decided`` each become one. A trial's ``results.json`` repeats the metric that stood when
+it was run. `gsbench.analysis.judgement` judges by declarations, and `gsbench.analysis.declaration` says what came
+before and after them.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from gsbench.parsing import DamagedError, fault_of, read_bytes
-from gsbench.records import Count, Part, iterate_rows
+from gsbench.records import STRICT, Amount, Count, Part, iterate_rows
+from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import DECLARED
 from gsbench.runs.trial_record import Declared
 
@@ -29,11 +31,9 @@ INTERPOLATION, EXTRAPOLATION = "interpolation", "extrapolation"
 QUESTIONS = {"every_nth": INTERPOLATION, "sector": EXTRAPOLATION}  # what a split (scene.split) asks of a model
 AT = "@"  # psnr@extrapolation
 STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
-
+ERROR_RATE = 0.05
 
 TrialKey = Annotated[str, Field(pattern=r"^[^/]*/[^/]*/[^/]*$")]
-STOPPING, TUNED = "stopping", "tuning"  # keys of plans of looks at a sweep, and of tuning
-CLAIMS = ""  # plans of claims, which came first and have no key of their own
 Planned = Mapping[str, tuple[int, ...]]  # seeds by scene, arm and hash of the configuration (`trial_key`)
 
 
@@ -42,62 +42,122 @@ def trial_key(scene: str, arm: str, config_hash: str) -> str:
     return f"{scene}/{arm}/{config_hash}"
 
 
-@dataclass(frozen=True)
-class Declaration:
-    """The metric ``metric``, perhaps of one question, declared at ``time`` (Unix, whole seconds) with all ``trials``
-    that were to be run.
+@dataclass(frozen=True, order=True)
+class Arm:
+    """What is compared: an initialiser with a densifier, and the swept settings that tell it from others of the two.
 
-    ``trials`` is None where they are not known: in what a trial repeats, and in records of earlier versions.
+    ``variant`` holds the items of a mapping from a setting to its value as text. A file of claims names its arms
+    itself; they have no ``init``.
     """
 
-    time: int
+    __pydantic_config__ = STRICT
+
+    init: str
+    densify: str
+    variant: tuple[tuple[str, str], ...] = ()
+
+    def __str__(self) -> str:
+        name = f"{self.init}-{self.densify}" if self.init else self.densify
+        return " ".join([name, *(f"{key.rpartition('.')[2]}={value}" for key, value in self.variant)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question(Part):
+    """Whether ``arm`` differs from ``baseline`` in ``metric``, the way that ``sign`` says and by ``least`` at least.
+
+    ``sign`` is that of the claimed difference, arm minus baseline; 0 where it is claimed that there is none. ``least``
+    is the smallest difference that matters, in the metric's unit or (``relative``) as a part of the baseline's value;
+    None where nobody said. ``scenes`` gives for each scene the folders of both arms' trials within the experiment,
+    without the seed (`trial_key`); without it, the trials are those of the two arms, on all scenes. ``seeds`` are in
+    the order in which they are added; without them, all that both arms have count. A question without arms is about
+    every two arms that are compared, in the metric's own direction, ``about`` interpolation or extrapolation where it
+    says so.
+    """
+
     metric: str
-    trials: Planned | None = field(default=None, compare=False, repr=False)
+    sign: int = 1
+    least: Amount | None = None
+    relative: bool = False
+    baseline: Arm | None = None
+    arm: Arm | None = None
+    scenes: dict[str, tuple[TrialKey, TrialKey]] = field(default_factory=dict)
+    seeds: tuple[Count, ...] = ()
+    about: str = ""
+    secondary: bool = False
+    name: str = ""
+
+    @property
+    def planned(self) -> Planned:
+        """The trials that the question names."""
+        return {key: self.seeds for keys in self.scenes.values() for key in keys}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Declaration(Part):
+    """Questions that were asked at ``time`` (UTC), which share ``error_rate``, the chance that any answer is false.
+
+    ``looks`` are numbers of seeds, rising: after each of them a question may be decided; none: all is judged once.
+    ``trials`` are all that were to be run where the questions name none. ``missing`` says by question what of it could
+    not be tested where it was declared, and why. ``plan`` is a plan of claims as earlier versions published it
+    (`gsbench.claims.published`).
+    """
+
+    time: str
+    questions: tuple[Question, ...] = ()
+    error_rate: Amount = ERROR_RATE
+    looks: tuple[Count, ...] = ()
+    trials: dict[TrialKey, tuple[Count, ...]] = field(default_factory=dict)
+    missing: dict[str, list[str]] = field(default_factory=dict)
+    plan: dict[str, Any] = field(default_factory=dict, compare=False)
+
+    def __post_init__(self) -> None:
+        if unix_time(self.time) is None:
+            raise ValueError("time is no moment")
+        if fault := fault_of(self.plan):
+            raise ValueError(f"in plan {fault}")
+
+    @property
+    def moment(self) -> int:
+        """The time in Unix seconds."""
+        return unix_time(self.time) or 0
 
     @property
     def when(self) -> str:
         """``2026-11-21 20:05 UTC``"""
-        return _readable(self.time)
+        return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(self.moment))
+
+    @property
+    def of_claims(self) -> bool:
+        """Return whether a file of claims was declared, each question of which has a name."""
+        return bool(self.plan) or any(question.name for question in self.questions)
+
+    @property
+    def primary(self) -> str:
+        """The metric that a sweep was declared to be about, as ``eval.primary`` names it."""
+        first = self.questions[0]
+        return f"{first.metric}{AT}{first.about}" if first.about else first.metric
+
+    @property
+    def planned(self) -> Planned:
+        """All trials that were to be run."""
+        found: dict[str, tuple[int, ...]] = dict(self.trials)
+        for question in self.questions:
+            found = dict(united(found, question.planned))
+        return found
+
+    @property
+    def hash(self) -> str:
+        """sha256 of all that decides about the answers: another one is another declaration."""
+        return sha256_of(replace(self, time="1970-01-01T00:00:00Z", missing={}).to_json())
 
     def summary(self) -> Declared:
-        """The part that a trial repeats: all but the trials."""
-        return Declared(metric=self.metric, time=time.strftime(STAMP, time.gmtime(self.time)))
-
-    def to_record(self) -> dict[str, Any]:
-        trials = {} if self.trials is None else {"trials": {key: list(seeds) for key, seeds in self.trials.items()}}
-        return self.summary().to_json() | trials
+        """The part that a trial repeats."""
+        return Declared(metric=self.primary, time=self.time)
 
 
-@dataclass(frozen=True)
-class DeclaredPlan:
-    """Plan of claims with this hash, all that decides about their verdicts, as written down at ``time``.
-
-    ``missing`` says by claim what of it could not be tested there, and why; it decides nothing.
-    """
-
-    time: int
-    hash: str
-    plan: dict[str, Any] = field(compare=False, repr=False)
-    missing: Mapping[str, Sequence[str]] = field(default_factory=dict, compare=False, repr=False)
-
-    @property
-    def when(self) -> str:
-        """The time, as that of a `Declaration`."""
-        return _readable(self.time)
-
-    @property
-    def kind(self) -> str:
-        """The kind of plan: `STOPPING`, `TUNED` or `CLAIMS`; one does not take the place of another kind's."""
-        return kind_of_plan(self.plan)
-
-    def to_record(self) -> dict[str, Any]:
-        missing = {"missing": {claim: list(lines) for claim, lines in self.missing.items()}} if self.missing else {}
-        return {"plan": self.plan, "hash": self.hash, "time": time.strftime(STAMP, time.gmtime(self.time))} | missing
-
-
-def kind_of_plan(plan: Mapping[str, Any]) -> str:
-    """The `DeclaredPlan.kind` of a plan."""
-    return next((kind for kind in (STOPPING, TUNED) if kind in plan), CLAIMS)
+def declared_now(**values: Any) -> Declaration:
+    """A declaration of this moment."""
+    return Declaration(time=time.strftime(STAMP, time.gmtime()), **values)
 
 
 def metric_and_question(primary: str) -> tuple[str, str]:
@@ -113,33 +173,39 @@ def metric_and_question(primary: str) -> tuple[str, str]:
     return metric, question
 
 
+def open_question(primary: str) -> Question:
+    """The question of ``eval.primary``: every two arms in one metric."""
+    metric, about = metric_and_question(primary)
+    return Question(metric=metric, sign=0, about=about)
+
+
 def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) -> list[Declaration]:
     """Read every declaration for the experiment in ``folder``, the oldest first.
 
     Those that only results of its trials record are ``repeated``.
     """
-    found = [declared for one in repeated if (declared := _from_record(one)) is not None]
-    found += [line.declaration for line in _lines(folder) if line.declaration is not None]
-    last = {one: one for one in found}  # of one metric and second the last, which the file says in full
-    return sorted(last.values(), key=lambda declaration: declaration.time)
+    path = folder / DECLARED
+    try:
+        content = read_bytes(path)
+    except FileNotFoundError:
+        content = b""
+    except DamagedError as error:
+        log.warning("left out: %s", error)
+        content = b""
+    found = [line.declaration for _, line in iterate_rows(content, _Line, path)]
+    known = {(one.primary, one.time) for one in found if one.questions}
+    for one in dict.fromkeys((said.metric, said.time) for said in repeated if said is not None):
+        if one not in known and unix_time(one[1]) is not None:
+            found.append(Declaration(time=one[1], questions=(open_question(one[0]),)))
+    return sorted(found, key=lambda declaration: declaration.moment)
 
 
-def read_plans(folder: Path, kind: str | None = None) -> list[DeclaredPlan]:
-    """Read the plans of a `DeclaredPlan.kind`, or of all, that were declared for the experiment in ``folder``.
-
-    The oldest first.
-    """
-    found = (line.declared_plan for line in _lines(folder))
-    plans = [plan for plan in found if plan is not None and kind in (None, plan.kind)]
-    return sorted(plans, key=lambda plan: plan.time)
-
-
-def standing_plan(plans: Sequence[DeclaredPlan]) -> DeclaredPlan:
-    """The latest of ``plans``, which are in the order of time and of one kind, with the time from which on it stood."""
-    first = len(plans) - 1
-    while first > 0 and plans[first - 1].hash == plans[-1].hash:
+def standing_one(declarations: Sequence[Declaration]) -> Declaration:
+    """The latest of ``declarations``, which are in the order of time, with the time from which on it stood."""
+    first = len(declarations) - 1
+    while first > 0 and declarations[first - 1].hash == declarations[-1].hash:
         first -= 1
-    return plans[first]
+    return declarations[first]
 
 
 def united(one: Planned, other: Planned) -> Planned:
@@ -147,33 +213,10 @@ def united(one: Planned, other: Planned) -> Planned:
     return {key: tuple(sorted({*one.get(key, ()), *other.get(key, ())})) for key in {**one, **other}}
 
 
-def record_text(metrics: Iterable[Declaration], plans: Iterable[DeclaredPlan]) -> str:
+def record_text(declarations: Iterable[Declaration]) -> str:
     """The content of ``declared.jsonl``, in the order of time."""
-    both: list[Declaration | DeclaredPlan] = [*metrics, *plans]
-    entries = sorted(both, key=lambda entry: entry.time)
-    return "".join(json.dumps(entry.to_record()) + "\n" for entry in entries)
-
-
-def merged_record(folders: Iterable[Path]) -> str:
-    """The content of one ``declared.jsonl`` in the place of those in ``folders``, shares of one experiment.
-
-    A plan that was declared on several machines, with none between, stands with the earliest of its times. Trials that
-    a later declaration of a metric brought are added to those of before, as they would be in one folder.
-    """
-    folders = list(folders)
-    plans: list[DeclaredPlan] = []
-    latest: dict[str, str] = {}  # hash by kind
-    for plan in sorted((plan for folder in folders for plan in read_plans(folder)), key=lambda plan: plan.time):
-        if latest.get(plan.kind) != plan.hash:
-            plans.append(plan)
-        latest[plan.kind] = plan.hash
-    metrics: list[Declaration] = []
-    declared = [one for folder in folders for one in read_declarations(folder)]
-    for one in sorted(declared, key=lambda declaration: declaration.time):
-        before: Planned | None = metrics[-1].trials if metrics else {}
-        trials = None if before is None or one.trials is None else united(before, one.trials)
-        metrics.append(replace(one, trials=trials))
-    return record_text(metrics, plans)
+    entries = sorted(declarations, key=lambda entry: entry.moment)
+    return "".join(json.dumps(entry.to_json()) + "\n" for entry in entries)
 
 
 def unix_time(text: object) -> int | None:
@@ -185,52 +228,20 @@ def unix_time(text: object) -> int | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Line(Part):
-    """A line of ``declared.jsonl``: a metric with its trials' seeds, or a plan of claims with its hash; and when.
+class _Line(Declaration):
+    """A line of ``declared.jsonl``; those of earlier versions have a ``metric`` with its trials, or a ``plan``."""
 
-    ``missing`` is that of a `DeclaredPlan`; earlier versions wrote none.
-    """
-
-    time: str
     metric: str | None = None
-    trials: dict[TrialKey, tuple[Count, ...]] | None = None
-    plan: dict[str, Any] | None = None
-    hash: str | None = None
-    missing: dict[str, list[str]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if unix_time(self.time) is None:
-            raise ValueError("time is no moment")
-        if fault := fault_of(self.plan):
-            raise ValueError(f"in plan {fault}")
 
     @property
-    def declaration(self) -> Declaration | None:
-        return None if self.metric is None else Declaration(unix_time(self.time) or 0, self.metric, self.trials)
-
-    @property
-    def declared_plan(self) -> DeclaredPlan | None:
-        if self.plan is None or self.hash is None:
-            return None
-        return DeclaredPlan(unix_time(self.time) or 0, self.hash, self.plan, self.missing)
-
-
-def _lines(folder: Path) -> list[_Line]:
-    path = folder / DECLARED
-    try:
-        content = read_bytes(path)
-    except FileNotFoundError:
-        return []
-    except DamagedError as error:
-        log.warning("left out: %s", error)
-        return []
-    return [line for _, line in iterate_rows(content, _Line, path)]
-
-
-def _from_record(record: Declared | None) -> Declaration | None:
-    moment = None if record is None else unix_time(record.time)
-    return None if record is None or moment is None else Declaration(moment, record.metric)
-
-
-def _readable(moment: int) -> str:
-    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(moment))
+    def declaration(self) -> Declaration:
+        questions = self.questions if self.metric is None else (open_question(self.metric),)
+        return Declaration(
+            time=self.time,
+            questions=questions,
+            error_rate=self.error_rate,
+            looks=self.looks,
+            trials=self.trials,
+            missing=self.missing,
+            plan=self.plan,
+        )

@@ -41,10 +41,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     densify = _only_densifier(first)
     found = declared_switches(_class_switches(first[0]), first[0].values["densify"]) | dict(options.switch)
     switches = choose_switches(found, options.switches, densify)
-    trials = {
-        run: _trials([*words, *_off(words_of(run, switches), first[0])])
-        for run in runs_to_train(switches, options.fractional)
-    }
+    trials = {run: _trials([*words, *_off(words_of(run, switches), first[0])]) for run in runs_to_train(switches)}
     every = list(trials.values())
     _check_different(trials)
     flat = [trial for group in every for trial in group]
@@ -62,7 +59,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     home = flat[0].files.home
     code = run_trials(flat)
     folders = {run: tuple(t.folder.relative_to(home).as_posix() for t in group) for run, group in trials.items()}
-    record = Record(densify, switches, tuple(folders.items()), options.fractional)
+    record = Record(densify, switches, tuple(folders.items()))
     write_record(home, record)
     if code == 0:
         metric = options.metric or flat[0].values["eval"].get("primary") or DEFAULT_METRIC
@@ -90,7 +87,6 @@ def _parser() -> ArgumentParser:
         help="a further switch, taken out by densify.KEY=VALUE (more, with semicolons between)",
     )
     parser.add_argument("--metric", help="printed; default: eval.primary, else psnr")
-    parser.add_argument("--fractional", action="store_true", help="from five switches on: a fraction of the runs")
     parser.add_argument("--dry-run", action="store_true", help="list the trials and their state; run nothing")
     return parser
 

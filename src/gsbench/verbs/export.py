@@ -7,12 +7,10 @@ import math
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from gsbench.analysis.results import load_experiment, read_experiment
+from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
 from gsbench.files import atomic, place_of
-from gsbench.runs.experiments import list_experiments
 from gsbench.runs.layout import STORE
 from gsbench.runs.stages import INIT
 from gsbench.settings import is_folder_name
@@ -55,23 +53,11 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument(
         "--out", type=path, metavar="PATH", help="the file, or for init the folder, to write; needed for a TRIAL"
     )
-    parser.add_argument(
-        "--with",
-        dest="shares",
-        type=path,
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="ARCHIVE",
-        help="with --results: also what these archives of the same experiment hold, from other machines or days",
-    )
     options = parser.parse_args(argv)
     if options.results is not None:
         if options.trial or options.to:
-            raise InputError("export --results takes an experiment, --with and --out alone")
-        return export_results(options.results, runs, options.out, options.shares)
-    if options.shares:
-        raise InputError("--with goes with --results EXPERIMENT")
+            raise InputError("export --results takes an experiment and --out alone")
+        return export_results(options.results, runs, options.out)
     if not options.trial or options.out is None:
         raise InputError("export needs a TRIAL and --out PATH, or --results EXPERIMENT (see gsbench export --help)")
     from gsbench.view.trials import find_trial, model_file
@@ -94,11 +80,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
-def export_results(name: str, runs: Path, out: Path | None, shares: Sequence[Path] = ()) -> int:
-    """Write the archive of an experiment's results and of its ``shares``, and say what is not in it; 0.
-
-    Of an experiment without a whole trial in ``runs`` the shares alone make the archive.
-    """
+def export_results(name: str, runs: Path, out: Path | None) -> int:
+    """Write the archive of an experiment's results, and say what is not in it; 0."""
     from gsbench.claims.archive import write_archive
 
     if not is_folder_name(name):
@@ -107,28 +90,11 @@ def export_results(name: str, runs: Path, out: Path | None, shares: Sequence[Pat
     if file.is_dir():
         file = file / f"{name}.zip"
     with place_of(file):
-        if shares:
-            left_out = _export_together(name, runs, shares, file)
-        else:
-            left_out = write_archive(load_experiment(runs, name), file)
+        left_out = write_archive(load_experiment(runs, name), file)
     for line in left_out:
         log.warning("left out: %s", line)
     print(f"{file}: results of {name}, {readable_bytes(file.stat().st_size)}")
     return 0
-
-
-def _export_together(name: str, runs: Path, shares: Sequence[Path], file: Path) -> list[str]:
-    """Write one archive of the trials here and in ``shares``; returns what is not in it."""
-    from gsbench.claims.archive import write_archive
-    from gsbench.claims.shares import merge
-
-    own = read_experiment(runs / name) if name in list_experiments(runs) else None
-    if own is None or not own.trials:
-        log.warning("%s has no whole trial here: the archive is of what the others hold", name)
-        return merge(shares, name, file)
-    with TemporaryDirectory() as folder:
-        archive = Path(folder) / f"{name}.zip"
-        return write_archive(own, archive) + merge([archive, *shares], name, file)
 
 
 def export_model(ply: Path, form: str, out: Path) -> None:

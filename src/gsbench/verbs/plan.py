@@ -9,11 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs, pair_arms
-from gsbench.analysis.quantities import Quantity, quantity
-from gsbench.analysis.results import TrialResult, load_experiment
-from gsbench.analysis.statistics import MIN_SCENES
-from gsbench.claims.planning import (
+from gsbench.analysis.judgement import pair
+from gsbench.analysis.pairing import BASELINE, choose_pairs
+from gsbench.analysis.planning import (
     Components,
     Size,
     components,
@@ -21,7 +19,11 @@ from gsbench.claims.planning import (
     smallest_difference,
     within_hours,
 )
+from gsbench.analysis.quantities import Quantity, quantity
+from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.analysis.statistics import MIN_SCENES
 from gsbench.errors import InputError
+from gsbench.runs.declaration import Question
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
@@ -50,13 +52,14 @@ def main(argv: Sequence[str], runs: Path) -> int:
     pairs = choose_pairs(sorted({trial.arm for trial in trials}), options.baseline)
     if not pairs:
         raise InputError(f"{options.experiment} has one arm, and planning needs pairs of trials of two")
-    views = ViewCache()
     for one, other in pairs:
-        paired = pair_arms([trial for trial in trials if trial.arm in (one, other)], one, other, shown.key, views)
-        found = components([matrix.mean(axis=1) for matrix in paired.differences])
-        print("\n".join([f"{arm_name(other)} against {arm_name(one)}", *_lines(found, shown, difference)]))
+        own = [trial for trial in trials if trial.arm in (one, other)]
+        paired = pair(own, Question(metric=shown.key, baseline=one, arm=other))
+        if not paired.rows:
+            raise InputError(f"no trials of {one} and {other} can be paired in {shown.name}: {paired.left_out[0]}")
+        found = components([row.after - row.before for row in paired.rows])
+        print("\n".join([f"{other} against {one}", *_lines(found, shown, difference)]))
         if options.hours is not None:
-            own = [trial for trial in trials if trial.arm in (one, other)]
             print("\n".join(_hours_lines(found, shown, options.hours, own)))
     return 0
 

@@ -23,7 +23,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: 0, or 1 where a source was left out; raises InputError where none can be read."""
     parser = ArgumentParser(
         prog="gsbench pool",
-        description="A random-effects mean over many sources: archives of `gsbench export --results`, and folders of "
+        description="A mean over many sources, each with the same weight: archives of `gsbench export --results`, and "
+        "folders of "
         "nerfbaselines' result files.",
     )
     parser.add_argument("sources", nargs="+", type=path, metavar="SOURCE")
@@ -74,8 +75,6 @@ def pool_sources(
         for study in found.studies:
             if protocol is not None and study.conditions["protocol"] != protocol:
                 notes.append(f"{study.name}: not asked for, it is by {study.conditions['protocol']}")
-            elif not study.error > 0:
-                faults.append(f"left out: {study.name} has one pair, or pairs without any spread: no error is known")
             else:
                 studies.append(study)
     if not studies:
@@ -84,13 +83,10 @@ def pool_sources(
 
 
 def _rows(pooled: Pooled) -> list[str]:
-    lines = ["| study | difference | standard error | weight | protocol |", "|---|---|---|---|---|"]
-    weights = pooled.weights or (None,) * len(pooled.studies)
-    for study, weight in zip(pooled.studies, weights, strict=True):
-        share = "" if weight is None else f"{100 * weight:.0f} %"
-        lines.append(
-            f"| {study.name} | {study.effect:+.4g} | {study.error:.3g} | {share} | {study.conditions['protocol']} |"
-        )
+    lines = ["| study | difference | 95 % interval | protocol |", "|---|---|---|---|"]
+    for study in pooled.studies:
+        interval = "unknown" if study.interval is None else f"{study.interval.low:+.4g} to {study.interval.high:+.4g}"
+        lines.append(f"| {study.name} | {study.effect:+.4g} | {interval} | {study.conditions['protocol']} |")
     return lines
 
 

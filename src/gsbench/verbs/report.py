@@ -8,7 +8,6 @@ from pathlib import Path
 
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.results import load_experiment
-from gsbench.claims.stopping import headline, standing_verdicts
 from gsbench.claims.switches import ablation_part
 from gsbench.errors import InputError
 from gsbench.files import place_of, write_text
@@ -36,8 +35,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     file = experiment.folder / REPORT_NAME if options.out is None else file_at(options.out, experiment.name)
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
-    looked = [headline(verdict) for verdict in standing_verdicts(experiment.folder)]
-    text = build_report(experiment, options.baseline or BASELINE, looked, ablation_part(experiment.folder))
+    text = build_report(experiment, options.baseline or BASELINE, ablation_part(experiment.folder))
     with place_of(file):
         write_text(file, text)
     print(file)

@@ -15,7 +15,6 @@ VERBS = {
     "report": ("gsbench.verbs.report", "one HTML file with the evidence of an experiment"),
     "check": ("gsbench.verbs.check", "test the claims of a paper, written in a file: supported, refuted or undecided"),
     "plan": ("gsbench.verbs.plan", "how many scenes and seeds resolve a difference, and what the hours at hand do"),
-    "trend": ("gsbench.verbs.trend", "whether a difference holds from small to large, along one setting"),
     "ablate": ("gsbench.verbs.ablate", "which part of a densifier carries its gain: its switches in all combinations"),
     "pool": (
         "gsbench.verbs.pool",

@@ -72,12 +72,21 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
     tally: Counter[Agreement] = Counter()
     rows = []
     for (scene, arm), group in by_key(own, lambda trial: (trial.scene, trial.arm)).items():
-        check_averageable(group, f"scene={scene} init={arm[0]} densify={arm[1]}")
+        check_averageable(group, f"scene={scene} init={arm.init} densify={arm.densify}")
         entries: list[Entry] = []
         for one in shown:
             cell = make_cell(group, one, [scene], len({trial.seed for trial in own}))
             entries += compare_with_printed(cell, paper.printed.get((scene, one.key)), one, tally)
-        rows.append(Row((scene, *arm), tuple(entries)))
+        rows.append(
+            Row(
+                (
+                    scene,
+                    arm.init,
+                    " ".join([arm.densify, *(f"{key.rpartition('.')[2]}={value}" for key, value in arm.variant)]),
+                ),
+                tuple(entries),
+            )
+        )
     heads = tuple(Column(one.name, heading) for one in shown for heading in (name, "Δ"))
     method = f"The printed numbers are of densify={paper.densify}; other arms stand beside them for orientation."
     notes = [f"{paper.title}.", f"Read from {paper.source}.", f"Conventions: {paper.conventions}.", method]

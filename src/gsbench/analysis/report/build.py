@@ -43,13 +43,10 @@ class AblationPart:
     charts: Sequence[str]
 
 
-def build_report(
-    experiment: Experiment, baseline: str = BASELINE, looked: Sequence[str] = (), ablation: AblationPart | None = None
-) -> str:
+def build_report(experiment: Experiment, baseline: str = BASELINE, ablation: AblationPart | None = None) -> str:
     """The report as HTML, with every densifier held against ``baseline``; a pure function of the experiment's files.
 
-    ``looked`` are the verdicts of a sweep that stopped when decided: they stand above those that take numbers of seeds
-    as fixed. ``ablation`` is what switching parts of a densifier off has shown.
+    ``ablation`` is what switching parts of a densifier off has shown.
     """
     trials = with_variants(experiment.trials)
     arms = sorted({trial.arm for trial in trials})
@@ -58,9 +55,9 @@ def build_report(
     search = search_part(experiment.folder)
     # Among points of a search, which were chosen by results, no test holds.
     pairs = [] if search else choose_pairs(arms, baseline, controls_of(trials))
-    judged = judge(trials, pairs, views, declared)
+    judged = judge(trials, pairs, declared)
     questions = question_part(trials, judged, views)
-    versus = [compare_arms(trials, *pair, views, own) for pair, own in judged.items()]
+    versus = [compare_arms(trials, *pair, own) for pair, own in judged.items()]
     quantity = next((one.declared for one in judged.values() if one.declared is not None), None)
     layout = layout_of(experiment.name)
     tables = [build_table(experiment)] if layout is None else paper_tables(experiment, layout)
@@ -79,7 +76,6 @@ def build_report(
         versus=versus,
         declared=declared.sentences(quantity.name) if declared and quantity else [],
         families=families(list(judged.values())),
-        looked=looked,
         ablation=ablation,
         tables=[to_html(table) for table in tables],
         contradictions=[] if layout is None else load_paper().contradictions,

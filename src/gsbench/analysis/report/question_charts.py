@@ -131,7 +131,7 @@ def _in_words(turn: Turn) -> str:
     """``PSNR (dB), sfm-volumetric against sfm-adc: +0.31 (+0.10 to +0.52) at interpolation, −0.20 (…) at …``"""
     digits = f".{turn.quantity.decimals + 1}f"
     sides = [
-        f"{signed(one.comparison.mean, digits)} ({_interval(one.comparison.interval, digits)}) at {name}"
+        f"{signed(one.verdict.mean or 0.0, digits)} ({_interval(one.verdict.interval, digits)}) at {name}"
         for one, name in ((turn.interpolation, "interpolation"), (turn.extrapolation, f"extrapolation, {turn.split}"))
     ]
     pair = f"{arm_name(turn.second)} against {arm_name(turn.first)}"

@@ -11,16 +11,17 @@ from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import short_version
 from gsbench.analysis.errors_by_region import MAP_PROPERTIES, RegionErrors, errors_by_region
 from gsbench.analysis.fairness import fairness_table
+from gsbench.analysis.judgement import pair_trials
 from gsbench.analysis.origins import machine_of, unlike_clouds
-from gsbench.analysis.pairing import ViewCache, arm_name, pair_trials
+from gsbench.analysis.pairing import arm_name
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart, short_number
-from gsbench.analysis.report.headlines import by_scene_lines, headline, secondary
+from gsbench.analysis.report.headlines import by_scene_lines, detail_lines, headline, secondary
 from gsbench.analysis.report.pictures import Pictures, choose_pictures
 from gsbench.analysis.report.volumes import share_above, volume_histogram
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.tables import Table, change_words, cost_change
 from gsbench.analysis.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve
-from gsbench.analysis.verdicts import ArmVerdicts, Verdict, judge
+from gsbench.analysis.verdicts import ArmVerdict, ArmVerdicts, judge
 from gsbench.errors import InputError
 from gsbench.events import Cause, RefineEvent
 from gsbench.runs import layout
@@ -42,12 +43,13 @@ class Versus:
 
     first: Arm
     second: Arm
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[ArmVerdict, ...]
     headline: str
     caveats: str  # what else than the idea may have made the difference
     fairness: Table
     secondary: str  # what else was found, where a metric was declared
     by_scene: tuple[str, ...]
+    details: tuple[str, ...]  # scenes like these, and trials far outside the others
     costs: tuple[str, ...]
     forests: tuple[str, ...]
     regions: tuple[tuple[RegionErrors, str], ...]
@@ -61,28 +63,17 @@ class Versus:
     @property
     def beyond(self) -> bool:
         """Return whether there are scenes enough to ask about scenes like these."""
-        return any(verdict.comparison.beyond is not None for verdict in self.verdicts)
-
-    @property
-    def tests(self) -> list[str]:
-        """``declared: exact sign flips of 9 pairs of trials, on these scenes`` and the like; without the role where all
-        verdicts come from one test."""
-        by_role = {v.role: f"{v.comparison.test}, on {v.comparison.scope}" for v in reversed(self.verdicts)}
-        if len(set(by_role.values())) == 1:
-            return [*by_role.values()][:1]
-        return [f"{role}: {test}" for role, test in reversed(by_role.items())]
+        return any(one.verdict.like_these is not None for one in self.verdicts)
 
 
-def compare_arms(
-    trials: Sequence[TrialResult], first: Arm, second: Arm, views: ViewCache, judged: ArmVerdicts | None = None
-) -> Versus:
+def compare_arms(trials: Sequence[TrialResult], first: Arm, second: Arm, judged: ArmVerdicts | None = None) -> Versus:
     """Verdicts, costs, forest plots, regions and crops of two arms; what cannot be had is said in the notes.
 
     ``judged`` are the pair's verdicts as one of several; without it, the pair is judged by itself.
     """
     own = [trial for trial in trials if trial.arm in (first, second)]
     if judged is None:
-        judged = judge(own, [(first, second)], views)[first, second]
+        judged = judge(own, [(first, second)])[first, second]
     verdicts, notes = judged.verdicts, list(judged.notes)
     pairs = pair_trials(own, first, second)
     pictures = choose_pictures(pairs, CROPS)
@@ -103,7 +94,8 @@ def compare_arms(
         caveats(trials, first, second),
         fairness_table(trials, first, second),
         secondary(judged),
-        tuple(by_scene_lines([verdict for verdict in verdicts if verdict.role in ("one of all", "declared")])),
+        tuple(by_scene_lines([one for one in verdicts if one.role in ("one of all", "declared")])),
+        tuple(detail_lines(verdicts)),
         tuple(_costs(own, first, second)),
         tuple(_forest(verdict) for verdict in verdicts),
         tuple(regions),
@@ -259,18 +251,18 @@ def _gap_words(gap: CurveGap, cost: str) -> str:
     return f"PSNR at equal {cost} during training {signed(gap.gap, '.2f')} dB on average ({span})"
 
 
-def _forest(verdict: Verdict) -> str:
-    comparison = verdict.comparison
+def _forest(one: ArmVerdict) -> str:
+    verdict = one.verdict
     rows = [
         ForestRow(s.scene, s.mean, s.interval.low if s.interval else None, s.interval.high if s.interval else None)
-        for s in comparison.scenes
+        for s in verdict.scenes
     ]
     if len(rows) > 1:
-        interval = comparison.interval
+        interval = verdict.interval
         bounds = (interval.low, interval.high) if interval else (None, None)
-        rows.append(ForestRow("mean of scenes", comparison.mean, *bounds))
-    better = "right of zero is better" if verdict.quantity.direction > 0 else "left of zero is better"
-    return forest_plot(f"{verdict.quantity.name}: {better}", rows, "difference", verdict.quantity.direction)
+        rows.append(ForestRow("mean of scenes", verdict.mean or 0.0, *bounds))
+    better = "right of zero is better" if one.quantity.direction > 0 else "left of zero is better"
+    return forest_plot(f"{one.quantity.name}: {better}", rows, "difference", one.quantity.direction)
 
 
 def _region_chart(errors: RegionErrors, first: Arm, second: Arm) -> str:

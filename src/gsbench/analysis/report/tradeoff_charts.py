@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gsbench.analysis.cells import by_key
-from gsbench.analysis.pairing import BASELINE, arm_name
+from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.report.charts import Series, line_chart, short_number
-from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.results import TrialResult
 from gsbench.analysis.tradeoffs import Curve, curve_gap, family_curve
 from gsbench.eval.facts import METRICS
 from gsbench.words import signed
@@ -24,7 +24,7 @@ def tradeoff_charts(trials: Sequence[TrialResult]) -> list[str]:
             for cost, label in COST_LABELS.items():
                 curves = _curves(own, metric, cost)
                 series = [
-                    Series(arm_name(family), list(zip(curve.cost.tolist(), curve.quality.tolist(), strict=True)))
+                    Series("-".join(family), list(zip(curve.cost.tolist(), curve.quality.tolist(), strict=True)))
                     for family, curve in curves.items()
                 ]
                 title = f"{metric.name} against {label}{where}"
@@ -65,7 +65,7 @@ def main_metrics(trials: Sequence[TrialResult]) -> list[Quantity]:
     return [quantity("psnr", trials)]
 
 
-def _curves(trials: Sequence[TrialResult], metric: Quantity, cost: str) -> dict[Arm, Curve]:
+def _curves(trials: Sequence[TrialResult], metric: Quantity, cost: str) -> dict[tuple[str, str], Curve]:
     families = sorted({(trial.init, trial.densify) for trial in trials})
     curves = {family: family_curve(trials, family, metric, cost) for family in families}
     return {family: curve for family, curve in curves.items() if len(curve.cost)}

@@ -58,17 +58,6 @@ def textured_error(trial: TrialResult) -> float:
     return float(np.mean(errors))
 
 
-def is_measurable(trial: TrialResult) -> bool:
-    """Return whether `textured_error` of the trial can be had: from its pictures, or as an archive brought it."""
-    return (trial.path / FROM_PIXELS).is_file() or (trial.path / RENDERS).is_dir()
-
-
-def same_in_pictures(one: TrialResult, other: TrialResult) -> bool:
-    """Return whether what archives brought of two trials' pictures agrees, as far as both brought it."""
-    kept = [read_if_sound(trial.path / FROM_PIXELS, FromPixels) for trial in (one, other)]
-    return None in kept or kept[0] == kept[1]
-
-
 COSTS = {
     "gaussians": Measure("gaussians", "Gaussians", lambda trial: _positive(trial.record.num_gaussians), True),
     "init_points": Measure(

@@ -3,7 +3,7 @@
 A paired difference of scene s and seed k is ``mean + scene effect + noise``: the effect differs between scenes by a
 deviation, and trainings of one scene differ by another. From pilot trials both are estimated by the analysis of
 variance (Searle, Casella and McCulloch 1992, *Variance components*, section 3.6). More seeds shrink the noise alone; a
-statement about scenes like these needs more scenes. Power is that of a two-sided 5 % t test (`analysis.power`).
+statement about scenes like these needs more scenes. Power is that of the two-sided 5 % tests of `analysis.statistics`.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
-from gsbench.analysis.power import POWER, t_power
-from gsbench.analysis.statistics import MIN_SCENES, pooled_deviation
+from gsbench.analysis.statistics import ALPHA, DEGREES, MIN_SCENES, sign_test_needs
 from gsbench.errors import InputError
 
+POWER = 0.8
+LARGEST_SHIFT = 30.0  # in standard errors; beyond it scipy's noncentral t gives nan, and all is seen
 MAX_SCENES, MAX_SEEDS = 30, 40  # the largest designs that are looked at
 PRECISION = 1e-6  # of a smallest difference, relative
 HOUR = 3600.0
@@ -54,9 +56,10 @@ def components(differences: Sequence[NDArray[np.float64]]) -> Components:
 
     Raises InputError where no scene has two pairs.
     """
-    within = pooled_deviation(differences)
-    if within is None:
+    degrees = sum(len(values) - 1 for values in differences)
+    if degrees == 0:
         raise InputError("planning needs pilot trials of two seeds at least in some scene")
+    within = math.sqrt(sum(float(((values - values.mean()) ** 2).sum()) for values in differences) / degrees)
     counts = np.array([len(values) for values in differences], dtype=float)
     total = int(counts.sum())
     between = None
@@ -70,21 +73,38 @@ def components(differences: Sequence[NDArray[np.float64]]) -> Components:
 
 
 def power(size: Size, difference: float, found: Components, like_these: bool) -> float:
-    """The chance to see ``difference``: in the mean of these scenes, or of ``scenes like these`` where scenes vary.
+    """The chance to see ``difference``: in the mean of these scenes, or in how many of ``scenes like these`` it helps.
 
-    The test about these scenes takes pairs of trials as units (`analysis.statistics.student`), so scenes that differ
-    make it see less.
     Raises InputError where the pilot had one scene and others are asked about.
     """
-    noise = found.within**2 / size.seeds
     if not like_these:
-        pairs = size.scenes * size.seeds
-        spread = (found.between or 0.0) ** 2 * size.seeds * (size.scenes - 1) / (pairs - 1)  # of scenes, in the test's
-        stretch = math.sqrt(1 + spread / found.within**2) if found.within else 1.0
-        return t_power(abs(difference), math.sqrt(noise / size.scenes), pairs - 1, stretch=stretch)
+        return power_of_mean(found.within, size, difference)
     if found.between is None:
         raise InputError("one scene does not tell how an effect differs between scenes: run pilot trials on two")
-    return t_power(abs(difference), math.sqrt((found.between**2 + noise) / size.scenes), size.scenes - 1)
+    needed = sign_test_needs(size.scenes, ALPHA)
+    if needed is None:
+        return 0.0
+    spread = math.hypot(found.between, found.within / math.sqrt(size.seeds))
+    helps = float(special.ndtr(abs(difference) / spread)) if spread else 1.0  # a scene is seen to be helped
+    return float(special.bdtrc(needed - 1, size.scenes, helps))
+
+
+def power_of_mean(deviation: float, size: Size, difference: float) -> float:
+    """The chance that the t test of these scenes sees ``difference``, where trainings differ by ``deviation``.
+
+    By the noncentral t distribution; the far tail of the wrong sign is left out.
+    """
+    if deviation == 0:
+        return 1.0 if difference else 0.0
+    degrees = max(size.seeds - 1, DEGREES * size.scenes * (size.seeds - 1))
+    shift = min(abs(difference) / deviation * math.sqrt(size.scenes * size.seeds), LARGEST_SHIFT)
+    return float(1 - special.nctdtr(degrees, shift, special.stdtrit(degrees, 1 - ALPHA / 2)))
+
+
+def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None:
+    """Seeds of each arm on these ``scenes`` that see ``difference`` with a power of `POWER`; None above `MAX_SEEDS`."""
+    sizes = (Size(scenes, seeds) for seeds in range(2, MAX_SEEDS + 1))
+    return next((one.seeds for one in sizes if power_of_mean(deviation, one, difference) >= POWER), None)
 
 
 def sizes_needed(difference: float, found: Components, like_these: bool) -> list[Size]:

@@ -5,20 +5,22 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from gsbench.claims.check import Check, ClaimVerdict, prepare
 from gsbench.claims.file import parse_claims
+from gsbench.claims.looks import Planned, run_looks
 from gsbench.claims.page import make_page, to_html, to_markdown
-from gsbench.claims.sweep import Check, prepare, run_looks
 from gsbench.cli import run
 from gsbench.config.compose import TrialConfig
 from gsbench.config.jobs import with_seed
 from gsbench.errors import InputError
-from gsbench.runs.declaration import DeclaredPlan, read_plans
+from gsbench.runs.declaration import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs.check import describe
 from tests.analysis.synthetic import Plan, trial_data, write_trial
@@ -26,7 +28,6 @@ from tests.claims.test_file import GOOD, changed, without
 from tests.launch.test_declare import TINY
 
 EFFECT = 1.0  # dB, of "volumetric" in the made-up trials
-DECLARED = DeclaredPlan(0, "hash", {})
 
 
 def content(**changes: Any) -> dict[str, Any]:
@@ -62,51 +63,59 @@ class FakeRunner:
             write_trial(folder.runs, data, views, folder.path.name.partition("-")[0])
 
 
-def ready(trial: TrialConfig) -> bool:
-    return (TrialFolder.of(trial.values).path / "results.json").exists()
+def looked(check: Check, runner: FakeRunner) -> list[ClaimVerdict]:
+    """Go through the looks; what is done is not run again."""
+
+    def run(planned: Sequence[Planned]) -> None:
+        trials = check.to_run(planned)
+        if left := [one for one in trials if not (TrialFolder.of(one.values).path / "results.json").exists()]:
+            runner(left)
+
+    check = replace(check, declaration=replace(check.declaration, time="2020-01-01T00:00:00Z"))
+    return check.verdicts(run_looks(check.declaration, check.judged, run))
 
 
 def test_a_clear_effect_ends_at_the_first_look_and_again_nothing_is_run(tmp_path: Path) -> None:
     check, runner = check_of(tmp_path), FakeRunner(noise=0.001)
-    first = run_looks(check, DECLARED, runner, ready)
+    first = looked(check, runner)
     assert [verdict.word for verdict in first] == ["supported"]
     assert runner.batches == [4]
-    again = run_looks(check, DECLARED, runner, ready)
+    again = looked(check, runner)
     assert runner.batches == [4]
-    assert again == first
+    assert [one.verdict.interval for one in again] == [one.verdict.interval for one in first]
 
 
 def test_seeds_are_added_look_by_look_up_to_the_most(tmp_path: Path) -> None:
     runner = FakeRunner(noise=2.0)
-    (verdict,) = run_looks(check_of(tmp_path), DECLARED, runner, ready)
+    (verdict,) = looked(check_of(tmp_path), runner)
     assert verdict.word == "undecided"
     assert runner.batches == [4, 2, 2]
 
 
 def test_a_failed_seed_makes_its_claim_wait_and_its_return_decides(tmp_path: Path) -> None:
     check, runner = check_of(tmp_path), FakeRunner(noise=0.001, fails=1)
-    (verdict,) = run_looks(check, DECLARED, runner, ready)
+    (verdict,) = looked(check, runner)
     assert (verdict.word, runner.batches) == ("undecided", [4])
-    assert "waits for courtyard; failed: courtyard/sfm-adc seed 1 (" in verdict.reason
-    assert verdict.reason.endswith("): no room")  # once for both arms, of which the reason is the same
+    assert "the next look waits for them; failed: " in verdict.reason
+    assert verdict.reason.endswith("no room")  # once for both arms, of which the reason is the same
     runner.fails = None
     for failed in list(tmp_path.rglob("failed.json")):
         shutil.rmtree(failed.parent)
-    (verdict,) = run_looks(check, DECLARED, runner, ready)
+    (verdict,) = looked(check, runner)
     assert (verdict.word, runner.batches) == ("supported", [4, 2])
 
 
 def test_what_is_missing_here_is_named_and_nothing_is_run_for_it(tmp_path: Path) -> None:
     file = parse_claims(content() | {"scenes": {"courtyard": None, "garden": None}})
     check = prepare(file, tmp_path, lambda trial, metric: "no data" * (trial.values["scene"]["name"] == "garden"))
-    assert check.questions[0].scenes == ("courtyard",)
-    (verdict,) = run_looks(check, DECLARED, FakeRunner(noise=0.001), ready)
+    assert list(check.declaration.questions[0].scenes) == ["courtyard"]
+    (verdict,) = looked(check, FakeRunner(noise=0.001))
     assert verdict.word == "supported"
-    assert verdict.notes[0] == "garden: no data"
+    assert verdict.missing == ("garden: no data",)
     nothing = prepare(file, tmp_path / "b", lambda trial, metric: "no data")
-    assert run_looks(nothing, DECLARED, FakeRunner(0.1), ready)[0].reason == "courtyard, garden: no data"
+    assert looked(nothing, FakeRunner(0.1))[0].reason == "courtyard, garden: no data"
     assert "not testable here  lpips: courtyard, garden: no data" in describe(nothing)
-    assert nothing.plan_hash != check.plan_hash  # what can be tested here is a part of the plan
+    assert nothing.declaration.hash != check.declaration.hash  # what can be tested here is a part of it
 
 
 def test_settings_that_do_not_compose_name_their_place(tmp_path: Path) -> None:
@@ -132,10 +141,18 @@ def test_another_seed_is_another_folder_and_the_same_settings(tmp_path: Path) ->
 
 def test_the_page_says_all_in_both_formats(tmp_path: Path) -> None:
     check = check_of(tmp_path, says="it is <better> | by far")
-    verdicts = run_looks(check, DECLARED, FakeRunner(noise=0.001), ready)
-    page = make_page(check.file, verdicts, DECLARED, [DECLARED, DeclaredPlan(0, "older", {})])
+    verdicts = looked(check, FakeRunner(noise=0.001))
+    older = replace(check.declaration, time="2019-01-01T00:00:00Z", error_rate=0.1)
+    page = make_page(check.file, verdicts, check.declaration, [older, check.declaration])
     for text in (to_markdown(page), to_html(page)):
-        for part in ("supported", "PSNR", "courtyard", "1 other plan", "looks planned at 2, 3, 4 seeds", "abstract"):
+        for part in (
+            "supported",
+            "PSNR",
+            "courtyard",
+            "1 other declaration",
+            "looks planned at 2, 3, 4 seeds",
+            "abstract",
+        ):
             assert part in text
     assert "<better>" not in to_html(page)
     assert "<svg" in to_html(page)
@@ -161,12 +178,12 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     assert run(["check", str(path)]) == 0
     out = capsys.readouterr().out
     assert "  points: " in out
-    assert "not testable here  size: too large" in out
+    assert "not testable here    size: too large" in out
     home = tmp_path / "runs" / "check_it"
-    (plan,) = read_plans(home)
+    (declared,) = read_declarations(home)
     measured = [json.loads(file.read_text())["measured"] for file in home.glob("*/*/*/results.json")]
     assert len(measured) == 4
-    assert min(measured) >= plan.to_record()["time"]
+    assert min(measured) >= declared.time
     first = (home / "claims.md").read_text(), (home / "claims.html").read_text()
     for text in first:
         assert "opacity=0.03 differs from" in text
@@ -175,7 +192,7 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     assert "| init.count | 200 | 300 | ≠ |" in first[0]
     assert run(["check", str(path)]) == 0
     assert ((home / "claims.md").read_text(), (home / "claims.html").read_text()) == first
-    assert read_plans(home) == [plan]
+    assert read_declarations(home) == [declared]
     archive = tmp_path / "published" / "check_it.zip"
     assert run(["export", "--results", "check_it", "--out", str(archive)]) == 0
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "elsewhere"))
@@ -209,4 +226,4 @@ def test_a_file_of_claims_allows_no_code(tmp_path: Path, key: str, monkeypatch: 
     with pytest.raises(InputError, match=r"stranger\.Mine is not gsbench's own"):
         prepare(file, tmp_path, lambda trial, metric: "")
     check = prepare(file, tmp_path, lambda trial, metric: "", ["allow_targets=[stranger]"])
-    assert check.trials(check.questions, 1)[1].values["densify"]["_target_"] == "stranger.Mine"
+    assert check.trials(2)[1].values["densify"]["_target_"] == "stranger.Mine"

@@ -1,0 +1,278 @@
+"""Checks of a file of claims: what can be tested here, the trials that it takes, and the verdicts so far.
+
+The trials are ordinary ones of one experiment, found again by their folders, so a check that was killed goes on where
+it stopped and ends with the same verdicts. From published archives the same verdicts are made without any training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from gsbench.analysis.judgement import Pairs, Verdict, folder_key, judge
+from gsbench.analysis.measures import find_measure
+from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL
+from gsbench.claims.archive import unpack_archive
+from gsbench.claims.file import Claim, ClaimsFile
+from gsbench.claims.looks import Planned, trials_of_look
+from gsbench.claims.published import resolve
+from gsbench.config.compose import TrialConfig, compose_one
+from gsbench.config.jobs import with_seed
+from gsbench.errors import InputError
+from gsbench.records import read_if_sound
+from gsbench.runs.declaration import Declaration, declared_now, read_declarations, standing_one
+from gsbench.runs.layout import FAILED, SEED
+from gsbench.runs.trial_folder import Failure, TrialFolder
+from gsbench.words import closest, some_of, without_places
+
+Lacking = Callable[[TrialConfig, str], str]  # (trial, metric) -> why it cannot be had here, or ""
+NOT_TESTABLE = "not testable here"
+
+
+@dataclass(frozen=True)
+class ClaimVerdict:
+    """A claim with its verdict; ``missing`` says which scenes could not be tested, and why."""
+
+    claim: Claim
+    verdict: Verdict
+    missing: tuple[str, ...] = ()
+    failed: tuple[str, ...] = ()
+
+    @property
+    def word(self) -> str:
+        """Supported, refuted, too small to matter, undecided, or not testable here."""
+        return NOT_TESTABLE if self.verdict.untestable else self.verdict.outcome
+
+    @property
+    def reason(self) -> str:
+        """In a few words, why the verdict is what it is."""
+        claim, verdict, least = self.claim, self.verdict, self.claim.effect
+        if verdict.untestable:
+            return verdict.untestable
+        if verdict.outcome == TOO_SMALL or (verdict.outcome == SUPPORTED and not claim.sign):
+            sign = verdict.mean is not None and verdict.interval is not None and verdict.interval.excludes_zero()
+            known = f"; it is {'higher' if (verdict.mean or 0) > 0 else 'lower'}" if sign else ""
+            return f"any effect is smaller than the least that matters ({least}){known}"
+        if verdict.outcome == SUPPORTED:
+            return f"it is {claim.direction}{self._by_least()}"
+        if verdict.outcome == "refuted":
+            return f"it is not {claim.direction} but the contrary" if claim.sign else f"it differs by more than {least}"
+        if verdict.hangs and verdict.final:
+            return "it hangs on trials far outside the others"
+        if verdict.final:
+            return f"after all {verdict.pairs.seeds} seeds neither a difference nor its being below {least} is sure"
+        waits = "trials are missing: the next look waits for them"
+        return waits + (f"; failed: {some_of(list(self.failed))}" if self.failed else "")
+
+    def _by_least(self) -> str:
+        verdict = self.verdict
+        if verdict.interval is None or verdict.least is None:
+            return ""
+        smallest = verdict.interval.low if self.claim.sign > 0 else -verdict.interval.high
+        return "" if smallest >= verdict.least else f"; whether by {self.claim.effect} or more is open"
+
+
+@dataclass(frozen=True)
+class Check:
+    """A file of claims in a runs folder: its declaration, and the first trial of each folder that it names.
+
+    ``missing`` says by claim what cannot be tested here. Trials of ``only`` these scenes are run here, of all where
+    none are named.
+    """
+
+    file: ClaimsFile
+    runs: Path
+    declaration: Declaration
+    first: Mapping[str, TrialConfig]  # by folder
+    only: tuple[str, ...] = ()
+
+    @property
+    def home(self) -> Path:
+        return self.runs / self.file.name
+
+    def to_run(self, planned: Sequence[Planned]) -> list[TrialConfig]:
+        """The trials of a look that are run here."""
+        scenes = {self._scene_of(name) for name in self.only}
+        return [
+            with_seed(self.first[key], seed)
+            for key, seed in planned
+            if not self.only or self.first[key].values["scene"]["name"] in scenes
+        ]
+
+    def trials(self, seeds: int) -> list[TrialConfig]:
+        """The trials to be run here for the first ``seeds`` seeds of every claim."""
+        return self.to_run(trials_of_look(self.declaration, range(len(self.declaration.questions)), seeds))
+
+    def judged(self) -> list[Verdict]:
+        """The verdicts from the trials that are done, of the questions that can be tested."""
+        trials = read_experiment(self.home).trials if self.home.is_dir() else ()
+        return judge(trials, self.declaration)
+
+    def verdicts(self, judged: Sequence[Verdict]) -> list[ClaimVerdict]:
+        """All claims in the order of the file, with the reasons of trials that failed."""
+        found = claim_verdicts(self.file, self.declaration, judged)
+        return [replace(one, failed=tuple(self._failed(one.verdict))) for one in found]
+
+    def _failed(self, verdict: Verdict) -> list[str]:
+        """Why trials of the question failed, each reason once."""
+        folders = [
+            self.home / f"{key}{SEED}{seed}"
+            for both in verdict.question.scenes.values()
+            for key in both
+            for seed in verdict.question.seeds
+        ]
+        failures = [read_if_sound(folder / FAILED, Failure) for folder in ([] if verdict.final else folders)]
+        return list(dict.fromkeys(failure.reason for failure in failures if failure is not None))
+
+    def _scene_of(self, name: str) -> str:
+        """The scene that the file calls so, as its trials call it."""
+        for question in self.declaration.questions:
+            if name in question.scenes:
+                return str(self.first[question.scenes[name][0]].values["scene"]["name"])
+        return name
+
+
+def prepare(
+    file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequence[str] = (), only: Sequence[str] = ()
+) -> Check:
+    """Compose the first trial of every scene and arm of every claim; ``lacking`` says what cannot be had here.
+
+    ``permissions`` are words such as ``allow_targets=[mine]`` that were typed: a file of claims can give none. Where
+    ``only`` some scenes are run here, nobody asks whether the others could be.
+
+    Raises InputError, naming claim, scene and arm, for settings that do not compose, for an unknown scene, and for one
+    of ``only`` that cannot be run here: the declaration would be another one than that of the other machines.
+    """
+    for scene in only:
+        if scene not in file.scenes:
+            near = closest(scene, file.scenes)
+            raise InputError(f"{file.name} has no scene {scene}{near} (it has {', '.join(file.scenes)})")
+    first: dict[str, TrialConfig] = {}
+    known: dict[tuple[str, ...], TrialConfig] = {}
+    questions, missing = [], {}
+    for claim in file.claims:
+        scenes: dict[str, tuple[str, str]] = {}
+        reasons: dict[str, list[str]] = {}  # scenes by reason
+        for scene in () if claim.not_testable else file.scenes_of(claim):
+            trials = []
+            for arm in (claim.baseline, claim.arm):
+                words = (*file.words(claim, scene, arm), f"name={file.name}", "seed=0", *permissions)
+                if words not in known:
+                    known[words] = _composed(words, runs, f"claim {claim.id}, scene {scene}, arm {arm}")
+                trials.append(known[words])
+            asked = trials if scene in (only or (scene,)) else []
+            reason = next((why for trial in asked if (why := lacking(trial, claim.metric))), "")
+            if reason and only:
+                raise InputError(
+                    f"claim {claim.id} cannot be tested here on {scene}, which --scene names: {reason}; mend that, "
+                    "or give the claim the reason on all machines (not_testable)"
+                )
+            if reason:
+                reasons.setdefault(reason, []).append(scene)
+                continue
+            baseline, arm_key = (_folder_of(trial) for trial in trials)
+            if baseline == arm_key:
+                raise InputError(f"claim {claim.id}: {claim.baseline} and {claim.arm} are the same trial on {scene}")
+            first |= {baseline: trials[0], arm_key: trials[1]}
+            scenes[scene] = baseline, arm_key
+        if scenes:
+            questions.append(file.question(claim, scenes))
+        if reasons:
+            missing[claim.id] = [without_places(f"{some_of(names)}: {reason}") for reason, names in reasons.items()]
+    declaration = declared_now(
+        questions=tuple(questions), error_rate=file.error_rate, looks=file.looks, missing=missing
+    )
+    return Check(file, runs, declaration, first, tuple(only))
+
+
+def claim_verdicts(file: ClaimsFile, declaration: Declaration, judged: Sequence[Verdict]) -> list[ClaimVerdict]:
+    """Every claim of the file, with its verdict among those ``judged`` by ``declaration``, or why there is none."""
+    by_name = {verdict.question.name: verdict for verdict in judged}
+    found = []
+    for claim in file.claims:
+        reasons = tuple(declaration.missing.get(claim.id, ()))
+        verdict = by_name.get(claim.id)
+        if verdict is None or claim.not_testable:
+            why = claim.not_testable or "; ".join(reasons) or "it was not tested"
+            measure = find_measure(claim.metric)
+            verdict = Verdict(file.question(claim, {}), measure, Pairs(()), untestable=why)
+            reasons = ()
+        found.append(ClaimVerdict(claim, verdict, reasons))
+    return found
+
+
+def recheck(
+    file: ClaimsFile, archives: Sequence[Path], folder: Path
+) -> tuple[list[ClaimVerdict], Declaration, list[Declaration]]:
+    """Judge the claims of ``file`` by the trials in ``archives`` alone, unpacked into the empty folder ``folder``.
+
+    Returns the verdicts, the declaration that they follow, and all of the same experiment. Raises InputError, one line,
+    for a damaged archive, one of another experiment or without declared claims, where archives were made under several
+    declarations, and where the file's claims are not those that were declared.
+    """
+    trials: dict[tuple[str, int], TrialResult] = {}
+    every: list[Declaration] = []
+    standing: dict[str, Path] = {}
+    for place, archive in enumerate(archives):
+        share = unpack_archive(archive, folder / str(place))
+        if share.name != file.name:
+            raise InputError(f"{archive} is of the experiment {share.name}, not of {file.name}")
+        declared = [one for one in read_declarations(share.folder) if one.of_claims]
+        if not declared:
+            raise InputError(f"{archive}: no claims were declared in it: it is no archive of a gsbench check")
+        every += declared
+        standing.setdefault(_questions_hash(declared[-1]), archive)
+        for trial in share.trials:
+            other = trials.setdefault((folder_key(trial), trial.seed), trial)
+            if other.metrics != trial.metrics:
+                raise InputError(
+                    f"{archive}: {trial.label} has other results in another archive: leave one of them out"
+                )
+    if len(standing) > 1:
+        raise InputError(f"{' and '.join(map(str, standing.values()))} were made under unlike declarations of claims")
+    every.sort(key=lambda one: one.moment)
+    declaration = resolve(standing_one(every), list(trials.values()))
+    _check_same_claims(file, declaration)
+    verdicts = claim_verdicts(file, declaration, judge(list(trials.values()), declaration))
+    return verdicts, declaration, every
+
+
+def _questions_hash(declaration: Declaration) -> str:
+    return str(declaration.plan) if declaration.plan else declaration.hash
+
+
+def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
+    """Raise InputError where a claim's question is not the one that was declared before the trials ran."""
+    declared = {question.name: question for question in declaration.questions}
+    for claim in file.claims:
+        asked, was = file.question(claim, {}), declared.get(claim.id)
+        if was is None:
+            continue
+        for what in ("metric", "sign", "least", "relative"):
+            if getattr(asked, what) != getattr(was, what):
+                raise InputError(
+                    f"claim {claim.id}: its {what} was {getattr(was, what)} when it was declared ({declaration.when}), "
+                    f"and is {getattr(asked, what)} in the file: give the file as it was then"
+                )
+        if (claim.baseline, claim.arm) != tuple(arm.densify for arm in (was.baseline, was.arm) if arm is not None):
+            raise InputError(
+                f"claim {claim.id}: other arms were declared ({declaration.when}): give the file as it was"
+            )
+    if unknown := declared.keys() - {claim.id for claim in file.claims}:
+        raise InputError(f"claims were declared that the file lacks: {', '.join(sorted(unknown))}")
+
+
+def _folder_of(trial: TrialConfig) -> str:
+    """The folder of the trial within its experiment, without the seed."""
+    folder = TrialFolder.of(trial.values).path
+    return "/".join(folder.parts[-3:]).rpartition(SEED)[0]
+
+
+def _composed(words: Sequence[str], runs: Path, where: str) -> TrialConfig:
+    try:
+        trial = compose_one(words)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    return TrialConfig(trial.values | {"runs": str(runs.resolve())}, trial.yaml, trial.overrides)

@@ -1,0 +1,158 @@
+"""`pair` and `judge` on trials in files: what is paired, what is named, what each outcome rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsbench.analysis.judgement import Pairs, find_outlying, folder_key, judge, pair
+from gsbench.analysis.pairing import choose_pairs
+from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.runs.declaration import Arm, Declaration, Question
+from tests.analysis.untruths import scene_pairs
+
+ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
+PSNR = Question(metric="psnr", least=0.1, baseline=ADC, arm=VOLUMETRIC)
+EARLY, LATE = "2020-01-01T00:00:00Z", "2037-01-01T00:00:00Z"
+
+
+def named(trials: tuple[TrialResult, ...], seeds: tuple[int, ...] = (0, 1, 2)) -> Question:
+    """The question about these trials by their folders."""
+    keys = {(trial.scene, trial.densify): folder_key(trial) for trial in trials}
+    scenes = {scene: (keys[scene, "adc"], keys[scene, "volumetric"]) for scene, _ in keys}
+    return replace(PSNR, scenes=scenes, seeds=seeds, name="claim")
+
+
+def test_pairs_share_scene_and_seed(make_experiment: Callable[..., Experiment]) -> None:
+    trials = make_experiment(effect={"psnr": 0.7}, trial_noise=0.0, residual_noise=0.0).trials
+    found = pair(trials, PSNR)
+    assert found.scenes == ("courtyard", "garden")
+    assert found.differences.shape == (2, 3)
+    assert np.allclose(found.differences, 0.7)  # all noise is shared by the arms
+    assert pair(trials, named(trials)).differences.tolist() == found.differences.tolist()
+
+
+def test_what_has_no_partner_is_named_and_scenes_keep_the_seeds_that_all_have(
+    make_experiment: Callable[..., Experiment],
+) -> None:
+    trials = [t for t in make_experiment().trials if (t.scene, t.densify, t.seed) != ("garden", "adc", 1)]
+    found = pair(trials, PSNR)
+    assert "garden: seed 1 has no partner" in found.left_out
+    assert "2 seeds of each scene count, since garden has no more (others up to 3)" in found.left_out
+    assert found.differences.shape == (2, 2)
+    assert len(found.trials) == 8
+
+
+def test_of_planned_seeds_none_beyond_the_first_that_is_missing_counts(
+    make_experiment: Callable[..., Experiment],
+) -> None:
+    trials = make_experiment().trials
+    kept = [t for t in trials if (t.scene, t.densify, t.seed) != ("garden", "adc", 1)]
+    assert pair(kept, named(trials)).seeds == 1
+
+
+def test_arms_under_different_conditions_are_not_compared(make_experiment: Callable[..., Experiment]) -> None:
+    trials = make_experiment().trials
+    for trial in trials:
+        if trial.densify == "adc":
+            object.__setattr__(trial.record, "iterations", 7000)
+    found = pair(trials, PSNR)
+    assert not found.rows
+    assert all("the arms differ in iterations, so they are not compared" in line for line in found.left_out)
+
+
+def test_ratios_are_taken_of_logarithms(make_experiment: Callable[..., Experiment]) -> None:
+    trials = make_experiment().trials
+    question = replace(named(trials), metric="gaussians", relative=True, least=0.1)
+    (verdict,) = judge(trials, Declaration(time=EARLY, questions=(question,)))
+    counts = {(t.scene, t.densify, t.seed): t.record.num_gaussians or 0 for t in trials}
+    ratios = [counts[s, "volumetric", k] / counts[s, "adc", k] for s in ("courtyard", "garden") for k in range(3)]
+    assert verdict.mean == pytest.approx(np.mean(np.log(ratios)))
+    assert verdict.shown(np.log(1.284)) == "+28.4 %"
+
+
+def test_a_look_waits_for_every_scene_and_stops_where_it_is_decided(make_experiment: Callable[..., Experiment]) -> None:
+    trials = make_experiment(effect={"psnr": 3.0}).trials
+    declared = Declaration(time=EARLY, questions=(named(trials),), looks=(2, 3))
+    (whole,) = judge(trials, declared)
+    assert (whole.outcome, whole.final) == ("supported", True)
+    first = [trial for trial in trials if trial.seed == 0]
+    (waits,) = judge(first, declared)
+    assert (waits.outcome, waits.final, waits.answer) == ("undecided", False, None)
+    (nothing,) = judge([trial for trial in trials if trial.scene == "garden"], declared)
+    assert not nothing.final
+    later = [trial for trial in trials if trial.seed < whole.pairs.seeds]
+    assert judge(later, declared)[0].interval == whole.interval
+
+
+def test_trials_that_were_measured_before_the_question_cost_it_its_place(
+    make_experiment: Callable[..., Experiment],
+) -> None:
+    trials = make_experiment(effect={"psnr": 3.0}).trials
+    one, late = (judge(trials, Declaration(time=t, questions=(named(trials),), looks=(3,)))[0] for t in (EARLY, LATE))
+    assert (one.late, late.late) == (0, 12)
+    assert one.answer is not None
+    assert late.answer is not None
+    assert late.answer.level == pytest.approx(one.answer.level / 4)  # psnr, ssim, flip and one LPIPS
+
+
+def test_arms_that_never_differ_cannot_be_tested(make_experiment: Callable[..., Experiment]) -> None:
+    trials = make_experiment().trials
+    for trial in trials:
+        object.__setattr__(trial.record, "metrics", {"psnr": 20.0})
+        object.__setattr__(trial.record, "num_gaussians", 5)
+    (verdict,) = judge(trials, Declaration(time=EARLY, questions=(named(trials),), looks=(2, 3)))
+    assert "equal to the last bit" in verdict.untestable
+    assert verdict.final
+
+
+# --- trials far outside the others
+
+
+def rows(before: list[list[float]], after: list[list[float]]) -> Pairs:
+    both = (np.array([b, a]) for b, a in zip(before, after, strict=True))
+    return Pairs(tuple(scene_pairs(place, noise, 0.0) for place, noise in enumerate(both)))
+
+
+def test_a_training_that_failed_is_found() -> None:
+    good = [[20.0, 20.1, 19.9, 20.05]] * 2
+    found = find_outlying(rows(good, [[20.5, 20.6, 10.0, 20.4], [20.5, 20.4, 20.6, 20.5]]))
+    assert [trial.path for trial in found] == [Path("0/b2")]
+    assert find_outlying(rows(good, good)) == []
+    assert find_outlying(rows([[20.0, 30.0]], [[20.0, 20.1]])) == []  # of two nobody knows which one failed
+
+
+def test_a_verdict_that_hangs_on_one_training_is_undecided(make_experiment: Callable[..., Experiment]) -> None:
+    """Without the training that failed the mean has the other sign."""
+    trials = make_experiment(scenes=("a", "b", "c"), seeds=range(6)).trials
+    values = {"adc": [20.0, 20.01, 19.99, 20.0, 20.01, 19.99], "volumetric": [20.02, 20.0, 20.01, 20.02, 20.0, 20.01]}
+    for trial in trials:
+        value = values[trial.densify][trial.seed] - (5.0 if trial.densify == "volumetric" and trial.seed == 5 else 0.0)
+        object.__setattr__(trial.record, "metrics", {"psnr": value})
+    (verdict,) = judge(trials, Declaration(time=EARLY, questions=(replace(PSNR, least=None),)))
+    assert {trial.seed for trial in verdict.outlying} == {5}
+    assert verdict.outcome == "undecided"
+    assert verdict.without is not None
+
+
+# --- which arms are held against which
+
+
+def test_comparisons_worth_making() -> None:
+    arms = [Arm("dim", "adc"), Arm("dim", "volumetric"), ADC, VOLUMETRIC]
+    assert choose_pairs(arms) == [(arms[0], arms[1]), (arms[2], arms[3])]
+    three = [Arm(init, "x") for init in "abc"]
+    assert choose_pairs(three) == [(three[0], three[1]), (three[0], three[2])]
+    assert choose_pairs(arms[2:], baseline="volumetric") == [(arms[3], arms[2])]
+    assert choose_pairs([ADC]) == []
+
+
+def test_variants_are_held_against_the_baselines_own() -> None:
+    arms = [Arm("sfm", name, (("cap", str(cap)),)) for name in ("adc", "volumetric") for cap in (1, 2)]
+    assert choose_pairs(arms) == [(arms[0], arms[2]), (arms[1], arms[3])]
+    arms = [ADC, *(Arm("sfm", "volumetric", (("threshold", str(k)),)) for k in (1, 2))]
+    assert choose_pairs(arms) == [(arms[0], arms[1]), (arms[0], arms[2])]
