@@ -275,4 +275,4 @@ def _composed(words: Sequence[str], runs: Path, where: str) -> TrialConfig:
         trial = compose_one(words)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    return TrialConfig(trial.values | {"runs": str(runs.resolve())}, trial.yaml, trial.overrides)
+    return TrialConfig(trial.values | {"runs": str(runs.resolve())}, trial.overrides)
