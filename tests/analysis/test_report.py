@@ -143,7 +143,7 @@ def test_every_trial_is_traceable(experiment: Experiment, page: str) -> None:
 
 def test_errors_are_sorted_by_texture(experiment: Experiment) -> None:
     """The made-up renders of "volumetric" are sharper in the grass and wrong in a smooth corner."""
-    found = errors_by_region(experiment.trials, ADC, VOLUMETRIC)
+    found = errors_by_region(pair_trials(experiment.trials, ADC, VOLUMETRIC))
     verdicts = [word for _, word in found.changes]
     assert verdicts[0] == "worse"
     assert verdicts[-1] == "better"
@@ -159,19 +159,19 @@ def test_texture_energy_is_the_squared_gradient() -> None:
 
 def test_a_map_sorts_the_errors_where_it_is_at_hand(experiment: Experiment) -> None:
     with pytest.raises(InputError, match=r"kept no maps; eval\.maps=true keeps them"):
-        errors_by_region(experiment.trials, ADC, VOLUMETRIC, "depth")
+        errors_by_region(pair_trials(experiment.trials, ADC, VOLUMETRIC), "depth")
     depth = np.ones((120, 160))
     depth[:, TEXTURED] = 2.0
     for trial in experiment.trials:
         (trial.path / "maps").mkdir()
         for view in range(3):
             np.savez(trial.path / "maps" / f"view{view:03d}.npz", depth=depth)
-    found = errors_by_region(experiment.trials, ADC, VOLUMETRIC, "depth", bins=2)
+    found = errors_by_region(pair_trials(experiment.trials, ADC, VOLUMETRIC), "depth", bins=2)
     assert [word for _, word in found.changes] == ["worse", "better"]
     with pytest.raises(InputError, match=r"view000\.npz has no map 'volume'"):
-        errors_by_region(experiment.trials, ADC, VOLUMETRIC, "volume")
+        errors_by_region(pair_trials(experiment.trials, ADC, VOLUMETRIC), "volume")
     with pytest.raises(InputError, match="unknown property 'hue'"):
-        errors_by_region(experiment.trials, ADC, VOLUMETRIC, "hue")
+        errors_by_region(pair_trials(experiment.trials, ADC, VOLUMETRIC), "hue")
 
 
 def test_crops_lie_where_the_arms_differ_most(experiment: Experiment) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from gsbench.analysis.cells import by_key
-from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.results import TrialResult
 from gsbench.analysis.statistics import answer_family
 from gsbench.errors import InputError
 from gsbench.runs.layout import GROUND_TRUTH, MAPS, MASKS, RENDERS
@@ -72,16 +72,13 @@ def absolute_error(render: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Array
 
 
 def errors_by_region(
-    trials: Sequence[TrialResult], first: Arm, second: Arm, property_name: str = "texture", bins: int = BINS
+    pairs: Sequence[tuple[TrialResult, TrialResult]], property_name: str = "texture", bins: int = BINS
 ) -> RegionErrors:
-    """Compare two arms in bins of ``texture`` or of a map (``MAP_PROPERTIES``).
+    """Compare the trials of two arms, in ``pairs`` of one scene and seed, in bins of ``texture`` or of a map (``MAP_PROPERTIES``).
 
     The maps are those of the first arm's trials, so that both arms are sorted alike. Raises ``InputError``, saying what
     is missing, where renders or maps are absent.
     """
-    from gsbench.analysis.judgement import pair_trials  # here, since it reads measures that this module makes
-
-    pairs = pair_trials(trials, first, second)
     if not pairs:
         raise InputError("no trials of the two arms share a scene, a seed and their conditions")
     read_property = _property_reader(property_name)

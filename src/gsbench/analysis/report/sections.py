@@ -81,7 +81,7 @@ def compare_arms(trials: Sequence[TrialResult], first: Arm, second: Arm, judged:
     without: dict[str, list[str]] = {}  # properties by the reason for which they are not shown
     for name in ("texture", *MAP_PROPERTIES):
         try:
-            found = errors_by_region(own, first, second, name)
+            found = errors_by_region(pairs, name)
             regions.append((found, _region_chart(found, first, second)))
         except InputError as error:
             without.setdefault(str(error), []).append(name)
