@@ -74,7 +74,7 @@ def absolute_error(render: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Array
 def errors_by_region(
     pairs: Sequence[tuple[TrialResult, TrialResult]], property_name: str = "texture", bins: int = BINS
 ) -> RegionErrors:
-    """Compare the trials of two arms, in ``pairs`` of one scene and seed, in bins of ``texture`` or of a map (``MAP_PROPERTIES``).
+    """Compare two arms, by their ``pairs`` of trials, in bins of ``texture`` or of a map (``MAP_PROPERTIES``).
 
     The maps are those of the first arm's trials, so that both arms are sorted alike. Raises ``InputError``, saying what
     is missing, where renders or maps are absent.
