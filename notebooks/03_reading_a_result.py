@@ -24,16 +24,16 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from gsbench.analysis.power import seeds_needed
 from IPython.display import Markdown
 
 from gsbench.analysis import load_experiment, to_frame
 from gsbench.analysis.errors_by_region import errors_by_region
-from gsbench.analysis.pairing import ViewCache, pair_arms
-from gsbench.analysis.statistics import compare
+from gsbench.analysis.judgement import judge, pair, pair_trials
+from gsbench.analysis.planning import seeds_needed
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.cli import run
+from gsbench.runs.declaration import Arm, Declaration, Question
 
 os.environ["GSBENCH_RUNS"] = tempfile.mkdtemp(prefix="gsbench-")
 runs = Path(os.environ["GSBENCH_RUNS"])
@@ -84,23 +84,20 @@ frame.groupby("densify")[["psnr", "num_gaussians"]].agg(["mean", "std", "min", "
 # ## Seeds are paired
 #
 # The same seed means the same order of photographs in both arms, and every trial is judged on the same test views. So
-# we look at differences: volumetric minus baseline, for each seed and each view.
+# we look at differences: volumetric minus baseline, for each seed. A question names two arms, a metric, the direction
+# that is claimed and the least difference that matters.
 
 # %%
-adc, volumetric = (init, "adc"), (init, "volumetric")
-views = ViewCache()
-paired = pair_arms(experiment.trials, adc, volumetric, "psnr", views)
-(differences,) = paired.differences  # [seeds, views], one matrix a scene
+adc, volumetric = Arm(init, "adc"), Arm(init, "volumetric")
+question = Question(metric="psnr", sign=+1, least=0.1, baseline=adc, arm=volumetric)  # more PSNR is better
+(differences,) = pair(experiment.trials, question).differences  # [seeds], one row a scene
 
 plt.figure(figsize=(7, 3))
-for seed, row in enumerate(differences):
-    plt.plot(np.full(len(row), seed), row, "o", color="C0", alpha=0.5)
-    plt.plot([seed - 0.2, seed + 0.2], [row.mean()] * 2, color="C3", linewidth=2)
+plt.bar(np.arange(len(differences)), differences, width=0.4, color="C3")
 plt.axhline(0, color="grey", linewidth=1)
 plt.xticks(range(len(differences)))
 plt.xlabel("seed")
 plt.ylabel("PSNR difference, dB")
-plt.title("one dot a test view, one bar the mean of a trial pair")
 plt.tight_layout()
 
 # %% [markdown]
@@ -109,17 +106,16 @@ plt.tight_layout()
 #
 # ## The verdict
 #
-# An arm is *better* or *worse* where Student's t over the pairs of trials says p < 5 %, which is where its 95 %
-# interval leaves zero out: two readings of one test. Otherwise the verdict is *no evidence*, which is not the same as
-# *no difference*.
+# One interval, Student's t over the pairs of trials, makes the verdict. *Supported*: it lies on the claimed side of
+# zero; *refuted*: on the other; *too small to matter*: within the least difference on either side. Otherwise it is
+# *undecided*, which is not the same as *no difference*.
 
 # %%
-result = compare(paired, direction=+1)  # +1: more PSNR is better
+(result,) = judge(experiment.trials, Declaration(time="2026-01-01T00:00:00Z", questions=(question,)))
 print(f"mean difference  {result.mean:+.3f} dB ({result.relative:+.2%})")
 print(f"95 % interval    {result.interval.low:+.3f} to {result.interval.high:+.3f} dB")
-print(f"p                {result.p:.3f}, {result.test}")
-print(f"speaks of        {result.scope}")
-print(f"verdict          {result.verdict}")
+print(f"p                {result.p:.3f}")
+print(f"verdict          {result.outcome}")
 
 # %% [markdown]
 # With few trials, only a large difference can be seen. How many seeds would it take to see a given one in eight of
@@ -130,8 +126,8 @@ for difference in (0.05, 0.1, 0.2, 0.5):
     print(f"{difference:4} dB: {seeds_needed(result.deviation, 1, difference) or 'more than 1000'} seeds an arm")
 
 # %% [markdown]
-# More seeds tell more about *this* scene only. For "scenes like these", gsbench wants at least six scenes, which then
-# are the units.
+# More seeds tell more about *this* scene only. For "scenes like these", gsbench wants at least six scenes, and counts
+# in how many of them the arm helps.
 #
 # ## Where it helps
 #
@@ -139,10 +135,10 @@ for difference in (0.05, 0.1, 0.2, 0.5):
 # bins by the texture of the ground truth, and the error of both arms is taken in each bin.
 
 # %%
-regions = errors_by_region(experiment.trials, adc, volumetric, "texture")
-middle = [comparison.mean for comparison in regions.comparisons]
-low = [c.mean - c.interval.low for c in regions.comparisons]
-high = [c.interval.high - c.mean for c in regions.comparisons]
+regions = errors_by_region(pair_trials(experiment.trials, adc, volumetric), "texture")
+middle = [change.mean for change in regions.changes]
+low = [c.mean - c.interval.low for c in regions.changes]
+high = [c.interval.high - c.mean for c in regions.changes]
 bins = np.arange(1, len(middle) + 1)
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.4))
 left.plot(bins, regions.first, "o-", label="adc")

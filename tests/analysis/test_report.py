@@ -144,7 +144,7 @@ def test_every_trial_is_traceable(experiment: Experiment, page: str) -> None:
 def test_errors_are_sorted_by_texture(experiment: Experiment) -> None:
     """The made-up renders of "volumetric" are sharper in the grass and wrong in a smooth corner."""
     found = errors_by_region(pair_trials(experiment.trials, ADC, VOLUMETRIC))
-    verdicts = [word for _, word in found.changes]
+    verdicts = found.words()
     assert verdicts[0] == "worse"
     assert verdicts[-1] == "better"
     assert found.second[-1] < 0.6 * found.first[-1]
@@ -167,7 +167,7 @@ def test_a_map_sorts_the_errors_where_it_is_at_hand(experiment: Experiment) -> N
         for view in range(3):
             np.savez(trial.path / "maps" / f"view{view:03d}.npz", depth=depth)
     found = errors_by_region(pair_trials(experiment.trials, ADC, VOLUMETRIC), "depth", bins=2)
-    assert [word for _, word in found.changes] == ["worse", "better"]
+    assert found.words() == ("worse", "better")
     with pytest.raises(InputError, match=r"view000\.npz has no map 'volume'"):
         errors_by_region(pair_trials(experiment.trials, ADC, VOLUMETRIC), "volume")
     with pytest.raises(InputError, match="unknown property 'hue'"):

@@ -17,7 +17,7 @@ from PIL import Image, UnidentifiedImageError
 
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.results import TrialResult
-from gsbench.analysis.statistics import answer_family
+from gsbench.analysis.statistics import Answer, answer_family
 from gsbench.errors import InputError
 from gsbench.runs.layout import GROUND_TRUTH, MAPS, MASKS, RENDERS
 from gsbench.scene.masks import read_mask
@@ -40,15 +40,20 @@ MAP_PROPERTIES = {
 class RegionErrors:
     """Mean absolute errors (8-bit levels) of two arms in bins of a property, from its lowest values to its highest.
 
-    ``edges`` are the inner edges of each scene's bins; ``changes`` are second arm minus first with a word for each bin:
-    better, worse or undecided, adjusted for their number.
+    ``edges`` are the inner edges of each scene's bins; ``changes`` are second arm minus first, one for each bin,
+    adjusted for their number.
     """
 
     property: str
     first: tuple[float, ...]
     second: tuple[float, ...]
-    changes: tuple[tuple[float, str], ...]
+    changes: tuple[Answer, ...]
     edges: dict[str, tuple[float, ...]]
+
+    def words(self) -> tuple[str, ...]:
+        """Say of each bin whether the second arm is better, worse or undecided there."""
+        words = {"supported": "better", "refuted": "worse"}
+        return tuple(words.get(one.outcome(-1, None), "undecided") for one in self.changes)
 
 
 def texture_energy(image: NDArray[np.uint8]) -> Array:
@@ -103,9 +108,7 @@ def errors_by_region(
         seeds = min(len(array) for _, array in kept)
         differing.append(np.array([(array[:seeds, :, 1] - array[:seeds, :, 0]).mean(axis=1) for _, array in kept]))
     first_means, second_means = (tuple(float(mean[place]) for mean in means) for place in (0, 1))
-    words = {"supported": "better", "refuted": "worse"}
-    changes = [(one.mean, words.get(one.outcome(-1, None), "undecided")) for one in answer_family(differing)]
-    return RegionErrors(property_name, first_means, second_means, tuple(changes), edges)
+    return RegionErrors(property_name, first_means, second_means, tuple(answer_family(differing)), edges)
 
 
 def view_names(trial: TrialResult) -> list[str]:
