@@ -19,8 +19,7 @@ from gsbench.init import MODEL_FOLDER, Dim, SiftKornia, read_cloud
 from gsbench.init.networks import extract_and_match
 from gsbench.init.networks.extract_and_match import NetworkJob, at_low_resolution, choose_pairs, open_store
 from gsbench.init.networks.extractors import SUPERPOINT_BORDER, build_extractor, extract_features
-from gsbench.init.networks.feature_store import FeatureStore
-from gsbench.init.networks.features import Features
+from gsbench.init.networks.features import Features, FeatureStore
 from gsbench.init.networks.matching import MutualNearest, build_matcher, match_within_memory
 from gsbench.logs import no_progress
 from gsbench.scene.courtyard.render import surface_distance

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsbench.init.colmap.pairs import exhaustive_pairs
-from gsbench.init.preview import STRONGEST, best_pairs, count_agreements
+from gsbench.init.colmap.pairs import STRONGEST, best_pairs, count_agreements, exhaustive_pairs
 
 
 def slow_count(first: np.ndarray, second: np.ndarray) -> int:

@@ -12,8 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from gsbench.init.colmap.reconstruct import similarity_to
-from gsbench.init.plot import draw_cloud, view_from_above
-from gsbench.init.report import compare_poses, make_report, measure_gauge, training_extent
+from gsbench.init.report import compare_poses, draw_cloud, make_report, measure_gauge, training_extent, view_from_above
 from gsbench.scene.types import Capture
 
 NAMES = ("a.png", "b.png", "c.png", "d.png")

@@ -30,8 +30,7 @@ from gsbench.pipeline.steps.model_metrics import (
 )
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.camera import Camera
-from gsbench.scene.courtyard.depth import courtyard_depth
-from gsbench.scene.courtyard.render import courtyard_cameras
+from gsbench.scene.courtyard.render import courtyard_cameras, courtyard_depth
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.types import Scene, View
 

@@ -12,8 +12,8 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import points_of, read_model, read_reference, write_model
+from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap, read_photos
-from gsbench.scene.split import SplitRule
 from tests.scene.cameras import cameras_of
 
 from .conftest import smooth_image

@@ -16,9 +16,8 @@ from gsbench.errors import InputError
 from gsbench.runs.hashing import LATER, config_hash
 from gsbench.scene.camera import Camera
 from gsbench.scene.hold_out import hold_out
-from gsbench.scene.options import SceneConfig
+from gsbench.scene.options import SceneConfig, SplitRule
 from gsbench.scene.readers import read_colmap, read_photos
-from gsbench.scene.split import SplitRule
 from tests.scene.test_sectors import ring
 
 NAMES = [f"{k:02d}.png" for k in range(24)]

@@ -20,8 +20,8 @@ from gsbench.init.point_files import read_points, read_similarity
 from gsbench.scene.colmap import read_model
 from gsbench.scene.images import IMAGE_SUFFIXES, exif_orientation, image_size, read_image
 from gsbench.scene.names import check_picture_names
+from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import fingerprint, list_images, read_photos
-from gsbench.scene.split import SplitRule
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and links of a POSIX system")
 SECONDS = 20

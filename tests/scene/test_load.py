@@ -13,9 +13,9 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.scene.load import load_scene
+from gsbench.scene.options import SplitRule
 from gsbench.scene.prepare import CameraModel, Job, prepare_all, undistort
 from gsbench.scene.readers import read_colmap
-from gsbench.scene.split import SplitRule
 
 WIDTH, HEIGHT = 200, 150
 MODELS = {

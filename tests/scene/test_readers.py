@@ -11,9 +11,8 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.scene.names import match_names, select_images, split_names
-from gsbench.scene.options import SceneConfig
+from gsbench.scene.options import SceneConfig, SplitRule
 from gsbench.scene.readers import list_images, missing_model, read_colmap, read_photos
-from gsbench.scene.split import SplitRule
 
 
 @pytest.mark.parametrize("text", [False, True])

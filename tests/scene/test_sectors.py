@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsbench.scene.camera import Camera
-from gsbench.scene.columns import ANGLE, DISTANCE
 from gsbench.scene.courtyard.render import ring_camera
-from gsbench.scene.nearness import nearness
-from gsbench.scene.sectors import arrange, sector_of
+from gsbench.scene.hold_out import arrange, sector_of
+from gsbench.scene.nearness import ANGLE, DISTANCE, nearness
 from tests.scene import cameras
 
 looking = partial(cameras.looking, size=(40, 30), focal=50.0)

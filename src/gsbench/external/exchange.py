@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.eval.matching import match_by_order, match_pictures
+from gsbench.eval.pictures import match_by_order, match_pictures
 from gsbench.files import write_json
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply

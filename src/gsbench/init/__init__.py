@@ -15,11 +15,10 @@ from gsbench.init.base import (
 )
 from gsbench.init.dataset import Dataset
 from gsbench.init.dim import Dim, SiftKornia
-from gsbench.init.jittered import Jittered
+from gsbench.init.placed import Carved, Random
 from gsbench.init.ply import Ply
 from gsbench.init.points import Points
-from gsbench.init.random import Carved, Random
-from gsbench.init.sfm import Sfm, SfmDense
+from gsbench.init.sfm import Jittered, Sfm, SfmDense
 from gsbench.logs import Progress
 
 __all__ = [

@@ -17,9 +17,8 @@ from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize
 from gsbench.eval.facts import METRICS
-from gsbench.eval.matching import Matching, match_by_order, match_pictures
 from gsbench.eval.options import EvalConfig
-from gsbench.eval.pictures import Pair, measure
+from gsbench.eval.pictures import Matching, Pair, match_by_order, match_pictures, measure
 from gsbench.files import storage_errors
 from gsbench.logs import progress
 from gsbench.pipeline.components import build_metrics, make_evaluator

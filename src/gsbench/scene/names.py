@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 from gsbench.errors import InputError
 from gsbench.scene.images import IMAGE_SUFFIXES
-from gsbench.scene.split import TEST_EVERY
+from gsbench.scene.options import TEST_EVERY
 from gsbench.words import some_of
 
 MAX_IMAGES = 200  # the paper's limit per scene

@@ -8,7 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.scene.camera import Camera
-from gsbench.scene.columns import ANGLE, DISTANCE
+
+ANGLE, DISTANCE = "angle_to_nearest", "distance_to_nearest"
+COUNTED = "counted"  # the share of a view's pixels that its mask does not ignore; where there are masks
+
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from gsbench.scene.hold_out import Cameras, hold_out
 from gsbench.scene.images import IMAGE_SUFFIXES
 from gsbench.scene.masks import check_sizes, find_masks
 from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, check_picture_names, match_names, select_images
-from gsbench.scene.split import EVERY_NTH, TEST_LIST, TRAIN_LIST, SplitRule
+from gsbench.scene.options import EVERY_NTH, TEST_LIST, TRAIN_LIST, SplitRule
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.types import Capture
 from gsbench.words import counted, some_of

@@ -24,7 +24,7 @@ from gsbench.files import atomic, place_of
 from gsbench.parsing import resolved
 from gsbench.records import Number, Part, read_typed
 from gsbench.scene.camera import Camera
-from gsbench.scene.sectors import arrange, looked_at, scene_up
+from gsbench.scene.hold_out import arrange, looked_at, scene_up
 from gsbench.scene.transforms import OPENGL, Matrix, Undo, rotation_of
 from gsbench.system.install import install_command
 
@@ -168,7 +168,7 @@ def through(cameras: Sequence[Camera], like: Camera, frames: int) -> list[Camera
     """``frames`` cameras with the picture of ``like`` on a smooth way along ``cameras``, where the photographs stand.
 
     A cubic spline through the means of up to `KEYS` groups of neighbours, in the order of
-    `gsbench.scene.sectors.arrange`, at a steady pace; it looks where the groups look.
+    `gsbench.scene.hold_out.arrange`, at a steady pace; it looks where the groups look.
     """
     order = arrange(cameras).order
     groups = np.array_split(np.array(order), min(KEYS, len(order)))

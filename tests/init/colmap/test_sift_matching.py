@@ -15,11 +15,10 @@ from hypothesis import strategies as st
 from gsbench.init import MODEL_FOLDER, Sfm
 from gsbench.init.base import Timer
 from gsbench.init.colmap.database import create_database, guessed_groups
-from gsbench.init.colmap.options import DatabaseTask
+from gsbench.init.colmap.initializer import DatabaseTask
+from gsbench.init.colmap.pairs import best_pairs
 from gsbench.init.colmap.reconstruct import Verification
-from gsbench.init.colmap.sift import extract_sift
-from gsbench.init.colmap.sift_matching import deal, divide, match_sift
-from gsbench.init.preview import best_pairs
+from gsbench.init.colmap.sift import deal, divide, extract_sift, match_sift
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 
@@ -145,8 +144,8 @@ def test_auto_leaves_out_what_a_preview_does_not_propose(
     shutil.copy(database, tmp_path / "database.db")
     names = sorted({name for pair in pairs for name in pair})
     task = DatabaseTask(tmp_path / "database.db", bare_photos.images, names, pairs, bare_photos, tmp_path)
-    monkeypatch.setattr("gsbench.init.preview.ALL_PAIRS_UP_TO", 5)
-    monkeypatch.setattr("gsbench.init.preview.best_pairs", lambda descriptors: best_pairs(descriptors, 2))
+    monkeypatch.setattr("gsbench.init.colmap.pairs.ALL_PAIRS_UP_TO", 5)
+    monkeypatch.setattr("gsbench.init.colmap.pairs.best_pairs", lambda descriptors: best_pairs(descriptors, 2))
     monkeypatch.setattr("gsbench.init.colmap.sift.extract_sift", lambda *_: None)
     counts = Sfm(threads=1, pairs="auto").fill_database(task, no_progress, Timer())
     assert counts["pairs_selected"] + counts["pairs_left_out"] == len(pairs)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsbench.scene.courtyard.depth import courtyard_depth
-from gsbench.scene.courtyard.render import courtyard_cameras, surface_distance
+from gsbench.scene.courtyard.render import courtyard_cameras, courtyard_depth, surface_distance
 
 
 @pytest.mark.parametrize("seed", [0, 3])

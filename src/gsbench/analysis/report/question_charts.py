@@ -17,7 +17,7 @@ from gsbench.analysis.results import TrialResult
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.verdicts import ArmVerdicts, Pair
 from gsbench.errors import InputError
-from gsbench.scene.columns import ANGLE, DISTANCE
+from gsbench.scene.nearness import ANGLE, DISTANCE
 from gsbench.words import counted, signed
 
 MOST_POINTS = 12  # of a line; more views are taken together in as many bins

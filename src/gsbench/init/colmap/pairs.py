@@ -1,7 +1,13 @@
-"""Pairs of images to be matched. All functions return index pairs (i, j), i < j, sorted."""
+"""Pairs of images to be matched: all, neighbours, or those whose few strongest features agree.
+
+For the last, Wu, "Towards Linear-time Incremental Structure from Motion" (3DV 2013), matches the largest
+features first and leaves out pairs in which few of them agree. Here the agreement ranks each image's partners, and the
+best are kept: what a pair of distant views adds to a track, its nearer views mostly hold already.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -75,3 +81,70 @@ def _degrees(parts: tuple[float, float, float], negative: bool) -> float:
     degrees, minutes, seconds = (float(part) for part in parts)
     value = degrees + minutes / 60 + seconds / 3600
     return -value if negative else value
+
+
+ALL_PAIRS_UP_TO = 30  # images: 435 pairs take no longer than a preview is worth
+STRONGEST = 256  # features of an image in the preview
+PARTNERS = 24  # of each image: 98 % of the points of all pairs and more, on the scenes that were tried
+SQUARED_RATIO = 0.8**2  # of the distances to best and second-best match
+QUANTUM = 512.0  # a descriptor of unit length in whole numbers, as COLMAP's SIFT has them
+
+
+def best_pairs(descriptors: Sequence[NDArray[np.generic]], partners: int = PARTNERS) -> list[Pair]:
+    """Pair each image with the ``partners`` that agree best with it; sorted pairs (i, j), i < j.
+
+    ``descriptors`` are those of each image's strongest features [K, D], at most `STRONGEST` of which are read: whole
+    numbers, or floats of unit length. Of equal partners those nearer in the order of images come first.
+    """
+    agreement = count_agreements(descriptors)
+    agreement += agreement.T
+    count = len(descriptors)
+    pairs: set[Pair] = set()
+    for i in range(count):
+        order = np.lexsort((np.abs(np.arange(count) - i), -agreement[i]))
+        pairs.update((min(i, j), max(i, j)) for j in order[order != i][:partners].tolist())
+    return sorted(pairs)
+
+
+def proposed_pairs(names: Sequence[str], strongest: Callable[[str], NDArray[np.generic]]) -> list[tuple[str, str]]:
+    """The pairs of the images ``names`` that ``pairs=auto`` matches: all pairs of a few, of more the `best_pairs`.
+
+    ``strongest`` gives the descriptors of an image's strongest features.
+    """
+    if len(names) <= ALL_PAIRS_UP_TO:
+        pairs = exhaustive_pairs(len(names))
+    else:
+        pairs = best_pairs([strongest(name) for name in names])
+    return [(names[first], names[second]) for first, second in pairs]
+
+
+def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.int64]:
+    """Count the features of images i < j that are each other's nearest and pass the ratio test; [N, N], upper triangle.
+
+    Descriptors are whole numbers here, and their products stay below 2^24: exact in float32, so every machine and any
+    number of threads count the same.
+    """
+    count = len(descriptors)
+    width = max(part.shape[1] for part in descriptors)
+    table = np.zeros((count, STRONGEST, width), dtype=np.float32)
+    squares = np.full((count, STRONGEST), np.inf, dtype=np.float32)  # of what is not there: never the nearest
+    for index, part in enumerate(descriptors):
+        strongest = part[:STRONGEST].astype(np.float32)
+        if part.dtype.kind == "f":
+            strongest = (QUANTUM * strongest).round()
+        table[index, : len(strongest)] = strongest
+        squares[index, : len(strongest)] = (strongest**2).sum(axis=1)
+    agreements = np.zeros((count, count), dtype=np.int64)
+    rows = np.arange(STRONGEST)
+    for i in range(count - 1):
+        products = table[i] @ table[i + 1 :].reshape(-1, width).T  # one large product: small ones are slow
+        distances = squares[i][:, None] + squares[i + 1 :].reshape(-1) - 2 * products
+        distances = distances.reshape(STRONGEST, -1, STRONGEST)  # [S, J, S]
+        nearest = distances.argmin(axis=2)  # [S, J]
+        nearest_back = distances.argmin(axis=0)  # [J, S]
+        mutual = np.take_along_axis(nearest_back, nearest.T, axis=1) == rows  # [J, S]
+        best = np.take_along_axis(distances, nearest[..., None], axis=2)[..., 0]
+        np.put_along_axis(distances, nearest[..., None], np.inf, axis=2)
+        distinct = best < SQUARED_RATIO * distances.min(axis=2)  # [S, J]
+        agreements[i, i + 1 :] = np.count_nonzero(mutual & distinct.T, axis=1)
+    return agreements

@@ -12,13 +12,12 @@ import torch
 from gsbench.errors import InputError
 from gsbench.files import file_sha256
 from gsbench.init.base import Preparation, Timer
-from gsbench.init.colmap.options import ColmapOptions
+from gsbench.init.colmap.initializer import ColmapOptions
+from gsbench.init.colmap.pairs import STRONGEST, proposed_pairs
 from gsbench.init.colmap.reconstruct import load_reference, select_pairs
 from gsbench.init.networks.extractors import build_extractor, extract_features
-from gsbench.init.networks.feature_store import FeatureStore
-from gsbench.init.networks.features import Features, FeatureSettings
+from gsbench.init.networks.features import Features, FeatureSettings, FeatureStore
 from gsbench.init.networks.matching import build_matcher, match_within_memory
-from gsbench.init.preview import STRONGEST, proposed_pairs
 from gsbench.logs import Progress
 from gsbench.scene.masks import read_mask
 from gsbench.scene.types import Capture

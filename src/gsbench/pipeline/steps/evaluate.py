@@ -35,10 +35,9 @@ from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, MAPS, METRICS, PER
 from gsbench.runs.stages import EVALUATE
 from gsbench.runs.step import Step
 from gsbench.runs.trial_record import Earlier, Evaluation
-from gsbench.scene.columns import COUNTED
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
-from gsbench.scene.nearness import nearness
+from gsbench.scene.nearness import COUNTED, nearness
 from gsbench.scene.types import Scene
 from gsbench.train.trainer import snapshot_file
 

@@ -33,8 +33,7 @@ from gsbench.pipeline.steps.maps import paint, surface_depth, unproject
 from gsbench.pipeline.steps.views import Views
 from gsbench.raster import Rasterizer
 from gsbench.scene.camera import Camera
-from gsbench.scene.courtyard.depth import courtyard_depth
-from gsbench.scene.courtyard.render import courtyard_cameras, surface_distance
+from gsbench.scene.courtyard.render import courtyard_cameras, courtyard_depth, surface_distance
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
 from gsbench.scene.options import SceneConfig
