@@ -231,7 +231,7 @@ def test_which_views_made_the_points_is_said_under_a_table(tmp_path: Path) -> No
     ):
         views = {m: BASE[m] + rng.normal(0, 0.01, 6) for m in METRICS}
         data = trial_data(plan, "courtyard", init, "adc", 0, views)
-        data["init_report"] = {"training_points": {"taken": taken}, "mean_track_length": 3.0 if choice else None}
+        data["init_report"] = {"training_points": {"removed": taken}, "mean_track_length": 3.0 if choice else None}
         write_trial(tmp_path, data, views, **({"init__points_from": choice} if choice not in (None, "all") else {}))
     notes = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"]).notes
     said = [note for note in notes if note.startswith("Initial points")]

@@ -78,10 +78,10 @@ def test_dataset_keeps_what_two_training_views_see(with_points: Capture, tmp_pat
     assert len(after.images) == len(before.images), "test views keep their cameras"
     points = report.training_points
     assert points is not None
-    assert (points.choice, points.kept, points.of) == ("train", len(wanted), before.num_points3D())
-    assert points.taken == pytest.approx(1 - len(wanted) / before.num_points3D())
+    assert (points.choice, points.kept, points.total) == ("train", len(wanted), before.num_points3D())
+    assert points.removed == pytest.approx(1 - len(wanted) / before.num_points3D())
     said = json.loads((tmp_path / REPORT_FILE).read_text())["training_points"]
-    assert said["taken"] == points.taken
+    assert said["removed"] == points.removed
     assert not (tmp_path / "work").exists()
 
 
@@ -112,7 +112,7 @@ def test_retriangulated_points_are_near_the_first_ones_and_have_training_observa
     report = Dataset(points_from="retriangulated").run(with_points, tmp_path)
     model, test = read_model(tmp_path / MODEL_FOLDER), set(with_points.test_names)
     assert report.training_points is not None
-    assert 0 < report.training_points.taken < 0.6  # type: ignore[operator]
+    assert 0 < report.training_points.removed < 0.6  # type: ignore[operator]
     assert not any(names & test for names in seen_by(model))
     assert poses(tmp_path).keys() == set(with_points.image_names)
     first = read_cloud_of(with_points)
@@ -194,8 +194,8 @@ def test_estimated_cameras_keep_all_views_and_points_of_training_views(
     assert not any(names & test for names in seen_by(model))
     points = report.training_points
     assert points is not None
-    assert points.of is not None
-    assert points.kept == model.num_points3D() < points.of
+    assert points.total is not None
+    assert points.kept == model.num_points3D() < points.total
 
 
 def test_without_two_training_views_nothing_is_left(with_points: Capture, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ def cameras(names: Sequence[str]) -> list[Camera]:
 def test_every_nth_is_what_it_was() -> None:
     found = hold_out(NAMES, SplitRule())
     assert found.test == ("00.png", "08.png", "16.png")
-    assert found.words == "every 8th image"
+    assert found.description == "every 8th image"
 
 
 def test_a_sector_is_contiguous_and_walks_around() -> None:
@@ -38,7 +38,7 @@ def test_a_sector_is_contiguous_and_walks_around() -> None:
     parts = [hold_out(NAMES, replace(rule, sector=part), cameras=cameras).test for part in range(4)]
     assert parts[0] == tuple(NAMES[:6])
     assert [name for part in parts for name in part] == NAMES
-    assert "part 0 of 4 by azimuth" in hold_out(NAMES, rule, cameras=cameras).words
+    assert "part 0 of 4 by azimuth" in hold_out(NAMES, rule, cameras=cameras).description
 
 
 @given(st.integers(9, 24), st.integers(2, 8), st.integers(0, 1))
@@ -58,8 +58,8 @@ def test_validation_puts_the_test_views_away_and_asks_the_same_of_the_rest(split
     rule = SplitRule(split=split, sectors=4, test_every=4)  # type: ignore[arg-type]
     test = hold_out(NAMES, rule, cameras=cameras).test
     found = hold_out(NAMES, replace(rule, validation=True), cameras=cameras)
-    assert f"the {len(test)} test views (" in found.words
-    assert found.words.endswith("put away unseen")
+    assert f"the {len(test)} test views (" in found.description
+    assert found.description.endswith("put away unseen")
     assert not set(test) & {*found.train, *found.test}
     assert sorted([*found.train, *found.test, *test]) == NAMES
     if split == "sector":  # the part beside the one put away
@@ -71,7 +71,7 @@ def test_validation_of_lists_takes_every_nth_of_the_training_list() -> None:
     found = hold_out(NAMES, rule, lists=(NAMES[4:], NAMES[:4]))
     assert found.test == tuple(NAMES[4::5])
     assert not set(NAMES[:4]) & {*found.train, *found.test}
-    assert "the 4 test views (by lists) put away unseen" in found.words
+    assert "the 4 test views (by lists) put away unseen" in found.description
 
 
 def test_a_put_away_view_is_no_part_of_the_capture(make_scene: Callable[..., Path]) -> None:

@@ -49,7 +49,7 @@ def test_a_ring_is_cut_by_azimuth_whatever_its_names_and_gauge(seed: int, sector
     rotation, shift = some_rotation(seed), np.array([5.0, -3.0, 2.0]) * (100 if far else 1)
     cameras = [turned(camera, rotation, shift, 0.3) for camera in ring(degrees)]
     found = arrange(cameras)
-    assert "surround" in found.words
+    assert "surround" in found.description
     assert found.order[0] == 0, "a closed ring begins at the first camera"
     around = [int(index) for index in np.argsort(degrees)]
     parts = [{found.order[place] for place in sector_of(24, part, sectors)} for part in range(sectors)]
@@ -67,19 +67,19 @@ def test_an_open_ring_begins_after_its_gap() -> None:
 def test_cameras_on_one_side_are_cut_by_planes_in_order() -> None:
     arc = ring([0.0, 20.0, 40.0, 60.0, 80.0, 100.0])
     found = arrange(arc)
-    assert "one side" in found.words
+    assert "one side" in found.description
     assert found.order == (0, 1, 2, 3, 4, 5)
 
 
 def test_parallel_and_outward_looking_cameras_are_cut_by_planes() -> None:
     places = [np.array([x, 0.0, 0.0]) for x in (0.0, 3.0, 1.0, 2.0)]
     row = [looking(place, place + np.array([0.0, 5.0, 0.0])) for place in places]
-    assert "one direction" in arrange(row).words
+    assert "one direction" in arrange(row).description
     assert arrange(row).order == (0, 2, 3, 1)
     outward = [
         looking(camera.center, 2 * camera.center - [0, 0, 1.5]) for camera in ring([0.0, 90.0, 180.0, 270.0, 45.0])
     ]
-    assert "do not look at one place" in arrange(outward).words
+    assert "do not look at one place" in arrange(outward).description
 
 
 def test_an_exact_ring_is_cut_alike_whatever_the_last_digits_are() -> None:

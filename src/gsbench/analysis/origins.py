@@ -89,7 +89,7 @@ def points_from(trial: TrialResult) -> str:
 def _taken(trial: TrialResult) -> float | None:
     """The share of points that went with the test views, where it is known."""
     found = trial.record.init_report.get("training_points")
-    return found.get("taken") if isinstance(found, dict) else None
+    return found.get("removed") if isinstance(found, dict) else None
 
 
 def cloud_lines(trials: Sequence[TrialResult]) -> list[str]:

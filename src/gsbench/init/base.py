@@ -113,14 +113,14 @@ class Gauge:
 class TrainingPoints:
     """Record of a cloud in which test views have no say (``init.points_from``): what is left of it.
 
-    ``taken`` is the share of the ``of`` points that went (negative where more came); None where test photographs were
-    never matched, so that nobody knows how many there would have been.
+    ``removed`` is the share that is gone of the ``total`` points of all views (negative where more came); both are None
+    where test photographs were never matched, so that nobody knows how many there would have been.
     """
 
     choice: PointsFrom
     kept: int
-    of: int | None
-    taken: float | None
+    total: int | None
+    removed: float | None
 
 
 @dataclass(frozen=True)

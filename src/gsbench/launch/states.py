@@ -95,7 +95,7 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
         return TrialState(folder, state, _changed(folder / RESULTS), "")
     if state == "running":
         holder = read_holder(folder / LOCK)
-        since, where = (None, "process ? on ?") if holder is None else (holder.since, holder.words)
+        since, where = (None, "process ? on ?") if holder is None else (holder.since, holder.description)
         return TrialState(folder, state, since, f"{_reached(folder)} {where}".strip())
     if state == "damaged":
         return TrialState(folder, state, _changed(folder / RESULTS), _damage(folder))

@@ -30,10 +30,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Cameras in order: ``order`` are their indices; ``words`` say by what, and why by that."""
+    """Cameras in order: ``order`` are their indices; ``description`` says by what, and why."""
 
     order: tuple[int, ...]
-    words: str
+    description: str
 
 
 def arrange(cameras: Sequence[Camera]) -> Arrangement:
@@ -42,16 +42,16 @@ def arrange(cameras: Sequence[Camera]) -> Arrangement:
     azimuths, fault = _azimuths(cameras, centers)
     if azimuths is None:
         places = along_axis(centers)
-        words = f"by planes across the principal axis of the cameras' centres, since {fault}"
-        return Arrangement(_sorted(places), words)
+        description = f"by planes across the principal axis of the cameras' centres, since {fault}"
+        return Arrangement(_sorted(places), description)
     order = np.argsort(azimuths, kind="stable")
     gaps = np.diff(azimuths[order], append=azimuths[order[0]] + 360.0)  # [V] after each camera, degrees
     widest = int(gaps.argmax())
     gap = float(gaps[widest])
     if gap >= SURROUNDED:
         fault = f"the cameras stand on one side of the scene, with none in {gap:.0f} degrees around its centre"
-        words = f"by planes across the principal axis of the cameras' centres, since {fault}"
-        return Arrangement(_sorted(along_axis(centers)), words)
+        description = f"by planes across the principal axis of the cameras' centres, since {fault}"
+        return Arrangement(_sorted(along_axis(centers)), description)
     if gap > OPEN_RING:
         order = np.roll(order, -(widest + 1))
     return Arrangement(
@@ -132,11 +132,11 @@ Cameras = Callable[[Sequence[str]], Sequence[Camera]]
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Result of a rule on sorted names; ``words`` say how."""
+    """Result of a rule on sorted names; ``description`` says how."""
 
     train: tuple[str, ...]
     test: tuple[str, ...]
-    words: str
+    description: str
 
 
 def hold_out(
@@ -148,12 +148,12 @@ def hold_out(
     where they came without. Raises InputError where nothing is left for training or for testing.
     """
     rule.check()
-    train, test, words = _divide(names, rule, lists, cameras)
+    train, test, description = _divide(names, rule, lists, cameras)
     if not rule.validation:
-        return HeldOut(train, test, words)
+        return HeldOut(train, test, description)
     again = replace(rule, split="every_nth", train_list=None, test_list=None) if rule.by_lists else rule
     learned, judged, how = _divide(train, again, (None, None), cameras)
-    away = f"the {counted(len(test), 'test view')} ({words}) put away unseen"
+    away = f"the {counted(len(test), 'test view')} ({description}) put away unseen"
     return HeldOut(learned, judged, f"for validation {how}, with {away}")
 
 
@@ -165,15 +165,15 @@ def _divide(
         train, test = split_names(names, rule.test_every, *lists)
         return tuple(train), tuple(test), "by lists"
     if rule.split == "sector":
-        test, words = _sector(names, rule, matched, cameras)
+        test, description = _sector(names, rule, matched, cameras)
     elif matched is not None:
         test = select_images(names, matched, least=1)
-        words = f"{matched} evenly spread over the sorted names, as many as in a sector of {rule.sectors}"
+        description = f"{matched} evenly spread over the sorted names, as many as in a sector of {rule.sectors}"
     else:
         train, test = split_names(names, rule.test_every)
         return tuple(train), tuple(test), f"every {rule.test_every}th image" if rule.test_every else "none"
     train, test = split_names(names, test=test)
-    return tuple(train), tuple(test), words
+    return tuple(train), tuple(test), description
 
 
 def _sector(
@@ -189,4 +189,4 @@ def _sector(
     found = arrange(cameras(names))
     places = sector_of(len(names), rule.sector, rule.sectors, exactly)
     test = [names[found.order[place]] for place in places]
-    return test, f"part {rule.sector} of {rule.sectors} {found.words}"
+    return test, f"part {rule.sector} of {rule.sectors} {found.description}"

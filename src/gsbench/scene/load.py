@@ -14,10 +14,10 @@ import secrets
 import shutil
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import Resample, check_size, image_size, read_image
 from gsbench.scene.masks import Mask, read_mask
 from gsbench.scene.names import MIN_IMAGES
-from gsbench.scene.prepare import CameraModel, Intrinsics, Job, intrinsics_of, mask_file, prepare_all
+from gsbench.scene.prepare import CameraModel, Job, mask_file, pinhole_of, prepare_all
 from gsbench.scene.sizes import downscaled_size
 from gsbench.scene.types import Capture, Scene, View
 from gsbench.words import some_of
@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 PrincipalPoint = Literal["used", "centred"]
 CACHE_VERSION = 1  # raise when prepared pixels or the file below change
 CAMERAS_FILE = "cameras.json"
+INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
 
 
 def load_scene(
@@ -124,9 +125,9 @@ def _build(
                 mask = capture.masks.get(name)
                 jobs[name] = Job(capture.images / name, model, work / file, downscale, max_size, resample, mask)
             else:
-                entries[name] |= asdict(intrinsics_of(model))
-        for name, intrinsics in zip(jobs, prepare_all(list(jobs.values()), threads, progress), strict=True):
-            entries[name] |= asdict(intrinsics)
+                entries[name] |= _intrinsics(pinhole_of(model))
+        for name, camera in zip(jobs, prepare_all(list(jobs.values()), threads, progress), strict=True):
+            entries[name] |= _intrinsics(camera)
         document = {"version": CACHE_VERSION, "scene": capture.name, "views": entries}
         (work / CAMERAS_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
         _publish(work, folder)
@@ -182,10 +183,14 @@ def _report_unregistered(capture: Capture, registered: set[str]) -> None:
             )  # fmt: skip
 
 
+def _intrinsics(camera: Camera) -> dict[str, float]:
+    return {key: getattr(camera, key) for key in INTRINSICS}
+
+
 def _camera(entry: dict[str, object]) -> Camera:
     pose = np.array(entry["pose"], dtype=np.float64)  # [3, 4] world to camera
-    intrinsics = Intrinsics(**{key: entry[key] for key in ("width", "height", "fx", "fy", "cx", "cy")})  # type: ignore[arg-type]
-    return Camera(**asdict(intrinsics), rotation=pose[:, :3], translation=pose[:, 3])
+    intrinsics: dict[str, Any] = {key: entry[key] for key in INTRINSICS}
+    return Camera(**intrinsics, rotation=pose[:, :3], translation=pose[:, 3])
 
 
 def _cache_key(

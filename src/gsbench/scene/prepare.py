@@ -19,6 +19,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
+from gsbench.scene.camera import Camera
 from gsbench.scene.images import Resample, read_image, resize_image
 from gsbench.scene.masks import WHITE, read_mask, resize_mask, write_mask
 from gsbench.scene.sizes import downscaled_size
@@ -44,22 +45,6 @@ class CameraModel:
 
 
 @dataclass(frozen=True)
-class Intrinsics:
-    """A pinhole camera without a pose: size, focal lengths and principal point in px."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-    def resized(self, width: int, height: int) -> Intrinsics:
-        sx, sy = width / self.width, height / self.height
-        return Intrinsics(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
-
-
-@dataclass(frozen=True)
 class Job:
     """One image to prepare: where it is, its camera (of the file's size), and the PNG to write.
 
@@ -80,19 +65,19 @@ def mask_file(image_file: str) -> str:
     return Path(image_file).with_suffix(".mask.png").name
 
 
-def intrinsics_of(camera: CameraModel) -> Intrinsics:
-    """The pinhole intrinsics of an undistorted COLMAP camera."""
+def pinhole_of(camera: CameraModel) -> Camera:
+    """An undistorted COLMAP camera as a `Camera` at the origin."""
     fx, fy, cx, cy = camera.params if camera.name == "PINHOLE" else (camera.params[0], *camera.params)
-    return Intrinsics(camera.width, camera.height, fx, fy, cx, cy)
+    return Camera(camera.width, camera.height, fx, fy, cx, cy, np.eye(3), np.zeros(3))
 
 
-def prepare_all(jobs: Sequence[Job], threads: int = 2, progress: Progress = no_progress) -> list[Intrinsics]:
-    """Prepare all images and return their final intrinsics, in the order of ``jobs``.
+def prepare_all(jobs: Sequence[Job], threads: int = 2, progress: Progress = no_progress) -> list[Camera]:
+    """Prepare all images and return their final cameras, at the origin, in the order of ``jobs``.
 
     Distorted images go through child processes, because COLMAP's native code can abort the process it runs in; such an
     abort, like an unreadable image, raises `InputError`. ``progress`` counts images.
     """
-    results: list[Intrinsics] = []
+    results: list[Camera] = []
     for chunk in _chunks(jobs):
         if any(job.camera.distorted for job in chunk):
             try:
@@ -106,28 +91,28 @@ def prepare_all(jobs: Sequence[Job], threads: int = 2, progress: Progress = no_p
     return results
 
 
-def prepare_chunk(jobs: Sequence[Job], threads: int) -> list[Intrinsics]:
+def prepare_chunk(jobs: Sequence[Job], threads: int) -> list[Camera]:
     """Prepare some images in this process."""
     with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
         return list(pool.map(prepare_image, jobs))
 
 
-def prepare_image(job: Job) -> Intrinsics:
-    """Read, undistort if needed, downscale, and write one image as PNG; returns its final intrinsics."""
+def prepare_image(job: Job) -> Camera:
+    """Read, undistort if needed, downscale, and write one image as PNG; returns its final camera, at the origin."""
     image = read_image(job.source)  # [H, W, 3]
     if image.shape[:2] != (job.camera.height, job.camera.width):
         raise InputError(f"{job.source}: the image changed its size while it was read: run again")
     if job.camera.distorted:
-        image, intrinsics = undistort(image, job.camera)
+        image, camera = undistort(image, job.camera)
     else:
-        intrinsics = intrinsics_of(job.camera)
-    width, height = downscaled_size(intrinsics.width, intrinsics.height, job.downscale, job.max_size)
+        camera = pinhole_of(job.camera)
+    width, height = downscaled_size(camera.width, camera.height, job.downscale, job.max_size)
     image = resize_image(image, width, height, job.resample)
     job.target.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(image).save(job.target, format="PNG", compress_level=_PNG_COMPRESSION)
     if job.mask is not None:
         _prepare_mask(job.mask, job, width, height)
-    return intrinsics.resized(width, height)
+    return camera.resized(width, height)
 
 
 def _prepare_mask(source: Path, job: Job, width: int, height: int) -> None:
@@ -142,7 +127,7 @@ def _prepare_mask(source: Path, job: Job, width: int, height: int) -> None:
     write_mask(counts, job.target.with_name(mask_file(job.target.name)))
 
 
-def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np.uint8], Intrinsics]:
+def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np.uint8], Camera]:
     """Undistort one image [H, W, 3] of any perspective COLMAP camera model; its size changes.
 
     Raises `InputError` for a camera that has no pinhole image (a full panorama) or nonsensical parameters.
@@ -163,8 +148,8 @@ def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np
         flat, pinhole = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, source)
     except (ValueError, RuntimeError) as error:
         raise InputError(refusal) from error
-    fx, fy, cx, cy = (float(value) for value in pinhole.params)
-    return np.array(flat.to_array()), Intrinsics(pinhole.width, pinhole.height, fx, fy, cx, cy)
+    params = tuple(float(value) for value in pinhole.params)
+    return np.array(flat.to_array()), pinhole_of(CameraModel("PINHOLE", pinhole.width, pinhole.height, params))
 
 
 def _chunks(jobs: Sequence[Job]) -> Iterator[Sequence[Job]]:

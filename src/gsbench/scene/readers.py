@@ -259,7 +259,7 @@ def _capture(
         model=model,
         exact_poses=exact_poses,
         fingerprint=fingerprint(folder, kept, model_files(model) if model is not None else (), masks),
-        held_out=held_out.words,
+        held_out=held_out.description,
         masks=masks,
     )
 

@@ -87,7 +87,7 @@ def is_held(path: Path) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Holder(Part):
+class LockHolder(Part):
     """Record that a lock's holder writes of itself: host, process, Slurm job, time of start (Unix), its work."""
 
     host: str
@@ -97,20 +97,20 @@ class Holder(Part):
     what: str = ""
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """``process 17 on node3, Slurm job 5``"""
         return f"process {self.pid} on {self.host}{f', Slurm job {self.slurm}' if self.slurm else ''}"
 
 
-def read_holder(path: Path) -> Holder | None:
+def read_holder(path: Path) -> LockHolder | None:
     """Read what the holder of the lock ``path`` wrote about itself; None where nothing can be read."""
-    return read_if_sound(_holder_file(path), Holder)
+    return read_if_sound(_holder_file(path), LockHolder)
 
 
 def describe_holder(path: Path) -> str:
     """The holder of a lock, for people."""
     holder = read_holder(path)
-    return "another process" if holder is None else holder.words
+    return "another process" if holder is None else holder.description
 
 
 def this_process() -> dict[str, Any]:

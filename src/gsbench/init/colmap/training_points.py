@@ -40,7 +40,7 @@ def keep_training_points(model: pycolmap.Reconstruction, names: Collection[str],
         for image_id, index in seen:
             model.images[image_id].set_point3D_for_point2D(index, point_id)
     model.extract_colors_for_all_images(images)
-    return _taken(model, before, "train")
+    return _record(model, before, "train")
 
 
 def retriangulate(
@@ -68,7 +68,7 @@ def retriangulate(
         elements = [pycolmap.TrackElement(ids[e.image_id], e.point2D_idx) for e in point.track.elements]
         model.add_point3D(point.xyz, pycolmap.Track(elements), point.color)
     model.update_point_3d_errors()
-    return _taken(model, before, "retriangulated")
+    return _record(model, before, "retriangulated")
 
 
 def database_of_tracks(path: Path, model: pycolmap.Reconstruction, names: Collection[str]) -> None:
@@ -152,7 +152,7 @@ def _ids(model: pycolmap.Reconstruction, names: Collection[str]) -> set[int]:
     return {image.image_id for image in model.images.values() if image.has_pose and image.name in wanted}
 
 
-def _taken(model: pycolmap.Reconstruction, before: int, choice: PointsFrom) -> TrainingPoints:
+def _record(model: pycolmap.Reconstruction, before: int, choice: PointsFrom) -> TrainingPoints:
     left = model.num_points3D()
     if left == 0:
         raise InputError(
