@@ -13,7 +13,8 @@ from pydantic import NonNegativeFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.init.base import Preparation, Timer
-from gsbench.init.colmap.initializer import MIN_DETECTION_SIZE, ColmapInitializer, DatabaseTask
+from gsbench.init.colmap.initializer import ColmapInitializer
+from gsbench.init.colmap.options import MIN_DETECTION_SIZE, DatabaseTask
 from gsbench.init.colmap.pairs import Pairing
 from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.init.networks.features import FeatureSettings

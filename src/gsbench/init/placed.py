@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from annotated_types import Interval
+from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.init.base import Initializer, InitReport, PointCloud, Seed, Timer
+from gsbench.init.colmap.alignment import Array
 from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
@@ -120,8 +122,6 @@ class Carved(Random):
     seen_by: PositiveInt = 1
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        from gsbench.init.points import in_view
-
         whole = super().cloud(capture, model)
         cameras = np.zeros(self.count, dtype=np.int64)  # that see a point
         for name in capture.train_names:
@@ -140,3 +140,21 @@ def random_cloud(center: np.ndarray, half_edge: float, count: int, seed: int) ->
     generator = np.random.default_rng(seed)
     points = center + half_edge * generator.uniform(-1.0, 1.0, (count, 3))
     return PointCloud(points, generator.integers(0, 256, (count, 3), dtype=np.uint8))
+
+
+def in_view(points: Array, name: str, model: pycolmap.Reconstruction) -> tuple[NDArray[np.int64], Array, Array]:
+    """The ``points`` [P, 3] that the image ``name`` has in view: their indices [V], pixels [V, 2] and distances [V].
+
+    All three are empty for an image that the model does not place. Occlusion is not looked for.
+    """
+    image = model.find_image_with_name(name)
+    if image is None or not image.has_pose:
+        return np.empty(0, np.int64), np.empty((0, 2)), np.empty(0)
+    pose, camera = image.cam_from_world(), model.cameras[image.camera_id]
+    local = points @ pose.rotation.matrix().T + pose.translation  # [P, 3]
+    (ahead,) = np.nonzero(local[:, 2] > 0)
+    pixels = np.asarray(camera.img_from_cam(local[ahead])).reshape(-1, 2)  # [A, 2]
+    with np.errstate(invalid="ignore"):
+        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)  # NaN is outside
+    seen = ahead[inside]
+    return seen, pixels[inside], np.linalg.norm(local[seen], axis=1)

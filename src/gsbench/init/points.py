@@ -15,7 +15,7 @@ from gsbench.errors import InputError
 from gsbench.files import file_sha256
 from gsbench.init.base import PointCloud, Seed
 from gsbench.init.colmap.alignment import Array
-from gsbench.init.placed import PlacedCloud
+from gsbench.init.placed import PlacedCloud, in_view
 from gsbench.init.point_files import read_points, read_similarity
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath
@@ -112,21 +112,3 @@ def seen_colors(points: Array, capture: Capture, model: pycolmap.Reconstruction)
             colors[kept] = read_image(capture.images / name)[row, column]
         nearest[kept] = distance[nearer]
     return colors
-
-
-def in_view(points: Array, name: str, model: pycolmap.Reconstruction) -> tuple[NDArray[np.int64], Array, Array]:
-    """The ``points`` [P, 3] that the image ``name`` has in view: their indices [V], pixels [V, 2] and distances [V].
-
-    All three are empty for an image that the model does not place. Occlusion is not looked for.
-    """
-    image = model.find_image_with_name(name)
-    if image is None or not image.has_pose:
-        return np.empty(0, np.int64), np.empty((0, 2)), np.empty(0)
-    pose, camera = image.cam_from_world(), model.cameras[image.camera_id]
-    local = points @ pose.rotation.matrix().T + pose.translation  # [P, 3]
-    (ahead,) = np.nonzero(local[:, 2] > 0)
-    pixels = np.asarray(camera.img_from_cam(local[ahead])).reshape(-1, 2)  # [A, 2]
-    with np.errstate(invalid="ignore"):
-        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)  # NaN is outside
-    seen = ahead[inside]
-    return seen, pixels[inside], np.linalg.norm(local[seen], axis=1)

@@ -13,7 +13,8 @@ from pydantic import PositiveFloat, PositiveInt
 from gsbench.errors import InputError
 from gsbench.init.base import MODEL_FOLDER, InitReport, Timer
 from gsbench.init.colmap.alignment import Array
-from gsbench.init.colmap.initializer import MIN_DETECTION_SIZE, ColmapInitializer, DatabaseTask
+from gsbench.init.colmap.initializer import ColmapInitializer
+from gsbench.init.colmap.options import MIN_DETECTION_SIZE, DatabaseTask
 from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture

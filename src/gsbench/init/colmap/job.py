@@ -15,7 +15,7 @@ from gsbench.init.base import OWN_GAUGE_FOLDER, InitReport, Preparation, Timer, 
 from gsbench.init.colmap import database as colmap_database
 from gsbench.init.colmap import mapping, reconstruct
 from gsbench.init.colmap.alignment import Similarity
-from gsbench.init.colmap.initializer import ColmapOptions, DatabaseTask
+from gsbench.init.colmap.options import ColmapOptions, DatabaseTask
 from gsbench.init.colmap.training_points import keep_training_points, retriangulate
 from gsbench.logs import Progress
 from gsbench.scene.types import Capture

@@ -12,7 +12,7 @@ import torch
 from gsbench.errors import InputError
 from gsbench.files import file_sha256
 from gsbench.init.base import Preparation, Timer
-from gsbench.init.colmap.initializer import ColmapOptions
+from gsbench.init.colmap.options import ColmapOptions
 from gsbench.init.colmap.pairs import STRONGEST, proposed_pairs
 from gsbench.init.colmap.reconstruct import load_reference, select_pairs
 from gsbench.init.networks.extractors import build_extractor, extract_features
