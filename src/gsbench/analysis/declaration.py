@@ -114,10 +114,11 @@ def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration |
             whole = later
     named = replace(whole, time=since[0].time)
     seen = tuple(trial for trial in trials if measured(trial) < named.moment)
-    if planned := named.planned:
+    if named.names_trials:
+        planned = named.planned
         added = tuple(trial for trial in trials if not _is_planned(trial, planned))
     else:  # the first record may be lost but for what its trials repeat: all since the next may have been added
-        again = next((one.moment for one in since if one.planned), math.inf)
+        again = next((one.moment for one in since if one.names_trials), math.inf)
         added = tuple(trial for trial in trials if measured(trial) >= again)
     return ActiveDeclaration(named, seen, added, len(trials), tuple(others))
 

@@ -74,7 +74,8 @@ def declare(metrics: Mapping[Path, str | None], planned: Mapping[Path, Planned])
             before = {} if standing is None else standing.planned
             together = united(before, planned[home])
             same = standing is not None and standing.primary == metric
-            if same and together == before:
+            known_trials = standing is not None and standing.names_trials
+            if same and (together == before or not known_trials):
                 continue
             added = declared_now(questions=(open_question(metric),), trials=dict(together))
             _write(home, [*every, added])
@@ -98,6 +99,8 @@ def declare_questions(home: Path, asked: Declaration) -> Declaration:
 
     One that is the latest of its kind there already stands with its time.
     """
+    if not asked.questions:
+        return asked
     make_home(home)
     with hold(home / f".{DECLARED}.lock", "the declarations"):
         every = read_declarations(home)

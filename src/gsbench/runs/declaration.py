@@ -97,7 +97,7 @@ class Declaration(Part):
     """Questions that were asked at ``time`` (UTC), which share ``error_rate``, the chance that any answer is false.
 
     ``looks`` are numbers of seeds, rising: after each of them a question may be decided; none: all is judged once.
-    ``trials`` are all that were to be run where the questions name none. ``missing`` says by question what of it could
+    ``trials`` are all that were to be run where the questions name none; None: nobody knows. ``missing`` says by question what of it could
     not be tested where it was declared, and why. ``plan`` is a plan of claims as earlier versions published it
     (`gsbench.claims.published`).
     """
@@ -106,7 +106,7 @@ class Declaration(Part):
     questions: tuple[Question, ...] = ()
     error_rate: Amount = ERROR_RATE
     looks: tuple[Count, ...] = ()
-    trials: dict[TrialKey, tuple[Count, ...]] = field(default_factory=dict)
+    trials: dict[TrialKey, tuple[Count, ...]] | None = None
     missing: dict[str, list[str]] = field(default_factory=dict)
     plan: dict[str, Any] = field(default_factory=dict, compare=False)
 
@@ -138,9 +138,14 @@ class Declaration(Part):
         return f"{first.metric}{AT}{first.about}" if first.about else first.metric
 
     @property
+    def names_trials(self) -> bool:
+        """Return whether it is known which trials were to be run: not in what a trial repeats."""
+        return self.trials is not None or any(question.scenes for question in self.questions)
+
+    @property
     def planned(self) -> Planned:
         """All trials that were to be run."""
-        found: dict[str, tuple[int, ...]] = dict(self.trials)
+        found: dict[str, tuple[int, ...]] = dict(self.trials or {})
         for question in self.questions:
             found = dict(united(found, question.planned))
         return found
@@ -193,7 +198,8 @@ def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) ->
         log.warning("left out: %s", error)
         content = b""
     found = [line.declaration for _, line in iterate_rows(content, _Line, path)]
-    known = {(one.primary, one.time) for one in found if one.questions}
+    found = [one for one in found if one.questions or one.plan]
+    known = {(one.primary, one.time) for one in found if not one.plan}
     for one in dict.fromkeys((said.metric, said.time) for said in repeated if said is not None):
         if one not in known and unix_time(one[1]) is not None:
             found.append(Declaration(time=one[1], questions=(open_question(one[0]),)))
