@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from gsbench.analysis.results import load_experiment
+from gsbench.analysis.statistics import student
 from gsbench.claims.archive import write_archive
-from gsbench.claims.studies import Wanted, _result, file_mark, read_source, standard_error
+from gsbench.claims.studies import Wanted, _result, file_mark, read_source
 from gsbench.cli import run
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, write_runs
@@ -70,10 +71,17 @@ def test_an_archive_is_a_study_of_its_pairs(tmp_path: Path) -> None:
     (study,) = read_source(file, WANTED).studies
     trials = load_experiment(tmp_path / "runs_lab_0", "exp").trials
     by_arm = {(one.densify, one.scene, one.seed): one.metrics["psnr"] for one in trials}
-    pairs = np.array([by_arm["volumetric", *key[1:]] - value for key, value in by_arm.items() if key[0] == "adc"])
-    assert len(pairs) == 6
+    pairs = np.array(
+        [
+            [by_arm["volumetric", scene, k] - by_arm["adc", scene, k] for k in range(3)]
+            for scene in ("courtyard", "garden")
+        ]
+    )
     assert study.effect == pytest.approx(pairs.mean())
-    assert study.error == pytest.approx(pairs.std(ddof=1) / np.sqrt(6))
+    test = student(pairs)
+    assert test is not None
+    assert study.interval is not None
+    assert (study.interval.low, study.interval.high) == pytest.approx((test.interval().low, test.interval().high))
     assert study.conditions == {"protocol": "paper-1", "metric": "psnr"}
     assert study.name == "lab"
 
@@ -89,7 +97,7 @@ def test_where_each_scene_has_one_initialiser_they_are_one_study(tmp_path: Path)
     by_arm = {(trial.densify, trial.scene, trial.seed): trial.metrics["psnr"] for trial in kept}
     pairs = np.array([by_arm["volumetric", *key[1:]] - value for key, value in by_arm.items() if key[0] == "adc"])
     assert study.effect == pytest.approx(pairs.mean())
-    assert study.error == pytest.approx(pairs.std(ddof=1) / np.sqrt(len(pairs)))
+    assert study.interval is not None
     assert [("sfm" in note, "dataset" in note) for note in found.notes] == [(False, True), (True, False)]
 
 
@@ -118,14 +126,6 @@ def test_unlike_budgets_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert sentence in (tmp_path / "p.html").read_text(encoding="utf-8")
 
 
-def test_from_six_scenes_on_scenes_are_the_units() -> None:
-    rng = np.random.default_rng(0)
-    few, many = ([rng.normal(size=3) for _ in range(count)] for count in (5, 6))
-    assert standard_error(few)[1] == pytest.approx(np.concatenate(few).std(ddof=1) / np.sqrt(15))
-    assert standard_error(many)[1] == pytest.approx(np.std([d.mean() for d in many], ddof=1) / np.sqrt(6))
-    assert np.isnan(standard_error([np.array([1.0])])[1])
-
-
 def test_result_files_of_nerfbaselines_are_a_study_of_their_scenes(tmp_path: Path) -> None:
     for scene, base, gain in (("garden", 27.0, 0.5), ("room", 31.0, 0.7), ("stump", 26.0, 0.3)):
         nerfbaselines_file(tmp_path / "nb", "gaussian-splatting", scene, [base, base + 1])
@@ -134,7 +134,8 @@ def test_result_files_of_nerfbaselines_are_a_study_of_their_scenes(tmp_path: Pat
     nerfbaselines_file(tmp_path / "nb", "zipnerf", "garden", [1.0])
     (study,) = read_source(tmp_path / "nb", WANTED).studies
     assert study.effect == pytest.approx(0.5, abs=1e-5)
-    assert study.error == pytest.approx(0.2 / np.sqrt(3), abs=1e-5)
+    assert study.interval is not None
+    assert study.interval.high - study.effect == pytest.approx(4.3027 * 0.2 / np.sqrt(3), abs=1e-3)
     assert study.conditions["protocol"] == "nerfbaselines nerf"
     with pytest.raises(InputError, match="nerfbaselines measures psnr, ssim, lpips_alex"):
         read_source(tmp_path / "nb", Wanted(("new",), ("gaussian-splatting",), "flip"))

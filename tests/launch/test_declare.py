@@ -41,10 +41,10 @@ def test_a_declaration_is_kept_with_its_time_and_changes_are_added(
     assert read_declarations(tmp_path / "exp") == []
     for trials in ([psnr, psnr], [psnr], [undeclared]):  # said again, or not said: it stands
         declare(declared_metrics(trials), planned_trials(trials))
-        assert [one.metric for one in read_declarations(tmp_path / "exp")] == ["psnr"]
+        assert [one.primary for one in read_declarations(tmp_path / "exp")] == ["psnr"]
     with caplog.at_level(logging.WARNING):
         declare(declared_metrics([ssim]), planned_trials([ssim]))
-    assert {one.metric for one in read_declarations(tmp_path / "exp")} == {"psnr", "ssim"}
+    assert {one.primary for one in read_declarations(tmp_path / "exp")} == {"psnr", "ssim"}
     assert "about ssim, and the report will say that psnr was declared before" in caplog.text
 
 

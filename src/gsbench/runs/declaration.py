@@ -98,8 +98,8 @@ class Declaration(Part):
 
     ``looks`` are numbers of seeds, rising: after each of them a question may be decided; none: all is judged once.
     ``trials`` are all that were to be run where the questions name none; None: nobody knows. ``missing`` says by
-    question what of it could not be tested where it was declared, and why. ``plan`` is a plan of claims as earlier versions published it
-    (`gsbench.claims.published`).
+    question what of it could not be tested where it was declared, and why. ``plan`` is a plan of claims as earlier
+    versions published it (`gsbench.claims.published`).
     """
 
     time: str
