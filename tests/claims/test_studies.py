@@ -177,7 +177,7 @@ def test_three_labs_make_a_mean_and_a_page(tmp_path: Path, capsys: pytest.Captur
     out = capsys.readouterr().out
     assert "| lab0 | +" in out
     assert "of 3 studies" in out
-    assert "a further study would lie between" in out
+    assert "a further one would lie between" in out
     page = (tmp_path / "page.html").read_text()
     assert "<svg" in page
     assert "all together" in page

@@ -75,6 +75,8 @@ def pool_sources(
         for study in found.studies:
             if protocol is not None and study.conditions["protocol"] != protocol:
                 notes.append(f"{study.name}: not asked for, it is by {study.conditions['protocol']}")
+            elif study.interval is None:
+                faults.append(f"left out: {study.name} has one pair of trials: nothing tells how sure it is")
             else:
                 studies.append(study)
     if not studies:
