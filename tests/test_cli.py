@@ -23,8 +23,7 @@ from gsbench.gaussians.model import Gaussians, colors
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.launch.plan import add_to_plan
 from gsbench.runs.explain_cache import explain_steps
-from gsbench.runs.stages import EVALUATE, INIT, TRAIN
-from gsbench.runs.step import Step
+from gsbench.runs.stages import EVALUATE, INIT, TRAIN, Step
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.stopping import Stopped

@@ -24,7 +24,6 @@ from gsbench.analysis.verdicts import declared_lines, judge
 from gsbench.errors import InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.runs.declaration import Arm
-from gsbench.runs.hashing import BEFORE
 from tests.analysis.synthetic import BASE, METRICS, Plan, trial_data, write_trial
 
 SPLITS = {"every_nth": "aaaaaaaa", "sector": "bbbbbbbb"}
@@ -125,26 +124,6 @@ def test_two_splits_never_share_a_cell(tmp_path: Path) -> None:
     experiment = write_splits(tmp_path, {})
     with pytest.raises(InputError, match="differ in"):
         build_table(experiment, rows=["scene", "densify"], columns=["init"])
-
-
-def test_results_older_than_splits_stand_beside_new_ones(tmp_path: Path) -> None:
-    """What an old configuration does not say is what it was before, so nothing seems to have been swept."""
-    plan, rng = Plan(), np.random.default_rng(0)
-    later = {f"{group}__{name}": value for group, name, value in (
-        (*key.split("."), value) for key, value in BEFORE.items() if key.startswith("scene"))}  # fmt: skip
-    for seed in range(4):
-        views = {m: BASE[m] + rng.normal(0, 0.01, 6) for m in METRICS}
-        settings = later if seed % 2 else {}
-        data = trial_data(plan, "courtyard", "sfm", "adc", seed, views)
-        data |= {"split": "every_nth"} if seed % 2 else {}
-        write_trial(tmp_path, data, views, "aaaaaaaa" if seed % 2 else "bbbbbbbb", **settings)
-    experiment = load_experiment(tmp_path, "exp")
-    table = build_table(experiment, metrics=["psnr"])
-    assert len(table.rows) == 1
-    assert table.row_headings == ("scene", "init", "densify")
-    cell = table.rows[0].entries[0].cell
-    assert cell is not None
-    assert cell.count == 4
 
 
 def test_a_declared_question_makes_the_verdict_and_the_other_is_secondary(tmp_path: Path) -> None:

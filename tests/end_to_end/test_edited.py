@@ -44,25 +44,22 @@ def test_an_edited_loss_is_trained_with(gsbench: Run, tmp_path: Path) -> None:
 
     train()
     first = results()
-    assert first["code"]["files"]["eval/ssim.py"]
+    assert first["code"]["rooms"]["eval/ssim.py"]
     loss = copy / "train" / "trainer.py"
     text = loss.read_text()
     assert text.count("PhotometricLoss(options.ssim_weight,") == 1
     loss.write_text(text + "# a comment\n")
     assert "was done" in train()
     loss.write_text(text.replace("(options.ssim_weight,", "(0.95,"))
-    assert "will be checked: the code of gsbench changed in: train/trainer.py" in train("--dry-run")
+    assert "will be checked: the code of gsbench changed in: train" in train("--dry-run")
     stale = gsbench("explain", "--stale", *QUICK, **changes)
-    assert "code.train/trainer.py: " in stale.stdout
+    assert "code.train: " in stale.stdout
     assert stale.stdout.count("not in the store") == 2  # train, evaluate
     assert "was done" not in train()
     second = results()
     assert second["metrics"]["psnr"] != first["metrics"]["psnr"]
     assert second["hashes"]["init"] == first["hashes"]["init"]
 
-    with (copy / "densify" / "mcmc.py").open("a") as other:
-        other.write("MORE = 1\n")
-    assert "was done" in train()  # another arm
     loss.write_text(text)
     assert "iteration" not in train()  # the store has it
     assert results()["metrics"] == first["metrics"]

@@ -58,14 +58,14 @@ def test_an_edited_densifier_is_never_averaged_with_what_it_was(
     train(2)
 
     refused = ask("tables", "edited", code=2)
-    assert "different versions of mine.Mine" in refused
+    assert "different versions of helper" in refused
     assert "courtyard seeds 0, 1" in refused
     listed = json.loads(ask("status", "edited", "--json"))
     states = {Path(trial["folder"]).name.partition("-")[2]: trial["state"] for trial in listed}
     assert states == {"seed0": "superseded", "seed1": "superseded", "seed2": "done"}
     forgotten = ask("status", "edited", "--forget-superseded")
     assert forgotten.count("removed /") == 2
-    assert "mine.Mine was" in forgotten
+    assert "helper was" in forgotten
     assert ask("status", "edited") == "1 trial: 1 done\n"
     ask("tables", "edited")
 

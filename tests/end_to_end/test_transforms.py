@@ -17,7 +17,7 @@ from PIL import Image
 from gsbench.cli import run
 from gsbench.init import Sfm
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.pipeline.steps.capture import CaptureSource
+from gsbench.pipeline.steps.scene import CaptureSource
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig

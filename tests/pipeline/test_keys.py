@@ -8,9 +8,9 @@ import pytest
 
 from gsbench.config.compose import compose_one
 from gsbench.pipeline.parts import Parts
-from gsbench.pipeline.steps import code as code_module
 from gsbench.pipeline.steps import init as init_module
-from gsbench.pipeline.steps.capture import CaptureSource
+from gsbench.pipeline.steps import inputs as inputs_module
+from gsbench.pipeline.steps.scene import CaptureSource
 from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs.hashing import config_hash
 from gsbench.runs.store import Store
@@ -22,12 +22,12 @@ WORDS = [
 ]  # fmt: skip
 BARE = Capture("garden", Path("photos"), ("a.jpg", "b.jpg", "c.jpg"), ("a.jpg",), None, False, "0" * 64)
 KEYS = [
-    ("config", "829d41d8682f8e0ab480d40763b896e350b8d976d9e067920f049be019c6b979"),
-    ("init", "974e9139210e7e6ef41a8ec7b4f58645d4493ac8e8a413880403cad374ed9df4"),  # of the cameras
-    ("init", "c37f77392d25080252dd1ef80d5eb8cf9e7441e0778f5fb3a9eb1e0285416a16"),
-    ("train", "1649b68fd180a316c33b0a173fa131e09765cd3a4aaf2d9923cf3158a4d8f426"),
-    ("ground_truth", "ffebc31a202d233f2dd1c9af264a7e3e5cef988a8f4a5914c840336f97149d37"),
-    ("evaluate", "3ecf34844d1c0c1042e002ae18189474e7cd5676aea0cfc7f5e8a70c40ae9b58"),
+    ("config", "84cbf20c22697c9af1c644d018f019b5237a03fca6c07628d0d2d71de76e239a"),
+    ("init", "33343fcdd1b72fb6244c22140544aa03499aca7308e443aa21bb34b9c1f59ccb"),  # of the cameras
+    ("init", "54407ff14b3b0210305785c62be5478da0fc54cb0e67ec0ed797cf24d5a197a3"),
+    ("train", "f71bd50c23af2e8f41abfa9c24c115942c401359c23438de6c8734df51f9e0a6"),
+    ("ground_truth", "eddab634295b7c2e1947393af6f5106a18b7eb12deb1149642b3d894b68b2fe6"),
+    ("evaluate", "5e44ae967a0264d4dc7521876b6d9970177b403d7af49dae9048f226541b16a0"),
 ]
 
 
@@ -39,7 +39,7 @@ class BareSource(CaptureSource):
 def test_the_keys_of_a_known_trial_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A photographs' trial without cameras: so the keys of the cameras that stand in for them are seen as well."""
     monkeypatch.setattr(init_module, "version", lambda package: "4.0.0")
-    monkeypatch.setattr(code_module, "edited", lambda files: {})  # as in a release
+    monkeypatch.setattr(inputs_module, "edited", lambda files: {})  # as in a release
     values = compose_one(WORDS).values
     trial = TrialSteps(Parts(values), Store(tmp_path / "store"), BareSource)
     keys = [("config", config_hash(values)), *((step.stage.name, step.key) for step in trial.steps())]

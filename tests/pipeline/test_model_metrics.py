@@ -18,7 +18,6 @@ from gsbench.errors import InputError
 from gsbench.eval.facts import FLICKER, GEOMETRY, OF_MODELS
 from gsbench.gaussians.model import Gaussians, rgb_to_dc
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.pipeline.steps.maps import unproject
 from gsbench.pipeline.steps.model_metrics import (
     ModelMetrics,
     measure_flicker,
@@ -28,6 +27,7 @@ from gsbench.pipeline.steps.model_metrics import (
     seen_by_test_alone,
     unused_points,
 )
+from gsbench.pipeline.steps.pictures import unproject
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.camera import Camera
 from gsbench.scene.courtyard.render import courtyard_cameras, courtyard_depth

@@ -10,11 +10,9 @@ import pytest
 
 from gsbench.config.compose import compose_one
 from gsbench.pipeline.parts import Parts
-from gsbench.pipeline.steps.views import makers_of_views
+from gsbench.pipeline.steps.scene import makers_of_views
 from gsbench.pipeline.wiring import TrialSteps
-from gsbench.runs.code import ON_RESULTS, files_of
 from gsbench.runs.hashing import config_hash
-from gsbench.runs.source import gsbench_imports
 from gsbench.runs.store import Store
 from gsbench.system.own_modules import allowed_modules
 from tests.pipeline.test_keys import WORDS, BareSource
@@ -104,26 +102,10 @@ def test_options_of_ones_own_class_have_an_effect_whatever_they_are_called(home:
     assert moved(keys_of(home, *words), keys_of(home, *words, "eval.extra.m.weights=3")) == {"config", "evaluate"}
 
 
-def test_a_part_that_no_trial_has_counts_where_ones_own_class_asks_for_it(home: Path) -> None:
-    for text in (
-        "from gsbench.analysis.statistics import student",
-        "import gsbench.analysis\ndef f():\n    return gsbench.analysis.statistics.student",
-        "from gsbench import analysis as a\nf = lambda: a.statistics.holm",
-    ):
-        (home / "mine.py").write_text(f"{text}\n{METRIC.format(1)}")
-        _forget()
-        compose_one([*WORDS, "allow_targets=[mine]"])
-        asked = gsbench_imports("mine.M")
-        assert "analysis/statistics.py" in files_of([], asked), text
-    assert not any(file.startswith(tuple(ON_RESULTS)) for file in files_of([("gsbench.pipeline.steps.train", None)]))
-
-
 def test_the_cache_of_prepared_photographs_knows_the_code_that_prepared_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    reached = files_of([("gsbench.scene.load", None)])
-    assert {"scene/images.py", "scene/prepare.py", "scene/masks.py", "scene/colmap.py"} <= reached.keys()
-    monkeypatch.setattr("gsbench.pipeline.steps.views.edited", lambda files: dict.fromkeys(files, "edited"))
+    monkeypatch.setattr("gsbench.pipeline.steps.scene.edited", lambda rooms: dict.fromkeys(rooms, "edited"))
     makers_of_views.cache_clear()
     found = makers_of_views()
     makers_of_views.cache_clear()
-    assert found["scene/images.py"] == "edited"
+    assert found["scene"] == "edited"
     assert {"pycolmap", "pillow"} <= found.keys()

@@ -1,13 +1,13 @@
-"""The state of gsbench's own code: which files count for what, and which edits do."""
+"""Which code made a result: the rooms of gsbench behind a stage, and the modules of a user's."""
 
 from __future__ import annotations
 
-import os
+import hashlib
+import importlib
 import shutil
-import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -16,41 +16,61 @@ from gsbench.runs import code
 from gsbench.runs.code import (
     AS_RELEASED,
     PACKAGE,
-    changed_files,
+    ROOMS,
+    changed_rooms,
     changed_while_running,
-    digest_of,
     edited,
-    files_of,
-    state_of,
+    has_changed_since_import,
+    module_digest,
+    states_of,
+    syntax_of,
+    unnamed_modules,
+    user_modules,
 )
+from gsbench.system.imports import import_closure
+from gsbench.system.own_modules import allow_modules, allowed_modules
 
-ADC = [("gsbench.pipeline.steps.train", None), ("gsbench.densify.adc", None)]
 SOURCE = '"""A module."""\nX = 0.8  # weight\n\n\ndef loss(a):\n    """The loss."""\n    return X * a\n'
+# Rooms that make no number: what is said, how processes run, where files lie. What `config` and `settings` make of the
+# user's words is in the keys as it is.
+WITHOUT_NUMBERS = frozenset(
+    """
+    analysis app bench cli claims config datasets downloads errors files launch logs parsing records renders runs
+    settings system tracking verbs view words
+    """.split()  # noqa: SIM905 - words are easier to read than a list of quoted ones
+)
+STEPS = {"scene": "scene", "init": "init", "train": "train", "ground_truth": "scene", "evaluate": "evaluate"}
+# Of what a step's module imports, what another stage's key stands for, or what makes objects alone.
+TYPES = ("raster", "gaussians", "eval", "weights.py", "pipeline/steps/inputs.py")  # of `pipeline/steps/inputs.py`
+BESIDE = {
+    "scene": TYPES,
+    "init": TYPES,
+    "train": (*TYPES, "init", "pipeline/steps/scene.py"),
+    "ground_truth": (*TYPES, "init"),
+    "evaluate": ("init",),
+}
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A copy of gsbench that is not the one that runs, without files of a release, read as by a new process."""
     copy = shutil.copytree(PACKAGE, tmp_path / "gsbench", ignore=shutil.ignore_patterns("__pycache__", "*.json"))
     monkeypatch.setattr(code, "PACKAGE", copy)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(code, "IMPORTED_AT", time.time_ns() + 10**12)
-    again(monkeypatch)
+    again()
     yield copy
-    again(monkeypatch)
+    again()
 
 
-def again(monkeypatch: pytest.MonkeyPatch) -> None:
+def again() -> None:
     """As in another process."""
-    monkeypatch.setattr(code, "_sources", {})
-    for cached in (code._released, code._digests, code._place):
+    for cached in (code._released, code._state, code._files):
         cached.cache_clear()
 
 
 @pytest.mark.parametrize(
     "edit",
     [
-        lambda text: text.replace("  # weight", ""),
         lambda text: text.replace("weight", "another comment"),
         lambda text: text.replace("The loss.", "It is\n    longer."),
         lambda text: text.replace("A module.", ""),
@@ -61,7 +81,7 @@ def again(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_comments_docstrings_and_layout_do_not_count(edit: Callable[[str], str]) -> None:
     assert edit(SOURCE) != SOURCE
-    assert digest_of(edit(SOURCE).encode()) == digest_of(SOURCE.encode())
+    assert syntax_of(edit(SOURCE).encode()) == syntax_of(SOURCE.encode())
 
 
 @pytest.mark.parametrize(
@@ -70,125 +90,177 @@ def test_comments_docstrings_and_layout_do_not_count(edit: Callable[[str], str])
         lambda text: text.replace("0.8", "0.81"),
         lambda text: text.replace("*", "+"),
         lambda text: text.replace("(a)", "(a=None)"),
-        lambda text: text.replace("return X", "return -X"),
         lambda text: text.replace("X", "Y"),
         lambda text: text.replace("    return X * a", "    return X * a\n    'more'"),
         lambda text: text.replace("X = 0.8", "X = '0.8'"),
-        lambda text: text.replace("X = 0.8", "X = 'a', 'b'"),
-        lambda text: text.replace("X = 0.8", "X = ['a', 'b']"),
         lambda text: text + "X = None\n",
         lambda text: text + "(",
     ],
 )
 def test_whatever_can_change_a_number_counts(edit: Callable[[str], str]) -> None:
-    assert digest_of(edit(SOURCE).encode()) != digest_of(SOURCE.encode())
+    assert syntax_of(edit(SOURCE).encode()) != syntax_of(SOURCE.encode())
 
 
-def test_a_stage_reaches_what_its_numbers_depend_on_and_no_more() -> None:
-    files = files_of(ADC)
-    assert {"train/trainer.py", "train/loss.py", "eval/ssim.py", "densify/adc.py", "densify/base.py"} <= files.keys()
-    assert {"gaussians/trainable.py", "scene/load.py", "pipeline/components.py"} <= files.keys()
-    assert not {"densify/mcmc.py", "eval/lpips.py", "verbs/tables.py", "words.py", "config/schema.py"} & files.keys()
-    assert "init/colmap/mapping.py" in files_of([("gsbench.init", "Sfm")])
-    assert "init/dim.py" not in files_of([("gsbench.init", "Sfm")])
-    assert {"densify/mcmc.py", "densify/gns.py"} <= files_of([("gsbench.densify", None)]).keys()
+@pytest.mark.parametrize("stage", ROOMS)
+def test_the_table_has_all_rooms_that_a_stage_imports(stage: str) -> None:
+    step = PACKAGE / "pipeline" / "steps" / f"{STEPS[stage]}.py"
+    steps = [step, step.with_name("external.py")] if stage == "train" else [step]
+    known = (*ROOMS[stage], *BESIDE[stage], "__init__.py", "pipeline/__init__.py", "pipeline/steps/__init__.py")
+    for file in {path.relative_to(PACKAGE).as_posix() for step in steps for path in import_closure(step)}:
+        if file.partition("/")[0].removesuffix(".py") not in WITHOUT_NUMBERS:
+            assert any(file == room or file.startswith(f"{room}/") for room in known), file
 
 
-def test_what_python_loads_for_a_stage_is_counted() -> None:
-    """Python's own imports as the judge: no module of a room that makes numbers may be missing."""
-    asked = "import gsbench.train.trainer, sys; print(*(n for n in sys.modules if n.startswith('gsbench.')))"
-    loaded = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True).stdout.split()
-    files = files_of([("gsbench.train.trainer", None)])
-    for name in loaded:
-        below = name.removeprefix("gsbench.")
-        file = f"{below.replace('.', '/')}.py"
-        arm = below.startswith("densify.")  # which the package passes on, and the training does not use
-        if (PACKAGE / file).is_file() and below.partition(".")[0] not in code.WITHOUT_PART and not arm:
-            assert file in files, name
+def test_rooms_are_there() -> None:
+    for room in {room for rooms in ROOMS.values() for room in rooms}:
+        assert (PACKAGE / room).exists(), room
 
 
-def test_an_edit_is_seen_by_the_next_process_and_a_comment_is_not(
-    package: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before = files_of(ADC)
-    assert changed_files(before) == []
+def test_an_edit_is_seen_by_the_next_process_and_a_comment_is_not(package: Path) -> None:
+    before = states_of(ROOMS["train"])
+    assert changed_rooms(before) == []
     loss = package / "train" / "loss.py"
     text = loss.read_text()
     loss.write_text(text + "# more\n")
-    assert changed_files(before) == []
-    again(monkeypatch)
-    assert changed_files(before) == []
+    again()
+    assert changed_rooms(before) == []
     loss.write_text(text + "MORE = 1\n")
-    assert changed_files(before) == [], "this process has loaded what it was"
-    again(monkeypatch)
-    assert changed_files(before) == ["train/loss.py"]
-    assert files_of(ADC) != before
-    loss.write_text(text)
-    again(monkeypatch)
-    assert files_of(ADC) == before
+    assert changed_rooms(before) == [], "this process has loaded what it was"
+    again()
+    assert changed_rooms(before) == ["train"]
+    assert states_of(ROOMS["scene"]) == {room: before.get(room) or code._state(room) for room in ROOMS["scene"]}
     loss.unlink()
-    again(monkeypatch)
-    assert changed_files(before) == ["train/loss.py"]
-
-
-def test_an_edit_of_the_same_size_and_time_is_seen(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before, loss = files_of(ADC), package / "train" / "loss.py"
-    state = loss.stat()
-    loss.write_text(loss.read_text().replace("1 - ", "2 - "))
-    os.utime(loss, ns=(state.st_atime_ns, state.st_mtime_ns))
-    assert loss.stat().st_size == state.st_size
-    again(monkeypatch)
-    assert changed_files(before) == ["train/loss.py"]
+    again()
+    assert changed_rooms(before) == ["train"]
+    assert changed_rooms({"gone": "0"}) == ["gone"]
 
 
 def test_where_all_is_as_released_nothing_is_in_the_key(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert edited(files_of(ADC)) == files_of(ADC)  # before the first release
+    assert edited(states_of(ROOMS["train"])) == states_of(ROOMS["train"])  # before the first release
     code.main()
-    again(monkeypatch)
-    released = files_of(ADC)
+    again()
+    with monkeypatch.context() as patch:
+        patch.setattr(code, "syntax_of", lambda source: pytest.fail("a released room is parsed"))
+        released = states_of(ROOMS["train"])
     assert set(released.values()) == {AS_RELEASED}
     assert edited(released) == {}
+    with (package / "densify" / "adc.py").open("a") as file:
+        file.write("# a comment\n")
     (package / "eval" / "ssim.py").write_text("C1 = 2\n")
-    again(monkeypatch)
-    assert list(edited(files_of(ADC))) == changed_files(released) == ["eval/ssim.py"]
+    again()
+    assert list(edited(states_of(ROOMS["train"]))) == changed_rooms(released) == ["eval/ssim.py"]
     code.main()  # of the next release, where the version of the stage is bumped by hand, or the numbers are the same
-    again(monkeypatch)
-    assert changed_files(released) == []
-    (package / "train" / "loss_log.py").unlink()  # as a release may
-    code.main()
-    again(monkeypatch)
-    assert state_of("train/journal.py") == AS_RELEASED
+    again()
+    assert changed_rooms(released) == []
 
 
 def test_an_edit_of_what_is_loaded_is_taken_for_unknown(
     package: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    before = files_of(ADC)
+    before = states_of(["train"])
     (package / "train" / "loss.py").touch()
     monkeypatch.setattr(code, "IMPORTED_AT", time.time_ns() - 10**9)
     monkeypatch.setitem(sys.modules, "gsbench.train.loss", sys)
-    again(monkeypatch)
-    assert "train/loss.py" in changed_files(before)
-    assert "train/loss.py was edited when it had been loaded" in caplog.text
+    again()
+    assert changed_rooms(before) == ["train"]
+    assert "was edited when it had been loaded" in caplog.text
 
 
 def test_what_is_loaded_after_an_edit_is_told(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "gsbench.train.journal", raising=False)
     monkeypatch.setitem(sys.modules, "gsbench.train.loss", sys)
-    files = files_of(ADC)
-    for name in ("loss.py", "loss_log.py"):
-        (package / "train" / name).touch()
-    assert changed_while_running(files, in_processes=False) == ["train/journal.py"]
-    assert changed_while_running(files, in_processes=True) == ["train/loss.py", "train/journal.py"]
+    states_of(["train"])
+    changed_while_running(["train"], in_processes=False)
+    for name in ("loss.py", "journal.py"):
+        with (package / "train" / name).open("a") as file:
+            file.write("MORE = 1\n")
+    assert changed_while_running(["train"], in_processes=False) == ["train/journal.py"]
+    assert changed_while_running(["train"], in_processes=True) == ["train/journal.py", "train/loss.py"]
 
 
-def test_it_is_quick_and_does_without_a_cache(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = files_of(ADC)
-    with monkeypatch.context() as patch:
-        patch.setattr(code, "_parsed", lambda file: pytest.fail(f"{file} is parsed again"))
-        again(monkeypatch)
-        assert files_of(ADC) == first
-    for content in ("{", "[]", '{"files": 3}', '{"files": {"train/loss.py": [1]}}'):
-        code._cache_file().write_text(content)
-        again(monkeypatch)
-        assert files_of(ADC) == first
+# ---- the user's code
+
+NAMES = ("own_code", "helper", "pack", "late")
+CLASS = "class Mine: ...\n"
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder in which somebody types, whose modules are allowed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    allow_modules(NAMES[:3])
+    yield tmp_path
+    for name in [*sys.modules]:
+        if name.split(".")[0] in NAMES:
+            del sys.modules[name]
+    allowed_modules().clear()
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def values_of(*targets: str, allowed: tuple[str, ...] = ("own_code", "helper")) -> dict[str, object]:
+    return {"densify": {"inner": [{"_target_": name} for name in targets]}, "allow_targets": list(allowed)}
+
+
+def test_a_users_class_has_all_modules_that_were_allowed(home: Path) -> None:
+    for name in ("own_code", "helper", "unrelated"):
+        (home / f"{name}.py").write_text(CLASS)
+    assert user_modules(values_of("gsbench.densify.ADC")) == {}
+    assert user_modules(values_of("own_code.Mine")) == {n: digest(home / f"{n}.py") for n in ("own_code", "helper")}
+    assert user_modules(values_of("nowhere_to_be_found.X", allowed=("bash", "json", "yaml"))) == {}
+
+
+def test_a_package_is_hashed_whole_and_its_name_does_not_matter(home: Path) -> None:
+    (home / "pack" / "inner").mkdir(parents=True)
+    files = {"mine.py": CLASS, "inner/deep.py": "X = 1\n", "inner/kernel.cu": "int x;\n", "notes.txt": "a"}
+    for name, text in files.items():
+        (home / "pack" / name).write_text(text)  # without __init__.py: a namespace
+    first = module_digest("pack")
+    (home / "pack" / "notes.txt").write_text("b")
+    assert module_digest("pack") == first
+    for name in ("inner/deep.py", "inner/kernel.cu"):
+        (home / "pack" / name).write_text(files[name] + "\n")
+        assert module_digest("pack") != first
+        (home / "pack" / name).write_text(files[name])
+    assert module_digest("pack") == first
+
+
+def test_an_imported_file_is_taken_as_it_was_until_it_is_loaded_again(home: Path) -> None:
+    own = home / "own_code.py"
+    for text in ("A = 1\n", "A = 2\n"):  # not imported yet
+        own.write_text(text)
+        assert module_digest("own_code") == digest(own)
+        assert not has_changed_since_import("own_code")
+    module = importlib.import_module("own_code")
+    first = module_digest("own_code")
+    own.write_text("class Mine:\n    other = True\n")
+    assert module_digest("own_code") == first != digest(own)
+    assert has_changed_since_import("own_code")
+    importlib.reload(module)
+    assert module_digest("own_code") == digest(own)
+    assert not has_changed_since_import("own_code")
+
+
+def test_the_file_of_another_folder_is_found_whatever_this_process_has_imported(home: Path) -> None:
+    (home / "own_code.py").write_text(CLASS)
+    importlib.import_module("own_code")
+    other = home / "elsewhere"
+    other.mkdir()
+    (other / "own_code.py").write_text("class Other: ...\n")
+    assert module_digest("own_code", str(other)) == digest(other / "own_code.py")
+    assert module_digest("own_code", str(home)) == digest(home / "own_code.py")
+    (home / "own_code.py").unlink()
+    assert module_digest("own_code", str(home)) is None
+
+
+def test_what_was_imported_and_is_not_named_is_told(home: Path) -> None:
+    (home / "own_code.py").write_text("import sys\nsys.path.insert(0, 'lib')\nimport late, json.tool, helper\n" + CLASS)
+    (home / "lib").mkdir()
+    (home / "lib" / "late.py").touch()
+    (home / "helper.py").touch()
+    before = set(sys.modules)
+    importlib.import_module("own_code")
+    assert unnamed_modules(before, {"own_code", "helper"}) == ["late"]

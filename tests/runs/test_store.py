@@ -16,7 +16,7 @@ import pytest
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError
 from gsbench.runs.layout import MANIFEST
-from gsbench.runs.step import Stage, Step
+from gsbench.runs.stages import Stage, Step
 from gsbench.runs.store import Manifest, Store, read_manifest
 from tests.runs.toy import TOY, expected_text, toy_inputs
 

@@ -18,7 +18,7 @@ from gsbench.launch.states import states_of_experiment
 from gsbench.logs import log_to
 from gsbench.parsing import DamagedError, read_bytes
 from gsbench.runs.experiments import list_experiments
-from gsbench.runs.step import Step
+from gsbench.runs.stages import Step
 from gsbench.runs.store import Store
 from gsbench.system.locks import describe_holder, hold, is_held
 from tests.finished import write_results

@@ -11,9 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
-from gsbench.runs.hashing import LATER, config_hash
 from gsbench.scene.camera import Camera
 from gsbench.scene.hold_out import hold_out
 from gsbench.scene.options import SceneConfig, SplitRule
@@ -130,15 +128,3 @@ def test_too_many_sectors_and_photographs_without_cameras_are_refused() -> None:
         hold_out(NAMES[:5], SplitRule(split="sector"), cameras=cameras)
     with pytest.raises(InputError, match="needs the cameras"):
         hold_out(NAMES, SplitRule(split="sector"))
-
-
-def test_later_settings_have_no_part_in_a_hash_at_the_value_of_before() -> None:
-    values = compose_one(["scene=garden", "scene.path=photos", "init=sfm"]).values
-    before = values | {
-        group: {key: value for key, value in values[group].items() if key not in LATER[group]} for group in LATER
-    }
-    assert {key: values["scene"][key] for key in LATER["scene"]} == LATER["scene"]
-    assert config_hash(values) == config_hash(before)
-    for key, value in {"split": "sector", "sector": 1, "sectors": 4, "match_views": True, "validation": True}.items():
-        changed = values | {"scene": values["scene"] | {key: value}}
-        assert config_hash(changed) != config_hash(values)

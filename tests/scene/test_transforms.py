@@ -14,7 +14,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.init.base import read_cloud
-from gsbench.pipeline.steps.capture import CaptureSource
+from gsbench.pipeline.steps.scene import CaptureSource
 from gsbench.scene import transforms
 from gsbench.scene.colmap import read_model
 from gsbench.scene.options import SceneConfig
@@ -159,7 +159,7 @@ def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: 
     assert capture.train_names == tuple(f"train/r_{k}.png" for k in range(5))
     camera = read_transforms(tmp_path).frames["train/r_0.png"].camera
     assert camera.params == pytest.approx((0.5 * 40 / math.tan(0.5 * angle),) * 2 + (20, 20))
-    from gsbench.pipeline.steps.capture import masked, masked_step
+    from gsbench.pipeline.steps.scene import masked, masked_step
 
     assert masked_step(capture, "black") is None
     step = masked_step(capture, "white")

@@ -14,8 +14,7 @@ import pytest
 import torch
 
 from gsbench import cli
-from gsbench.runs.stages import TRAIN
-from gsbench.runs.step import Step
+from gsbench.runs.stages import TRAIN, Step
 from gsbench.runs.store import Store
 from gsbench.system import jit
 from gsbench.verbs import doctor

@@ -16,8 +16,7 @@ from gsbench.analysis.differences import (
 from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
-from gsbench.runs.hashing import BEFORE, NOT_HASHED
-from gsbench.runs.splits import setting
+from gsbench.runs.hashing import NOT_HASHED
 
 K = TypeVar("K", bound=Hashable)
 
@@ -52,7 +51,7 @@ def field_value(trial: TrialResult, name: str) -> str:
         return str(getattr(trial.record, name))
     if name not in trial.config and name.startswith(NOT_HASHED):
         return str(trial.whole_config.get(name))
-    return str(setting(trial.config, name))
+    return str(trial.config.get(name))
 
 
 def check_fields(trials: Iterable[TrialResult], names: Iterable[str]) -> None:
@@ -66,8 +65,7 @@ def check_fields(trials: Iterable[TrialResult], names: Iterable[str]) -> None:
 
 
 def _has(trial: TrialResult, name: str) -> bool:
-    known = bool(trial.config) and name in BEFORE
-    return known or name in trial.config or (name.startswith(NOT_HASHED) and name in trial.whole_config)
+    return name in trial.config or (name.startswith(NOT_HASHED) and name in trial.whole_config)
 
 
 def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> list[TrialResult]:
@@ -112,7 +110,7 @@ def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
     swept = swept_settings(trials)
     if not swept:
         return list(trials)
-    return [replace(trial, variant=tuple((key, str(setting(trial.config, key))) for key in swept)) for trial in trials]
+    return [replace(trial, variant=tuple((key, str(trial.config.get(key))) for key in swept)) for trial in trials]
 
 
 def make_cell(trials: Sequence[TrialResult], quantity: Quantity, scenes: Sequence[str], expected: int) -> Cell:

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from gsbench.analysis.configurations import canonical
 from gsbench.analysis.results import TrialResult
-from gsbench.runs.hashing import BEFORE
-from gsbench.runs.source import SHOWN
+from gsbench.runs.code import SHOWN
 from gsbench.words import counted
 
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
@@ -20,7 +19,7 @@ IGNORED_SETTINGS = (
     *("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path"),
     *("eval.primary", "eval.controls", "densify.switches"),
 )
-CODE = "code of "  # how the keys of ``TrialResult.code`` start that are a user's own classes
+CODE = "code of "  # how the keys of ``TrialResult.code`` start that are a user's modules
 
 
 def differing_conditions(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
@@ -48,18 +47,18 @@ def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
         return {}
     kinds = {trial.kind: trial.config_texts for trial in trials}.values()
     keys = {key for texts in kinds for key in texts if not key.startswith(IGNORED_SETTINGS)}
-    values = {key: {texts.get(key, canonical(BEFORE.get(key))) for texts in kinds} for key in keys}
+    values = {key: {texts.get(key, canonical(None)) for texts in kinds} for key in keys}
     return {key: sorted(found) for key, found in sorted(values.items()) if len(found) > 1}
 
 
 def differing_code(trials: Iterable[TrialResult]) -> dict[str, Versions]:
-    """The classes, stages and files of gsbench of which the trials used several versions; of many files, one."""
+    """The user's modules, stages and rooms of gsbench of which the trials used several versions; of many rooms, one."""
     trials = list(trials)
     found = _several(trials, lambda trial: trial.code)
-    files = list(_several(trials, lambda trial: trial.files).items())
-    if files:
-        part, versions = files[0]
-        found[part if len(files) == 1 else f"{part} and {counted(len(files) - 1, 'more file')}"] = versions
+    rooms = list(_several(trials, lambda trial: trial.rooms).items())
+    if rooms:
+        part, versions = rooms[0]
+        found[part if len(rooms) == 1 else f"{part} and {counted(len(rooms) - 1, 'more room')}"] = versions
     return found
 
 
@@ -102,11 +101,11 @@ def _when(trials: Sequence[TrialResult]) -> str:
 
 
 def find_superseded(
-    trials: Sequence[TrialResult], present: Callable[[str, TrialResult], str | None] = lambda target, trial: None
+    trials: Sequence[TrialResult], present: Callable[[str, TrialResult], str | None] = lambda module, trial: None
 ) -> dict[Path, str]:
     """Folders of trials whose code is no longer the present one, each with the reason.
 
-    ``present(class, trial)`` is the hash of a user's class as its file is now, None where that cannot be seen; then
+    ``present(module, trial)`` is the hash of a user's module as it is now, None where that cannot be seen; then
     the version that finished a trial last is the present one, as it is among the stages of gsbench.
     """
     reasons: dict[Path, str] = {}
@@ -116,14 +115,14 @@ def find_superseded(
             name = part.removeprefix(CODE)
             now = present(name, trial) if part.startswith(CODE) else None
             if version != (now or latest[part]):
-                words = "its file is now" if now else "later trials have"
+                words = "it is now" if now else "later trials have"
                 newer = short_version(now or latest[part])
                 reasons[trial.path] = f"{name} was {short_version(version)}, {words} {newer}"
     return reasons
 
 
 def _code(trial: TrialResult) -> dict[str, str]:
-    return trial.code | trial.files
+    return trial.code | trial.rooms
 
 
 def _finished(trial: TrialResult) -> float:

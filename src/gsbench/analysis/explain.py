@@ -135,8 +135,8 @@ def _origin(trial: TrialResult) -> dict[str, str]:
         origin["code"] = ", ".join(f"{part} {short_version(version)}" for part, version in trial.code.items())
     if record.code.commit:
         origin["commit"] = f"{record.code.commit}{', edited' if record.code.edited else ''}"
-    files = [name.removeprefix("gsbench's ") for name, state in trial.files.items() if state != AS_RELEASED]
-    if files and len(files) < len(trial.files):  # else it was before the first release
-        origin["edited"] = f"since the last release: {some_of(files)}"
+    rooms = [name.removeprefix("gsbench's ") for name, state in trial.rooms.items() if state != AS_RELEASED]
+    if rooms and len(rooms) < len(trial.rooms):  # else it was before the first release
+        origin["edited"] = f"since the last release: {some_of(rooms)}"
     origin["versions"] = ", ".join(f"{key} {value}" for key, value in record.versions.items())
     return origin

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.quantities import metric_keys
 from gsbench.analysis.results import Experiment, TrialResult
-from gsbench.runs.splits import setting
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,7 +54,7 @@ def _row(trial: TrialResult, swept: Sequence[str], metrics: Sequence[str]) -> di
     }
     return (
         {name: getattr(record, name) for name in NAMES}
-        | {key: setting(trial.config, key) for key in swept}
+        | {key: trial.config.get(key) for key in swept}
         | {name: getattr(record, name) for name in CONDITIONS}
         | {"width": size[0], "height": size[1]}
         | {key: trial.metrics.get(key) for key in metrics}

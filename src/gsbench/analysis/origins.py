@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.results import TrialResult
-from gsbench.runs.source import SHOWN
+from gsbench.runs.code import SHOWN
 from gsbench.system.machine import kind_of_machine
 from gsbench.words import counted
 

@@ -19,7 +19,7 @@ from gsbench.analysis.origins import machine_of
 from gsbench.analysis.results import TrialResult
 from gsbench.eval.facts import LPIPS, find
 from gsbench.eval.protocol import PAPER, protocol_of
-from gsbench.runs.splits import BY_LISTS
+from gsbench.runs.trial_record import BY_LISTS
 
 NOT_RECORDED = "not recorded"
 PLACES = {"sampled": "drawn from the parent's density", "parent_mean": "the parent's mean"}

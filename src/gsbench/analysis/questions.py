@@ -18,7 +18,6 @@ from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import Interval, t_interval
 from gsbench.analysis.verdicts import ArmVerdict, ArmVerdicts, Pair
 from gsbench.runs.declaration import EXTRAPOLATION, INTERPOLATION
-from gsbench.runs.splits import setting
 
 # settings that say what is held out: trials that differ in them alone are of one arm
 SPLIT_SETTINGS = tuple(
@@ -70,7 +69,7 @@ def without_split(trials: Sequence[TrialResult]) -> dict[str, Arm]:
     swept = [key for key in swept_settings(trials) if key not in SPLIT_SETTINGS]
     arms = {}
     for trial in trials:
-        variant = tuple((key, str(setting(trial.config, key))) for key in swept)
+        variant = tuple((key, str(trial.config.get(key))) for key in swept)
         arms[str(trial.path)] = Arm(trial.init, trial.densify, variant)
     return arms
 

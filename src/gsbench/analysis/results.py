@@ -23,10 +23,9 @@ from gsbench.runs.declaration import QUESTIONS
 from gsbench.runs.declaration import Arm as Arm
 from gsbench.runs.experiments import experiment_home, places_of_trials
 from gsbench.runs.layout import CONFIG, FAILED, RESULTS, SEED
-from gsbench.runs.splits import split_text
 from gsbench.runs.translation_record import Translation
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError
+from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError, split_text
 
 log = logging.getLogger(__name__)
 
@@ -123,18 +122,18 @@ class TrialResult:
     def code(self) -> dict[str, str]:
         """The versions of the code that made the trial; empty for what another program made.
 
-        ``code of <class>`` is the hash of the files that a user's own class needs, ``stage <name>`` the version of
+        ``code of <module>`` is the hash of a user's module, ``stage <name>`` the version of
         one of gsbench's stages.
         """
         code = self.record.code
-        return {f"code of {target}": digest for target, digest in code.sources.items()} | {
+        return {f"code of {module}": digest for module, digest in code.sources.items()} | {
             f"stage {name}": str(version) for name, version in code.stages.items()
         }
 
     @cached_property
-    def files(self) -> dict[str, str]:
-        """The files of gsbench that had a part in the trial, with their states then (`gsbench.runs.code`)."""
-        return {f"gsbench's {file}": state for file, state in self.record.code.files.items()}
+    def rooms(self) -> dict[str, str]:
+        """The rooms of gsbench that had a part in the trial, with their states then (`gsbench.runs.code`)."""
+        return {f"gsbench's {room}": state for room, state in self.record.code.rooms.items()}
 
     @property
     def finished(self) -> float:

@@ -16,7 +16,6 @@ from gsbench.analysis.results import TrialResult
 from gsbench.claims.file import DIRECTIONS, read_least
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Arm, Declaration, Question
-from gsbench.runs.splits import setting
 
 PATHS = ("scene.path", "init.path")  # where somebody's files lay
 
@@ -88,11 +87,11 @@ def _folder(chosen: Mapping[str, Any], plan: Mapping[str, Any], kinds: Mapping[s
         key
         for key, trial in kinds.items()
         if all(value in (None, getattr(trial, group)) for group, value in named.items())
-        and all(setting(trial.config, name) == value for name, value in given.items() if name in trial.config)
+        and all(trial.config.get(name) == value for name, value in given.items() if name in trial.config)
     ]
     if len(found) > 1:  # what others name and these trials do not, they do not have
         others = dict(_others(chosen, plan))
-        found = [key for key in found if all(setting(kinds[key].config, name) != others[name] for name in others)]
+        found = [key for key in found if all(kinds[key].config.get(name) != others[name] for name in others)]
     if len(found) > 1:
         raise InputError(f"the settings of the declared plan do not tell {' and '.join(found)} apart")
     return found[0] if found else ""

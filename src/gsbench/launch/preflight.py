@@ -12,7 +12,7 @@ from gsbench.config.compose import TrialConfig
 from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.launch.trial import Trial
-from gsbench.runs.source import OWN
+from gsbench.runs.code import OWN
 from gsbench.system.install import install_command
 
 

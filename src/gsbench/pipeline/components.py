@@ -24,9 +24,8 @@ from gsbench.eval.protocol import get_protocol
 from gsbench.external.settings import External
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.raster.executors import offers
+from gsbench.runs.code import OWN, has_changed_since_import, module_digest, unnamed_modules
 from gsbench.runs.declaration import metric_and_question
-from gsbench.runs.hashing import WITHOUT_EFFECT, as_before
-from gsbench.runs.source import OWN, has_changed_since_import, source_of, unseen_imports
 from gsbench.settings import checked, unknown_setting
 
 log = logging.getLogger(__name__)
@@ -62,9 +61,6 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     require_values(values, group)
     options = {key: value for key, value in values.items() if key not in RESERVED}
     own = target.startswith(OWN)
-    if not own:  # a class may be older than a setting of the group's YAML, which means what was before it
-        known = inspect.signature(cls).parameters.keys() | as_before(group, options).keys()
-        options = {key: value for key, value in options.items() if key in known}
     if dataclasses.is_dataclass(cls) and not own:
         options = checked(cls, options, group)
     else:
@@ -135,13 +131,6 @@ def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str,
     return metrics
 
 
-def rasterizer_inputs(rasterizer: Rasterizer, target: str | None = None) -> str | dict[str, Any]:
-    """The rasterizer as it enters a stage's key: gsbench's own by name, a user's by class, source and options."""
-    if not own_names(rasterizer, target):
-        return rasterizer.name
-    return {"name": rasterizer.name} | options_of("raster", rasterizer, target)
-
-
 def _check_names(cls: Any, options: dict[str, Any], group: str) -> None:
     """Raise InputError for an option that the constructor of ``cls`` does not take."""
     parameters = inspect.signature(cls).parameters
@@ -160,48 +149,17 @@ def locate(target: str, group: str, allow_targets: list[str]) -> type:
     if not isinstance(found, type) or lacking:
         without = f": it has no {', '.join(lacking)}()" if lacking else ""
         raise InputError(f"{group}._target_={target} is not a class for {group}{without}")
-    if not target.startswith(OWN) and not source_of(target):
+    if target.startswith(OWN):
+        return found
+    module, named = target.split(".")[0], {name.split(".")[0] for name in allow_targets}
+    if module_digest(module) is None:
         log.warning("no file of %s was found: results do not know its version", target)
-    if has_changed_since_import(target):  # the first call also notes the file as it is now, while it is what runs
+    if has_changed_since_import(module):  # the first call notes the files as they are, while they are what runs
         log.warning("the code of %s has changed since it was imported: this process goes on with what it was", target)
-    if not target.startswith(OWN) and (unseen := unseen_imports(target, before)):
-        log.warning(
-            "%s imports %s by a name or from a folder that its text does not give: results do not know their versions",
-            *(target, ", ".join(unseen)),
-        )
+    if unnamed := unnamed_modules(before, {module, *named}):
+        words = ", ".join(unnamed)
+        log.warning("%s imports %s, whose versions results do not know: name them in allow_targets too", target, words)
     return found
-
-
-def options_of(group: str, component: Any, target: str | None = None) -> dict[str, Any]:
-    """Class and options of a component of ``group``, as they enter a stage's key.
-
-    Options of gsbench's own classes that cannot change a result are left out. ``target`` is the import path by which a
-    configuration names the class, which need not be where it is defined.
-    """
-    cls, names = type(component), own_names(component, target)
-    values: dict[str, Any] = {"class": f"{cls.__module__}.{cls.__qualname__}"} | source_of(*names)
-    if dataclasses.is_dataclass(component):
-        left_out = () if names else WITHOUT_EFFECT
-        fields = [field.name for field in dataclasses.fields(component) if field.init and field.name not in left_out]
-        values |= as_before(group, {name: _plain(getattr(component, name)) for name in fields})
-    return values
-
-
-def own_names(component: Any, target: str | None = None) -> list[str]:
-    """Import paths behind a component that are not gsbench's: where it is asked for, where its class is defined.
-
-    The class may be one that a function made, or lie within another: what has files is its module.
-    """
-    named = [target, f"{type(component).__module__}.{type(component).__name__}"]
-    return [name for name in dict.fromkeys(named) if name is not None and not name.startswith(OWN)]
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
 
 
 def make_evaluator(

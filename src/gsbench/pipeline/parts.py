@@ -22,8 +22,10 @@ from gsbench.pipeline.components import (
     check_offers,
     make_evaluator,
 )
+from gsbench.pipeline.steps.inputs import UserCode
 from gsbench.raster import Rasterizer, create_rasterizer
 from gsbench.raster.executors import AUTO, resolve
+from gsbench.runs.code import user_modules
 from gsbench.scene.options import SceneConfig
 from gsbench.system.resources import available_threads
 from gsbench.train.device import select_device
@@ -112,9 +114,10 @@ class Parts:
         return make_evaluator(self.eval, self.device, self.metrics)
 
     @cached_property
-    def targets(self) -> dict[str, str]:
-        """The import paths by which the configuration names the parts' classes: ``{"densify": "mine.Mine"}``."""
-        return {".".join(place): target for place, target in targets_in(self.values)}
+    def user_code(self) -> UserCode:
+        """The user's code behind the parts."""
+        targets = {".".join(place): target for place, target in targets_in(self.values)}
+        return UserCode(user_modules(self.values), targets)
 
     @property
     def measured_earlier(self) -> list[int]:

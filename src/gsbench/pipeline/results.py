@@ -13,12 +13,11 @@ from gsbench import __version__
 from gsbench.events import sum_events
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.parsing import read_json
+from gsbench.runs.code import user_modules
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.hashing import config_hash, flatten, sha256_of
 from gsbench.runs.layout import EVENTS
 from gsbench.runs.rows import read_rows
-from gsbench.runs.source import sources_of
-from gsbench.runs.splits import split_text
 from gsbench.runs.stages import EVALUATE, INIT, STAGES, TRAIN
 from gsbench.runs.store import Entry, read_manifest
 from gsbench.runs.trial_folder import TrialFolder
@@ -35,6 +34,7 @@ from gsbench.runs.trial_record import (
     TrialRecord,
     read_evaluation,
     read_training,
+    split_text,
 )
 from gsbench.scene.types import Capture, Scene
 
@@ -51,7 +51,7 @@ def results_of(
 ) -> TrialRecord:
     """The results of the trial with the configuration ``values``; ``entries`` are those of its steps, by stage.
 
-    ``capture`` are the photographs, ``raster`` the executor that rendered, ``code`` the files of gsbench that had a
+    ``capture`` are the photographs, ``raster`` the executor that rendered, ``code`` the rooms of gsbench that had a
     part, with their states.
     """
     init, trained, evaluated = entries[INIT.name], entries[TRAIN.name], entries[EVALUATE.name]
@@ -103,9 +103,9 @@ def results_of(
             "evaluate": evaluated.key,
         },
         code=Code(
-            sources=sources_of(values),
+            sources=user_modules(values),
             stages={stage.name: stage.version for stage in STAGES},
-            files=dict(sorted(code.items())),
+            rooms=dict(sorted(code.items())),
             **training.checkout,
         ),
         machine=training.machine,

@@ -22,10 +22,8 @@ from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.results import results_of
 from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs import layout
-from gsbench.runs.code import WIRING, state_of
 from gsbench.runs.layout import BUILDING, CONFIG, FAILED, LOG
-from gsbench.runs.stages import EVALUATE, GROUND_TRUTH, INIT, TRAIN
-from gsbench.runs.step import Stage
+from gsbench.runs.stages import EVALUATE, GROUND_TRUTH, INIT, TRAIN, Stage
 from gsbench.runs.store import Entry, Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
@@ -121,7 +119,7 @@ def _run(parts: Parts, config_yaml: str, folder: TrialFolder) -> TrialRecord:
         (folder.path / FAILED).unlink(missing_ok=True)
         trial = TrialSteps(parts, store)
     entries: dict[str, Entry] = {}
-    code = {file: state_of(file) for file in WIRING}
+    code: dict[str, str] = {}
     with mirror, _recorded_failures(values, folder):
         for step in trial.steps():
             entries[step.stage.name] = entry = store.get(step)

@@ -12,14 +12,12 @@ from dataclasses import asdict
 from gsbench.errors import InputError
 from gsbench.init import Sfm
 from gsbench.pipeline.parts import Parts
-from gsbench.pipeline.steps.capture import CaptureSource, masked, masked_step
 from gsbench.pipeline.steps.evaluate import evaluate_step, measure_step
 from gsbench.pipeline.steps.external import external_step
-from gsbench.pipeline.steps.ground_truth import ground_truth_step
 from gsbench.pipeline.steps.init import init_step
+from gsbench.pipeline.steps.scene import CaptureSource, Views, ground_truth_step, masked, masked_step
 from gsbench.pipeline.steps.train import train_step
-from gsbench.pipeline.steps.views import Views
-from gsbench.runs.step import Step
+from gsbench.runs.stages import Step
 from gsbench.runs.store import Store
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.types import Capture
@@ -59,7 +57,7 @@ class TrialSteps:
         if parts.initializer.needs_reference(self.capture):
             reference = init_step(store, self.capture, Sfm())
             yield reference
-        init = init_step(store, self.capture, parts.initializer, reference, parts.targets.get("init"))
+        init = init_step(store, self.capture, parts.initializer, reference, parts.user_code)
         yield init
         self.views = Views(store, self.capture, init, parts.scene)
         trained = self._train_step()
@@ -86,13 +84,13 @@ class TrialSteps:
             parts.seed,
             parts.device,
             parts.measured_earlier,
-            parts.targets,
+            parts.user_code,
         )
 
     def _evaluate_step(self, trained: Step) -> Step:
         parts = self.parts
         if parts.program is not None and not parts.program.leaves_model:
-            return measure_step(self.views, trained, parts.evaluator, parts.eval.of_model, parts.targets)
+            return measure_step(self.views, trained, parts.evaluator, parts.eval.of_model, parts.user_code)
         return evaluate_step(
             self.views,
             trained,
@@ -104,7 +102,7 @@ class TrialSteps:
             parts.measured_earlier,
             made_by_program=parts.program is not None,
             of_model=parts.eval.of_model,
-            targets=parts.targets,
+            user=parts.user_code,
         )
 
 

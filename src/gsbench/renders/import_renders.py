@@ -22,7 +22,7 @@ from gsbench.files import atomic, file_sha256, write_text
 from gsbench.pipeline.results import versions
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.renders.reference_images import Truth
-from gsbench.runs.code import files_of
+from gsbench.runs.code import ROOMS, states_of
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, MASKS, PER_VIEW, RENDERS, SEED
 from gsbench.runs.stages import EVALUATE
@@ -32,10 +32,6 @@ from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
 from gsbench.settings import is_folder_name
 
-MEASURING = [
-    ("gsbench.renders.measure", None),
-    ("gsbench.eval.evaluator", None),
-]  # what makes an entered trial's numbers
 KEPT_GROUPS = ("scene", "eval", "tracking", "launch")  # of the configuration: what is true of renders too
 
 
@@ -173,7 +169,7 @@ def _results(
         resolution=truth.resolution,
         renders=dict(source),
         hashes={"config": identity, "data": truth.data},
-        code=Code(stages={EVALUATE.name: EVALUATE.version}, files=files_of(MEASURING)),
+        code=Code(stages={EVALUATE.name: EVALUATE.version}, rooms=states_of(ROOMS[EVALUATE.name])),
         versions=versions(),
     )
 

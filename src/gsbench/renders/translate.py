@@ -24,7 +24,7 @@ from gsbench.gaussians.model import MAX_SH_DEGREE
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.parts import Parts
-from gsbench.pipeline.steps.views import makers_of_views
+from gsbench.pipeline.steps.scene import makers_of_views
 from gsbench.pipeline.wiring import TrialSteps
 from gsbench.runs.layout import GROUND_TRUTH, MASKS, POINT_CLOUD, PROTOCOLS, RENDERS, STORE, VIEWS
 from gsbench.runs.store import Store

@@ -1,281 +1,273 @@
-"""State of gsbench's own code behind a result: a digest of each file that has a part in it. Loads no torch.
+"""Which code made a result: gsbench's own by rooms, the user's by modules. Loads no torch.
 
-A file's digest is of its syntax: comments, docstrings and layout have no part in it. Where all files are as in a
-release (``released.json``), the versions of the stages stand for them, which are bumped by hand.
+Where gsbench is as in a release (``released.json``), the versions of its stages stand for it, which are bumped by hand.
+In a checkout that differs, the key of a stage has the digests of the rooms that it uses as well. A user's modules are
+hashed whole: those that ``allow_targets`` names, since nothing else of the user's can be imported.
 """
 
 from __future__ import annotations
 
 import ast
 import hashlib
+import importlib.util
 import logging
-import os
 import sys
+import sysconfig
 import uuid
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any
 
 from gsbench import IMPORTED_AT
 from gsbench.files import write_json
 from gsbench.parsing import DamagedError, read_json
-from gsbench.system.imports import read_imports
 
+OWN = "gsbench."  # how the import paths of gsbench's own classes start
+SHOWN = 8  # characters of a digest that people see
 PACKAGE = Path(__file__).resolve().parents[1]
-RELEASED = "released.json"  # in the package: the digests of all files as they were released
-AS_RELEASED = "released"  # the state of a file that is
+RELEASED = "released.json"  # in the package: the digests of all rooms as they were released
+AS_RELEASED = "released"  # the state of a room that is
 DIGEST_CHARACTERS = 16
-# Parts that make no number: what is said, how processes run, where files lie. What `config` and `settings` make of the
-# user's words is in the keys as it is.
-WITHOUT_NUMBERS = frozenset(
-    """
-    app cli config errors launch logs parsing records runs settings system tracking verbs words
-    """.split()  # noqa: SIM905 - words are easier to read than a list of quoted ones
-)
-# Parts that work on results: none in a trial, unless a user's class asks for one. No stage's version stands for them.
-ON_RESULTS = frozenset(("analysis", "bench", "claims", "datasets", "renders", "view"))
-WITHOUT_PART = WITHOUT_NUMBERS | ON_RESULTS
-# Modules that put a trial together: a part in each, and followed no further, since they know parts of every kind.
-WIRING = tuple(f"pipeline/{name}.py" for name in ("components", "parts", "results", "trial", "wiring"))
 
-DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-WITHOUT_MEANING = frozenset({"ctx", "kind", "type_comment"})  # fields of a tree that say nothing the rest does not
+# What makes the numbers of each stage: folders and files of gsbench. What only says, shows, launches or reads has no
+# part, nor what makes objects of the settings, which are in the keys as they are. An edit of one densifier changes the
+# room of all: the price of a table that anybody can check.
+MODEL = ("scene", "gaussians", "densify", "raster", "train", "events.py")
+LOSS = ("eval/ssim.py", "eval/images.py", "eval/matching.py")
+ROOMS = {
+    "scene": ("scene", "init", "pipeline/steps/scene.py"),
+    "init": ("scene", "init", "gaussians", "weights.py", "pipeline/steps/init.py"),
+    "train": (*MODEL, *LOSS, "external", "pipeline/steps/train.py", "pipeline/steps/external.py"),
+    "ground_truth": ("scene", "pipeline/steps/scene.py"),
+    "evaluate": (*MODEL, "eval", "weights.py", "pipeline/steps"),
+}
+VIEWS_ROOMS = ("scene",)  # of the prepared photographs beside the store
 
-Names = tuple[tuple[str, str | None], ...]
+INSTALLED = frozenset({"site-packages", "dist-packages"})  # folders of packages that are known by their versions
+CODE_SUFFIXES = frozenset({".py", ".so", ".pyd", ".c", ".cpp", ".cu", ".h", ".cuh"})
 
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class _Source:
-    """A file of gsbench as it was when this process first asked: its digest, what it imports of gsbench."""
+# ---- gsbench's own code
 
-    stamp: list[int]
+
+@dataclass(frozen=True)
+class _File:
+    """A file of gsbench as it was when this process first asked."""
+
     digest: str
-    names: Names
     loaded: bool  # whether this process had run it by then
 
 
-_sources: dict[str, _Source] = {}  # by the path below the package
-_unkept: set[str] = set()  # those whose digests no other process has left
+def states_of(rooms: Iterable[str]) -> dict[str, str]:
+    """``{"eval": state}``: the state of each room, which is a digest of its syntax, or ``released``."""
+    return {room: _state(room) for room in sorted(set(rooms))}
 
 
-def files_of(roots: Iterable[tuple[str, str | None]], asked: Iterable[tuple[str, str | None]] = ()) -> dict[str, str]:
-    """``{"eval/ssim.py": state}`` for each file that the ``roots``, modules or names in them, reach by their imports.
-
-    A name that a package only passes on counts as what defines it, so that an arm does not depend on its neighbours.
-    ``asked`` are those that a user's class imports, which may be of parts that otherwise have none in a trial.
-    The state is a digest, or ``released``.
-    """
-    found: dict[str, str] = {}
-    waiting = [(root, False) for root in roots] + [(root, True) for root in asked]
-    while waiting:
-        name, is_asked = waiting.pop()
-        file = _file(*name)
-        if file is not None and file not in found and (_part(file) or (is_asked and _top(file) in ON_RESULTS)):
-            found[file] = state_of(file)
-            if file not in WIRING:
-                waiting += [(imported, not _part(file)) for imported in _read(file).names]
-    _keep_digests()
-    return dict(sorted(found.items()))
+def edited(states: Mapping[str, str]) -> dict[str, str]:
+    """The rooms among ``states`` that are not as released."""
+    return {room: state for room, state in states.items() if state != AS_RELEASED}
 
 
-def edited(files: Mapping[str, str]) -> dict[str, str]:
-    """List the ``files`` that are not as released."""
-    return {file: state for file, state in files.items() if state != AS_RELEASED}
+def changed_rooms(recorded: Mapping[str, str]) -> list[str]:
+    """The rooms whose state is no longer the recorded one."""
+    return [room for room, state in recorded.items() if _state(room) != state]
 
 
-def changed_files(recorded: Mapping[str, str]) -> list[str]:
-    """List the files whose state is no longer the recorded one."""
-    changed = [file for file, state in recorded.items() if state_of(file) != state]
-    _keep_digests()
-    return changed
-
-
-def changed_while_running(files: Iterable[str], in_processes: bool) -> list[str]:
-    """List the ``files`` that may have run in another state than was noted: they were edited and loaded later.
+def changed_while_running(rooms: Iterable[str], in_processes: bool) -> list[str]:
+    """The files of ``rooms`` that may have run in another state than was noted: they were edited, then loaded.
 
     With ``in_processes``, the work was done in processes of their own, which load all anew.
     """
-    known = [(file, _sources[file]) for file in files if file in _sources]
-    return [file for file, source in known if (in_processes or not source.loaded) and _stamp(file) != source.stamp]
+    changed = set()
+    for room in rooms:
+        now = {name: hashlib.sha256(content).hexdigest() for name, content in _contents(room).items()}
+        noted = _files(room)
+        for name in now.keys() | noted.keys():
+            file = noted.get(name)
+            if (file is None or in_processes or not file.loaded) and now.get(name) != (file and file.digest):
+                changed.add(name)
+    return sorted(changed)
 
 
-def state_of(file: str) -> str:
-    """The state of a file of gsbench: its digest, or ``released``; that of one that is gone is "gone"."""
-    released = _released().get(file)
-    try:
-        digest = _read(file).digest
-    except OSError:
-        return AS_RELEASED if _released() and released is None else "gone"
-    return AS_RELEASED if digest == released else digest
+@cache
+def _state(room: str) -> str:
+    contents, released = _contents(room), _released().get(room) or {}
+    for name, file in _files(room).items():
+        if file.loaded and (PACKAGE / name).stat().st_mtime_ns > IMPORTED_AT:
+            log.warning(
+                "gsbench's %s was edited when it had been loaded: start again, else it is unknown what ran", name
+            )
+            return uuid.uuid4().hex[:DIGEST_CHARACTERS]
+    if released.get("bytes") == _digest(contents):  # as nearly always where gsbench is installed: nothing is parsed
+        return AS_RELEASED
+    digest = _digest({name: syntax_of(content) for name, content in contents.items()})
+    return AS_RELEASED if digest == released.get("syntax") else digest
 
 
-def digest_of(source: bytes) -> str:
-    """The digest of a Python file's syntax, the same for every version of Python."""
-    try:
-        parts: list[str] = []
-        _put(ast.parse(source), parts)
-        source = "".join(parts).encode("utf-8", "surrogatepass")
-    except (SyntaxError, ValueError, RecursionError):  # it cannot be run either
-        pass
-    return hashlib.sha256(source).hexdigest()[:DIGEST_CHARACTERS]
+@cache
+def _files(room: str) -> dict[str, _File]:
+    return {
+        name: _File(hashlib.sha256(content).hexdigest(), _module(name) in sys.modules)
+        for name, content in _contents(room).items()
+    }
 
 
-def _put(node: Any, parts: list[str]) -> None:
-    """Add a tree as text; fields that are empty are left out, as newer versions of Python add such."""
-    if isinstance(node, ast.AST):
-        parts.append(f"{type(node).__name__}(")
-        for name, value in ast.iter_fields(node):
-            if name == "body" and isinstance(node, DOCUMENTED) and _is_text(value[0] if value else None):
-                value = value[1:]
-            if value is not None and value != [] and name not in WITHOUT_MEANING:
-                parts.append(f"{name}=")
-                _put(value, parts)
-        parts.append(")")
-    elif isinstance(node, list):
-        parts.append("[")
-        for item in node:
-            _put(item, parts)
-        parts.append("]")
-    else:
-        parts.append(f"{node!r},")
-
-
-def _is_text(node: ast.AST | None) -> bool:
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
-
-
-def _part(file: str) -> bool:
-    return _top(file) not in WITHOUT_PART
-
-
-def _top(file: str) -> str:
-    """The part of gsbench that a file belongs to."""
-    return file.partition("/")[0].removesuffix(".py")
+def _contents(room: str) -> dict[str, bytes]:
+    """The files of a room by their paths below the package."""
+    place = PACKAGE / room
+    files = [place] if place.suffix else sorted(place.rglob("*.py"))
+    return {file.relative_to(PACKAGE).as_posix(): file.read_bytes() for file in files if file.is_file()}
 
 
 def _module(file: str) -> str:
-    return file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    return f"{PACKAGE.name}.{file.removesuffix('.py').removesuffix('/__init__').replace('/', '.')}"
 
 
-def _file(module: str, name: str | None) -> str | None:
-    """The file below the package where ``name`` of ``module`` is defined, or that of the module."""
-    head, _, below = module.partition(".")
-    if head != PACKAGE.name:
-        return None
-    if name is not None and (inner := _place(f"{below}.{name}".lstrip("."))) is not None:
-        return inner
-    file = _place(below)
-    if file is None or name is None or not file.endswith("__init__.py"):
-        return file
-    for source, taken in _read(file).names:
-        if taken == name and source != module:
-            return _file(source, name)
-    return file
+def _digest(contents: Mapping[str, bytes]) -> str:
+    parts = "".join(f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name, content in sorted(contents.items()))
+    return hashlib.sha256(parts.encode()).hexdigest()[:DIGEST_CHARACTERS]
 
 
 @cache
-def _place(module: str) -> str | None:
-    """The file of a module, by its name below the package."""
-    for file in (f"{module.replace('.', '/')}.py", f"{module.replace('.', '/')}/__init__.py".lstrip("/")):
-        if (PACKAGE / file).is_file():
-            return file
-    return None
-
-
-def _object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; empty where there is none, or none that can be read."""
+def _released() -> dict[str, dict[str, str]]:
     try:
-        value = read_json(path)
+        found: dict[str, dict[str, str]] = read_json(PACKAGE / RELEASED)
     except (FileNotFoundError, DamagedError):
         return {}
-    return value if isinstance(value, dict) else {}
+    return found
 
 
-@cache
-def _released() -> dict[str, str]:
-    return _object(PACKAGE / RELEASED)
-
-
-def _read(file: str) -> _Source:
-    """A file of gsbench as it was when this process first asked, which is what it runs. Raises OSError."""
-    if file not in _sources:
-        stamp, loaded = _stamp(file), f"{PACKAGE.name}.{_module(file)}" in sys.modules
-        known = _digests().get(file)
-        if known is None or known[0] != stamp:
-            known = _digests()[file] = [stamp, *_parsed(file)]
-            _unkept.add(file)
-        digest = known[1]
-        if loaded and stamp[1] > IMPORTED_AT:
-            log.warning(
-                "gsbench's %s was edited when it had been loaded: start again, else it is unknown what ran", file
-            )
-            digest = uuid.uuid4().hex[:DIGEST_CHARACTERS]
-        names = tuple((module, name) for module, name in known[2])
-        _sources[file] = _Source(stamp, digest, names, loaded)
-    return _sources[file]
-
-
-def _parsed(file: str) -> tuple[str, list[list[str | None]]]:
-    """The digest of a file, and what it imports of gsbench."""
-    content = (PACKAGE / file).read_bytes()
+def syntax_of(source: bytes) -> bytes:
+    """A Python file without comments, docstrings and layout; a file that is not Python as it is."""
     try:
-        name = f"{PACKAGE.name}.{_module(file)}".removesuffix(".__init__")
-        names = read_imports(ast.parse(content), name, file.endswith("__init__.py")).names
+        tree = ast.parse(source)
     except (SyntaxError, ValueError, RecursionError):
-        names = ()
-    own = [[module, taken] for module, taken in names if module.partition(".")[0] == PACKAGE.name]
-    return digest_of(content), own
+        return source
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and _is_text(body):
+            node.body = node.body[1:]
+    return ast.dump(tree).encode("utf-8", "surrogatepass")
 
 
-def _stamp(file: str) -> list[int]:
-    """Mark that changes whenever a file does; empty where it is gone."""
-    try:
-        found = os.stat(PACKAGE / file)
-    except FileNotFoundError:
-        return []
-    return [found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino]
-
-
-@cache
-def _digests() -> dict[str, list[Any]]:
-    """Digests and imports of files by the state in which they had them, as other processes have left them on disk."""
-    kept = _object(_cache_file())
-    files = kept.get("files")
-    if kept.get("read_by") != _read_by() or not isinstance(files, dict):
-        return {}
-    return {file: entry for file, entry in files.items() if isinstance(entry, list) and len(entry) == 3}
-
-
-def _keep_digests() -> None:
-    """Leave the digests to other processes, where that is allowed."""
-    if _unkept:
-        with suppress(OSError):
-            _cache_file().parent.mkdir(parents=True, exist_ok=True)
-            write_json(_cache_file(), {"read_by": _read_by(), "files": _digests()})
-    _unkept.clear()
-
-
-def _read_by() -> list[Any]:
-    """State of Python and of the code that find digests and imports."""
-    return [sys.version, _stamp("runs/code.py"), _stamp("system/imports.py")]
-
-
-def _cache_file() -> Path:
-    """In the user's cache, one for each place where gsbench lies."""
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(home, "gsbench", f"code-{hashlib.sha256(str(PACKAGE).encode()).hexdigest()[:DIGEST_CHARACTERS]}.json")
+def _is_text(body: Any) -> bool:
+    first = body[0] if body else None
+    return isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str)
 
 
 def main() -> None:
-    """Write the digests of all files as those of a release (docs/releasing.md)."""
-    files = sorted(path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py"))
-    digests = {file: digest_of((PACKAGE / file).read_bytes()) for file in files if _part(file)}
-    write_json(PACKAGE / RELEASED, digests)
+    """Write the digests of all rooms as those of a release (docs/releasing.md)."""
+    found = {}
+    for room in sorted({room for rooms in ROOMS.values() for room in rooms}):
+        contents = _contents(room)
+        syntax = {name: syntax_of(content) for name, content in contents.items()}
+        found[room] = {"bytes": _digest(contents), "syntax": _digest(syntax)}
+    write_json(PACKAGE / RELEASED, found)
+
+
+# ---- the user's code
+
+_as_imported: dict[str, tuple[ModuleSpec, str | None]] = {}  # what a module's files held when it was imported
+
+
+def user_modules(values: Mapping[str, Any]) -> dict[str, str]:
+    """``{module: sha256}`` of the user's code behind a configuration: empty where all of its classes are gsbench's.
+
+    That are the modules of its classes, and all that ``allow_targets`` names: one may import the other. What is
+    installed counts where a class is from it; else its version stands for it.
+    """
+    named = {target.split(".")[0] for target in _targets(values) if not target.startswith(OWN)}
+    if not named:
+        return {}
+    helpers = {name.split(".")[0] for name in values.get("allow_targets") or ()} - named
+    helpers = {name for name in helpers if (spec := _find(name)) is not None and not _is_installed(spec)}
+    digests = {name: module_digest(name) for name in sorted(named | helpers)}
+    return {name: digest for name, digest in digests.items() if digest is not None}
+
+
+def module_digest(name: str, folder: str | None = None) -> str | None:
+    """The sha256 of a top-level module: of its file, or of all code in its package. None where it is not found.
+
+    One that this process has imported counts as it was then: that is the code that runs. With ``folder``, it is looked
+    for as a program started there would find it, whatever this process has imported.
+    """
+    loaded = sys.modules.get(name) if folder is None else None
+    spec = _find(name, folder) if loaded is None else loaded.__spec__
+    if spec is None:
+        return None
+    if loaded is None:
+        return _digest_on_disk(spec)
+    known = _as_imported.get(name)
+    if known is None or known[0] is not spec:
+        known = _as_imported[name] = (spec, _digest_on_disk(spec))
+    return known[1]
+
+
+def has_changed_since_import(name: str) -> bool:
+    """Return whether a module's files are no longer those that this process has imported, and therefore runs."""
+    loaded = sys.modules.get(name)
+    spec = None if loaded is None else loaded.__spec__
+    return spec is not None and module_digest(name) != _digest_on_disk(spec)
+
+
+def unnamed_modules(before: Collection[str], named: Collection[str]) -> list[str]:
+    """The user's modules that were imported since ``before`` and are not ``named``: an edit there goes unnoticed."""
+    tops = {name.split(".")[0] for name in sys.modules.keys() - set(before)} - {*named, PACKAGE.name}
+    specs = {top: getattr(sys.modules.get(top), "__spec__", None) for top in tops}
+    return sorted(top for top, spec in specs.items() if spec is not None and not _is_installed(spec))
+
+
+def _targets(values: Any) -> Iterator[str]:
+    """The import paths of classes in a configuration, at any depth."""
+    if isinstance(values, Mapping):
+        if isinstance(values.get("_target_"), str):
+            yield values["_target_"]
+        for value in values.values():
+            yield from _targets(value)
+    elif isinstance(values, list | tuple):
+        for value in values:
+            yield from _targets(value)
+
+
+def _find(name: str, folder: str | None = None) -> ModuleSpec | None:
+    """A top-level module, as Python would find it; imports nothing."""
+    importlib.invalidate_caches()  # the files may be younger than what a finder remembers of their folder
+    try:
+        if folder is not None:
+            return PathFinder.find_spec(name, [*sys.path, folder])
+        return importlib.util.find_spec(name) if name else None
+    except (ImportError, ValueError):
+        return None
+
+
+def _digest_on_disk(spec: ModuleSpec) -> str | None:
+    """One hash of the code of a module: of one file the sha256 of what it holds, of several that of their list."""
+    folders = [Path(place) for place in spec.submodule_search_locations or ()]
+    if not folders:
+        file = Path(spec.origin or "")
+        return hashlib.sha256(file.read_bytes()).hexdigest() if spec.has_location and file.is_file() else None
+    parts = [
+        f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(folder).as_posix()}\n"
+        for folder in folders
+        for file in sorted(folder.rglob("*"))
+        if file.suffix in CODE_SUFFIXES and file.is_file()
+    ]
+    return hashlib.sha256("".join(parts).encode()).hexdigest() if parts else None
+
+
+def _is_installed(spec: ModuleSpec) -> bool:
+    """Return whether a module is Python's own or of an installed package, which its version stands for."""
+    places = [spec.origin] if spec.has_location else list(spec.submodule_search_locations or [])
+    library = [sysconfig.get_path(key) for key in ("stdlib", "platstdlib")]
+    return all(
+        place is None or INSTALLED & set(Path(place).parts) or any(Path(place).is_relative_to(one) for one in library)
+        for place in places
+    )
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from typing import Any
 from gsbench.records import read_if_sound
 from gsbench.runs.hashing import flatten
 from gsbench.runs.layout import MANIFEST
-from gsbench.runs.step import Step
+from gsbench.runs.stages import Step
 from gsbench.runs.store import Manifest, Store, read_manifest
 
 KEY = re.compile(r'"[0-9a-f]{64}"')

@@ -7,35 +7,19 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from gsbench.runs.source import OWN, source_of
+from gsbench.runs.code import OWN, user_modules
 
 # Options of gsbench's own classes that cannot change a result; what they mean in a user's class, nobody knows.
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
 # Settings of a group that say how results will be read, or what may be varied, whatever they are.
 DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",)}
-# Settings that are younger than results that people keep, with the value at which all is as it was before them: at
-# that value they have no part in a hash or key, and a configuration without them means it.
-LATER: dict[str, dict[str, Any]] = {
-    "scene": {
-        "split": "every_nth",
-        "sector": 0,
-        "sectors": 8,
-        "match_views": False,
-        "validation": False,
-        "masks": None,
-        "transparent": "black",
-    },
-    "init": {"points_from": "all"},
-    "train": {"resolution_schedule": "none"},
-    "eval": {"bands": False, "fps": None},
-}
-BEFORE = {f"{group}.{name}": value for group, values in LATER.items() for name, value in values.items()}
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
 
 
 def config_hash(values: dict[str, Any]) -> str:
     """sha256 of what determines a result apart from the seed: not names, devices, folders, tracking or launchers."""
-    return sha256_of(_with_sources(determining(values)))
+    modules = user_modules(values)
+    return sha256_of(determining(values) | ({"code": modules} if modules else {}))
 
 
 def determining(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -45,23 +29,8 @@ def determining(values: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(group, dict):
             without_effect = WITHOUT_EFFECT if str(group.get("_target_") or OWN).startswith(OWN) else ()
             dropped = (*without_effect, *DECLARED.get(key, ()))
-            kept[key] = {name: value for name, value in as_before(key, group).items() if name not in dropped}
+            kept[key] = {name: value for name, value in group.items() if name not in dropped}
     return kept
-
-
-def as_before(group: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """``values`` of a group without the settings of `LATER` that stand at the value of before them."""
-    later = LATER.get(group, {})
-    return {name: value for name, value in values.items() if name not in later or value != later[name]}
-
-
-def _with_sources(values: Any) -> Any:
-    """``values`` with the source of each user's own class beside its ``_target_``, at any depth."""
-    if not isinstance(values, dict):
-        return values
-    target = values.get("_target_")
-    sources = source_of(target) if isinstance(target, str) else {}
-    return {key: _with_sources(value) for key, value in values.items()} | sources
 
 
 def sha256_of(values: Any) -> str:

@@ -18,7 +18,7 @@ from pydantic_core import from_json
 from gsbench.files import file_sha256
 from gsbench.parsing import DamagedError, fault_of, read_bytes
 from gsbench.records import Part
-from gsbench.runs.code import changed_files
+from gsbench.runs.code import changed_rooms
 from gsbench.runs.hashing import config_hash, sha256_of
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS, PER_VIEW
 from gsbench.runs.stages import STAGES
@@ -110,8 +110,8 @@ def changes(folder: Path, values: dict[str, Any], record: TrialRecord, made_of: 
         made, now = made_of.stages.get(name), versions.get(name)
         if made != now:
             yield f"it was made by version {made} of the stage {name}, which is now at {now}"
-    if files := changed_files(record.code.files):
-        yield f"the code of gsbench changed in: {', '.join(files)}"
+    if rooms := changed_rooms(record.code.rooms):
+        yield f"the code of gsbench changed in: {', '.join(rooms)}"
     if made_of.pycolmap != (installed := version_of(PYCOLMAP)):
         yield f"it was made with {PYCOLMAP} {made_of.pycolmap}, and {installed} is installed"
     for place, stamp in made_of.sources.items():

@@ -33,7 +33,7 @@ from gsbench.parsing import DamagedError, fault_of
 from gsbench.records import Amount, Count, Part, read_typed
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import MANIFEST, VIEWS
-from gsbench.runs.step import Stage, Step
+from gsbench.runs.stages import Stage, Step
 from gsbench.system.locks import BusyError, hold
 
 log = logging.getLogger(__name__)

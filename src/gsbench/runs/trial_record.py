@@ -5,6 +5,7 @@ files (``training.json``, ``metrics.json``): its writers fill these, its readers
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -21,6 +22,8 @@ FROM_RENDERS: Final = "renders"
 MADE_ELSEWHERE = "made by another program"  # how the reason of a quantity starts that nobody can know of such a trial
 RENDERS_ALONE = f"{MADE_ELSEWHERE}, of which only the renders are known"
 
+BY_LISTS = "list"  # of `split_text`
+
 Iteration = Annotated[str, Field(pattern=r"^\d{1,18}$")]  # as the key of an object
 
 
@@ -35,15 +38,15 @@ class Budget(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class Code(Part):
-    """The versions of the code: sha256 of the files of a user's classes, versions of gsbench's stages.
+    """The versions of the code: sha256 of the a user's modules, versions of gsbench's stages.
 
-    ``files`` are those of gsbench that had a part, with their states (`gsbench.runs.code`); ``commit`` is that of the
+    ``rooms`` are those of gsbench that had a part, with their states (`gsbench.runs.code`); ``commit`` is that of the
     checkout that trained, ``edited`` says whether files that git follows had changed.
     """
 
     sources: dict[str, str] = field(default_factory=dict)
     stages: dict[str, int] = field(default_factory=dict)
-    files: dict[str, str] = field(default_factory=dict)
+    rooms: dict[str, str] = field(default_factory=dict)
     commit: str | None = None
     edited: bool | None = None  # None: without a checkout, or not to be told
 
@@ -122,7 +125,7 @@ class TrialRecord(Part):
     budget: Budget | None = None
     train_views: Count | None = None
     test_views: Count | None = None
-    split: str = ""  # the views that are held out, as short text (`gsbench.runs.splits`)
+    split: str = ""  # the views that are held out, as short text (`split_text`)
     held_out: str = ""  # the same in a sentence
     resolution: tuple[Count, Count] | None = None
     events: dict[str, Count] = field(default_factory=dict)  # totals of the refinements, by cause
@@ -190,3 +193,15 @@ def read_training(folder: Path) -> Training:
 def read_evaluation(folder: Path) -> Evaluation:
     """The record of the evaluation in ``folder``; raises as `read_training` does."""
     return read_typed(folder / METRICS, Evaluation)
+
+
+def split_text(config: Mapping[str, Any]) -> str:
+    """``every_nth``, ``sector 0 of 8`` or ``list``, and whether it is matched, or for validation."""
+    text, sectors = str(config.get("scene.split")), config.get("scene.sectors")
+    if text == "sector":
+        text = f"sector {config.get('scene.sector')} of {sectors}"
+    if config.get("scene.train_list") or config.get("scene.test_list"):
+        text = BY_LISTS
+    elif config.get("scene.match_views"):
+        text += ", matched" if text.startswith("sector") else f", matched with {sectors}"
+    return f"{text}, validation" if config.get("scene.validation") else text

@@ -14,7 +14,6 @@ from types import ModuleType
 
 # Python's switch against the current folder as a place of modules, with a value that tells ours from the user's.
 SAFE_PATH = ("PYTHONSAFEPATH", "gsbench")
-PATH_AT_START = tuple(sys.path)  # where Python looked for modules before any code of a user's could add to it
 
 
 class AllowedModules(MetaPathFinder):

@@ -12,8 +12,8 @@ from gsbench.analysis.differences import find_superseded
 from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.launch.plan import forget, read_plan, remove
 from gsbench.launch.states import TrialState, states_of_experiment
+from gsbench.runs.code import module_digest
 from gsbench.runs.experiments import experiment_home, list_experiments
-from gsbench.runs.source import source_on_disk
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
@@ -63,8 +63,8 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
     """
     places = {trial.folder: trial.cwd for trial in read_plan(home)}
 
-    def present(target: str, trial: TrialResult) -> str | None:
-        return source_on_disk(target, places[trial.path]) if trial.path in places else None
+    def present(module: str, trial: TrialResult) -> str | None:
+        return module_digest(module, places[trial.path]) if trial.path in places else None
 
     reasons = find_superseded(read_experiment(home).trials, present)
     return [

@@ -9,7 +9,7 @@ import torch
 
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
-from gsbench.pipeline.steps.figures import draw_ellipsoids
+from gsbench.pipeline.steps.pictures import draw_ellipsoids
 from tests.train.conftest import orbit_camera
 
 

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.pipeline.steps.maps import unproject, view_maps
+from gsbench.pipeline.steps.pictures import unproject, view_maps
 from gsbench.raster.reference import ReferenceRasterizer
 from tests.train.conftest import orbit_camera
 

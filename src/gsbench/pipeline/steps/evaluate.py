@@ -24,16 +24,13 @@ from gsbench.gaussians.ply import read_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.logs import progress
-from gsbench.pipeline.components import options_of, rasterizer_inputs
-from gsbench.pipeline.steps.code import step_of_code
-from gsbench.pipeline.steps.figures import draw_ellipsoids
-from gsbench.pipeline.steps.maps import view_maps
+from gsbench.pipeline.steps.inputs import GSBENCH_ALONE, UserCode, options_of, rasterizer_inputs, step_of
 from gsbench.pipeline.steps.model_metrics import ModelMetrics, measure_model, nothing_known
-from gsbench.pipeline.steps.views import Views
+from gsbench.pipeline.steps.pictures import draw_ellipsoids, view_maps
+from gsbench.pipeline.steps.scene import Views
 from gsbench.raster import Rasterizer
 from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, MAPS, METRICS, PER_VIEW, POINT_CLOUD, RENDERS
-from gsbench.runs.stages import EVALUATE
-from gsbench.runs.step import Step
+from gsbench.runs.stages import EVALUATE, Step
 from gsbench.runs.trial_record import Earlier, Evaluation
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
@@ -55,13 +52,12 @@ def evaluate_step(
     earlier: Sequence[int] = (),
     made_by_program: bool = False,
     of_model: Mapping[str, Any] = MappingProxyType({}),
-    targets: Mapping[str, str] = MappingProxyType({}),
+    user: UserCode = GSBENCH_ALONE,
 ) -> Step:
     """Render and measure the model of ``trained``, and its snapshots of the iterations ``earlier``.
 
     ``maps`` also keeps what the report needs to say where an arm helps; ``of_model`` says what is measured of the model
-    itself (`gsbench.eval.options.EvalConfig.of_model`). ``targets`` has the import paths by which the configuration
-    names classes, by their places in it. The key of a training by another program
+    itself (`gsbench.eval.options.EvalConfig.of_model`). The key of a training by another program
     (``made_by_program``) knows nothing of the rendering, so it is in this step's.
     """
     inputs: dict[str, Any] = {
@@ -73,8 +69,8 @@ def evaluate_step(
     if earlier:
         inputs["earlier"] = list(earlier)
     if made_by_program:
-        inputs |= {"raster": rasterizer_inputs(rasterizer, targets.get("raster")), "background": list(background)}
-    inputs |= _further_metrics(evaluator, targets) | dict(of_model)
+        inputs |= {"raster": rasterizer_inputs(rasterizer, user), "background": list(background)}
+    inputs |= _further_metrics(evaluator, user) | dict(of_model)
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
@@ -108,8 +104,7 @@ def evaluate_step(
         found = measure_model(of_model, rasterizer, gaussians, views, color, folder / RENDERS)
         _write_metrics(folder, evaluator, per_view, found, scene, at)
 
-    components = ((rasterizer, targets.get("raster")), *_named(evaluator, targets))
-    return step_of_code(EVALUATE, inputs, build, __name__, components)
+    return step_of(EVALUATE, inputs, build, user)
 
 
 def measure_step(
@@ -117,15 +112,15 @@ def measure_step(
     trained: Step,
     evaluator: Evaluator,
     of_model: Mapping[str, Any] = MappingProxyType({}),
-    targets: Mapping[str, str] = MappingProxyType({}),
+    user: UserCode = GSBENCH_ALONE,
 ) -> Step:
-    """Measure the renders that another program left in ``trained``, as they are; ``targets`` as for `evaluate_step`."""
+    """Measure the renders that another program left in ``trained``, as they are."""
     inputs: dict[str, Any] = {
         "renders": trained.key,
         "protocol": evaluator.protocol.id,
         "unavailable": sorted(evaluator.unavailable),
     }
-    inputs |= _further_metrics(evaluator, targets) | dict(of_model)
+    inputs |= _further_metrics(evaluator, user) | dict(of_model)
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
@@ -140,17 +135,12 @@ def measure_step(
         unknown = nothing_known(of_model, "another program's renders are known, not its model")
         _write_metrics(folder, evaluator, per_view, [unknown], scene)
 
-    return step_of_code(EVALUATE, inputs, build, __name__, _named(evaluator, targets))
+    return step_of(EVALUATE, inputs, build, user)
 
 
-def _named(evaluator: Evaluator, targets: Mapping[str, str]) -> list[tuple[Any, str | None]]:
-    """The user's own metrics, each with the import path by which the configuration names its class."""
-    return [(metric, targets.get(f"{EXTRA}.{name}")) for name, metric in evaluator.extra.items()]
-
-
-def _further_metrics(evaluator: Evaluator, targets: Mapping[str, str]) -> dict[str, Any]:
+def _further_metrics(evaluator: Evaluator, user: UserCode) -> dict[str, Any]:
     """The user's own metrics and those of ``eval.more`` as they enter a key; nothing where there are none."""
-    own = {name: options_of("eval", metric, targets.get(f"{EXTRA}.{name}")) for name, metric in evaluator.extra.items()}
+    own = {name: options_of("eval", metric, user, f"{EXTRA}.{name}") for name, metric in evaluator.extra.items()}
     further: dict[str, Any] = {"extra": own, "more": list(evaluator.more)}
     return {name: value for name, value in further.items() if value}
 

@@ -24,12 +24,10 @@ from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS, External, fill
 from gsbench.files import write_json
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.pipeline.components import options_of
-from gsbench.pipeline.steps.code import step_of_code
-from gsbench.pipeline.steps.views import Views
+from gsbench.pipeline.steps.inputs import options_of, step_of
+from gsbench.pipeline.steps.scene import Views
 from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG, TRAINING
-from gsbench.runs.stages import TRAIN
-from gsbench.runs.step import Step
+from gsbench.runs.stages import TRAIN, Step
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 from gsbench.system.checkout import own_checkout
 from gsbench.system.machine import describe_machine
@@ -104,7 +102,7 @@ def external_step(
         write_json(folder / TRAINING, summary)
 
     stage = replace(TRAIN, version=1, resumable=False)  # it starts from the beginning, and is no training of ours
-    return step_of_code(stage, inputs, build, __name__)
+    return step_of(stage, inputs, build)
 
 
 def take_result(trainer: External, pattern: str, views: Views, output: Path, folder: Path) -> dict[str, Any]:

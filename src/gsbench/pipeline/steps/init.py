@@ -8,11 +8,8 @@ from pathlib import Path
 
 from gsbench.init.base import MODEL_FOLDER, Initializer
 from gsbench.logs import Progress, progress
-from gsbench.pipeline.components import options_of
-from gsbench.pipeline.steps.code import step_of_code
-from gsbench.pipeline.steps.held_out import split_of
-from gsbench.runs.stages import INIT
-from gsbench.runs.step import Step
+from gsbench.pipeline.steps.inputs import GSBENCH_ALONE, UserCode, options_of, split_of, step_of
+from gsbench.runs.stages import INIT, Step
 from gsbench.runs.store import Store
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Capture
@@ -24,17 +21,14 @@ def init_step(
     capture: Capture,
     initializer: Initializer,
     reference: Step | None = None,
-    target: str | None = None,
+    user: UserCode = GSBENCH_ALONE,
 ) -> Step:
-    """The initialiser's step; ``reference`` is the one whose cameras stand in for those that did not come.
-
-    ``target`` is the import path by which the configuration names the initialiser's class.
-    """
+    """The initialiser's step; ``reference`` is the one whose cameras stand in for those that did not come."""
     inputs = {
         "capture": capture.fingerprint,
         "test": split_of(capture),
         "exact_poses": capture.exact_poses,
-        "options": options_of("init", initializer, target),
+        "options": options_of("init", initializer, user),
         "content": initializer.content(),
         "reference": None if reference is None else reference.key,
         "pycolmap": version("pycolmap"),
@@ -46,7 +40,7 @@ def init_step(
             cameras = None if reference is None else store.path(reference) / MODEL_FOLDER
             initializer.run(capture, folder, report, reference=cameras)
 
-    return step_of_code(INIT, inputs, build, __name__, ((initializer, target),), in_processes=True)
+    return step_of(INIT, inputs, build, user, in_processes=True)
 
 
 def check_readable(capture: Capture, report: Progress) -> None:

@@ -29,8 +29,8 @@ from gsbench.eval.geometry import (
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.pipeline.steps.maps import paint, surface_depth, unproject
-from gsbench.pipeline.steps.views import Views
+from gsbench.pipeline.steps.pictures import paint, surface_depth, unproject
+from gsbench.pipeline.steps.scene import Views
 from gsbench.raster import Rasterizer
 from gsbench.scene.camera import Camera
 from gsbench.scene.courtyard.render import courtyard_cameras, courtyard_depth, surface_distance

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,14 +18,11 @@ from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.logs import progress
-from gsbench.pipeline.components import options_of, rasterizer_inputs
-from gsbench.pipeline.steps.code import step_of_code
-from gsbench.pipeline.steps.views import Views
+from gsbench.pipeline.steps.inputs import GSBENCH_ALONE, UserCode, options_of, rasterizer_inputs, step_of
+from gsbench.pipeline.steps.scene import Views
 from gsbench.raster import Rasterizer
-from gsbench.runs.hashing import as_before
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
-from gsbench.runs.stages import TRAIN
-from gsbench.runs.step import Step
+from gsbench.runs.stages import TRAIN, Step
 from gsbench.system.checkout import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.memory import peak_memory_mb, reset_peak_memory
@@ -42,20 +38,16 @@ def train_step(
     seed: int,
     device: torch.device,
     snapshot_at: Sequence[int] = (),
-    targets: Mapping[str, str] = MappingProxyType({}),
+    user: UserCode = GSBENCH_ALONE,
 ) -> Step:
-    """Train on the training views, from the cloud of the initialiser; keep the model at ``snapshot_at`` too.
-
-    ``targets`` has the import paths by which the configuration names classes, by their places in it.
-    """
-    by_densifier, by_rasterizer = targets.get("densify"), targets.get("raster")
-    values = as_before("train", dataclasses.asdict(options))
+    """Train on the training views, from the cloud of the initialiser; keep the model at ``snapshot_at`` too."""
+    values = dataclasses.asdict(options)
     of_model = {key: value for key, value in values.items() if key not in WITHOUT_EFFECT_ON_MODEL}
     inputs: dict[str, Any] = {
         "scene": views.inputs,
         "init": views.init.key,
-        "densify": options_of("densify", densifier, by_densifier),
-        "raster": rasterizer_inputs(rasterizer, by_rasterizer),
+        "densify": options_of("densify", densifier, user),
+        "raster": rasterizer_inputs(rasterizer, user),
         "train": of_model,
         "seed": seed,
     }
@@ -91,8 +83,7 @@ def train_step(
         }
         write_json(folder / TRAINING, summary)
 
-    components = ((densifier, by_densifier), (rasterizer, by_rasterizer))
-    return step_of_code(TRAIN, inputs, build, __name__, components)
+    return step_of(TRAIN, inputs, build, user)
 
 
 def initial_gaussians(init: Path, device: torch.device) -> Gaussians:

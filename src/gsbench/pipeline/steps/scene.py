@@ -1,26 +1,33 @@
-"""The photographs of a trial: the user's own, or the procedural courtyard, which a step renders first."""
+"""The photographs of a trial: as they come, as views of their final size, and the test views as they are kept."""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from gsbench.files import file_sha256
+from gsbench.init.base import MODEL_FOLDER
 from gsbench.init.point_files import read_points
 from gsbench.init.points import GREY
 from gsbench.logs import progress
-from gsbench.pipeline.steps.code import step_of_code
-from gsbench.runs.stages import CAPTURE
-from gsbench.runs.step import Step
+from gsbench.pipeline.steps.inputs import split_of, step_of
+from gsbench.runs.code import VIEWS_ROOMS, edited, states_of
+from gsbench.runs.layout import MASKS, VIEWS
+from gsbench.runs.made_of import PYCOLMAP, version_of
+from gsbench.runs.stages import CAPTURE, GROUND_TRUTH, Step
+from gsbench.runs.store import Store
 from gsbench.scene.colmap import write_frames
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.images import image_size
-from gsbench.scene.masks import IMAGES, prepare, prepared_mask
+from gsbench.scene.load import load_scene
+from gsbench.scene.masks import IMAGES, prepare, prepared_mask, write_mask
+from gsbench.scene.names import png_name
 from gsbench.scene.options import Behind, SceneConfig
 from gsbench.scene.readers import (
     SPARSE_FOLDERS,
@@ -33,7 +40,7 @@ from gsbench.scene.readers import (
 from gsbench.scene.sizes import check_final_size
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.transforms import read_transforms as read_transforms_files
-from gsbench.scene.types import Capture
+from gsbench.scene.types import Capture, Scene
 from gsbench.system.resources import available_threads
 
 
@@ -94,7 +101,7 @@ def _courtyard_step(options: SceneConfig) -> Step:
         with progress("scene") as report:
             render_courtyard(folder, progress=report, **inputs)
 
-    return step_of_code(CAPTURE, inputs, build, __name__)
+    return step_of(CAPTURE, inputs, build)
 
 
 def _transforms_step(said: Transforms) -> Step:
@@ -111,7 +118,7 @@ def _transforms_step(said: Transforms) -> Step:
         frames = {name: (frame.camera, frame.rotation, frame.translation) for name, frame in said.frames.items()}
         write_frames(target / SPARSE_FOLDERS[0], frames, cloud=cloud)
 
-    return step_of_code(CAPTURE, inputs, build, __name__)
+    return step_of(CAPTURE, inputs, build)
 
 
 def masked_step(capture: Capture, behind: Behind) -> Step | None:
@@ -135,10 +142,67 @@ def masked_step(capture: Capture, behind: Behind) -> Step | None:
             for done, _ in enumerate(made, 1):
                 report("pixels replaced", done, len(names))
 
-    return step_of_code(CAPTURE, inputs, build, __name__)
+    return step_of(CAPTURE, inputs, build)
 
 
 def masked(capture: Capture, folder: Path) -> Capture:
     """The capture with what `masked_step` left in ``folder``."""
     masks = {name: prepared_mask(folder, name) for name in capture.masks}
     return replace(capture, images=folder / IMAGES, masks=masks)
+
+
+class Views:
+    """Views of a trial, loaded when first asked for, and what they depend on."""
+
+    def __init__(self, store: Store, capture: Capture, init: Step, options: SceneConfig) -> None:
+        self.store, self.capture, self.init, self.options = store, capture, init, options
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """The inputs that the views depend on besides the cameras, which are those of ``init``."""
+        return {
+            "capture": self.capture.fingerprint,
+            "test": split_of(self.capture),
+            "downscale": self.options.downscale,
+            "max_size": self.options.max_size,
+            "resample": self.options.resample,
+            "principal_point": self.options.principal_point,
+        }
+
+    @cached_property
+    def scene(self) -> Scene:
+        """Undistorted and shrunk; ``init`` must be built. Prepared images are cached beside the store's stages."""
+        with progress("scene") as report:
+            return load_scene(
+                self.capture,
+                self.store.path(self.init) / MODEL_FOLDER,
+                self.store.root / VIEWS,
+                downscale=self.options.downscale,
+                max_size=self.options.max_size,
+                resample=self.options.resample,
+                principal_point=self.options.principal_point,
+                progress=report,
+                made_by=makers_of_views(),
+            )
+
+
+@cache
+def makers_of_views() -> dict[str, str | None]:
+    """Versions of what makes pixels of photographs: gsbench's rooms that are not as released, and packages.
+
+    Pillow reads and shrinks images, pycolmap undistorts them.
+    """
+    return {**edited(states_of(VIEWS_ROOMS)), **{package: version_of(package) for package in (PYCOLMAP, "pillow")}}
+
+
+def ground_truth_step(views: Views) -> Step:
+    """Keep the test views as PNG files, and the masks of those that ignore some pixels."""
+
+    def build(folder: Path) -> None:
+        for view in views.scene.test:
+            Image.fromarray(view.image).save(folder / png_name(view.name))
+            if view.mask is not None:
+                (folder / MASKS).mkdir(exist_ok=True)
+                write_mask(view.mask, folder / MASKS / png_name(view.name))
+
+    return step_of(GROUND_TRUTH, {"scene": views.inputs, "init": views.init.key}, build)
