@@ -11,8 +11,8 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 from skimage.metrics import peak_signal_noise_ratio
 
-from gsbench.analysis.agreement import agreements, cloud_distance, image_psnr, read_positions, render_psnr
 from gsbench.analysis.report.build import build_report
+from gsbench.analysis.report.models import agreements, cloud_distance, image_psnr, read_positions, render_psnr
 from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Arm

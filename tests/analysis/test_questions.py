@@ -15,8 +15,7 @@ from gsbench.analysis.pairing import ViewCache, choose_pairs
 from gsbench.analysis.questions import HOLDS, OPEN, TURNS, UNSURE, Turn, find_gaps, find_turns
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.report.question_charts import angle_charts, binned, question_part
-from gsbench.analysis.report.setting_charts import sweep_charts
-from gsbench.analysis.report.tradeoff_charts import tradeoff_charts
+from gsbench.analysis.report.setting_charts import sweep_charts, tradeoff_charts
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table

@@ -17,10 +17,10 @@ from gsbench.analysis.errors_by_region import errors_by_region, texture_energy
 from gsbench.analysis.judgement import pair_trials
 from gsbench.analysis.report.build import build_report, trial_figures
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
+from gsbench.analysis.report.models import log10_volumes, share_above, volume_histogram
 from gsbench.analysis.report.pictures import choose_pictures
 from gsbench.analysis.report.sections import compare_arms, mean_by_step
 from gsbench.analysis.report.setting_charts import sweep_charts
-from gsbench.analysis.report.volumes import log10_volumes, share_above, volume_histogram
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Arm

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsbench.analysis.shares import Run, shapley
+from gsbench.analysis.statistics import Run, shapley
 from gsbench.claims.ablation import ablate, plan_runs
 from gsbench.errors import InputError
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsbench.analysis.shares import Run
+from gsbench.analysis.statistics import Run
 from gsbench.claims.switches import (
     Record,
     ablation_part,

@@ -23,11 +23,11 @@ from gsbench.analysis.cells import (
     with_variants,
 )
 from gsbench.analysis.differences import differing_conditions
+from gsbench.analysis.notes import caveat_notes, declared_notes, equal_notes, origin_notes
 from gsbench.analysis.origins import cloud_notes, held_out_notes, machine_notes, points_notes
 from gsbench.analysis.pairing import BASELINE, choose_pairs
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Experiment, TrialResult
-from gsbench.analysis.table_notes import caveat_notes, declared_notes, equal_notes, origin_notes
 from gsbench.analysis.translations import translation_notes
 from gsbench.words import counted, signed
 

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.analysis.shares import Run, shapley
-from gsbench.analysis.statistics import ALPHA, Interval, student
+from gsbench.analysis.statistics import ALPHA, Interval, Run, shapley, student
 from gsbench.errors import InputError
 from gsbench.words import closest
 

@@ -8,9 +8,9 @@ from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
 
-from gsbench.analysis.caveats import caveats
 from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.fairness import fairness_table
+from gsbench.analysis.notes import caveats
 from gsbench.analysis.origins import cloud_notes, machine_notes
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.report.pictures import Crop, choose_pictures

@@ -19,8 +19,7 @@ from gsbench.analysis.quantities import metric_keys, metric_quantity
 from gsbench.analysis.report.build import AblationPart
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.results import TrialResult, read_experiment
-from gsbench.analysis.shares import Run
-from gsbench.analysis.statistics import Interval
+from gsbench.analysis.statistics import Interval, Run
 from gsbench.claims.ablation import Ablation, ablate, plan_runs
 from gsbench.errors import InputError
 from gsbench.files import write_json

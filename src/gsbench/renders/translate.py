@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsbench.analysis.results import TrialResult, load_experiment
-from gsbench.analysis.shares import Run, shapley
+from gsbench.analysis.statistics import Run, shapley
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, quantize, summarize
 from gsbench.eval.protocol import OTHERS, Protocol, get_protocol, protocol_of

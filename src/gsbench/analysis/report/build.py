@@ -8,7 +8,6 @@ from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
 
-from gsbench.analysis.agreement import agreements
 from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.errors_by_region import read_image
@@ -16,6 +15,7 @@ from gsbench.analysis.origins import cloud_lines
 from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs, controls_of
 from gsbench.analysis.paper import load_paper
 from gsbench.analysis.paper_tables import layout_of, paper_tables
+from gsbench.analysis.report.models import agreements
 from gsbench.analysis.report.pictures import data_uri
 from gsbench.analysis.report.question_charts import question_part
 from gsbench.analysis.report.sections import (
@@ -25,8 +25,7 @@ from gsbench.analysis.report.sections import (
     training_charts,
     volume_charts,
 )
-from gsbench.analysis.report.setting_charts import search_part, sweep_charts
-from gsbench.analysis.report.tradeoff_charts import tradeoff_charts, tradeoff_gaps
+from gsbench.analysis.report.setting_charts import search_part, sweep_charts, tradeoff_charts, tradeoff_gaps
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import build_table

@@ -12,7 +12,7 @@ from gsbench.analysis.pairing import ViewCache, arm_name
 from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.questions import TURNS, UNSURE, Gap, Turn, find_gaps, find_turns, without_split
 from gsbench.analysis.report.charts import Series, line_chart
-from gsbench.analysis.report.tradeoff_charts import main_metrics
+from gsbench.analysis.report.setting_charts import main_metrics
 from gsbench.analysis.results import TrialResult
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.verdicts import ArmVerdicts, Pair

@@ -6,18 +6,18 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gsbench.analysis.caveats import caveats
 from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import short_version
 from gsbench.analysis.errors_by_region import MAP_PROPERTIES, RegionErrors, errors_by_region
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.judgement import pair_trials
+from gsbench.analysis.notes import caveats
 from gsbench.analysis.origins import machine_of, unlike_clouds
 from gsbench.analysis.pairing import arm_name
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart, short_number
 from gsbench.analysis.report.headlines import by_scene_lines, detail_lines, headline, secondary
+from gsbench.analysis.report.models import share_above, volume_histogram
 from gsbench.analysis.report.pictures import Pictures, choose_pictures
-from gsbench.analysis.report.volumes import share_above, volume_histogram
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.tables import Table, change_words, cost_change
 from gsbench.analysis.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve

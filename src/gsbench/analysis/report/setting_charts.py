@@ -1,4 +1,4 @@
-"""The report's charts along settings: those of a search, and each metric over the one setting that a sweep varied."""
+"""The report's charts along settings: of a search, of a sweep that varied one setting, and of quality against cost."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from gsbench.analysis.cells import by_key
 from gsbench.analysis.configurations import canonical
 from gsbench.analysis.differences import differing_settings
 from gsbench.analysis.pairing import BASELINE
-from gsbench.analysis.quantities import Quantity, choose_quantities
+from gsbench.analysis.quantities import Quantity, choose_quantities, quantity
 from gsbench.analysis.report.charts import Series, line_chart, short_number
 from gsbench.analysis.results import TrialResult
-from gsbench.eval.facts import find
+from gsbench.analysis.tradeoffs import Curve, curve_gap, family_curve
+from gsbench.eval.facts import METRICS, find
 from gsbench.parsing import DamagedError
 from gsbench.runs.search_record import Point, SearchRecord, read_search
-from gsbench.words import counted
+from gsbench.words import counted, signed
 
 log = logging.getLogger(__name__)
 
@@ -114,14 +115,14 @@ def sweep_charts(trials: Sequence[TrialResult]) -> list[str]:
         places = {key: place for place, key in enumerate(sorted(values, key=lambda key: _order(values[key])))}
         arm = ", ".join(str(part).rpartition(".")[2] for part in family if part is not None)
         title = f"{setting.rpartition('.')[2]} ({arm})"
-        for quantity in choose_quantities(group):
+        for shown in choose_quantities(group):
             series = [
-                Series(scene, _deviations(own, setting, places, quantity))
+                Series(scene, _deviations(own, setting, places, shown))
                 for scene, own in sorted(by_key(group, lambda trial: trial.scene).items())
             ]
             names = [BASELINE if baseline and values[key] is None else _name(values[key]) for key in places]
-            label = f"{quantity.heading}, minus the scene's mean"
-            charts.append(line_chart(f"{quantity.name} by {title}", series, setting, label, x_names=names))
+            label = f"{shown.heading}, minus the scene's mean"
+            charts.append(line_chart(f"{shown.name} by {title}", series, setting, label, x_names=names))
     return [chart for chart in charts if chart]
 
 
@@ -168,3 +169,61 @@ def _order(value: object) -> tuple[int, float, str]:
 
 def _name(value: object) -> str:
     return short_number(value) if isinstance(value, int | float) and not isinstance(value, bool) else str(value)
+
+
+COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time (s)"}
+
+
+def tradeoff_charts(trials: Sequence[TrialResult]) -> list[str]:
+    """One chart for each pair of main metric and cost; a densifier's variants are the points of its line."""
+    charts = []
+    for where, own in _by_split(trials):
+        for metric in main_metrics(own):
+            for cost, label in COST_LABELS.items():
+                curves = _curves(own, metric, cost)
+                series = [
+                    Series("-".join(family), list(zip(curve.cost.tolist(), curve.quality.tolist(), strict=True)))
+                    for family, curve in curves.items()
+                ]
+                title = f"{metric.name} against {label}{where}"
+                charts.append(line_chart(title, series, label, metric.heading, log_x=True))
+    return [chart for chart in charts if chart]
+
+
+def tradeoff_gaps(trials: Sequence[TrialResult], baseline: str = BASELINE) -> list[str]:
+    """The area between every densifier's curve and the baseline's, in words, where both have several points."""
+    lines = []
+    for where, own in _by_split(trials):
+        for metric in main_metrics(own):
+            for cost, label in COST_LABELS.items():
+                curves = _curves(own, metric, cost)
+                for (init, densify), curve in curves.items():
+                    first = curves.get((init, baseline))
+                    gap = curve_gap(first, curve) if first is not None and densify != baseline else None
+                    if gap is not None:
+                        amount = signed(gap.gap, f".{metric.decimals + 1}f")
+                        arms = f"{init}-{densify} at the same {label} as {init}-{baseline}{where}"
+                        scale = f"from {short_number(gap.low)} to {short_number(gap.high)}, log scale"
+                        lines.append(f"{metric.name} of {arms}: {amount} on average ({scale}).")
+    return lines
+
+
+def _by_split(trials: Sequence[TrialResult]) -> list[tuple[str, list[TrialResult]]]:
+    """The trials by what was held out, with words for it where that is not one way for all."""
+    groups = by_key(trials, lambda trial: trial.split)
+    return [(f", {split}" if len(groups) > 1 else "", own) for split, own in groups.items()]
+
+
+def main_metrics(trials: Sequence[TrialResult]) -> list[Quantity]:
+    """PSNR, and the first perceptual metric that is at hand, beginning with the protocol's LPIPS."""
+    for name in ("lpips", *(facts.key for facts in METRICS if facts.perceptual)):
+        perceptual = quantity(name, trials)
+        if all(perceptual.read(trial) is not None for trial in trials):
+            return [quantity("psnr", trials), perceptual]
+    return [quantity("psnr", trials)]
+
+
+def _curves(trials: Sequence[TrialResult], metric: Quantity, cost: str) -> dict[tuple[str, str], Curve]:
+    families = sorted({(trial.init, trial.densify) for trial in trials})
+    curves = {family: family_curve(trials, family, metric, cost) for family in families}
+    return {family: curve for family, curve in curves.items() if len(curve.cost)}

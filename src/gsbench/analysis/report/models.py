@@ -1,10 +1,11 @@
-"""Agreement of two trainings of one arm: their renders of the test views, and the places of their Gaussians.
+"""Trained models in the report: the volumes of their Gaussians, and how far two trainings of one arm lie apart.
 
-Two seeds may reach one PSNR by different models. What is compared is one training with another, not with photographs.
+Two seeds may reach one PSNR by different models. One training is compared with another, not with photographs.
 """
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -108,14 +109,8 @@ def cloud_distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> C
 
 def read_positions(path: Path) -> NDArray[np.float64]:
     """The centres [N, 3] of the Gaussians of a 3DGS PLY whose opacity is at least 0.1; raises `InputError`."""
-    from plyfile import PlyData, PlyParseError  # here, since only reports read point clouds
-
-    try:
-        vertices = PlyData.read(path)["vertex"]
-        points = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)  # [N, 3]
-        logits = np.asarray(vertices["opacity"], dtype=np.float64)
-    except (OSError, ValueError, KeyError, PlyParseError) as error:
-        raise InputError(f"{path} is not a readable 3DGS PLY ({error})") from None
+    *places, logits = _columns(path, ("x", "y", "z", "opacity"))
+    points = np.stack(places, axis=1)  # [N, 3]
     return points[(logits >= np.log(MIN_OPACITY / (1 - MIN_OPACITY))) & np.isfinite(points).all(axis=1)]
 
 
@@ -158,3 +153,40 @@ def _measured(
 def _spread(count: int, at_most: int) -> NDArray[np.int64]:
     """Indices of at most ``at_most`` of ``count`` things, evenly spread, the first and the last among them."""
     return np.unique(np.linspace(0, count - 1, min(count, at_most)).round().astype(np.int64))
+
+
+LOG10_SPHERE = math.log10(4 / 3 * math.pi)
+BIN_WIDTH = 0.25  # decades
+
+
+def log10_volumes(path: Path) -> NDArray[np.float64]:
+    """log10 of the volumes ``4/3 π s1 s2 s3`` [N] of a 3DGS PLY, whose scales are natural logarithms."""
+    logs = np.sum(_columns(path, ("scale_0", "scale_1", "scale_2")), axis=0)
+    return LOG10_SPHERE + logs / math.log(10)
+
+
+def _columns(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
+    """The values [N] of these properties of the Gaussians of a 3DGS PLY; raises `InputError`."""
+    from plyfile import PlyData, PlyParseError  # here, since only reports read point clouds
+
+    try:
+        vertices = PlyData.read(path)["vertex"]
+        return [np.asarray(vertices[name], dtype=np.float64) for name in names]
+    except (OSError, ValueError, KeyError, PlyParseError) as error:
+        raise InputError(f"{path} is not a readable 3DGS PLY ({error})") from None
+
+
+def volume_histogram(trials: Sequence[TrialResult]) -> list[tuple[float, float]]:
+    """(volume, share of Gaussians) of the trials' pooled Gaussians, in bins of a quarter decade; only filled bins."""
+    volumes = np.concatenate([log10_volumes(trial.path / POINT_CLOUD) for trial in trials])
+    volumes = volumes[np.isfinite(volumes)]
+    bins, counts = np.unique(np.floor(volumes / BIN_WIDTH), return_counts=True)
+    return [
+        (10 ** ((k + 0.5) * BIN_WIDTH), n / len(volumes)) for k, n in zip(bins.tolist(), counts.tolist(), strict=True)
+    ]
+
+
+def share_above(trials: Sequence[TrialResult], threshold: float) -> float:
+    """The share of the trials' pooled Gaussians whose volume exceeds ``threshold``."""
+    volumes = np.concatenate([log10_volumes(trial.path / POINT_CLOUD) for trial in trials])
+    return float(np.mean(volumes > math.log10(threshold)))

@@ -1,14 +1,15 @@
-"""Notes below a table about the experiment as a whole: who trained, what was declared, in what arms differ."""
+"""Notes below a table and beside a verdict: who trained, what was declared, in what else arms differ."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gsbench.analysis.caveats import caveats
-from gsbench.analysis.cells import with_variants
+from gsbench.analysis.attribution import attribute, attribution_sentence
+from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.pairing import arm_name, choose_pairs, controls_of
 from gsbench.analysis.results import Arm, Experiment, TrialResult
+from gsbench.analysis.tuning import tuning_sentence
 from gsbench.runs.layout import SEARCH
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 
@@ -86,3 +87,35 @@ def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tupl
         return trials, []
     arms = sorted({trial.arm for trial in trials})
     return trials, choose_pairs(arms, controls=controls_of(trials)) if arms else []
+
+
+EQUAL_COUNTS = 0.02  # relative: arms closer than this have one count, as governed ones do
+
+
+def caveats(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
+    """Say where two arms of ``trials`` have unlike counts, differ in more than one ingredient, and where one was tuned
+    more; else "".
+    """
+    mixed = attribution_sentence(attribute(trials, first, second), first, second)
+    counts = counts_sentence(trials, first, second)
+    return " ".join(filter(None, [counts, mixed, tuning_sentence(trials, (first, second))]))
+
+
+def counts_sentence(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
+    """Say how many more Gaussians the second arm has, over the scenes that both have; "" where counts are equal."""
+    means = []
+    for arm in (first, second):
+        own = by_key([trial for trial in trials if trial.arm == arm], lambda trial: trial.scene)
+        counts = {scene: [trial.record.num_gaussians or 0 for trial in group] for scene, group in own.items()}
+        means.append({scene: sum(found) / len(found) for scene, found in counts.items() if all(found)})
+    shared = means[0].keys() & means[1].keys()
+    if not shared:
+        return ""
+    change = sum(means[1][scene] for scene in shared) / sum(means[0][scene] for scene in shared) - 1
+    if abs(change) <= EQUAL_COUNTS:
+        return ""
+    more = f"{abs(change):.0%}".replace("%", " %") + (" more" if change > 0 else " fewer")
+    return (
+        f"{arm_name(second)} has {more} Gaussians than {arm_name(first)}: this is no comparison at one count, which "
+        "densify.cap=governor makes."
+    )
