@@ -62,7 +62,7 @@ def test_every_option_composes(group: str, option: str) -> None:
     extra += ["densify=none"] if (group, option) == ("train", "none") else []
     extra += needs(option) if group == "densify" else []
     values = composed(f"{group}={option}", *extra)
-    own = {"external/program": "external", **dict.fromkeys(("photos", "colmap", "transforms"), "capture")}
+    own = {"external/program": "external", **dict.fromkeys(("photos", "colmap", "transforms", "blender"), "capture")}
     assert values[group]["name"] == own.get(option, option.rpartition("/")[2])
 
 
