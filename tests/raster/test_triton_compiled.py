@@ -95,8 +95,8 @@ def test_kernels_compile_without_spills(launches: list[Launch], target: int, mon
             assert made.inner_loop / composite.UNROLL.value < FORWARD_ENTRY
         if launch.name == "composite_backward":
             assert made.inner_loop / composite.UNROLL_BACK.value < BACKWARD_ENTRY
-    assert len({name for name, _ in compiled}) == 14
-    assert len(compiled) == (32 if target == 90 else 19)
+    assert len({name for name, _ in compiled}) == 13
+    assert len(compiled) == (23 if target == 90 else 16)
 
 
 def test_growing_compiles_nothing_anew(launches: list[Launch]) -> None:
