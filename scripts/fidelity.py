@@ -29,7 +29,8 @@ PAGE = ROOT / "docs" / "fidelity.md"
 ROW = re.compile(r"^\| `(\w+)` \|.*\| (0|1e-\d+) \|[^|]*\|$", re.MULTILINE)
 HEAD = """# How near each arm is to its source
 
-Made by `scripts/fidelity.py --write`; a test makes it again and compares. Sources were read for facts; nothing was
+Made by `scripts/fidelity.py --write` from the facts at the end of each arm's file in `conf/densify/`; a test makes it
+again and compares. Sources were read for facts; nothing was
 copied, and none of them was run here. So a row says: what the source does, as it was understood, was written down a
 second time, one Gaussian at a time in numpy (`tests/densify/`), and gsbench's arm did the same on made-up Gaussians
 with uneven Adam moments: the same Gaussians in the same order, the same parameters and moments, the same counts. The
