@@ -13,6 +13,7 @@ import numpy as np
 
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
+from gsbench.raster.cpu.shuffle import BLOCK, CHANNELS, load_colors, store_block, store_colors
 from gsbench.raster.cpu.simd import (
     absolute,
     exp2,
@@ -40,18 +41,18 @@ TRANSMITTANCE_MIN = np.float32(CONSTANTS.transmittance_min)
 LOG2_BLOCK_MIN = np.float32(math.log2(CONSTANTS.alpha_min) - 0.01)
 ONE = np.float32(1)
 ZERO = np.float32(0)
-BLOCK_SPAN = np.float32(at.BLOCK - 1)
+BLOCK_SPAN = np.float32(BLOCK - 1)
 TO_PRECISION = np.float32(2 * math.log(2.0))  # -curve to entry of the inverse covariance, up to sign
 BATCH = 64  # entries that the forward pass blends block by block: as many as a word has bits
 BATCH_AHEAD = 24  # list entries that the forward pass's prefetch runs ahead
 AHEAD = 6  # and that of the backward pass, which does more for each
 NEVER_STOPPED = np.float32(1e9)  # more entries than a tile can have
 
-LANE_X = (np.arange(LANES) % at.BLOCK).astype(np.float32)  # px within a block
-LANE_Y = (np.arange(LANES) // at.BLOCK).astype(np.float32)
+LANE_X = (np.arange(LANES) % BLOCK).astype(np.float32)  # px within a block
+LANE_Y = (np.arange(LANES) // BLOCK).astype(np.float32)
 # px within a tile, in the order by block and lane
-PIXEL_X = np.concatenate([block % at.BLOCK * at.BLOCK + LANE_X for block in range(LANES)]).astype(np.float32)
-PIXEL_Y = np.concatenate([block // at.BLOCK * at.BLOCK + LANE_Y for block in range(LANES)]).astype(np.float32)
+PIXEL_X = np.concatenate([block % BLOCK * BLOCK + LANE_X for block in range(LANES)]).astype(np.float32)
+PIXEL_Y = np.concatenate([block // BLOCK * BLOCK + LANE_Y for block in range(LANES)]).astype(np.float32)
 
 
 @inlined
@@ -97,7 +98,7 @@ def composite_tiles(
     transmittance, last = frame.transmittance, frame.last
     tiles_x, width, height = frame.camera.tiles_x, frame.camera.width, frame.camera.height
     lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
-    column, row = lane_x * np.float32(at.BLOCK), lane_y * np.float32(at.BLOCK)
+    column, row = lane_x * np.float32(BLOCK), lane_y * np.float32(BLOCK)
     floats, integers = memory
     red, green, blue = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :], floats[2 * at.TILE_PIXELS :]
     batch = floats[3 * at.TILE_PIXELS :]  # [BATCH * RECORD]
@@ -113,7 +114,7 @@ def composite_tiles(
             store(green, place, splat(ZERO))
             store(blue, place, splat(ZERO))
             store(transmittance, state + place, splat(ONE))
-            x, y = left + block % 4 * at.BLOCK, top + block // 4 * at.BLOCK
+            x, y = left + block % 4 * BLOCK, top + block // 4 * BLOCK
             live[block] = mask_bits((lane_x < np.float32(width - x)) & (lane_y < np.float32(height - y)))
             store(last, state + place, select(mask_from_bits(live[block]), splat(NEVER_STOPPED), ZERO))
             if live[block] != 0:
@@ -190,18 +191,26 @@ def composite_tiles(
 
         for block in range(16):
             place = block * LANES
+            x, y = left + block % 4 * BLOCK, top + block // 4 * BLOCK
             behind = load(transmittance, state + place)
-            store(red, place, fma(behind, frame.background[0], load(red, place)))
-            store(green, place, fma(behind, frame.background[1], load(green, place)))
-            store(blue, place, fma(behind, frame.background[2], load(blue, place)))
-        for y in range(top, min(top + at.TILE, height)):
-            for x in range(left, min(left + at.TILE, width)):
-                local = place_in_tile(x - left, y - top)
+            r = fma(behind, frame.background[0], load(red, place))
+            g = fma(behind, frame.background[1], load(green, place))
+            b = fma(behind, frame.background[2], load(blue, place))
+            if x + BLOCK <= width and y + BLOCK <= height:
                 pixel = y * width + x
-                image[3 * pixel] = red[local]
-                image[3 * pixel + 1] = green[local]
-                image[3 * pixel + 2] = blue[local]
-                alpha[pixel] = ONE - transmittance[state + local]
+                store_colors(image, CHANNELS * pixel, CHANNELS * width, r, g, b)
+                store_block(alpha, pixel, width, ONE - behind)
+                continue
+            store(red, place, r)
+            store(green, place, g)
+            store(blue, place, b)
+            for lane in range(LANES):  # a block across the image's edge
+                if x + lane % 4 < width and y + lane // 4 < height:
+                    pixel = (y + lane // 4) * width + x + lane % 4
+                    image[CHANNELS * pixel] = red[place + lane]
+                    image[CHANNELS * pixel + 1] = green[place + lane]
+                    image[CHANNELS * pixel + 2] = blue[place + lane]
+                    alpha[pixel] = ONE - transmittance[state + place + lane]
 
 
 @inlined
@@ -241,17 +250,28 @@ def composite_backward_tiles(
         begin, end = frame.starts[tile], frame.processed[tile]
         if begin == end:
             continue
+        for block in range(16):
+            place = block * LANES
+            x, y = left + block % 4 * BLOCK, top + block // 4 * BLOCK
+            if x + BLOCK <= width and y + BLOCK <= height:
+                r, g, b = load_colors(g_image, CHANNELS * (y * width + x), CHANNELS * width)
+                store(red, place, r)
+                store(green, place, g)
+                store(blue, place, b)
+                continue
+            for lane in range(LANES):  # a block across the image's edge
+                red[place + lane] = green[place + lane] = blue[place + lane] = ZERO
+                if x + lane % 4 < width and y + lane // 4 < height:
+                    pixel = (y + lane // 4) * width + x + lane % 4
+                    red[place + lane] = g_image[CHANNELS * pixel]
+                    green[place + lane] = g_image[CHANNELS * pixel + 1]
+                    blue[place + lane] = g_image[CHANNELS * pixel + 2]
         for place in range(at.TILE_PIXELS):
-            red[place] = green[place] = blue[place] = behind[place] = ZERO
-        for y in range(top, min(top + at.TILE, height)):
-            for x in range(left, min(left + at.TILE, width)):
-                local = place_in_tile(x - left, y - top)
-                pixel = y * width + x
-                red[local] = g_image[3 * pixel]
-                green[local] = g_image[3 * pixel + 1]
-                blue[local] = g_image[3 * pixel + 2]
-                if len(g_alpha) > 0:
-                    behind[local] = -g_alpha[pixel]
+            behind[place] = ZERO
+        if len(g_alpha) > 0:
+            for y in range(top, min(top + at.TILE, height)):
+                for x in range(left, min(left + at.TILE, width)):
+                    behind[place_in_tile(x - left, y - top)] = -g_alpha[y * width + x]
         for place in range(0, at.TILE_PIXELS, LANES):
             final = load(frame.transmittance, state + place)
             light = fma(load(red, place), frame.background[0], load(behind, place))

@@ -13,7 +13,6 @@ from gsbench.raster.cpu.simd import SUM_LANES
 from gsbench.raster.cpu.vector import LANES
 from gsbench.scene.camera import Camera
 
-BLOCK = 4  # px; one vector holds the 4x4 pixels of a block, row by row
 TILE = 16  # px; a tile is 4x4 blocks, row by row; fixed by the 16-bit masks, checked against RasterConstants.tile
 TILE_PIXELS = TILE * TILE
 

@@ -1,4 +1,4 @@
-"""Vectors turned into other vectors: 16x16 transposition, integers in the bits of lanes, and harmonics by channel.
+"""Vectors turned into other vectors: 16x16 transposition, blocks of pixels, integers in the bits of lanes, harmonics.
 
 The kernels hold a quantity of 16 Gaussians in a vector; records, gradient rows and the coefficients of one Gaussian lie
 side by side in memory. Here one becomes the other.
@@ -17,6 +17,7 @@ from gsbench.raster.cpu.simd import address, intrinsic
 from gsbench.raster.cpu.vector import LANES, VECTOR, lane_indices
 
 CHANNELS = 3
+BLOCK = 4  # px, the sides of the 16 pixels of a vector
 REST = CHANNELS * NUM_SH_REST  # numbers of one Gaussian in ``sh_rest``: coefficient by coefficient, r g b
 REST_STARTS = (0, LANES, REST - LANES)  # of the three vectors that hold them; the last two share three numbers
 
@@ -53,6 +54,62 @@ def transpose(typing_context: Any, array: Any, index: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, index), codegen
+
+
+def _row_pointers(context: Any, builder: Any, sig: Any, args: Any, numbers: int) -> list[Any]:
+    """Pointers to the four rows of a block, ``numbers`` float32 each, that begin at ``args[1]``, ``args[2]`` apart."""
+    first = address(context, builder, sig, args)
+    stride = context.cast(builder, args[2], sig.args[2], types.intp)
+    kind = ir.VectorType(ir.FloatType(), numbers).as_pointer()
+    places = [builder.mul(stride, ir.Constant(ir.IntType(64), row)) for row in range(LANES // BLOCK)]
+    return [builder.bitcast(builder.gep(first, [place]), kind) for place in places]
+
+
+@intrinsic
+def store_block(typing_context: Any, array: Any, index: Any, stride: Any, values: Any) -> Any:
+    """Write a block's 16 pixels to the image of one number a pixel whose rows are ``stride`` apart."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        for row, pointer in enumerate(_row_pointers(context, builder, sig, args, BLOCK)):
+            lanes = lane_indices(range(BLOCK * row, BLOCK * (row + 1)))
+            builder.store(builder.shuffle_vector(args[3], args[3], lanes), pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, index, stride, values), codegen
+
+
+@intrinsic
+def store_colors(typing_context: Any, array: Any, index: Any, stride: Any, red: Any, green: Any, blue: Any) -> Any:
+    """Write a block's 16 pixels to the image of three numbers a pixel whose rows are ``stride`` numbers apart."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        red, green, blue = args[3:]
+        for row, pointer in enumerate(_row_pointers(context, builder, sig, args, CHANNELS * BLOCK)):
+            lanes = list(range(BLOCK * row, BLOCK * (row + 1)))
+            both = [*lanes, *(LANES + lane for lane in lanes), *[0] * (LANES - 2 * BLOCK)]
+            red_green = builder.shuffle_vector(red, green, lane_indices(both))
+            mixed = [place for k, lane in enumerate(lanes) for place in (k, BLOCK + k, LANES + lane)]
+            builder.store(builder.shuffle_vector(red_green, blue, lane_indices(mixed)), pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, index, stride, red, green, blue), codegen
+
+
+@intrinsic
+def load_colors(typing_context: Any, array: Any, index: Any, stride: Any) -> Any:
+    """The inverse of ``store_colors``: red, green and blue of a block's 16 pixels."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        pointers = _row_pointers(context, builder, sig, args, CHANNELS * BLOCK)
+        rows = [builder.load(pointer, align=4) for pointer in pointers]
+        channels = []
+        for channel in range(CHANNELS):
+            places = lane_indices([CHANNELS * k + channel for k in range(2 * BLOCK)])  # of two rows side by side
+            upper, lower = (builder.shuffle_vector(rows[k], rows[k + 1], places) for k in (0, 2))
+            channels.append(builder.shuffle_vector(upper, lower, lane_indices(range(LANES))))
+        return context.make_tuple(builder, sig.return_type, channels)
+
+    return types.UniTuple(VECTOR, CHANNELS)(array, index, stride), codegen
 
 
 @intrinsic
