@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from gsbench.analysis import judgement
-from gsbench.analysis.cells import by_key
+from gsbench.analysis.cells import by_key, in_brief
 from gsbench.analysis.declaration import ActiveDeclaration
 from gsbench.analysis.judgement import folder_key
 from gsbench.analysis.planning import seeds_needed
@@ -29,6 +29,7 @@ from gsbench.words import counted, signed, some_of
 
 Role = Literal["declared", "secondary", "one of all"]
 Pair = tuple[Arm, Arm]
+VERDICT = "Verdict, "  # how a line below a table begins that says one
 WORDS: dict[Outcome, str] = {
     "supported": "better",
     "refuted": "worse",
@@ -102,7 +103,7 @@ def judge(
                 notes += [f"{one.name}: {line}" for line in answer.notes]
                 continue
             own = [trial for arm in pair for trial in by_arm.get(arm, [])]
-            reasons = [trial.unavailable[one.key] for trial in own if one.key in trial.unavailable]
+            reasons = [in_brief(trial.unavailable[one.key]) for trial in own if one.key in trial.unavailable]
             reason = (*reasons, *answer.notes, f"no trials of {pair[0]} and {pair[1]} can be paired")[0]
             notes.append(f"{one.name}: {reason}")
             missing = reason if primary is not None and one.key == primary.key else missing
@@ -159,9 +160,9 @@ def declared_lines(declared: ActiveDeclaration, judged: dict[Pair, ArmVerdicts])
         found = [verdict for verdict in one.verdicts if verdict.quantity.key == declared.metric]
         if found and found[0].role == "secondary":
             continue  # the other question
-        lines += [f"Verdict, {against}: {in_words(verdict)}." for verdict in found]
+        lines += [f"{VERDICT}{against}: {in_words(verdict)}." for verdict in found]
         if not found:
-            lines.append(f"Verdict, {against}: none, since {declared.metric} has no value: {one.missing}.")
+            lines.append(f"{VERDICT}{against}: none, since {declared.metric} has no value: {one.missing}.")
     return lines
 
 

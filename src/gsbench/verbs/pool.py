@@ -5,14 +5,16 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from html import escape
+from importlib.resources import files
 from pathlib import Path
 
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import metric_quantity
-from gsbench.analysis.report.page import write_page
 from gsbench.claims.pooling import Pooled, describe, pool, pooled_forest
 from gsbench.claims.studies import Wanted, read_source
 from gsbench.errors import InputError
+from gsbench.files import place_of, write_text
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 
 DONE, LEFT_OUT = 0, 1
@@ -46,7 +48,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         print(f"gsbench: {fault}", file=sys.stderr)
     if options.out is not None:
         title += f": {options.metric}"
-        write_page(options.out, title, _forest(title, pooled, options.metric), [*describe(pooled), *notes, *faults])
+        _write_page(options.out, title, _forest(title, pooled, options.metric), [*describe(pooled), *notes, *faults])
         print(options.out)
     return LEFT_OUT if faults else DONE
 
@@ -95,3 +97,16 @@ def _rows(pooled: Pooled) -> list[str]:
 def _forest(title: str, pooled: Pooled, metric: str) -> str:
     shown = metric_quantity(metric, ())
     return pooled_forest(pooled, title, f"difference in {shown.name}{BETTER[shown.direction]}", shown.direction)
+
+
+def _write_page(out: Path, title: str, chart: str, lines: Sequence[str]) -> None:
+    """Write the page to the file ``out``; ``chart`` is SVG. Raises InputError where it cannot be written."""
+    style = files("gsbench.analysis.report").joinpath("style.css").read_text(encoding="utf-8")
+    listed = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    page = (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f'<link rel="icon" href="data:,"><style>{style}</style></head>\n'
+        f'<body><main><h1>{escape(title)}</h1><div class="charts">{chart}</div><ul>{listed}</ul></main></body></html>\n'
+    )
+    with place_of(out):
+        write_text(out, page)

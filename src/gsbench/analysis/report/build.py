@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
@@ -28,8 +28,8 @@ from gsbench.analysis.report.sections import (
 from gsbench.analysis.report.setting_charts import search_part, sweep_charts, tradeoff_charts, tradeoff_gaps
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.table_formats import to_html
-from gsbench.analysis.tables import build_table
-from gsbench.analysis.verdicts import families, judge
+from gsbench.analysis.tables import Table, build_table
+from gsbench.analysis.verdicts import VERDICT, families, judge
 from gsbench.runs.layout import FIGURES
 from gsbench.words import signed
 
@@ -76,7 +76,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE, ablation: Abl
         declared=declared.sentences(quantity.name) if declared and quantity else [],
         families=families(list(judged.values())),
         ablation=ablation,
-        tables=[to_html(table) for table in tables],
+        tables=[to_html(_without_verdicts(table)) for table in tables],
         contradictions=[] if layout is None else load_paper().contradictions,
         search=search,
         questions=questions,
@@ -96,6 +96,11 @@ def build_report(experiment: Experiment, baseline: str = BASELINE, ablation: Abl
         columns=list(dict.fromkeys(key for row in rows for key in row)),
         warnings=experiment.warnings,
     )
+
+
+def _without_verdicts(table: Table) -> Table:
+    """The table without the notes that repeat the verdicts, which stand at the top of the page."""
+    return replace(table, notes=tuple(note for note in table.notes if not note.startswith(VERDICT)))
 
 
 def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
