@@ -28,12 +28,12 @@ from IPython.display import Markdown
 
 from gsbench.analysis import load_experiment, to_frame
 from gsbench.analysis.errors_by_region import errors_by_region
-from gsbench.analysis.judgement import judge, pair, pair_trials
+from gsbench.analysis.judgement import judge, pair_trials
 from gsbench.analysis.planning import seeds_needed
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.cli import run
-from gsbench.runs.declaration import Arm, Declaration, Question
+from gsbench.runs.declaration import Arm, Question, declared_now
 
 os.environ["GSBENCH_RUNS"] = tempfile.mkdtemp(prefix="gsbench-")
 runs = Path(os.environ["GSBENCH_RUNS"])
@@ -83,39 +83,41 @@ frame.groupby("densify")[["psnr", "num_gaussians"]].agg(["mean", "std", "min", "
 # %% [markdown]
 # ## Seeds are paired
 #
-# The same seed means the same order of photographs in both arms, and every trial is judged on the same test views. So
-# we look at differences: volumetric minus baseline, for each seed. A question names two arms, a metric, the direction
-# that is claimed and the least difference that matters.
+# The same seed means the same order of photographs in both arms, and every trial is measured on the same test views.
+# So we look at differences: volumetric minus baseline, for each seed. A question names the two arms and the metric,
+# and `judge` answers the questions of a declaration.
 
 # %%
 adc, volumetric = Arm(init, "adc"), Arm(init, "volumetric")
-question = Question(metric="psnr", sign=+1, least=0.1, baseline=adc, arm=volumetric)  # more PSNR is better
-(differences,) = pair(experiment.trials, question).differences  # [seeds], one row a scene
+question = Question(metric="psnr", sign=1, least=0.1, baseline=adc, arm=volumetric)  # 0.1 dB is what matters
+(verdict,) = judge(experiment.trials, declared_now(questions=(question,)))
+(differences,) = verdict.pairs.differences  # [seeds], one row a scene
 
 plt.figure(figsize=(7, 3))
-plt.bar(np.arange(len(differences)), differences, width=0.4, color="C3")
+plt.plot(range(len(differences)), differences, "o", color="C0")
+plt.axhline(differences.mean(), color="C3", linewidth=2)
 plt.axhline(0, color="grey", linewidth=1)
 plt.xticks(range(len(differences)))
 plt.xlabel("seed")
 plt.ylabel("PSNR difference, dB")
+plt.title("one dot a pair of trials; their mean in red")
 plt.tight_layout()
 
 # %% [markdown]
-# The views of one trial share its training, so they are no independent repetitions. The trial pair is the unit that a
-# test may count: here there are three.
+# The views of one trial share its training, so they are no independent repetitions. The pair of trials is the unit
+# that a test may count: here there are three.
 #
 # ## The verdict
 #
-# One interval, Student's t over the pairs of trials, makes the verdict. *Supported*: it lies on the claimed side of
-# zero; *refuted*: on the other; *too small to matter*: within the least difference on either side. Otherwise it is
-# *undecided*, which is not the same as *no difference*.
+# There are four outcomes. *Supported*: the interval of the mean difference lies on the claimed side of zero. *Refuted*:
+# on the other side. *Too small to matter*: within ± the least difference that matters. *Undecided*: these trials cannot
+# tell, which is not the same as *no difference*.
 
 # %%
-(result,) = judge(experiment.trials, Declaration(time="2026-01-01T00:00:00Z", questions=(question,)))
-print(f"mean difference  {result.mean:+.3f} dB ({result.relative:+.2%})")
-print(f"95 % interval    {result.interval.low:+.3f} to {result.interval.high:+.3f} dB")
-print(f"p                {result.p:.3f}")
-print(f"verdict          {result.outcome}")
+print(f"mean difference  {verdict.mean:+.3f} dB ({verdict.relative:+.2%})")
+print(f"interval         {verdict.interval.low:+.3f} to {verdict.interval.high:+.3f} dB")
+print(f"p                {verdict.p:.3f}")
+print(f"verdict          {verdict.outcome}, on {', '.join(verdict.pairs.scenes)}")
 
 # %% [markdown]
 # With few trials, only a large difference can be seen. How many seeds would it take to see a given one in eight of
@@ -123,11 +125,11 @@ print(f"verdict          {result.outcome}")
 
 # %%
 for difference in (0.05, 0.1, 0.2, 0.5):
-    print(f"{difference:4} dB: {seeds_needed(result.deviation, 1, difference) or 'more than 1000'} seeds an arm")
+    print(f"{difference:4} dB: {seeds_needed(verdict.deviation, 1, difference) or 'more than 1000'} seeds an arm")
 
 # %% [markdown]
-# More seeds tell more about *this* scene only. For "scenes like these", gsbench wants at least six scenes, and counts
-# in how many of them the arm helps.
+# More seeds tell more about *this* scene only. For "scenes like these", gsbench wants at least six scenes, which then
+# are the units.
 #
 # ## Where it helps
 #
@@ -136,24 +138,23 @@ for difference in (0.05, 0.1, 0.2, 0.5):
 
 # %%
 regions = errors_by_region(pair_trials(experiment.trials, adc, volumetric), "texture")
-middle = [change.mean for change in regions.changes]
-low = [c.mean - c.interval.low for c in regions.changes]
-high = [c.interval.high - c.mean for c in regions.changes]
-bins = np.arange(1, len(middle) + 1)
+changes = [change for change, _ in regions.changes]
+words = [word for _, word in regions.changes]
+bins = np.arange(1, len(changes) + 1)
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.4))
 left.plot(bins, regions.first, "o-", label="adc")
 left.plot(bins, regions.second, "o-", label="volumetric")
 left.set(xlabel="texture, from the lowest fifth to the highest", ylabel="mean error, 8-bit levels", xticks=bins)
 left.legend()
-right.errorbar(bins, middle, [low, high], fmt="o", color="C3", capsize=4)
+right.bar(bins, changes, color=["C0" if word == "undecided" else "C3" for word in words])
 right.axhline(0, color="grey", linewidth=1)
 right.set(xlabel="texture, from the lowest fifth to the highest", ylabel="volumetric minus adc", xticks=bins)
 figure.tight_layout()
 
 # %% [markdown]
-# A point below zero means that the volumetric rule has the smaller error there. Where the interval crosses zero,
-# there is no evidence either way. `errors_by_region` can also sort by depth, by the distance to the initial cloud, or
-# by the volume of the Gaussians, when the trials were run with `eval.maps=true`.
+# A bar below zero means that the volumetric rule has the smaller error there; a red one is decided, a blue one is not.
+# `errors_by_region` can also sort by depth, by the distance to the initial cloud, or by the volume of the Gaussians,
+# when the trials were run with `eval.maps=true`.
 #
 # ## Is the comparison fair?
 #
@@ -163,7 +164,7 @@ figure.tight_layout()
 # %%
 for arm in (adc, volumetric):
     counts = [trial.record.num_gaussians for trial in experiment.trials if trial.arm == arm]
-    print(f"{arm[1]:>10}: {', '.join(f'{count:,}' for count in counts)} Gaussians")
+    print(f"{arm.densify:>10}: {', '.join(f'{count:,}' for count in counts)} Gaussians")
 
 # %% [markdown]
 # All of this, for every metric and with pictures, is in one file: `gsbench report reading`. To see what lies behind
