@@ -20,6 +20,7 @@ from gsbench.errors import GsbenchError, InputError
 CHUNK = 1 << 20
 TEMPORARY = re.compile(r"^\..+\.tmp(-\d+)?$")  # how gsbench names a file that it is still writing
 FULL = (errno.ENOSPC, errno.EDQUOT)
+BROKEN = (errno.EIO, errno.ELOOP, errno.ESTALE)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
 # Messages of libraries, without an error number, when a write is cut short: numpy's tofile, torch's zip writer, SQLite.
 FULL_TEXT = re.compile(
@@ -229,6 +230,10 @@ def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
         return InputError(
             f"the file system of {place} has no locks ({os.strerror(number)}), without which trials would disturb each "
             "other: set runs=FOLDER or GSBENCH_RUNS to another one, or have its lock service started"
+        )
+    if number in BROKEN:
+        return InputError(
+            f"{place} cannot be opened ({os.strerror(number)}): look at its disk and its links, or set runs=FOLDER"
         )
     if number in FORBIDDEN:
         return InputError(f"{place} may not be written to ({os.strerror(number)}): set runs=FOLDER or GSBENCH_RUNS")

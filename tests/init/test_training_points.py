@@ -18,7 +18,7 @@ from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Dataset, Initializer, Sfm, SiftKornia, read_cloud
 from gsbench.init.base import REPORT_FILE, PointsFrom
 from gsbench.init.colmap.training_points import track_matches
-from gsbench.pipeline.components import options_of
+from gsbench.pipeline.steps.inputs import options_of
 from gsbench.scene.colmap import read_model
 from gsbench.scene.types import Capture
 
@@ -206,5 +206,5 @@ def test_without_two_training_views_nothing_is_left(with_points: Capture, tmp_pa
 
 def test_the_choice_of_before_has_no_part_in_a_key() -> None:
     for made in (Sfm, SiftKornia, Dataset):
-        assert "points_from" not in options_of("init", made())
+        assert options_of("init", made())["points_from"] == "all"
         assert options_of("init", made(points_from="train"))["points_from"] == "train"

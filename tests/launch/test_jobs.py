@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from gsbench.config.compose import compose_one
-from gsbench.launch.jobs import collect
+from gsbench.launch.jobs import clouds_first, collect
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.trial import Trial
 
@@ -63,3 +63,14 @@ def test_what_cannot_be_read_is_said(folder: Path, content: bytes) -> None:
     job: Any = SimpleNamespace(paths=SimpleNamespace(result_pickle=folder / "r.pkl", stderr=folder / "log"))
     outcome = collect(job, trial.folder, [trial])
     assert "cannot be read" in outcome.message
+
+
+def test_one_trial_of_each_cloud_begins_first() -> None:
+    def trial(scene: str, seed: int) -> Any:
+        return SimpleNamespace(values={"scene": scene, "init": "sfm", "seed": seed})
+
+    trials = [trial(scene, seed) for scene in "ab" for seed in (0, 1)]
+    assert [(t.values["scene"], t.values["seed"]) for t in clouds_first(trials)] == [
+        *(("a", 0), ("b", 0)),
+        *(("a", 1), ("b", 1)),
+    ]

@@ -14,7 +14,8 @@ import torch
 
 from gsbench.densify import ADC, PixelGS
 from gsbench.errors import InputError
-from gsbench.pipeline.components import build_rasterizer, check_offers, rasterizer_inputs
+from gsbench.pipeline.components import build_rasterizer, check_offers
+from gsbench.pipeline.steps.inputs import rasterizer_inputs
 from gsbench.raster import create_rasterizer
 from gsbench.runs.hashing import config_hash
 from tests.config.test_schema import composed

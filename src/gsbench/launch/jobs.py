@@ -25,6 +25,7 @@ from gsbench.files import require_own
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.queue import forget_submission
 from gsbench.launch.trial import Trial
+from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import JOBS
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.install import install_command
@@ -112,7 +113,7 @@ def job_folder(values: dict[str, Any]) -> Path:
 
 def _run(trials: Sequence[Trial], executor: Executor, parallel: int) -> list[Outcome]:
     """At most ``parallel`` processes at once; a stopped parent stops them, a killed one leaves them to finish."""
-    waiting, running, outcomes = list(trials), dict[Path, "Job[Outcome]"](), list[Outcome]()
+    waiting, running, outcomes = clouds_first(trials), dict[Path, "Job[Outcome]"](), list[Outcome]()
     try:
         while waiting or running:
             while waiting and len(running) < parallel and not any(outcome.fatal for outcome in outcomes):
@@ -133,6 +134,15 @@ def _run(trials: Sequence[Trial], executor: Executor, parallel: int) -> list[Out
                 process.send_signal(signal.SIGTERM)  # the controller passes it on; the trial saves a checkpoint
         raise
     return outcomes
+
+
+def clouds_first(trials: Sequence[Trial]) -> list[Trial]:
+    """The trials with one of each scene and initialiser first, so that the others need not wait for one cloud."""
+    first: dict[str, Trial] = {}
+    for trial in trials:
+        first.setdefault(sha256_of([trial.values["scene"], trial.values["init"]]), trial)
+    begin = list(first.values())
+    return begin + [trial for trial in trials if all(trial is not other for other in begin)]
 
 
 def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome:

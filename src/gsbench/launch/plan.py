@@ -56,7 +56,12 @@ def add_to_plan(trials: Sequence[Trial]) -> None:
             entries = {name: replace(entry, sweep=sweep) for name, entry in entries.items()}
         make_home(home)
         with hold(home / f".{PLAN}.lock", "the plan"):
-            write_entries(home, read_entries(home) | entries)
+            try:
+                known = read_entries(home)
+            except InputError as error:  # trials of other commands are found by their folders, if they have begun
+                log.warning("%s", error)
+                known = {}
+            write_entries(home, known | entries)
 
 
 def forget(home: Path, folders: Iterable[Path]) -> None:

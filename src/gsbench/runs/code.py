@@ -36,7 +36,7 @@ DIGEST_CHARACTERS = 16
 # part, nor what makes objects of the settings, which are in the keys as they are. An edit of one densifier changes the
 # room of all: the price of a table that anybody can check.
 MODEL = ("scene", "gaussians", "densify", "raster", "train", "events.py")
-LOSS = ("eval/ssim.py", "eval/images.py", "eval/matching.py")
+LOSS = ("eval/ssim.py", "eval/images.py", "eval/pictures.py")
 ROOMS = {
     "scene": ("scene", "init", "pipeline/steps/scene.py"),
     "init": ("scene", "init", "gaussians", "weights.py", "pipeline/steps/init.py"),

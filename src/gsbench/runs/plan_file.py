@@ -59,7 +59,7 @@ def read_entries(home: Path) -> dict[str, Entry]:
     except FileNotFoundError:
         return {}
     except DamagedError as error:
-        raise InputError(f"{error}: delete it, and give the sweep's command again") from None
+        raise InputError(f"{error}: each command of a sweep writes it anew, with its own trials") from None
 
 
 def write_entries(home: Path, entries: dict[str, Entry]) -> None:
