@@ -143,7 +143,8 @@ def settings_page() -> str:
                 named = f" (`{group}={'`, `'.join(choices)}`)" if kind is cls else ""
                 based = f", made from `{bases[0].__name__}`" if bases else ""
                 if rows or named:
-                    lines += [f"**`{kind.__name__}`**{named}{based}", ""]
+                    said = plain((inspect.getdoc(kind) or "").partition("\n")[0])
+                    lines += [f"**`{kind.__name__}`**{named}{based}. {said}", ""]
                 lines += [*table(*HEADS), *rows, ""] if rows else []
     return "\n".join(lines) + "\n"
 
