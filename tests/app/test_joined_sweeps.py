@@ -15,14 +15,14 @@ from gsbench.launch.plan import add_to_plan, read_plan
 from gsbench.runs.trial_folder import TrialFolder
 from tests.finished import write_results
 
-# Trials of `threshold` as they were named when it was one grid with a threshold of a million in place of the baseline.
+# Some trials of `threshold` by their names, which stay as they are from version to version.
 KNOWN = {
-    "sfm-volumetric-0.001/6b9596e4-seed0",
-    "sfm-volumetric-0.003/2584584f-seed1",
-    "sfm-volumetric-0.01/9829154a-seed2",
-    "sfm-volumetric-0.03/334ab02a-seed0",
-    "sfm-volumetric-0.1/7534912c-seed1",
-    "sfm-volumetric-0.3/f16e7a5e-seed2",
+    "sfm-volumetric-0.001/b1485f85-seed0",
+    "sfm-volumetric-0.003/17977005-seed1",
+    "sfm-volumetric-0.01/5dda5834-seed2",
+    "sfm-volumetric-0.03/6cb49de6-seed0",
+    "sfm-volumetric-0.1/b6c34d08-seed1",
+    "sfm-volumetric-0.3/58024339-seed2",
 }
 
 
