@@ -124,7 +124,7 @@ def _arms(name: str, trials: Sequence[TrialResult]) -> tuple[list[tuple[str, str
     arms = [(_run_as(init, inits), densify) for init, densify in (TABLE1_ARMS if name == "table1" else TABLE2_ARMS)]
     if name == "table1" and arms[0][0] not in inits and len(inits) == 1:
         other = inits.pop()
-        note = f"Initial clouds from {other} stand in for the paper's DIM: the columns do not repeat its experiment."
+        note = f"Initial clouds from {other} replace the paper's DIM: the columns do not repeat its experiment."
         return [(other, densify) for _, densify in TABLE1_ARMS], [note]
     return arms, []
 

@@ -80,7 +80,7 @@ def power(size: Size, difference: float, found: Components, like_these: bool) ->
     if not like_these:
         return power_of_mean(found.within, size, difference)
     if found.between is None:
-        raise InputError("one scene does not tell how an effect differs between scenes: run pilot trials on two")
+        raise InputError("one scene cannot show how an effect differs between scenes: run pilot trials on two")
     needed = sign_test_needs(size.scenes, ALPHA)
     if needed is None:
         return 0.0

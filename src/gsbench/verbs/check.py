@@ -108,7 +108,7 @@ def _permissions(words: Sequence[str]) -> Sequence[str]:
     """The words after the file, which can only be permissions. Raises InputError for others."""
     for word in words:
         if word.split("=")[0] != PERMISSIONS:
-            raise InputError(f"{word}: settings of a check stand in its file of claims; here only {PERMISSIONS}=[…]")
+            raise InputError(f"{word}: settings of a check are in its file of claims; here only {PERMISSIONS}=[…]")
     return words
 
 

@@ -176,7 +176,7 @@ def check_kernels() -> Iterator[Finding]:
 
     place = cache_base()
     if place.name.startswith(TEMPORARY_PREFIX):
-        text = "the user's cache may not be written to, so every start compiles anew: set NUMBA_CACHE_DIR to a folder"
+        text = "the user's cache cannot be written to, so every start compiles anew: set NUMBA_CACHE_DIR to a folder"
         yield Finding("note", "kernels", text)
     else:
         yield Finding("ok", "kernels", f"those for the CPU are kept in {place}")

@@ -26,7 +26,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument(
         "--out", type=path, metavar="PATH", help=f"a folder or a .html file; default: {REPORT_NAME} with the experiment"
     )
-    parser.add_argument("--baseline", help=f"the densifier that others are held against ({BASELINE})")
+    parser.add_argument("--baseline", help=f"the densifier to compare with ({BASELINE})")
     options = parser.parse_args(argv)
     experiment = load_experiment(runs, options.experiment)
     densifiers = sorted({trial.densify for trial in experiment.trials})

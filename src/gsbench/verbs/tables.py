@@ -131,7 +131,7 @@ def _parser() -> ArgumentParser:
     parser.add_argument(
         "--paper",
         metavar="NAME",
-        help=f"also hold the trials against published numbers: {', '.join(published_names())}",
+        help=f"also compare the trials with published numbers: {', '.join(published_names())}",
     )
     parser.add_argument(
         "--protocol",

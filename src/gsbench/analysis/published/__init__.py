@@ -88,7 +88,7 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
             )
         )
     heads = tuple(Column(one.name, heading) for one in shown for heading in (name, "Δ"))
-    method = f"The printed numbers are of densify={paper.densify}; other arms stand beside them for orientation."
+    method = f"The printed numbers are of densify={paper.densify}; other arms are shown for orientation."
     notes = [f"{paper.title}.", f"Read from {paper.source}.", f"Conventions: {paper.conventions}.", method]
     notes += choice_lines(own, paper.setup)
     keys = tuple((one.key, heading) for one in shown for heading in (name, "delta"))

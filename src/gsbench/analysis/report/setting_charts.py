@@ -72,7 +72,7 @@ def _part(record: SearchRecord) -> SearchPart:
 def _judged(record: SearchRecord) -> str:
     if record.validation:
         return "Judged by validation views; no test view was looked at."
-    return "Judged by the test views, which are therefore no test of it (scene.validation=true judges by others)."
+    return "Judged by the test views, so they no longer test it (scene.validation=true judges by others)."
 
 
 def _by_setting(key: str, done: Sequence[tuple[Point, float]], name: str, log_scale: bool, best: Point) -> str:
