@@ -120,7 +120,7 @@ def test_table1_has_the_papers_rows_and_marks_what_was_not_run(make_experiment: 
 def test_table1_names_a_stand_in_for_the_papers_initialiser(make_experiment: Callable[..., Experiment]) -> None:
     experiment = make_experiment(experiment="table1", inits=("sfm",), scenes=("garden",))
     _, difference = paper_tables(experiment, "table1")
-    assert any("from sfm stand in for the paper's DIM" in note for note in difference.notes)
+    assert any("from sfm replace the paper's DIM" in note for note in difference.notes)
 
 
 def test_table2_has_the_papers_columns(make_experiment: Callable[..., Experiment]) -> None:
