@@ -77,7 +77,7 @@ def test_trainings_a_known_way_apart(tmp_path: Path) -> None:
 def test_only_trainings_of_one_arm_and_neighbouring_seeds_are_held_together(tmp_path: Path) -> None:
     write_runs(tmp_path, Plan(seeds=(0, 1, 5, 6, 7), pictures=True, views=2))
     found = agreements(load_experiment(tmp_path, "exp").trials)
-    assert [(one.scene, one.arm[1], one.pairs) for one in found] == [
+    assert [(one.scene, one.arm.densify, one.pairs) for one in found] == [
         (scene, arm, 3) for scene in ("courtyard", "garden") for arm in ("adc", "volumetric")
     ]
     assert all(one.distance == 0 and 40 < one.psnr < 100 for one in found)

@@ -205,7 +205,7 @@ def test_controls_are_held_against_their_arms(tmp_path: Path) -> None:
     arms = {name: densifier(name) for name in ("adc", "absgrad", "longaxis")}
     trials = trials_of(tmp_path, arms, eval__controls={"longaxis": "absgrad", "mcmc": "adc", "adc": "adc"})
     pairs = choose_pairs(sorted({trial.arm for trial in trials}), controls=controls_of(trials))
-    against = [(first[1], second[1]) for first, second in pairs]
+    against = [(first.densify, second.densify) for first, second in pairs]
     assert against == [("adc", "absgrad"), ("adc", "longaxis"), ("absgrad", "longaxis")]
     assert "sfm-longaxis against sfm-absgrad" in build_report(load_experiment(tmp_path, "exp"))
     varied = [Arm("sfm", name, (("cap", str(cap)),)) for name in ("absgrad", "adc", "longaxis") for cap in (1, 2)]
