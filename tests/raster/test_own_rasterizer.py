@@ -61,7 +61,7 @@ def test_the_real_program_trains_with_it_and_knows_its_source(folder: Path) -> N
     (manifest,) = (folder / "runs" / "store" / "train").glob("*/manifest.json")
     recorded = json.loads(manifest.read_text())["inputs"]["raster"]
     assert (recorded["class"], recorded["name"], recorded["rows"]) == ("untiled.Untiled", "untiled", 36)
-    assert len(recorded["source"]) == 64
+    assert len(recorded["source"]["untiled"]) == 64
 
     assert "was done" in gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own").stderr
     with (folder / "untiled.py").open("a") as stream:
