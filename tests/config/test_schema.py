@@ -108,7 +108,7 @@ def sweep_size(experiment: str) -> int:
 def test_the_demo_downloads_little_and_declares_what_it_measures() -> None:
     trials = compose_trials(["+experiment=demo"], multirun=True)
     asked = {(tuple(trial.values["eval"]["lpips"]), trial.values["eval"]["primary"]) for trial in trials}
-    assert asked == {(("squeeze",), "lpips_squeeze")}  # 5 MB; all four are 770
+    assert asked == {(("squeeze",), "flip")}  # which needs no weights; LPIPS joins where its weights are
 
 
 def test_experiments_have_the_size_of_the_paper() -> None:

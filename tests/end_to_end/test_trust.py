@@ -85,7 +85,7 @@ def test_nor_by_another_trainer_that_tells_its_version(capture: Path) -> None:
     (capture.parent / "train.py").write_text("import beside, sys; sys.exit('Error: trained ' + beside.WHAT)")
     (capture.parent / "beside.py").write_text("WHAT = 'with what lies beside it'")  # as many trainers have
     words = [
-        "densify=external",
+        "densify=external/program",
         f"densify.command=['{sys.executable}','{capture.parent / 'train.py'}','{{data}}']",
         f"densify.version_command=['{sys.executable}','-c','import plyfile_absent as p']",
         "densify.version=plyfile_absent",
