@@ -136,7 +136,12 @@ def test_a_plan_names_no_folder_of_packages_of_settings(place: Path, monkeypatch
 
 # ---- programs
 
-PROGRAM = ["densify=external/program", "densify.command=[python,'{data}']", "densify.result=x.ply", "densify.version='1'"]
+PROGRAM = [
+    "densify=external/program",
+    "densify.command=[python,'{data}']",
+    "densify.result=x.ply",
+    "densify.version='1'",
+]
 
 
 @pytest.mark.parametrize(
