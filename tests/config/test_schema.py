@@ -12,6 +12,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from gsbench.app.command import compose_trials
+from gsbench.config.compose import compose_one
 from gsbench.config.schema import check, plain, register_schemas
 from gsbench.config.trust import check_target
 from gsbench.errors import InputError
@@ -255,7 +256,7 @@ def test_names_of_own_metrics_are_their_own(name: str) -> None:
 
 def test_an_own_metric_must_be_allowed_and_name_a_class() -> None:
     with pytest.raises(InputError, match=r"eval\.extra\.edges\._target_=mine\.X is not gsbench's own"):
-        composed("eval.extra.edges._target_=mine.X")
+        compose_one(["eval.extra.edges._target_=mine.X"])
     with pytest.raises(InputError, match=r"eval\.extra\.edges must name a class"):
         composed("eval.extra.edges=3")
 

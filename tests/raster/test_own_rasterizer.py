@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from gsbench.config.compose import compose_one
 from gsbench.densify import ADC, PixelGS
 from gsbench.errors import InputError
 from gsbench.pipeline.components import build_rasterizer, check_offers
@@ -86,7 +87,7 @@ def test_options_are_checked_and_the_key_has_them(folder: Path) -> None:
         with pytest.raises(InputError, match=message):
             build_rasterizer(values["raster"], values["allow_targets"], CPU)
     with pytest.raises(InputError, match=r"allow_targets=\[untiled\]"):
-        composed(OWN[0])
+        compose_one(OWN[:1])
 
 
 def test_without_a_footprint_it_is_refused_where_one_is_asked_for(folder: Path) -> None:

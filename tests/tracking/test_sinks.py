@@ -123,8 +123,8 @@ def test_tensorboard_shows_the_same_numbers_once(tmp_path: Path) -> None:
         return events.Reload()
 
     for _ in range(2):  # after a crash between sending and noting it, too
-        assert mirror_trial(sink, tmp_path, folder, values)
-        assert not mirror_trial(sink, tmp_path, folder, values)
+        assert mirror_trial(sink, folder, values)
+        assert not mirror_trial(sink, folder, values)
         assert len(list(there.iterdir())) == 1
         losses = [(event.step, event.value) for event in shown().Scalars("train/loss")]
         assert losses == [(i, pytest.approx(1 / i)) for i in range(1, RECORDS + 1)]
@@ -140,8 +140,8 @@ def test_weights_and_biases_takes_a_trial_without_a_network(tmp_path: Path, monk
     monkeypatch.setenv("WANDB_MODE", "offline")
     folder, values = finished_trial(tmp_path, seed=1)
     sink = options() | {"sink": "wandb"}
-    assert mirror_trial(sink, tmp_path, folder, values)
-    assert not mirror_trial(sink, tmp_path, folder, values)
+    assert mirror_trial(sink, folder, values)
+    assert not mirror_trial(sink, folder, values)
     (file,) = (tmp_path / "wandb").rglob("*.wandb")
     said = file.read_bytes()
     for word in (b"train/loss", b"psnr", b"seed 1 a_scene a_init-a_densify"):
