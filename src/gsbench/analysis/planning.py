@@ -11,17 +11,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from gsbench.analysis.statistics import ALPHA, DEGREES, MIN_SCENES, sign_test_needs
+from gsbench.analysis.statistics import ALPHA, MIN_SCENES, error_and_degrees, sign_test_needs
 from gsbench.errors import InputError
 
 POWER = 0.8
-LARGEST_SHIFT = 30.0  # in standard errors; beyond it scipy's noncentral t gives nan, and all is seen
 MAX_SCENES, MAX_SEEDS = 30, 40  # the largest designs that are looked at
+DRAWS = 2000  # of a design's variances: they give its power to about 0.005
 PRECISION = 1e-6  # of a smallest difference, relative
 HOUR = 3600.0
 
@@ -92,13 +93,22 @@ def power(size: Size, difference: float, found: Components, like_these: bool) ->
 def power_of_mean(deviation: float, size: Size, difference: float) -> float:
     """The chance that the t test of these scenes sees ``difference``, where trainings differ by ``deviation``.
 
-    By the noncentral t distribution; the far tail of the wrong sign is left out.
+    The test estimates each scene's variance, and with it its degrees of freedom: the power is the mean over
+    simulated variances, given each of which it is that of a normal mean. The far tail of the wrong sign is left out.
     """
     if deviation == 0:
         return 1.0 if difference else 0.0
-    degrees = max(size.seeds - 1, DEGREES * size.scenes * (size.seeds - 1))
-    shift = min(abs(difference) / deviation * math.sqrt(size.scenes * size.seeds), LARGEST_SHIFT)
-    return float(1 - special.nctdtr(degrees, shift, special.stdtrit(degrees, 1 - ALPHA / 2)))
+    shift = abs(difference) / deviation * math.sqrt(size.scenes * size.seeds)
+    return float(special.ndtr(shift - _thresholds(size)).mean())
+
+
+@cache
+def _thresholds(size: Size) -> NDArray[np.float64]:
+    """Beyond how many of its true standard errors a mean is seen [DRAWS], for simulated variances of the scenes."""
+    freedom = size.seeds - 1
+    variances = np.random.default_rng(0).chisquare(freedom, (DRAWS, size.scenes)) / freedom
+    error, degrees = error_and_degrees(variances, size.seeds)
+    return special.stdtrit(degrees, 1 - ALPHA / 2) * error * math.sqrt(size.scenes * size.seeds)
 
 
 def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None:

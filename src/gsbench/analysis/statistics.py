@@ -81,12 +81,12 @@ def student(differences: Array) -> StudentT | None:
         return None
     if seeds == 1:
         return StudentT(float(differences.mean()), float(differences.std(ddof=1)) / math.sqrt(scenes), scenes - 1)
-    variances = differences.var(axis=1, ddof=1)
-    error, degrees = _error_and_degrees(variances[None], seeds)
+    variances = (differences - differences[:, :1]).var(axis=1, ddof=1)  # of pairs that are equal exactly 0
+    error, degrees = error_and_degrees(variances[None], seeds)
     return StudentT(float(differences.mean()), float(error[0]), float(degrees[0]))
 
 
-def _error_and_degrees(variances: Array, seeds: int) -> tuple[Array, Array]:
+def error_and_degrees(variances: Array, seeds: int) -> tuple[Array, Array]:
     """Standard error and degrees of freedom [D] of the mean over scenes, from the scenes' variances [D, S]."""
     total, squares = variances.sum(axis=1), (variances**2).sum(axis=1)
     satterthwaite = np.divide(total**2 * (seeds - 1), squares, out=np.full_like(total, seeds - 1.0), where=squares > 0)
@@ -177,7 +177,7 @@ def holm_factors(p_values: Iterable[float | None]) -> list[float | None]:
 
 @dataclass(frozen=True)
 class LikeThese:
-    """What scenes say of scenes like them: in how many of ``scenes`` the arm has the sign that is asked for.
+    """A statement of scenes about scenes like them: in how many the arm has the sign that is asked for.
 
     ``beyond`` of them have it by the least that matters, None where that is not known. ``share`` is the exact interval
     (Clopper and Pearson 1934) of the share of such scenes with the sign, ``median`` that of their median effect, from
@@ -277,7 +277,7 @@ def look_levels(scenes: int, looks: tuple[int, ...], alpha: float) -> tuple[floa
         added = rng.normal(0, math.sqrt(new), totals.shape)
         totals += added
         squares += added**2 / new + (rng.chisquare(new - 1, totals.shape) if new > 1 else 0.0)
-        error, degrees = _error_and_degrees((squares - totals**2 / seeds) / (seeds - 1), seeds)
+        error, degrees = error_and_degrees((squares - totals**2 / seeds) / (seeds - 1), seeds)
         p = 2 * special.stdtr(degrees, -np.abs(totals.mean(axis=1) / seeds / error))
         spent = alpha * (seeds / looks[-1]) ** SPENDING_POWER
         more = round(spent * DRAWS) - int(np.count_nonzero(~inside))
