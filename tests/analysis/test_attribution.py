@@ -161,9 +161,10 @@ def test_a_variant_of_a_setting_is_an_arm_that_can_isolate(tmp_path: Path) -> No
     write_arms(tmp_path, {"adc": densifier("adc"), "patient": densifier("adc", interval=50) | own})
     write_arms(tmp_path, {"patient": densifier("adc") | own})
     trials = with_variants(load_experiment(tmp_path, "exp").trials)
-    (mixed,) = {trial.arm[1] for trial in trials if trial.config["densify.interval"] == 50}
-    (baseline,) = {trial.arm[1] for trial in trials if trial.densify == "adc"}
-    assert "isolate schedule with sfm-patient interval=100, which is here" in sentence(trials, baseline, mixed)
+    (mixed,) = {trial.arm for trial in trials if trial.config["densify.interval"] == 50}
+    (baseline,) = {trial.arm for trial in trials if trial.densify == "adc"}
+    said = attribution_sentence(attribute(trials, baseline, mixed), baseline, mixed)
+    assert "isolate schedule with sfm-patient interval=100, which is here" in said
 
 
 def test_trials_without_a_record_are_said_to_have_none(tmp_path: Path) -> None:

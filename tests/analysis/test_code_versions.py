@@ -74,33 +74,34 @@ def test_a_moved_scene_is_no_other_version(tmp_path: Path) -> None:
     assert build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"]).rows[0].entries[0].text == "27.50 ± 0.71"
 
 
-def of_gsbench(**files: str) -> dict[str, Any]:
-    return code() | {"files": {f"{name}.py": state for name, state in files.items()}}
+def of_gsbench(**rooms: str) -> dict[str, Any]:
+    return code() | {"rooms": rooms}
 
 
-def test_two_states_of_a_file_of_gsbench_are_refused(tmp_path: Path) -> None:
-    one_trial(tmp_path, 0, psnr=27.0, _code=of_gsbench(loss="released", ssim="a" * 16, metric="b" * 16))
-    one_trial(tmp_path, 1, psnr=27.0, _code=of_gsbench(loss="c" * 16, ssim="d" * 16, metric="b" * 16))
+def test_two_states_of_a_room_of_gsbench_are_refused(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, psnr=27.0, _code=of_gsbench(train="released", eval="a" * 16, scene="b" * 16))
+    one_trial(tmp_path, 1, psnr=27.0, _code=of_gsbench(train="c" * 16, eval="d" * 16, scene="b" * 16))
     with pytest.raises(InputError) as refused:
         build_table(load_experiment(tmp_path, "exp"))
-    for part in ("different versions of gsbench's loss.py and 1 more file: released (", "cccccccc (garden seed 1; "):
+    for part in ("different versions of gsbench's train and 1 more room: released (", "cccccccc (garden seed 1; "):
         assert part in str(refused.value)
 
 
-def test_a_file_that_one_arm_alone_reaches_is_no_difference(tmp_path: Path) -> None:
-    one_trial(tmp_path, 0, psnr=27.0, _code=of_gsbench(loss="a" * 16))
-    one_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, _densify="mcmc", _code=of_gsbench(loss="a" * 16, mcmc="b" * 16))
+def test_a_room_that_one_arm_alone_uses_is_no_difference(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, psnr=27.0, _code=of_gsbench(train="a" * 16))
+    theirs = of_gsbench(train="a" * 16, external="b" * 16)
+    one_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, _densify="brush", _code=theirs)
     table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
     assert [entry.bold for row in table.rows for entry in row.entries] == [False, True]
 
 
 def test_a_number_names_its_commit_and_what_was_edited(tmp_path: Path) -> None:
-    made = of_gsbench(loss="released", ssim="a" * 16) | {"commit": "0123abcd", "edited": True}
+    made = of_gsbench(train="released", eval="a" * 16) | {"commit": "0123abcd", "edited": True}
     one_trial(tmp_path, 0, psnr=27.0, _code=made)
     said = explain_cell("exp:garden:psnr:adc", tmp_path)
     assert "commit    0123abcd, edited" in said
-    assert "edited    since the last release: ssim.py" in said
-    unreleased = of_gsbench(loss="b" * 16, ssim="a" * 16) | {"commit": "0123abcd", "edited": False}
+    assert "edited    since the last release: eval" in said
+    unreleased = of_gsbench(train="b" * 16, eval="a" * 16) | {"commit": "0123abcd", "edited": False}
     one_trial(tmp_path / "other", 0, psnr=27.0, _code=unreleased)
     said = explain_cell("exp:garden:psnr:adc", tmp_path / "other")
     assert "commit    0123abcd\n" in said
@@ -123,9 +124,7 @@ def test_without_the_file_the_version_that_finished_last_is_the_present_one(tmp_
 def test_the_file_decides_which_version_is_the_present_one(tmp_path: Path) -> None:
     finished_at(one_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=1.0, _code=code(OLD)), 1000)
     finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=1.0, _code=code(NEW)), 2000)
-    assert superseded(tmp_path, {"mine.Patient": OLD}) == {
-        "seed1": "mine.Patient was 22222222, its file is now 11111111"
-    }
+    assert superseded(tmp_path, {"mine.Patient": OLD}) == {"seed1": "mine.Patient was 22222222, it is now 11111111"}
     assert superseded(tmp_path, {"mine.Patient": "3" * 64}).keys() == {"seed0", "seed1"}
 
 
@@ -137,6 +136,6 @@ def test_stages_are_superseded_by_later_trials(tmp_path: Path) -> None:
 
 
 def test_trials_of_an_edited_gsbench_are_superseded(tmp_path: Path) -> None:
-    finished_at(one_trial(tmp_path, 0, psnr=1.0, _code=of_gsbench(loss="a" * 16)), 1000)
-    finished_at(one_trial(tmp_path, 1, psnr=1.0, _code=of_gsbench(loss="b" * 16)), 2000)
-    assert superseded(tmp_path) == {"seed0": "gsbench's loss.py was aaaaaaaa, later trials have bbbbbbbb"}
+    finished_at(one_trial(tmp_path, 0, psnr=1.0, _code=of_gsbench(train="a" * 16)), 1000)
+    finished_at(one_trial(tmp_path, 1, psnr=1.0, _code=of_gsbench(train="b" * 16)), 2000)
+    assert superseded(tmp_path) == {"seed0": "gsbench's train was aaaaaaaa, later trials have bbbbbbbb"}

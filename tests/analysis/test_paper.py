@@ -192,6 +192,7 @@ def own_trials(
             "scene__images": "images_4",
             "scene__downscale": 1,
             "scene__resample": "lanczos",
+            "scene__split": "every_nth",
             "scene__test_every": 8,
             "scene__max_images": 200,
             "densify__name": densify,

@@ -26,6 +26,7 @@ from gsbench.runs.declaration import Arm
 from tests.analysis.synthetic import BASE, METRICS, Plan, trial_data, write_trial
 
 SPLITS = {"every_nth": "aaaaaaaa", "sector": "bbbbbbbb"}
+SECTORS = {"sector": 0, "sectors": 8}
 ANGLES = {"every_nth": np.linspace(4, 8, 6), "sector": np.linspace(8, 40, 6)}
 
 
@@ -54,14 +55,14 @@ def write_splits(
                 rows = views | {"angle_to_nearest": ANGLES[split]}
                 if record:
                     data["held_out"] = {"every_nth": "every 8th image", "sector": "part 0 of 8 by azimuth"}[split]
-                settings = {f"scene__{key}": value for key, value in {"split": split, **scene}.items()}
+                settings = {f"scene__{key}": value for key, value in (SECTORS | {"split": split} | scene).items()}
                 write_trial(runs, data, rows, config_hash, **settings)
     return load_experiment(runs, "exp")
 
 
 def turns_of(experiment: Experiment) -> dict[str, Turn]:
     trials = with_variants(experiment.trials)
-    judged = judge(trials, choose_pairs(sorted({trial.arm for trial in trials})), ViewCache())
+    judged = judge(trials, choose_pairs(sorted({trial.arm for trial in trials})))
     return {turn.quantity.key: turn for turn in find_turns(trials, judged)}
 
 
@@ -92,7 +93,7 @@ def test_an_order_that_only_seems_to_turn_is_not_said_to(tmp_path: Path) -> None
 
 def test_the_gap_of_an_arm_is_paired_by_seed(tmp_path: Path) -> None:
     experiment = write_splits(tmp_path, {}, fall=5.0)
-    gaps = {(gap.arm[1], gap.quantity.key): gap for gap in find_gaps(experiment.trials)}
+    gaps = {(gap.arm.densify, gap.quantity.key): gap for gap in find_gaps(experiment.trials)}
     gap = gaps["adc", "psnr"]
     values = {
         s: [t.metrics["psnr"] for t in experiment.trials if t.densify == "adc" and t.split.startswith(s)]

@@ -42,7 +42,7 @@ def test_crossing_curves_cancel() -> None:
 
 def test_a_densifier_has_a_point_for_each_variant(make_experiment: Callable[..., Experiment]) -> None:
     experiment = make_experiment()
-    trials = [replace(trial, variant=f"seed={trial.seed}") for trial in experiment.trials]
+    trials = [replace(trial, variant=(("seed", str(trial.seed)),)) for trial in experiment.trials]
     for trial in trials:
         object.__setattr__(trial.record, "num_gaussians", 1000 * (1 + trial.seed))
     psnr = quantity("psnr", trials)

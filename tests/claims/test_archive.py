@@ -216,7 +216,7 @@ def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
     (first / "per_view.csv").write_text("view,psnr\nview000,1.0\n")
     (second / "results.json").write_text("{")
     assert run(["export", "--results", "exp", "--out", str(tmp_path / "out" / "a.zip")]) == 0
-    assert capsys.readouterr().out == f"{tmp_path / 'out' / 'a.zip'}\n"
+    assert capsys.readouterr().out.startswith(f"{tmp_path / 'out' / 'a.zip'}: results of exp, ")
     assert "does not average" in caplog.text
     assert "not JSON" in caplog.text
     assert len(unpack_archive(tmp_path / "out" / "a.zip", tmp_path / "b").trials) == 10

@@ -163,7 +163,7 @@ class TrialResult:
         """The rule that holds views out, as short text; "" where neither a record nor the configuration says it."""
         if self.record.split:
             return self.record.split
-        return "" if "scene.name" not in self.config else split_text(self.config)
+        return split_text(self.config) if self.config.get("scene.split") else ""
 
     @cached_property
     def question(self) -> str:

@@ -47,7 +47,7 @@ class ClaimVerdict:
 
     @property
     def reason(self) -> str:
-        """In a few words, why the verdict is what it is."""
+        """The reason for a verdict in a few words."""
         claim, verdict, least = self.claim, self.verdict, self.claim.effect
         if verdict.untestable:
             return verdict.untestable

@@ -86,9 +86,8 @@ def _read_archive(path: Path, wanted: Wanted, name: str) -> Found:
                 ]
                 together = Pairs(tuple(row for one in found for row in one.rows))
                 if not together.rows:
-                    raise InputError(
-                        f"{path}: {(*(line for one in found for line in one.left_out), 'nothing is paired')[0]}"
-                    )
+                    reason = next((f" ({line})" for one in found for line in one.left_out), "")
+                    raise InputError(f"{path}: no trials can be paired in {wanted.metric}{reason}")
                 test = student(together.differences)
                 mean, interval = float(together.differences.mean()), None if test is None else test.interval()
                 studies.append(Study(label, mean, interval, _conditions(protocol, wanted.metric), _budgets(own, pairs)))
