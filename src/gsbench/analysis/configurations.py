@@ -141,7 +141,7 @@ def facts_of(name: str) -> dict[str, str]:
 
 @cache
 def departures() -> dict[str, tuple[str, ...]]:
-    """Of each shipped class of densifiers, by its import path, the ingredients in which it departs from ADC."""
+    """Ingredients in which each shipped class of densifiers, by its import path, departs from ADC."""
     found = {}
     for name in shipped_arms():
         content = yaml.load((conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8"), Loader=_LOADER)

@@ -76,7 +76,7 @@ def equal_notes(experiment: Experiment) -> list[str]:
 
 
 def outcome(trial: TrialResult) -> tuple[dict[str, float], int | None]:
-    """What two trainings share that are one and the same: all metrics, and the number of Gaussians."""
+    """All metrics and the number of Gaussians: two trainings that share them are one and the same."""
     return dict(trial.metrics), trial.record.num_gaussians
 
 

@@ -1,4 +1,4 @@
-"""Which arms are held against which, and the metrics of single views, each file read once."""
+"""Pairs of arms that are held against each other, and the metrics of single views, each file read once."""
 
 from __future__ import annotations
 

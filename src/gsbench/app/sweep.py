@@ -55,7 +55,7 @@ class Sweep:
 
     @classmethod
     def begin(cls, context: HydraContext, task: TaskFunction, config: DictConfig) -> Sweep:
-        """What a sweeper of gsbench's does with what Hydra gives it."""
+        """The work of gsbench's sweepers on what Hydra gives them."""
         assert isinstance(task, Task)
         context = JobContext(context.config_loader, context.callbacks)
         begin_sweep(config, record=not task.look_only)

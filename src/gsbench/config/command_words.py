@@ -147,7 +147,7 @@ def parse_word(word: str) -> Override:
 
 
 def brackets(word: str) -> int:
-    """How many brackets are open at once at most: Hydra's parser goes down by recursion."""
+    """The most brackets that are open at once: Hydra's parser goes down by recursion."""
     depth = deepest = 0
     for letter in word:
         depth += (letter in "[{(") - (letter in "]})")

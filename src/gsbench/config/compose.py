@@ -43,7 +43,7 @@ ASKED = re.compile(r"\$\{hydra:\s*([\w.]+)\s*\}")
 
 @dataclass(frozen=True)
 class TrialConfig:
-    """What is asked for: the resolved values of one trial, and the overrides that give them.
+    """The resolved values of the one trial that is asked for, and the overrides that give them.
 
     ``job`` is what Hydra knows of the trial where it runs as a job of a sweep. One that was ``recorded`` is read from
     its own ``config.yaml``, and no overrides give it. Raises InputError for values that would make run what their

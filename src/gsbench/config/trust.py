@@ -71,7 +71,7 @@ HYDRAS_VALUES = ("${hydra_override_dirname:}", "${hydra_deprecated_override_dirn
 PUBLIC_CLASS = re.compile(rf"{PACKAGE}\.\w+\.[A-Z]\w*")  # known by its name; importing it may take seconds
 NO_LOGGING = {"version": 1, "root": None, "disable_existing_loggers": False}
 SHELL_SETTINGS = ("setup", "python", "srun_args", "additional_parameters")  # of submitit's launchers: lines and options
-# What a file's sweep may not give its jobs: the look at the whole comes before these are composed.
+# Settings that a file's sweep may not give its jobs: the look at the whole comes before these are composed.
 NOT_SWEPT = re.compile(rf"[\s+~]*(hydra|{PERMISSIONS})\s*([./@:=\[]|$)")
 
 

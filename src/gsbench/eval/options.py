@@ -80,7 +80,7 @@ class EvalConfig:
 
     @property
     def of_model(self) -> dict[str, Any]:
-        """What is to be measured of a model: the settings by name, those that ask for nothing left out."""
+        """Settings by name that say what is measured of a model, those that ask for nothing left out."""
         settings = {name: getattr(self, name) for name in ("geometry", "flicker", "bands", "fps")}
         return {name: value for name, value in settings.items() if value}
 

@@ -32,7 +32,7 @@ class Trial(TrialConfig):
 
     @property
     def folder(self) -> Path:
-        """Where that folder lies."""
+        """The place of that folder."""
         return self.files.path
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Which code made a result: gsbench's own by rooms, the user's by modules. Loads no torch.
+"""The code that made a result: gsbench's own by rooms, the user's by modules. Loads no torch.
 
 Where gsbench is as in a release (``released.json``), the versions of its stages stand for it, which are bumped by hand.
 In a checkout that differs, the key of a stage has the digests of the rooms that it uses as well. A user's modules are
@@ -32,7 +32,7 @@ RELEASED = "released.json"  # in the package: the digests of all rooms as they w
 AS_RELEASED = "released"  # the state of a room that is
 DIGEST_CHARACTERS = 16
 
-# What makes the numbers of each stage: folders and files of gsbench. What only says, shows, launches or reads has no
+# Folders and files of gsbench that make the numbers of each stage. What only says, shows, launches or reads has no
 # part, nor what makes objects of the settings, which are in the keys as they are. An edit of one densifier changes the
 # room of all: the price of a table that anybody can check.
 MODEL = ("scene", "gaussians", "densify", "raster", "train", "events.py")

@@ -44,7 +44,7 @@ def trial_key(scene: str, arm: str, config_hash: str) -> str:
 
 @dataclass(frozen=True, order=True)
 class Arm:
-    """What is compared: an initialiser with a densifier, and the swept settings that tell it from others of the two.
+    """An arm of a comparison: an initialiser, a densifier, and the swept settings that tell it from others of the two.
 
     ``variant`` holds the items of a mapping from a setting to its value as text. A file of claims names its arms
     itself; they have no ``init``.
@@ -63,7 +63,7 @@ class Arm:
 
 @dataclass(frozen=True, kw_only=True)
 class Question(Part):
-    """Whether ``arm`` differs from ``baseline`` in ``metric``, the way that ``sign`` says and by ``least`` at least.
+    """A question: does ``arm`` differ from ``baseline`` in ``metric``, the way ``sign`` says, by ``least`` at least?
 
     ``sign`` is that of the claimed difference, arm minus baseline; 0 where it is claimed that there is none. ``least``
     is the smallest difference that matters, in the metric's unit or (``relative``) as a part of the baseline's value;

@@ -1,4 +1,4 @@
-"""What a finished trial's results were made of, as ``results.json`` says it, and whether that still holds.
+"""The inputs of a finished trial's results, as ``results.json`` says them, and whether they still hold.
 
 A sweep that is given again recognises what is done by this, without reading photographs. Loads no torch.
 """

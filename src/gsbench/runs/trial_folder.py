@@ -217,14 +217,14 @@ class TrialFolder:
         return record
 
     def sound_record(self) -> TrialRecord | None:
-        """As `record`; None where the trial has no results that can be relied on."""
+        """The same as `record`, but None where the trial has no results that can be relied on."""
         try:
             return self.record()
         except (FileNotFoundError, DamagedError):
             return None
 
     def made_of(self) -> MadeOf | None:
-        """What the results were made of; None where they do not say. Raises as `record`, but checks nothing."""
+        """The inputs of the results; None where they do not say. Raises as `record`, but checks nothing."""
         return read_typed(self.path / RESULTS, OnDisk).made_of
 
     def settings(self) -> dict[str, Any]:
@@ -269,7 +269,7 @@ class TrialFolder:
         values: dict[str, Any],
         unavailable_now: Callable[[dict[str, Any]], Collection[str]] = lambda options: (),
     ) -> str:
-        """Why the trial with the resolved configuration ``values`` has to be run or checked; "" where it is done.
+        """The reason to run or check the trial with the resolved configuration ``values``; "" where it is done.
 
         It is done where nothing that it was made of has changed. A trial that lacks a metric for want of weights is
         done only if ``unavailable_now``, called with the ``eval`` settings, says that it would lack it again.

@@ -1,4 +1,4 @@
-"""What a training writes down: its losses, read without making the device wait, and records as JSON lines."""
+"""The journal of a training: its losses, read without making the device wait, and records as JSON lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What enters the key of a step: options of components, the held-out views, the code of gsbench and the user's."""
+"""Inputs of a step's key: options of components, the held-out views, the code of gsbench and the user's."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ class Resources:
 
 @dataclass
 class ForwardPass:
-    """What the forward pass leaves; the memory of its arrays belongs to an arena."""
+    """The arrays that the forward pass leaves; their memory belongs to an arena."""
 
     frame: at.Frame
     degree: int
