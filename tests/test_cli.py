@@ -288,12 +288,16 @@ def test_ui_needs_a_database(capsys: pytest.CaptureFixture[str]) -> None:
 def test_ui_serves_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None:
     commands: list[list[str]] = []
 
-    def run(command: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
-        commands.append(command)
-        assert options["env"]["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
-        return subprocess.CompletedProcess(command, 0)
+    class Server:
+        def __init__(self, command: list[str], env: dict[str, str]) -> None:
+            commands.append(command)
+            assert env["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
 
-    monkeypatch.setattr(subprocess, "run", run)
+        def wait(self) -> int:
+            return 0
+
+    monkeypatch.setattr(subprocess, "Popen", Server)
+    monkeypatch.setattr(ui, "end_descendants", lambda: None)
     assert ui.serve("sqlite:///x.db", 1234) == 0
     assert commands[0][commands[0].index("--host") + 1] == "127.0.0.1"
 
