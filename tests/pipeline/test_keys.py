@@ -24,10 +24,10 @@ BARE = Capture("garden", Path("photos"), ("a.jpg", "b.jpg", "c.jpg"), ("a.jpg",)
 KEYS = [
     ("config", "84cbf20c22697c9af1c644d018f019b5237a03fca6c07628d0d2d71de76e239a"),
     ("init", "33343fcdd1b72fb6244c22140544aa03499aca7308e443aa21bb34b9c1f59ccb"),  # of the cameras
-    ("init", "54407ff14b3b0210305785c62be5478da0fc54cb0e67ec0ed797cf24d5a197a3"),
-    ("train", "f71bd50c23af2e8f41abfa9c24c115942c401359c23438de6c8734df51f9e0a6"),
-    ("ground_truth", "eddab634295b7c2e1947393af6f5106a18b7eb12deb1149642b3d894b68b2fe6"),
-    ("evaluate", "5e44ae967a0264d4dc7521876b6d9970177b403d7af49dae9048f226541b16a0"),
+    ("init", "dfc40b276cecc590ed3121da6e3f42f79ac9437779bd78a389b2ca0aa76ea26a"),
+    ("train", "d75cc1f576b45bcf7cb956ab07a4c615f66a411b26c9d1d731cb564d75c38bdc"),
+    ("ground_truth", "dad1d708601ef56e7e24e4e877bea9616820a81676b8b46fc88f9004865d9847"),
+    ("evaluate", "07d5d48e3d3701ac044558585253c6892dd6fc5afa81ad255942e153bcbbb1f1"),
 ]
 
 
