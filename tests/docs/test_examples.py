@@ -89,7 +89,7 @@ def test_metric(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for trial in trials:
         results = json.loads((trial / "results.json").read_text())
         assert results["metric_facts"]["gradients"]["direction"] == -1
-        assert list(results["code"]["sources"]) == ["gradients.GradientError"]
+        assert list(results["code"]["sources"]) == ["gradients"]
         with (trial / "per_view.csv").open(newline="") as stream:
             rows = {row["view"]: float(row["gradients"]) for row in csv.DictReader(stream)}
         assert results["metrics"]["gradients"] == pytest.approx(np.mean(list(rows.values())))
