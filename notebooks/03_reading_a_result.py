@@ -125,7 +125,7 @@ print(f"verdict          {verdict.outcome}, on {', '.join(verdict.pairs.scenes)}
 
 # %%
 for difference in (0.05, 0.1, 0.2, 0.5):
-    print(f"{difference:4} dB: {seeds_needed(verdict.deviation, 1, difference) or 'more than 1000'} seeds an arm")
+    print(f"{difference:4} dB: {seeds_needed(verdict.deviation, 1, difference) or 'more than 40'} seeds an arm")
 
 # %% [markdown]
 # More seeds tell more about *this* scene only. For "scenes like these", gsbench wants at least six scenes, which then
@@ -138,15 +138,14 @@ for difference in (0.05, 0.1, 0.2, 0.5):
 
 # %%
 regions = errors_by_region(pair_trials(experiment.trials, adc, volumetric), "texture")
-changes = [change for change, _ in regions.changes]
-words = [word for _, word in regions.changes]
+changes = [change.mean for change in regions.changes]
 bins = np.arange(1, len(changes) + 1)
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.4))
 left.plot(bins, regions.first, "o-", label="adc")
 left.plot(bins, regions.second, "o-", label="volumetric")
 left.set(xlabel="texture, from the lowest fifth to the highest", ylabel="mean error, 8-bit levels", xticks=bins)
 left.legend()
-right.bar(bins, changes, color=["C0" if word == "undecided" else "C3" for word in words])
+right.bar(bins, changes, color=["C0" if word == "undecided" else "C3" for word in regions.words()])
 right.axhline(0, color="grey", linewidth=1)
 right.set(xlabel="texture, from the lowest fifth to the highest", ylabel="volumetric minus adc", xticks=bins)
 figure.tight_layout()
