@@ -112,7 +112,8 @@ def trial_of(settings: Sequence[str], runs: Path, capture: Path, *words: str) ->
     return folder
 
 
-CLOCKED = ("seconds", "peak_memory_mb", "measured")  # what differs between two runs of the same trial
+# What differs between two runs of the same trial: times, and where and when the files that it was made of were written.
+CLOCKED = ("seconds", "peak_memory_mb", "measured", "made_of")
 
 
 def start(environment: dict[str, str], cwd: Path, runs: Path, *arguments: str) -> subprocess.Popen[str]:

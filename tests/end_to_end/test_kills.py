@@ -182,10 +182,10 @@ def test_a_killed_tuning_goes_on_and_its_values_are_trained(
 
 
 def page_of(runs: Path) -> list[str]:
-    """The page without the minute in which its plan was declared, and without what is measured of a machine."""
+    """The page without the minute in which its claims were declared, and without what is measured of a machine."""
     lines = (runs / "check_it" / "claims.md").read_text().splitlines()
-    assert sum(" was declared " in line for line in lines) == 1
-    measured = (" was declared ", "| seconds of training |", "| memory (MB) |")
+    assert sum(" were declared " in line for line in lines) == 1
+    measured = (" were declared ", "| seconds of training |", "| memory (MB) |")
     assert all(sum(words in line for line in lines) == 1 for words in measured)
     return [line for line in lines if not any(words in line for words in measured)]
 
