@@ -112,7 +112,6 @@ def holders(runs: Path) -> dict[str, int]:
 def test_one_killed_trial_harms_no_other_and_the_next_command_mends_it(
     environment: dict[str, str], tmp_path: Path
 ) -> None:
-    pytest.importorskip("submitit", reason="needs the extra slurm")
     runs = tmp_path / "runs"
     process = start(environment, tmp_path, runs, *LOCAL, "seed=0,1,2")
     deadline = time.monotonic() + 120

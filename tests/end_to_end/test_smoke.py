@@ -170,7 +170,6 @@ def test_a_mirror_in_mlflow(gsbench: Run, runs: Path) -> None:
 @pytest.mark.skipif(os.name != "posix", reason="Slurm's commands are scripts of a shell here")
 def test_slurms_job_command_runs_the_trial(gsbench: Run, runs: Path, tmp_path: Path) -> None:
     """``sbatch`` keeps the script; its command is then run as Slurm would run one task of the array."""
-    pytest.importorskip("submitit", reason="needs the extra slurm")
     bin_folder = tmp_path / "bin"
     bin_folder.mkdir()
     for name in ("sbatch", "srun", "squeue"):

@@ -56,7 +56,6 @@ CLUSTER = [
 def slurm() -> None:
     if shutil.which("sinfo") is None:
         pytest.skip("no Slurm here: scripts/slurm_one_node.sh start (root, Debian or Ubuntu) sets one up")
-    pytest.importorskip("submitit", reason="needs the extra slurm")
     try:
         states = subprocess.run(
             ["sinfo", "-h", "-o", "%T"], capture_output=True, text=True, timeout=120, check=True

@@ -20,7 +20,7 @@ def test_the_name_is_that_of_the_project_file() -> None:
     project = content["project"]
     assert project["name"] == DISTRIBUTION
     assert list(project["scripts"]) == ["gsbench"]
-    assert f"{DISTRIBUTION}[dim,search,slurm,tensorboard,video,view]" in content["dependency-groups"]["dev"]
+    assert f"{DISTRIBUTION}[dim,search,tensorboard,video,view]" in content["dependency-groups"]["dev"]
 
 
 def test_from_a_checkout_the_hint_installs_the_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,7 +34,7 @@ def test_from_a_checkout_the_hint_installs_the_checkout(tmp_path: Path, monkeypa
 def test_elsewhere_the_hint_names_the_distribution(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(install, "__file__", "/usr/lib/python3/site-packages/gsbench/install.py")
     assert install_command() == "pip install 'gsbench-3dgs'"
-    assert install_command("slurm") == "pip install 'gsbench-3dgs[slurm]'"
+    assert install_command("view") == "pip install 'gsbench-3dgs[view]'"
 
 
 def test_no_text_sends_anyone_to_the_project_that_has_our_name() -> None:

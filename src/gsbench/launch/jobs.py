@@ -6,7 +6,6 @@ scheduler says of the process.
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 import os
 import pickle
@@ -20,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsbench.config.jobs import HydraJob
-from gsbench.errors import InputError
 from gsbench.files import require_own
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.queue import forget_submission
@@ -28,7 +26,6 @@ from gsbench.launch.trial import Trial
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import JOBS
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.system.install import install_command
 from gsbench.system.own_modules import allowed_modules, take_over
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
 from gsbench.system.stopping import Stopped, stop_on_signals
@@ -88,18 +85,11 @@ class TrialJob:
 def run_local(trials: Sequence[Trial]) -> list[Outcome]:
     """Run the trials in processes of this machine, ``launch.parallel`` at once; returns when all have ended."""
     values = trials[0].values
-    need_submitit("local")
     import submitit
 
     executor = submitit.LocalExecutor(job_folder(values))
     executor.update_parameters(timeout_min=values["launch"]["timeout_min"] or 365 * DAYS)
     return _run(trials, executor, values["launch"]["parallel"])
-
-
-def need_submitit(launcher: str) -> None:
-    """Raise InputError where submitit is missing."""
-    if importlib.util.find_spec("submitit") is None:
-        raise InputError(f"launch={launcher} needs submitit: {install_command('slurm')} (or pip install submitit)")
 
 
 def job_folder(values: dict[str, Any]) -> Path:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsbench.errors import InputError
-from gsbench.launch.jobs import SECONDS_BETWEEN_POLLS, collect, job_folder, job_of, need_submitit
+from gsbench.launch.jobs import SECONDS_BETWEEN_POLLS, collect, job_folder, job_of
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.queue import (
     ask_queue,
@@ -58,8 +58,7 @@ def run_slurm(trials: Sequence[Trial]) -> list[Outcome]:
 
 
 def make_executor(launch: dict[str, Any], folder: Path) -> SlurmExecutor:
-    """The submitit executor for the settings ``launch``. Raises InputError where submitit or Slurm is missing."""
-    need_submitit("slurm")
+    """The submitit executor for the settings ``launch``. Raises InputError where Slurm is missing."""
     import submitit
 
     try:

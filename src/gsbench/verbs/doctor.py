@@ -32,7 +32,6 @@ OPTIONAL = {  # module -> what needs it, and the extra that brings it
     "transformers": ("init=dim", "dim"),
     "gsplat": ("raster=gsplat", "gsplat"),
     "optuna": ("searches (hydra.sweeper.tune)", "search"),
-    "submitit": ("launch=local and launch=slurm", "slurm"),
     "tensorboard": ("tracking=tensorboard", "tensorboard"),
     "viser": ("gsbench view", "view"),
     "cv2": ("gsbench video to .mp4", "video"),
