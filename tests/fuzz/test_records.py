@@ -85,7 +85,7 @@ READS_ITSELF = {
     "claims/here.py", "launch/batch.py", "init/base.py",  # text of this very process
     "analysis/configurations.py",  # arms of the package; those of trials are read by TrialFolder
     "claims/stopping.py", "verbs/ablate.py",  # text of this process; words of a command line
-    "claims/archive.py", "claims/studies.py",  # archives and nerfbaselines' files, which anybody may have made
+    "claims/archive.py",  # archives, which anybody may have made
     "scene/load.py",  # prepared views, beside the store
     "parsing.py",
 }  # fmt: skip
