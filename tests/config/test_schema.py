@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -252,6 +253,12 @@ def test_hash_follows_the_source_of_a_users_metric(tmp_path: Path, monkeypatch: 
 def test_names_of_own_metrics_are_their_own(name: str) -> None:
     with pytest.raises(InputError, match=rf"eval\.extra\.{name}: name your metric"):
         composed(f"eval.extra.{name}._target_=mine.X", "allow_targets=[mine]")
+
+
+def test_values_of_a_trial_have_the_types_of_json() -> None:
+    """OmegaConf 2.4 keeps tuples, and a record of a trial knows none."""
+    values = composed()
+    assert json.loads(json.dumps(values)) == values
 
 
 def test_an_own_metric_must_be_allowed_and_name_a_class() -> None:

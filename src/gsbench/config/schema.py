@@ -263,5 +263,11 @@ def check_external(config: DictConfig) -> None:
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """The resolved configuration as plain Python."""
-    return OmegaConf.to_container(config, resolve=True, enum_to_str=True)  # type: ignore[return-value]
+    """The resolved configuration as plain Python, of the types that JSON has: OmegaConf 2.4 keeps tuples."""
+    return _without_tuples(OmegaConf.to_container(config, resolve=True, enum_to_str=True))
+
+
+def _without_tuples(values: Any) -> Any:
+    if isinstance(values, dict):
+        return {key: _without_tuples(value) for key, value in values.items()}
+    return [_without_tuples(value) for value in values] if isinstance(values, list | tuple) else values
