@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from gsbench.config.compose import compose_one
-from gsbench.launch.jobs import clouds_first, collect
+from gsbench.errors import InputError
+from gsbench.launch.jobs import clouds_first, collect, job_folder
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.trial import Trial
 
@@ -74,3 +75,18 @@ def test_one_trial_of_each_cloud_begins_first() -> None:
         *(("a", 0), ("b", 0)),
         *(("a", 1), ("b", 1)),
     ]
+
+
+def test_a_link_of_submitits_does_not_refuse_the_next_submission_and_any_other_does(tmp_path: Path) -> None:
+    values = compose_one(["name=cluster", f"runs={tmp_path}"]).values
+    folder = job_folder(values)
+    script = folder / "2_submission.sh"
+    script.write_text("#!/bin/bash\n")
+    left = folder / ".submission_file_aaa46bf3.sh"
+    left.symlink_to(script)
+    assert job_folder(values) == folder
+    assert not left.is_symlink()
+    assert script.exists()
+    (folder / "2_0_0_log.out").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match=r"2_0_0_log\.out is a link"):
+        job_folder(values)

@@ -96,6 +96,11 @@ def job_folder(values: dict[str, Any]) -> Path:
     """The folder in which the jobs of an experiment write what they print; made if it is not there."""
     runs = TrialFolder.of(values).runs
     folder = runs / JOBS / values["name"]
+    require_own(runs, folder)
+    # For each job script submitit leaves a link, which nobody reads again; a link of anybody else's is refused.
+    for link in folder.glob(".submission_file_*.sh"):
+        if link.is_symlink():
+            link.unlink(missing_ok=True)
     require_own(runs, folder, below=True)
     folder.mkdir(parents=True, exist_ok=True)
     return folder
