@@ -100,7 +100,7 @@ def _baseline_lines(experiment: Experiment, trial: TrialResult) -> list[str]:
 
 
 def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:
-    """What each trial came from; what is the same in all of them stands once, at the end."""
+    """Say what each trial came from; what all of them share is said once, at the end."""
     origins = [_origin(trial) for trial in trials]
     labels = list(dict.fromkeys(label for origin in origins for label in origin))
     shared = [label for label in labels if len({origin.get(label) for origin in origins}) == 1]

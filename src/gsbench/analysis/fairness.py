@@ -20,7 +20,6 @@ from gsbench.analysis.configurations import REFERENCE, canonical, notes_of, reso
 from gsbench.analysis.differences import CODE, short_version
 from gsbench.analysis.judgement import pair_trials
 from gsbench.analysis.origins import cloud_of, machine_of
-from gsbench.analysis.pairing import arm_name
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.tables import Column, Entry, Row, Table
 from gsbench.analysis.tuning import tuning_lines
@@ -56,12 +55,12 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
     notes += [f"Tuning. {line}" for line in tuning_lines(trials, (first, second))]
     notes += [line for trial in (one, other) for line in default_lines(trial)]
     return Table(
-        f"Fairness sheet: {arm_name(second)} against {arm_name(first)}",
+        f"Fairness sheet: {second} against {first}",
         ("what",),
-        (Column("", arm_name(first)), Column("", arm_name(second)), Column("", DIFFERS)),
+        (Column("", str(first)), Column("", str(second)), Column("", DIFFERS)),
         (*rows, *settings),
         tuple(notes),
-        (("", arm_name(first)), ("", arm_name(second)), ("", DIFFERS)),
+        (("", str(first)), ("", str(second)), ("", DIFFERS)),
         wrapped=True,
     )
 
@@ -70,17 +69,17 @@ def default_lines(trial: TrialResult) -> list[str]:
     """Settings of an arm by their origin, as its file states it: its authors' defaults, gsbench's, the trial's own."""
     name, config = shipped_name(trial.config), trial.config
     if not config:
-        return [f"Defaults. {arm_name(trial.arm)}: {UNKNOWN}."]
+        return [f"Defaults. {trial.arm}: {UNKNOWN}."]
     if trial.program:
         version = trial.trainer_version or UNKNOWN
         what = f"the program {trial.program} (version {version}) with its own defaults, but for what its command gives"
-        return [f"Defaults. {arm_name(trial.arm)}: {what}: {_shown(config.get('densify.command'))}."]
+        return [f"Defaults. {trial.arm}: {what}: {_shown(config.get('densify.command'))}."]
     if name is None:
         target = config.get("densify._target_", "a class that is not recorded")
         digest = trial.code.get(f"{CODE}{target}")
         of_file = f" (version {short_version(digest)})" if digest else ""
         what = f"{target}{of_file} is no arm of gsbench; its defaults stand in its class"
-        return [f"Defaults. {arm_name(trial.arm)}: {what}."]
+        return [f"Defaults. {trial.arm}: {what}."]
     notes = notes_of(name)
     own = resolved(shipped_arms()[name], config)
     changed = [
@@ -88,7 +87,7 @@ def default_lines(trial: TrialResult) -> list[str]:
         for key, value in own.items()
         if key in config and config[key] != value and not _is_open(value) and key not in NAMES
     ]
-    line = f"Defaults. {arm_name(trial.arm)}: densify={name}"
+    line = f"Defaults. {trial.arm}: densify={name}"
     line += f" but for {listed(changed)}" if changed else " as it is shipped"
     if notes.theirs:
         line += f"; its authors have {listed([f'{key} {value}' for key, value in notes.theirs.items()])}"
@@ -108,8 +107,8 @@ def _source(text: str) -> str:
 
 def _alone(found: Sequence[str], first: Arm, second: Arm) -> str:
     if not found:
-        return f"{arm_name(second)} and {arm_name(first)} differ in no recorded setting."
-    return f"{arm_name(second)} differs from {arm_name(first)} by {found[0]} alone."
+        return f"{second} and {first} differ in no recorded setting."
+    return f"{second} differs from {first} by {found[0]} alone."
 
 
 def _row(what: str, first: str, second: str) -> Row:

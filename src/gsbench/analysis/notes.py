@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from gsbench.analysis.attribution import attribute, attribution_sentence
 from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.declaration import standing
-from gsbench.analysis.pairing import arm_name, choose_pairs, controls_of
+from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.results import Arm, Experiment, TrialResult
 from gsbench.analysis.tuning import tuning_sentence
 from gsbench.runs.layout import SEARCH
@@ -70,7 +70,7 @@ def equal_notes(experiment: Experiment) -> list[str]:
         )
         shared = one.keys() & other.keys()
         if shared and all(one[key] == other[key] and one[key][0] for key in shared):
-            names = f"{arm_name(second)} and {arm_name(first)}"
+            names = f"{second} and {first}"
             notes.append(f"{names} are equal to the last bit in all their trials: what they differ in never acted.")
     return notes
 
@@ -116,6 +116,6 @@ def counts_sentence(trials: Sequence[TrialResult], first: Arm, second: Arm) -> s
         return ""
     more = f"{abs(change):.0%}".replace("%", " %") + (" more" if change > 0 else " fewer")
     return (
-        f"{arm_name(second)} has {more} Gaussians than {arm_name(first)}: this is no comparison at one count, which "
+        f"{second} has {more} Gaussians than {first}: this is no comparison at one count, which "
         "densify.cap=governor makes."
     )

@@ -69,7 +69,3 @@ def controls_of(trials: Sequence[TrialResult]) -> dict[str, str]:
         for key, value in trial.config.items()
         if key.startswith(CONTROLS)
     }
-
-
-def arm_name(arm: Arm) -> str:
-    return str(arm)

@@ -95,9 +95,8 @@ class Task:
         allow_modules(self.allowed, self.folder)
         set_up_logging()
         hydra: Any = HydraConfig.instance().cfg
-        check_composed(
-            hydra, self.allowed
-        )  # a job's files may say other things of Hydra than those that were looked at
+        # A job's files may say other things of Hydra than those that were looked at.
+        check_composed(hydra, self.allowed)
         for_hydra, words = typed(hydra.hydra.overrides)
         (outcome,) = self.handle([Trial.of(ready_trial(look_at(config, self.allowed), [*for_hydra, *words]))])
         if outcome.status == "failed":

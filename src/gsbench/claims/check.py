@@ -116,7 +116,7 @@ class Check:
         return [replace(one, failed=tuple(self._failed(one.verdict))) for one in found]
 
     def _failed(self, verdict: Verdict) -> list[str]:
-        """Why trials of the question failed, each reason once."""
+        """List the reasons why trials of the question failed, each once."""
         folders = [
             self.home / f"{key}{SEED}{seed}"
             for both in verdict.question.scenes.values()

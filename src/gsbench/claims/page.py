@@ -170,7 +170,7 @@ def _judged_on(one: ClaimVerdict) -> str:
 
 
 def _like_these(one: ClaimVerdict) -> list[str]:
-    """What the scenes say of scenes like these, where they are enough."""
+    """The statement about scenes like these, where the scenes are enough for one."""
     verdict, found = one.verdict, one.verdict.like_these
     if found is None:
         return []

@@ -12,7 +12,6 @@ from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.frame import to_frame
 from gsbench.analysis.notes import compared_pairs
-from gsbench.analysis.pairing import arm_name
 from gsbench.analysis.paper import load_paper
 from gsbench.analysis.paper_tables import PAPER_TABLES, layout_of, paper_tables
 from gsbench.analysis.published import published_names, published_table
@@ -98,7 +97,7 @@ def _fairness_sheets(experiment: Experiment, format_name: str) -> dict[str, str]
 
 def _as_file(arm: Arm) -> str:
     """An arm as a part of a file's name, its variant included."""
-    return re.sub(r"[^\w.=-]+", "_", arm_name(arm))
+    return re.sub(r"[^\w.=-]+", "_", str(arm))
 
 
 def _parser() -> ArgumentParser:

@@ -12,7 +12,7 @@ from gsbench.analysis.cells import by_key, with_variants
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.errors_by_region import read_image
 from gsbench.analysis.origins import cloud_lines
-from gsbench.analysis.pairing import BASELINE, ViewCache, arm_name, choose_pairs, controls_of
+from gsbench.analysis.pairing import BASELINE, ViewCache, choose_pairs, controls_of
 from gsbench.analysis.paper import load_paper
 from gsbench.analysis.paper_tables import layout_of, paper_tables
 from gsbench.analysis.report.models import agreements
@@ -68,7 +68,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE, ablation: Abl
         name=experiment.name,
         style=_resource("style.css"),
         script=_resource("script.js"),
-        arms=[arm_name(arm) for arm in arms],
+        arms=[str(arm) for arm in arms],
         scenes=sorted({trial.scene for trial in trials}),
         seeds=experiment.seeds,
         trials=trials,
@@ -84,7 +84,6 @@ def build_report(experiment: Experiment, baseline: str = BASELINE, ablation: Abl
         tradeoffs=tradeoff_charts(trials),
         gaps=tradeoff_gaps(trials, baseline),
         agreements=agreements(trials),
-        arm_name=arm_name,
         to_html=to_html,
         training=training_charts(trials, arms),
         events=event_charts(trials, arms),

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from gsbench.analysis.cells import by_key
-from gsbench.analysis.pairing import ViewCache, arm_name
+from gsbench.analysis.pairing import ViewCache
 from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.questions import TURNS, UNSURE, Gap, Turn, find_gaps, find_turns, without_split
 from gsbench.analysis.report.charts import Series, line_chart
@@ -53,7 +53,7 @@ def angle_charts(trials: Sequence[TrialResult], views: ViewCache) -> list[str]:
         for metric in main_metrics(group):
             series = []
             for arm, own in sorted(by_key(group, lambda trial: arms[str(trial.path)]).items()):
-                series.append(Series(arm_name(arm), binned(_points(own, metric, views))))
+                series.append(Series(str(arm), binned(_points(own, metric, views))))
             title = f"{metric.name} by distance from training, {scene}"
             label = "angle to the nearest training view (degrees)"
             charts.append(line_chart(title, series, label, metric.heading, dots=True))
@@ -134,7 +134,7 @@ def _in_words(turn: Turn) -> str:
         f"{signed(one.verdict.mean or 0.0, digits)} ({_interval(one.verdict.interval, digits)}) at {name}"
         for one, name in ((turn.interpolation, "interpolation"), (turn.extrapolation, f"extrapolation, {turn.split}"))
     ]
-    pair = f"{arm_name(turn.second)} against {arm_name(turn.first)}"
+    pair = f"{turn.second} against {turn.first}"
     said = "the order turns" if turn.word == TURNS else turn.word
     return f"{turn.quantity.name}, {pair}: {', '.join(sides)}: {said}"
 

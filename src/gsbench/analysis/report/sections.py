@@ -13,7 +13,6 @@ from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.judgement import pair_trials
 from gsbench.analysis.notes import caveats
 from gsbench.analysis.origins import machine_of, unlike_clouds
-from gsbench.analysis.pairing import arm_name
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart, short_number
 from gsbench.analysis.report.headlines import by_scene_lines, detail_lines, headline, secondary
 from gsbench.analysis.report.models import share_above, volume_histogram
@@ -58,7 +57,7 @@ class Versus:
 
     @property
     def title(self) -> str:
-        return f"{arm_name(self.second)} against {arm_name(self.first)}"
+        return f"{self.second} against {self.first}"
 
     @property
     def beyond(self) -> bool:
@@ -109,7 +108,7 @@ def training_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[
     keys = [key for key, _, _ in CURVES]
     means = {arm: _mean_curves(own, layout.CURVES, keys) for arm, own in _by_arm(trials, arms).items()}
     charts = [
-        line_chart(title, [Series(arm_name(arm), found[key]) for arm, found in means.items()], "iteration", y_label)
+        line_chart(title, [Series(str(arm), found[key]) for arm, found in means.items()], "iteration", y_label)
         for key, title, y_label in CURVES
     ]
     return [chart for chart in charts if chart]
@@ -121,7 +120,7 @@ def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str
     for arm in arms:
         logged = [trial.record.events for trial in trials if trial.arm == arm]
         totals.append(
-            (arm_name(arm), {c: statistics.fmean(float(events.get(c, 0)) for events in logged) for c in EVENT_CAUSES})
+            (str(arm), {c: statistics.fmean(float(events.get(c, 0)) for events in logged) for c in EVENT_CAUSES})
         )
     causes = [cause for cause in EVENT_CAUSES if any(counts[cause] for _, counts in totals)]
     if not causes:
@@ -133,8 +132,8 @@ def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str
     for arm, own in _by_arm(trials, arms).items():
         means = _mean_curves(own, layout.EVENTS, [*causes, "strictness"])
         series = [Series(label, means[cause]) for cause, label in zip(causes, labels, strict=True)]
-        charts.append(line_chart(f"Refinement over time: {arm_name(arm)}", series, "iteration", "Gaussians"))
-        strictness.append(Series(arm_name(arm), means["strictness"]))
+        charts.append(line_chart(f"Refinement over time: {arm}", series, "iteration", "Gaussians"))
+        strictness.append(Series(str(arm), means["strictness"]))
     title = "Thresholds of growth under the governor, as multiples of their settings"
     charts.append(line_chart(title, strictness, "iteration", "factor", log_y=True))
     return [chart for chart in charts if chart]
@@ -166,7 +165,7 @@ def _origin_chart(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> str:
     shown = [index for index in range(len(causes)) if any(row[index] for row in means.values())]
     if not shown:
         return ""
-    bars = [(arm_name(arm), [row[index] for index in shown]) for arm, row in means.items()]
+    bars = [(str(arm), [row[index] for index in shown]) for arm, row in means.items()]
     words = {cause.key: cause.words for cause in Cause}
     labels = [words.get(causes[index], causes[index]) for index in shown]
     return bar_chart("What made the final Gaussians, mean of a trial", labels, bars, "Gaussians")
@@ -180,18 +179,18 @@ def volume_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> tuple[l
     for arm in arms:
         own = [trial for trial in trials if trial.arm == arm]
         try:
-            final.append(Series(arm_name(arm), volume_histogram(own)))
+            final.append(Series(str(arm), volume_histogram(own)))
             if threshold:
-                notes.append(f"{arm_name(arm)}: {share_above(own, threshold):.2%} of volumes exceed {threshold:g}.")
+                notes.append(f"{arm}: {share_above(own, threshold):.2%} of volumes exceed {threshold:g}.")
         except InputError as error:
-            notes.append(f"{arm_name(arm)}: no histogram, {error}")
+            notes.append(f"{arm}: no histogram, {error}")
     marker = (threshold, f"V_th {threshold:g}") if threshold else None
     title = "Volumes of the trained Gaussians"
     charts = [line_chart(title, final, "volume (cubed scene units)", "share", log_x=True, log_y=True, marker=marker)]
     for arm in arms:
         own = [trial for trial in trials if trial.arm == arm]
         series = [Series(f"iteration {step}", points) for step, points in _logged_histograms(own).items()]
-        title = f"Volumes during training: {arm_name(arm)}"
+        title = f"Volumes during training: {arm}"
         charts.append(
             line_chart(title, series, "volume (cubed scene units)", "share", log_x=True, log_y=True, marker=marker)
         )
@@ -267,7 +266,7 @@ def _forest(one: ArmVerdict) -> str:
 
 def _region_chart(errors: RegionErrors, first: Arm, second: Arm) -> str:
     labels = ["lowest", *[""] * (len(errors.first) - 2), "highest"]
-    series = [(arm_name(first), errors.first), (arm_name(second), errors.second)]
+    series = [(str(first), errors.first), (str(second), errors.second)]
     what = MAP_PROPERTIES.get(errors.property, "texture energy of the ground truth")
     return bar_chart(f"Error by {what}", labels, series, "error (8-bit levels)")
 
