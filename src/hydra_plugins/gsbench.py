@@ -6,6 +6,7 @@ Hydra imports this file at every start, of any Hydra app in the same environment
 from __future__ import annotations
 
 from collections.abc import Sequence
+from inspect import signature
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
@@ -47,14 +48,14 @@ class GsbenchSweeper(Sweeper):
         self.begun = Sweep.begin(hydra_context, task_function, config)
 
     def sweep(self, arguments: list[str]) -> Any:
-        from gsbench.app.sweeps import sweep
-
-        return sweep(self.begun, self.params, self.tune, arguments)
+        return self.begun.run(self.params, self.tune, arguments)
 
 
 LAUNCHER = {"_target_": "hydra_plugins.gsbench.GsbenchLauncher"}
 SWEEPER = {"_target_": "hydra_plugins.gsbench.GsbenchSweeper", "params": {}, "grids": []}
-# gsbench.app.tuning
+# as gsbench.app.tuning.TuneSettings
 TUNE = {"points": None, "at_once": 1, "metric": None, "direction": None, "seed": 100, "ranges": {}}
-ConfigStore.instance().store(group="hydra/launcher", name="gsbench", node=LAUNCHER, provider="gsbench")
-ConfigStore.instance().store(group="hydra/sweeper", name="gsbench", node={**SWEEPER, "tune": TUNE}, provider="gsbench")
+# Hydra imports this file more than once; from 1.4 on it says so unless it is told that the same may come again.
+AGAIN: dict[str, Any] = {"replace": True} if "replace" in signature(ConfigStore.store).parameters else {}
+for group, node in (("launcher", LAUNCHER), ("sweeper", {**SWEEPER, "tune": TUNE})):
+    ConfigStore.instance().store(group=f"hydra/{group}", name="gsbench", node=node, provider="gsbench", **AGAIN)

@@ -195,7 +195,7 @@ def test_what_was_trained_elsewhere_is_not_known(tmp_path: Path) -> None:
 
 def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> None:
     trials_of(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")})
-    (tmp_path / "exp" / "search.json").write_text("{}")
+    (tmp_path / "exp" / "tuning.json").write_text("{}")
     assert not any("differs from" in note for note in build_table(load_experiment(tmp_path, "exp")).notes)
 
 

@@ -139,23 +139,23 @@ def test_values_that_were_tried_here_are_said(tmp_path: Path) -> None:
 def test_a_search_that_proposed_the_settings_is_named(tmp_path: Path) -> None:
     write_arms(tmp_path, {"adc": densifier("adc"), "volumetric": densifier("volumetric", volume_threshold=0.06841)})
     points = [
-        {"number": k, "state": "done", "value": 27.5, "settings": {"densify.volume_threshold": v}}
-        for k, v in enumerate((0.1, 0.06841))
+        {"value": value, "settings": {"densify.volume_threshold": threshold}}
+        for value, threshold in ((27.6, 0.1), (27.5, 0.06841))
     ]
-    record = {"metric": "psnr", "direction": 1, "wanted": 2, "seeds": 1, "log": [], "points": points}
+    record = {
+        "sweep": "vth", "arm": "sfm-volumetric", "metric": "psnr", "direction": 1, "wanted": 2, "seeds": [100],
+        "scenes": ["courtyard"], "ranges": {}, "log": [], "as_it_is": False, "points": points,
+    }  # fmt: skip
     (tmp_path / "vth").mkdir()
-    (tmp_path / "vth" / "search.json").write_text(json.dumps(record))
+    (tmp_path / "vth" / "tuning.json").write_text(json.dumps(record))
     for name, content in (("other", '{"points": [3, {"settings": []}]}'), ("broken", "{")):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "search.json").write_text(content)
+        (tmp_path / name / "tuning.json").write_text(content)
     (line,) = [note for note in sheet(tmp_path, "volumetric").notes if note.startswith("Tuning.")]
     assert (
-        "densify.volume_threshold=0.06841 is one of 2 points of the search vth, by psnr of its held-out views" in line
+        "densify.volume_threshold=0.06841 is one of 2 points of the search vth, by psnr of validation views, "
+        "none of which is held out." in line
     )
-
-    (tmp_path / "vth" / "search.json").write_text(json.dumps(record | {"validation": True}))
-    (line,) = [note for note in sheet(tmp_path, "volumetric").notes if note.startswith("Tuning.")]
-    assert "by psnr of validation views, none of which is held out." in line
 
 
 # --- where it stands

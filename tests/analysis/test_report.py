@@ -386,9 +386,12 @@ def test_no_scene_is_named_where_none_is_decided(tmp_path: Path) -> None:
 def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> None:
     write_runs(tmp_path, Plan())
     assert "Verdicts, " in build_report(load_experiment(tmp_path, "exp"))
-    point = {"number": 0, "state": "done", "value": 27.5, "settings": {"densify.volume_threshold": 0.6841}}
-    record = {"metric": "psnr", "direction": 1, "wanted": 1, "seeds": 1, "log": [], "points": [point]}
-    (tmp_path / "exp" / "search.json").write_text(json.dumps(record))
+    points = [{"value": 27.5, "settings": {"densify.volume_threshold": 0.6841}}]
+    record = {
+        "sweep": "vth", "arm": "sfm-volumetric", "metric": "psnr", "direction": 1, "wanted": 2, "seeds": [100],
+        "scenes": ["courtyard"], "ranges": {}, "log": [], "as_it_is": False, "points": points,
+    }  # fmt: skip
+    (tmp_path / "exp" / "tuning.json").write_text(json.dumps(record))
     page = build_report(load_experiment(tmp_path, "exp"))
     assert "Verdicts, " not in page
     assert "not held against each other" in page

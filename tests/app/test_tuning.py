@@ -18,12 +18,12 @@ from gsbench.analysis.report.build import build_report
 from gsbench.analysis.report.setting_charts import search_part
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
-from gsbench.app.tuning_plan import TuneSettings
+from gsbench.app.tuning import TuneSettings
+from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError
 from gsbench.launch.declare import declare, declared_metrics, planned_trials
 from gsbench.launch.outcome import Outcome, outcome_of_error, outcome_of_results
 from gsbench.launch.plan import add_to_plan
-from gsbench.launch.trial import Trial
 from gsbench.runs.declaration import Arm
 from gsbench.runs.layout import CONFIG, RESULTS
 from gsbench.runs.trial_record import record_from
@@ -113,12 +113,12 @@ def sweep(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sweep:
     return run
 
 
-def tuning(runs: Path) -> TuningRecord:
-    return read_tuning(runs / "fair")
+def tuning(runs: Path, arm: str) -> TuningRecord:
+    return read_tuning(runs / f"fair-tune-random-{arm}")
 
 
 def chosen(runs: Path, arm: str) -> dict[str, Any]:
-    best = tuning(runs).arms[f"random-{arm}"].best
+    best = tuning(runs, arm).best
     assert best is not None
     return dict(best.settings)
 
@@ -143,8 +143,8 @@ def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_th
         assert {one["densify"][KEYS[arm]] for one in own} == {closest}
         assert not any(one["scene"]["validation"] for one in own)
     assert fake.tuning("adc")[0].values["densify"]["gradient_threshold"] == 0.0002  # the arm as it is comes first
-    assert tuning(runs).arms["random-adc"].as_it_is
-    assert not tuning(runs).arms["random-volumetric"].as_it_is  # its stop is no multiple of 100
+    assert tuning(runs, "adc").as_it_is
+    assert not tuning(runs, "volumetric").as_it_is  # its stop is no multiple of 100
 
 
 @pytest.mark.parametrize("stops", [3, 9])  # in the search, and in the sweep
@@ -154,13 +154,13 @@ def test_killed_anywhere_it_goes_on_and_chooses_the_same(
 ) -> None:
     whole = Fake()
     assert sweep(whole) == 0
-    expected = tuning(runs)
+    expected = [tuning(runs, arm) for arm in KEYS]
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "again"))
     assert sweep(Fake(stops=stops)) == cli.INTERRUPTED
     rest = Fake()
     assert sweep(rest) == 0
     assert len(rest.trained) == 12 - stops  # nothing is trained twice but the one that was killed
-    assert read_tuning(tmp_path / "again" / "fair").arms == expected.arms
+    assert [tuning(tmp_path / "again", arm) for arm in KEYS] == expected
     again = Fake()
     assert sweep(again) == 0
     assert again.batches == [4]  # what is tuned is not even asked for
@@ -172,9 +172,9 @@ def test_killed_anywhere_it_goes_on_and_chooses_the_same(
 )
 def test_no_record_sets_what_was_not_searched(strange: dict[str, Any], sweep: Sweep, runs: Path) -> None:
     assert sweep(Fake()) == 0
-    file = runs / "fair" / "tuning.json"
+    file = runs / "fair-tune-random-volumetric" / "tuning.json"
     record = json.loads(file.read_text())
-    for point in record["arms"]["random-volumetric"]["search"]["points"]:
+    for point in record["points"]:
         point["settings"] |= strange
     file.write_text(json.dumps(record))
     again = Fake()
@@ -208,9 +208,7 @@ def test_a_point_is_judged_on_all_scenes_and_seeds_of_the_tuning(sweep: Sweep, r
     assert [(one.values["scene"]["sector"], one.values["seed"]) for one in fake.tuning("adc")] == [
         (sector, seed) for _ in range(2) for sector in (0, 1) for seed in (7, 8)
     ]
-    point = tuning(runs).arms["random-adc"].search
-    assert point is not None
-    assert point.points[0].value == pytest.approx(26 - np.log(1.5) + 0.075 + 1, abs=1e-4)
+    assert tuning(runs, "adc").points[0].value == pytest.approx(26 - np.log(1.5) + 0.075 + 1, abs=1e-4)
 
 
 @pytest.mark.slow
@@ -218,9 +216,11 @@ def test_points_that_fail_are_part_of_the_budget_and_an_arm_without_any_ends_the
     sweep: Sweep, runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert sweep(Fake(fails=[0])) == 1
-    search = tuning(runs).arms["random-adc"].search
-    assert search is not None
-    assert [point.state for point in search.points] == ["failed", "done", "done", "done"]
+    assert [point.value is None for point in tuning(runs, "adc").points] == [True, False, False, False]
+    mended = Fake()
+    assert sweep(mended) == 0
+    assert mended.tuning("adc")[0].values["densify"]["gradient_threshold"] == 0.0002  # it is tried again
+    assert all(point.value is not None for point in tuning(runs, "adc").points)
     capsys.readouterr()
     assert sweep(Fake(fails=[0, 2, 4, 6]), "name=none") == 1
     assert "no point of random-adc has a psnr (gsbench status none-tune-random-adc says why)" in capsys.readouterr().err
@@ -230,7 +230,7 @@ def test_zero_points_tune_nothing(sweep: Sweep, runs: Path) -> None:
     fake = Fake()
     assert sweep(fake, "hydra.sweeper.tune.points=0") == 0
     assert fake.batches == [4]
-    assert not (runs / "fair" / "tuning.json").exists()
+    assert not list(runs.glob("*/tuning.json"))
 
 
 def test_a_dry_run_says_what_will_be_tuned_and_trains_nothing(
@@ -267,8 +267,7 @@ def test_a_metric_of_ones_own_is_made_best_in_the_direction_that_is_given(
 ) -> None:
     words = ["hydra.sweeper.tune.metric=mine", f"hydra.sweeper.tune.direction={direction}"]
     assert sweep(Fake(own_metric=True), *words, "hydra.sweeper.tune.points=2") == 0
-    search = tuning(runs).arms["random-adc"].search
-    assert search is not None
+    search = tuning(runs, "adc")
     assert search.direction == (1 if direction == "maximize" else -1)
     assert search.best == best(search.points, key=lambda point: point.value)
 
@@ -322,9 +321,9 @@ def test_trials_from_before_the_tuning_and_with_other_values_are_named(sweep: Sw
         file.write_text(file.read_text().replace('"raster"', '"measured": "2020-01-01T00:00:00Z", "raster"'))
     (line,) = [note for note in notes(runs) if "random-volumetric: " in note]
     assert "when 2 of these 2 trials had been measured" in line
-    file = runs / "fair" / "tuning.json"
+    file = runs / "fair-tune-random-volumetric" / "tuning.json"
     record = json.loads(file.read_text())
-    for point in record["arms"]["random-volumetric"]["search"]["points"]:
+    for point in record["points"]:
         point["settings"]["densify.volume_threshold"] = 0.5
     file.write_text(json.dumps(record))
     lines = notes(runs)

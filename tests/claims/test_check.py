@@ -17,7 +17,7 @@ from gsbench.claims.file import parse_claims
 from gsbench.claims.looks import Planned, run_looks
 from gsbench.claims.page import make_page, to_html, to_markdown
 from gsbench.cli import run
-from gsbench.config.compose import TrialConfig
+from gsbench.config.compose import Trial
 from gsbench.config.jobs import with_seed
 from gsbench.errors import InputError
 from gsbench.runs.declaration import read_declarations
@@ -46,7 +46,7 @@ class FakeRunner:
         self.noise, self.fails = noise, fails
         self.batches: list[int] = []
 
-    def __call__(self, trials: Sequence[TrialConfig]) -> None:
+    def __call__(self, trials: Sequence[Trial]) -> None:
         import numpy as np
 
         self.batches.append(len(trials))

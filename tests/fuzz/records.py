@@ -46,8 +46,8 @@ SLOW_SECONDS = 20.0
 DONE, FAILED, EXPERIMENT = "sfm-adc", "sfm-volumetric", "exp"
 NAMES = (
     "results.json", "config.yaml", "plan.json", "declared.jsonl", "metrics.jsonl", "events.jsonl",
-    "volume_histograms.jsonl", "per_view.csv", "failed.json", "building.json", ".submitted.json", "search.json",
-    "tuning.json", "mlflow.json", ".lock.holder",
+    "volume_histograms.jsonl", "per_view.csv", "failed.json", "building.json", ".submitted.json", "tuning.json",
+    "mlflow.json", ".lock.holder",
 )  # fmt: skip
 STRANGE: tuple[str, ...] = (
     "null", "{}", "[]", '""', "true", "0", "-1", "NaN", "-Infinity", "1e400", "1e308", "9" * 400, "9" * 5000, '"x"',
@@ -131,15 +131,14 @@ def write_original(runs: Path) -> dict[str, Path]:
         {"plan": {"a": 1}, "hash": "h", "time": "2026-11-21T20:05:00Z"},
     ]
     (home / "declared.jsonl").write_text("".join(json.dumps(line) + "\n" for line in declared))
-    point = {"number": 0, "state": "done", "settings": {"a": 0.5, "b": "x"}, "value": 20.0}
-    search = {"metric": "psnr", "direction": 1, "wanted": 3, "seeds": 1, "log": ["a"], "points": [point]}
-    (home / "search.json").write_text(json.dumps(search))
-    found = search | {"log": [], "points": [point | {"settings": {"densify.volume_threshold": 0.03}}]}
-    arm = {"ranges": {"densify.volume_threshold": "0.01,0.03"}, "experiment": "t", "as_it_is": True, "search": found}
-    tuning = {"hash": "h", "metric": "psnr", "seeds": [100], "scenes": ["courtyard"], "arms": {"sfm-volumetric": arm}}
+    tuning = {
+        "sweep": home.name, "arm": "sfm-volumetric", "metric": "psnr", "direction": 1, "wanted": 3, "seeds": [100],
+        "scenes": ["courtyard"], "ranges": {"densify.volume_threshold": "0.01,0.03"}, "log": [], "as_it_is": True,
+        "points": [{"settings": {"densify.volume_threshold": 0.03}, "value": 20.0}],
+    }  # fmt: skip
     (home / "tuning.json").write_text(json.dumps(tuning))
     places_of = {name: done / name for name in NAMES}
-    places_of |= {name: home / name for name in ("plan.json", "declared.jsonl", "search.json", "tuning.json")}
+    places_of |= {name: home / name for name in ("plan.json", "declared.jsonl", "tuning.json")}
     places_of |= {name: failed / name for name in ("failed.json", "building.json", ".submitted.json")}
     places_of |= {"mlflow.json": variant / "mlflow.json", "config.yaml": variant / "config.yaml"}
     assert all(path.is_file() for path in places_of.values())

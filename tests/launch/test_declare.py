@@ -13,10 +13,9 @@ from gsbench.analysis.declaration import standing
 from gsbench.analysis.judgement import measured
 from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
-from gsbench.config.compose import compose_one
+from gsbench.config.compose import Trial, compose_one
 from gsbench.errors import InputError
 from gsbench.launch.declare import declare, declare_questions, declared_metrics, planned_trials
-from gsbench.launch.trial import Trial
 from gsbench.runs.declaration import Declaration, Question, read_declarations
 from tests.end_to_end.conftest import SMALL
 
@@ -28,7 +27,7 @@ TINY = [
 
 
 def composed(runs: Path, *words: str) -> Trial:
-    return Trial.of(compose_one(["name=exp", f"runs={runs}", *words]))
+    return compose_one(["name=exp", f"runs={runs}", *words])
 
 
 def test_a_declaration_is_kept_with_its_time_and_changes_are_added(

@@ -14,7 +14,6 @@ from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.jobs import clouds_first, collect, job_folder
 from gsbench.launch.outcome import Outcome
-from gsbench.launch.trial import Trial
 
 
 class Bomb:
@@ -32,7 +31,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def collected(folder: Path, returned: Any) -> Outcome:
-    trial = Trial.of(compose_one(["name=x"]))
+    trial = compose_one(["name=x"])
     result = folder / "1_0_result.pkl"
     result.write_bytes(pickle.dumps(returned))
     job: Any = SimpleNamespace(paths=SimpleNamespace(result_pickle=result, stderr=folder / "log"))
@@ -59,7 +58,7 @@ def test_nothing_is_run(folder: Path, wrap: Any) -> None:
 
 @pytest.mark.parametrize("content", [b"", b"no pickle", b"\x80\x05."])
 def test_what_cannot_be_read_is_said(folder: Path, content: bytes) -> None:
-    trial = Trial.of(compose_one(["name=x"]))
+    trial = compose_one(["name=x"])
     (folder / "r.pkl").write_bytes(content)
     job: Any = SimpleNamespace(paths=SimpleNamespace(result_pickle=folder / "r.pkl", stderr=folder / "log"))
     outcome = collect(job, trial.folder, [trial])

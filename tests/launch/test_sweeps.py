@@ -19,7 +19,7 @@ import pytest
 from gsbench import cli
 from gsbench.app.command import compose_trials, launch, run_trials
 from gsbench.config.command_words import GROUPS, options, parse
-from gsbench.config.compose import TrialConfig, compose_one
+from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import check_target
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError, explain_storage
@@ -29,7 +29,6 @@ from gsbench.launch.experience import Experience
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.plan import add_to_plan, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
-from gsbench.launch.trial import Trial
 from gsbench.runs import made_of
 from gsbench.runs.hashing import config_hash
 from gsbench.runs.stages import TRAIN, Step
@@ -49,7 +48,7 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @cache
-def _composed(*words: str) -> TrialConfig:
+def _composed(*words: str) -> Trial:
     return compose_one(words)
 
 
@@ -96,7 +95,7 @@ def finish(
 
 @cache
 def experiment(name: str) -> list[Trial]:
-    """TrialConfig once: the paper's tables take seconds."""
+    """Trial once: the paper's tables take seconds."""
     return compose_trials([f"+experiment={name}"])
 
 
@@ -332,7 +331,7 @@ def test_changes_are_noticed_and_named(change: str, names: str, runs: Path, monk
 def test_a_dry_run_says_what_has_changed(runs: Path) -> None:
     values = trial_values()
     finish(values)
-    trial = Trial.of(replace(_composed(), values=values))
+    trial = replace(_composed(), values=values)
     assert describe_plan([trial])[0].startswith("done     courtyard/sfm-volumetric seed 0")
     (runs.parent / "photos" / "a.jpg").write_bytes(b"other")
     assert describe_plan([trial])[0].endswith(f"  will be checked: {runs.parent / 'photos' / 'a.jpg'} has changed")
@@ -549,7 +548,7 @@ def test_what_is_done_is_found_in_a_folder_that_may_not_be_written_to(
 ) -> None:
     values = trial_values()
     results = finish(values)
-    trials = [Trial.of(replace(_composed(), values=values))]
+    trials = [replace(_composed(), values=values)]
     before = sorted(path for path in runs.rglob("*"))
 
     def refuse(*arguments: object, **named: object) -> None:
@@ -562,7 +561,7 @@ def test_what_is_done_is_found_in_a_folder_that_may_not_be_written_to(
     assert outcome.metrics == results.metrics
     assert sorted(path for path in runs.rglob("*")) == before
     with pytest.raises(InputError, match="may not be written to"):
-        run_batch([Trial.of(replace(_composed(), values=trial_values("seed=1")))])
+        run_batch([replace(_composed(), values=trial_values("seed=1"))])
 
 
 @pytest.mark.parametrize("folder", ["/proc/x", "/dev/null/x", "notes.txt/x"])

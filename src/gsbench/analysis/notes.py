@@ -10,7 +10,7 @@ from gsbench.analysis.declaration import standing
 from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.results import Arm, Experiment, TrialResult
 from gsbench.analysis.tuning import tuning_sentence
-from gsbench.runs.layout import SEARCH
+from gsbench.runs.layout import TUNING
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 
 _BY_PROGRAM = (
@@ -83,7 +83,7 @@ def outcome(trial: TrialResult) -> tuple[dict[str, float], int | None]:
 def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
     """The experiment's trials as arms, and the pairs of arms that are compared: none among the points of a search."""
     trials = with_variants(experiment.trials)
-    if (experiment.folder / SEARCH).exists():
+    if (experiment.folder / TUNING).exists():
         return trials, []
     arms = sorted({trial.arm for trial in trials})
     return trials, choose_pairs(arms, controls=controls_of(trials)) if arms else []

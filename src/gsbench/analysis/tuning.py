@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.attribution import TARGET, differing_keys
@@ -13,27 +12,25 @@ from gsbench.analysis.configurations import canonical, resolved, shipped_arms, s
 from gsbench.analysis.judgement import measured
 from gsbench.analysis.results import Arm, TrialResult, read_experiment
 from gsbench.records import read_if_sound
-from gsbench.runs.layout import SEARCH, TUNING
-from gsbench.runs.search_record import Point, SearchRecord, is_value
-from gsbench.runs.tuning_record import TunedArm, TuningRecord
+from gsbench.runs.layout import TUNING
+from gsbench.runs.tuning_record import Point, TuningRecord, is_value
 from gsbench.words import counted, listed
 
 MOST_VALUES = 8  # of a setting, or points of a search, that are named
 NOTHING = "No tuning is recorded: one choice of settings an arm was run here. What was tried elsewhere is not known."
-VALIDATION, HELD_OUT = "validation views", "its held-out views"
+VIEWS = "validation views"  # on which every search judges its points
 
 
 @dataclass(frozen=True)
 class Budget:
-    """The search for an arm's values: ``points``, each of as many ``trials`` of a scene, on which views."""
+    """The search for an arm's values: ``points``, each of as many ``trials`` of a scene."""
 
     points: int = 0
     trials: int = 0
-    views: str = ""
 
     def __str__(self) -> str:
         """``6 points of 2 seeds on validation views``, or ``none``."""
-        return f"{counted(self.points, 'point')} of {counted(self.trials, 'seed')} on {self.views}" if self else "none"
+        return f"{counted(self.points, 'point')} of {counted(self.trials, 'seed')} on {VIEWS}" if self else "none"
 
     def __bool__(self) -> bool:
         return self.points > 0
@@ -66,23 +63,17 @@ def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
 
 def _budget(trial: TrialResult) -> Budget:
     """Of the tuning by the trial's own sweep, else of the searches whose best it has: the largest."""
-    tuned = _tuned(trial)
-    if tuned is not None:
-        found = [tuned.search] if tuned.search is not None and _is_of(trial, tuned.best) else []
+    if tuned := _tunings_of_sweep(trial):
+        found = [one for one in tuned.values() if one.arm == _arm_in_records(trial) and _is_of(trial, one.best)]
     else:
         found = [one for _, one in _searches(trial) if _is_of(trial, one.best) and not _is_shipped(trial, one.best)]
-    budgets = [Budget(len(search.points), search.seeds, _views(search)) for search in found]
+    budgets = [Budget(len(search.points), len(search.seeds)) for search in found]
     return max(budgets, key=lambda budget: budget.points * budget.trials, default=Budget())
 
 
-def _tuned(trial: TrialResult) -> TunedArm | None:
-    """Return what the tuning of the trial's experiment says of its arm."""
-    record = _tuning_of(trial)
-    return None if record is None else record.arms.get(_arm_in_records(trial))
-
-
-def _tuning_of(trial: TrialResult) -> TuningRecord | None:
-    return read_if_sound(_home(trial) / TUNING, TuningRecord)
+def _tunings_of_sweep(trial: TrialResult) -> dict[str, TuningRecord]:
+    """The searches by which the trial's own sweep tuned its arms, by their experiments."""
+    return {name: record for name, record in _records(trial) if record.sweep == trial.path.parents[2].name}
 
 
 def _arm_in_records(trial: TrialResult) -> str:
@@ -93,24 +84,24 @@ def _arm_in_records(trial: TrialResult) -> str:
 def _tuned_here(own: Sequence[TrialResult]) -> list[str]:
     """Say what the sweep's tuning tried of an arm and chose, and whether these trials have it."""
     trial = own[0]
-    record, name = _tuning_of(trial), _arm_in_records(trial)
-    if record is None or name not in record.arms:
+    tunings, name = _tunings_of_sweep(trial), _arm_in_records(trial)
+    if not tunings:
         return []
-    tuned = record.arms[name]
-    if tuned.search is None or tuned.best is None:
+    experiment, search = next(((key, one) for key, one in tunings.items() if one.arm == name), ("", None))
+    best = None if search is None else search.best
+    if search is None or best is None:
         return [f"{name}: left as it is by the tuning of its sweep."]
-    search, best = tuned.search, tuned.best
-    chosen, where = listed(_settings(best)), listed(record.scenes)
+    chosen, where = listed(_settings(best)), listed(search.scenes)
     if not _is_of(trial, best):
         return [f"{name}: tuned to {chosen} by its sweep, but these trials have other values."]
     failed = sum(point.value is None for point in search.points)
     points = counted(len(search.points), "point") + (f" ({failed} failed)" if failed else "")
-    seeds = ", ".join(map(str, record.seeds))
+    seeds = ", ".join(map(str, search.seeds))
     line = (
-        f"{name}: {chosen} is the best of {points} by {record.metric} of {_views(search)} ({where}; seed {seeds}), "
-        f"{_when(own, tuned)}. "
-        f"Searched: {listed([f'{key}={text}' for key, text in tuned.ranges.items()])}; "
-        f"{'the first point was the arm as it is' if tuned.as_it_is else 'the arm as it is was no point'}. "
+        f"{name}: {chosen} is the best of {points} by {search.metric} of {VIEWS} ({where}; seed {seeds}), "
+        f"{_when(own, experiment)}. "
+        f"Searched: {listed([f'{key}={text}' for key, text in search.ranges.items()])}; "
+        f"{'the first point was the arm as it is' if search.as_it_is else 'the arm as it is was no point'}. "
         f"Tried: {_points(search)}."
     )
     values = {point.value for point in search.points if point.value is not None}
@@ -119,17 +110,16 @@ def _tuned_here(own: Sequence[TrialResult]) -> list[str]:
     return [line]
 
 
-def _when(own: Sequence[TrialResult], tuned: TunedArm) -> str:
-    """Say whether the tuning's own trials were measured before these, by their files."""
-    home = _home(own[0]).parent / (tuned.experiment or "")
-    times = [measured(trial) for trial in read_experiment(home).trials] if tuned.experiment and home.is_dir() else []
+def _when(own: Sequence[TrialResult], experiment: str) -> str:
+    """Say whether the trials of the tuning's ``experiment`` were measured before these, by their files."""
+    times = [measured(trial) for trial in read_experiment(own[0].path.parents[3] / experiment).trials]
     if not times:
         return "whose own trials are not there"
     later = sum(measured(trial) < max(times) for trial in own)
     return f"ended when {later} of these {len(own)} trials had been measured" if later else "before any of these trials"
 
 
-def _points(search: SearchRecord) -> str:
+def _points(search: TuningRecord) -> str:
     """``0.03 (27.31), 0.012 (27.4)``"""
     shown = [
         f"{', '.join(map(str, point.settings.values()))} ({'failed' if point.value is None else f'{point.value:.4g}'})"
@@ -162,39 +152,30 @@ def _kind(trial: TrialResult) -> object:
 
 
 def _searched(own: TrialResult) -> list[str]:
-    """Searches in the same runs folder that proposed the very values that the arm has."""
-    tuned = _tuned(own)
+    """Searches of other sweeps in the same runs folder that proposed the very values that the arm has."""
     lines = []
     for name, search in _searches(own):
         point = next((point for point in search.points if _is_of(own, point)), None)
-        if point is None or (tuned is not None and tuned.experiment == name):
+        if point is None or name in _tunings_of_sweep(own):
             continue
         place = "the best" if point == search.best else "one"
         lines.append(
             f"{own.arm}: {listed(_settings(point))} is {place} of {counted(len(search.points), 'point')} of "
-            f"the search {name}, by {search.metric} of {_views(search)}"
-            f"{', none of which is held out' if search.validation else ''}."
+            f"the search {name}, by {search.metric} of {VIEWS}, none of which is held out."
         )
     return lines
 
 
-def _searches(own: TrialResult) -> list[tuple[str, SearchRecord]]:
+def _searches(own: TrialResult) -> list[tuple[str, TuningRecord]]:
     """The searches of a trial's arm in its runs folder, with the names of their experiments."""
-    found = []
-    for file in sorted(_home(own).parent.glob(f"*/{SEARCH}")):
-        search = read_if_sound(file, SearchRecord)
-        if search is not None and search.arm in ("", _arm_in_records(own)):
-            found.append((file.parent.name, search))
-    return found
+    return [(name, record) for name, record in _records(own) if record.arm == _arm_in_records(own)]
 
 
-def _home(trial: TrialResult) -> Path:
-    """The folder of the trial's experiment."""
-    return trial.path.parents[2]
-
-
-def _views(search: SearchRecord) -> str:
-    return VALIDATION if search.validation else HELD_OUT
+def _records(own: TrialResult) -> list[tuple[str, TuningRecord]]:
+    """All searches in a trial's runs folder, with the names of their experiments."""
+    files = sorted(own.path.parents[3].glob(f"*/{TUNING}"))
+    found = [(file.parent.name, read_if_sound(file, TuningRecord)) for file in files]
+    return [(name, record) for name, record in found if record is not None]
 
 
 def _is_of(trial: TrialResult, point: Point | None) -> bool:

@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config.command_words import check_words, is_sweep, parse, parse_word
-from gsbench.config.compose import compose_whole, look_at, ready_trial
+from gsbench.config.compose import Trial, compose_whole, look_at, ready_trial
 from gsbench.config.hydra_entry import hydra_ready, run_main
 from gsbench.config.jobs import check_output_folder, typed
 from gsbench.config.messages import explained
@@ -33,7 +33,6 @@ from gsbench.launch.batch import run_batch
 from gsbench.launch.outcome import Outcome, objective
 from gsbench.launch.plan import describe_plan
 from gsbench.launch.preflight import check_parts, missing_folders, need_no_check
-from gsbench.launch.trial import Trial
 from gsbench.logs import set_up_logging, show_details
 from gsbench.system.own_modules import allow_modules
 
@@ -98,7 +97,7 @@ class Task:
         # A job's files may say other things of Hydra than those that were looked at.
         check_composed(hydra, self.allowed)
         for_hydra, words = typed(hydra.hydra.overrides)
-        (outcome,) = self.handle([Trial.of(ready_trial(look_at(config, self.allowed), [*for_hydra, *words]))])
+        (outcome,) = self.handle([ready_trial(look_at(config, self.allowed), [*for_hydra, *words])])
         if outcome.status == "failed":
             raise (InputError if outcome.bad_input else GsbenchError)(outcome.message)
         if hydra.hydra.mode == RunMode.RUN:
@@ -147,7 +146,7 @@ def run_app(words: Sequence[str], multirun: bool, task: Task) -> None:
         task.grids = OmegaConf.to_container(config.hydra.sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
         # Hydra would resolve ${…} in the grids when it makes the sweeper; there it is for each trial to do.
         chosen = [*words, *["hydra.sweeper.grids=[]"] * bool(task.grids)]
-        trial = None if multirun else Trial.of(ready_trial(config, words))
+        trial = None if multirun else ready_trial(config, words)
         if task.look_only:
             try:
                 _look(config, chosen, trial, task)

@@ -1,132 +1,455 @@
 """Tuning parity: before a sweep's trials, each arm gets the same number of points of a search, on validation views.
 
-The plan (`gsbench.app.tuning_plan`) is declared before anything is trained. The best point's values become words of the
-sweep's jobs. The searches of all arms go on side by side, one point of each at a time.
+What is tuned is given as intervals among the words of the sweep, or below ``hydra.sweeper.tune``: the number of points
+and, for each arm, the ranges of its settings. A search is the tuning of one arm. Each arm's points are trained in an
+experiment of its own, so that no table holds them; the first is the arm as it is, where that lies in the ranges. The
+best point's values become words of the sweep's jobs.
+
+Each arm has a study of Optuna's in memory, whose proposals depend on the results before them alone. A sweep that was
+killed asks it from the first point on again, and finds what was trained in the trials' folders.
 """
 
 from __future__ import annotations
 
 import logging
+import math
+import statistics
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
+from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 from omegaconf import OmegaConf
+from pydantic import NonNegativeInt, PositiveInt
 
-from gsbench.app.study import Values, arm_of, best_words, lie_in, words_of_values
-from gsbench.app.sweep import Sweep
-from gsbench.app.tuning_plan import DEFAULT_POINTS, PLACE, Plan, TuneSettings, make_plan
+from gsbench.app.grids import grid
+from gsbench.config.command_words import check_makes_trials, key_of, parse_word
+from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
+from gsbench.eval.facts import find, known_keys
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
-from gsbench.parsing import DamagedError
+from gsbench.runs.declaration import metric_and_question
 from gsbench.runs.experiments import make_home
 from gsbench.runs.layout import TUNING
-from gsbench.runs.search_record import SearchRecord
-from gsbench.runs.tuning_record import TunedArm, TuningRecord, read_tuning
-from gsbench.system.locks import hold
+from gsbench.runs.tuning_record import Point, TuningRecord, is_value
+from gsbench.settings import check_settings
+from gsbench.system.install import install_command
+from gsbench.words import closest, counted, listed
+
+if TYPE_CHECKING:
+    from optuna import Study
+    from optuna.distributions import BaseDistribution
+    from optuna.trial import Trial as Proposal
+
+    from gsbench.app.sweep import Sweep
 
 log = logging.getLogger(__name__)
 
+PLACE = "hydra.sweeper.tune"
+DEFAULT_METRIC = "psnr"
+DEFAULT_POINTS = 20  # of intervals on the command line
+SEED = "seed"
+MEASURED_ON = ("scene", "eval", "launch", "tracking", "hydra")  # groups that no arm may tune: they say how it is judged
+REPLACED = (SEED, "name", "scene.validation", "eval.primary")  # words of a job that a point's trials have otherwise
+DIGITS = 4  # significant digits of a value: a name for it that people can type
+DIRECTIONS: dict[int, Literal["maximize", "minimize"]] = {1: "maximize", -1: "minimize"}
+
+
+@dataclass(frozen=True)
+class TuneSettings:
+    """Settings of a tuning. ``points`` are those of each arm; 0 and None: nothing is tuned.
+
+    ``ranges`` maps an arm (``adc`` or ``sfm-adc``) to its settings, each with its values as on the command line;
+    ``seed`` are the seeds of a point's trials, none of which the sweep may have. ``intervals``: the sweep's words have
+    ranges as well.
+    """
+
+    points: NonNegativeInt | None = None
+    at_once: PositiveInt = 1  # points of an arm that are chosen before the next result is known
+    metric: str | None = None  # None: eval.primary, else PSNR
+    direction: Literal["maximize", "minimize"] | None = None
+    seed: int | str = 100
+    ranges: dict[str, dict[str, Any]] = field(default_factory=dict)
+    intervals: bool = False
+
+    def __post_init__(self) -> None:
+        check_settings(self, PLACE)
+        if self.ranges and self.points is None:
+            raise InputError(f"{PLACE}.ranges are given: say how many points each arm gets ({PLACE}.points=6; 0: none)")
+        if self.points and not self.ranges and not self.intervals:
+            raise InputError(
+                f"{PLACE}.points={self.points}, and no ranges to search: give them by arm, as "
+                f"{PLACE}.ranges.adc={{densify.gradient_threshold: 'tag(log, interval(1e-4, 4e-4))'}}, best in a file"
+            )
+        if self.points == 0 and self.intervals:
+            raise InputError(f"{PLACE}.points=0 searches nothing: give a value in place of each interval")
+
+
+@dataclass(frozen=True)
+class Goal:
+    """The measure of a good point: ``metric``, better where there is more of it (``sign`` 1) or less (-1).
+
+    ``points`` are all of an arm, ``at_once`` of them proposed before the next result is known; each is judged by the
+    mean of its trials with ``seeds``.
+    """
+
+    metric: str
+    sign: Literal[-1, 1]
+    points: int
+    at_once: int
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Search:
+    """The search for the values of ``arm`` (INIT-DENSIFY), in the experiment whose folder is ``home``.
+
+    ``jobs`` are the arm's of the sweep, without what a point's trials have otherwise; ``first`` are the arm's own
+    values, if the ranges hold them. ``points`` are those that were judged.
+    """
+
+    arm: str
+    home: Path
+    goal: Goal
+    texts: Mapping[str, str]
+    ranges: Mapping[str, BaseDistribution]
+    jobs: Sequence[Sequence[str]]
+    scenes: Sequence[str]
+    first: Mapping[str, Any] | None
+    points: list[Point] = field(default_factory=list)
+
+    @cached_property
+    def study(self) -> Study:
+        """The study, which holds what was judged so far."""
+        import optuna
+
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        sampler = optuna.samplers.TPESampler(seed=0, constant_liar=self.goal.at_once > 1)
+        study = optuna.create_study(direction=DIRECTIONS[self.goal.sign], sampler=sampler)
+        if self.first is not None:
+            study.enqueue_trial(dict(self.first))
+        return study
+
+    def propose(self) -> list[Proposal]:
+        """The next points; none where all are judged."""
+        count = min(self.goal.at_once, self.goal.points - len(self.points))
+        return [self.study.ask(dict(self.ranges)) for _ in range(count)]
+
+    def jobs_of(self, values: Mapping[str, Any]) -> list[list[str]]:
+        """The words of a point's trials."""
+        own = [f"name={self.home.name}", "scene.validation=true", "eval.primary=null", *words_of_values(values)]
+        return [[*job, *own, f"{SEED}={seed}"] for job in self.jobs for seed in self.goal.seeds]
+
+    def value_of(self, trial: Trial) -> float | None:
+        """The metric of a trial, by its files."""
+        record = trial.files.sound_record()
+        return None if record is None else record.metrics.get(self.goal.metric)
+
+    def judge(self, proposal: Proposal, trials: Sequence[Trial]) -> Point:
+        """Judge a point by the mean of its trials; it has failed where one lacks the metric."""
+        from optuna.trial import TrialState
+
+        values = [value for trial in trials if (value := self.value_of(trial)) is not None]
+        mean = statistics.fmean(values) if len(values) == len(trials) else None
+        self.study.tell(proposal, mean, state=TrialState.FAIL if mean is None else TrialState.COMPLETE)
+        point = Point(settings={key: _rounded(value) for key, value in proposal.params.items()}, value=mean)
+        self.points.append(point)
+        return point
+
+    def record(self) -> TuningRecord:
+        """What is searched, and what was found so far."""
+        return TuningRecord(
+            sweep=self.home.name.removesuffix(f"-tune-{self.arm}"),
+            arm=self.arm,
+            metric=self.goal.metric,
+            direction=self.goal.sign,
+            wanted=self.goal.points,
+            seeds=list(self.goal.seeds),
+            scenes=list(self.scenes),
+            ranges=dict(self.texts),
+            log=[key for key, one in self.ranges.items() if getattr(one, "log", False)],
+            as_it_is=self.first is not None,
+            points=self.points,
+        )
+
 
 def tuned_jobs(
-    begun: Sweep,
-    settings: Any,
-    jobs: Sequence[Sequence[str]],
-    searched: Sequence[Mapping[str, str]],
+    begun: Sweep, settings: Any, jobs: Sequence[Sequence[str]], intervals: Sequence[Mapping[str, str]]
 ) -> list[list[str]]:
-    """The jobs of a sweep with the values to which each arm is tuned first: in the intervals that are ``searched`` for
-    each job, and as ``settings`` (``hydra.sweeper.tune``) say.
+    """The jobs of a sweep with the values to which each arm is tuned first.
 
-    A tuning that is done already is taken from its record. Raises InputError for settings that fit no arm, and
-    GsbenchError where no point of an arm could be judged.
+    What is tuned are the ``intervals`` among the words of each job, and what ``settings`` (``hydra.sweeper.tune``) say.
+    Raises InputError for settings that fit no arm, and GsbenchError where no point of an arm could be judged.
     """
     given: Any = OmegaConf.to_container(settings) if OmegaConf.is_config(settings) else dict(settings)
-    if any(searched) and given.get("points") is None:
+    if any(intervals) and given.get("points") is None:
         given["points"] = DEFAULT_POINTS
-    wanted = TuneSettings(**given, intervals=any(searched))
+    wanted = TuneSettings(**given, intervals=any(intervals))
+    untuned = [list(job) for job in jobs]
     if not wanted.points:
-        if any(searched):
-            raise InputError(f"{PLACE}.points={wanted.points} searches nothing: give a value in place of each interval")
-        return [list(job) for job in jobs]
+        return untuned
     if not begun.config.launch.wait:
         raise InputError(f"{PLACE} learns from results, so launch.wait must be true")
-    plan = make_plan(begun, wanted, jobs, searched)
-    record = _done(plan)
+    trials = begun.trials(jobs)
+    searches = _plan(begun, wanted, jobs, intervals, trials)
+    tuned = {search.arm: search for search in searches if search.ranges}
     if begun.task.look_only:
-        print(plan.describe() + ("" if record is None else "; done"))
-        if record is None:
-            print("what it will choose is not known yet: the arms are listed as they are")
-            return [list(job) for job in jobs]
-    record = _search(begun, plan, len(jobs)) if record is None else record
-    return _with_chosen(begun, jobs, record)
+        print(_describe(searches))
+    if not _search(begun, list(tuned.values()), first=len(jobs)):
+        print("what it will choose is not known yet: the arms are listed as they are")
+        return untuned
+    chosen = {arm: _best_words(search) for arm, search in tuned.items()}
+    return [[*job, *chosen.get(trial.folder.parent.name, ())] for job, trial in zip(jobs, trials, strict=True)]
 
 
-def _done(plan: Plan) -> TuningRecord | None:
-    """The record of this very tuning; None where it is not there, or not whole."""
-    try:
-        record = read_tuning(plan.home)
-    except FileNotFoundError:
-        return None
-    except DamagedError as error:
-        log.warning("left out: %s", error)
-        return None
-    if record.hash != plan.hash:
-        return None
-    for arm in plan.arms:
-        chosen = _chosen(record, arm.name) if arm.name in record.arms else None
-        if not lie_in(chosen or {}, arm.ranges):
-            log.warning("left out: %s: its values of %s are not of the declared ranges", plan.home / TUNING, arm.name)
-            return None
-    return record
+def _search(begun: Sweep, searches: Sequence[Search], first: int) -> bool:
+    """Propose, train and judge the points of all arms side by side; False where that is only looked at, and not done.
+
+    ``first`` is the number of the first job.
+    """
+    while asked := [(search, proposal) for search in searches for proposal in search.propose()]:
+        words = [search.jobs_of(proposal.params) for search, proposal in asked]
+        trials = begun.trials([job for jobs in words for job in jobs], first)
+        first += len(trials)
+        of_points = [[trials.pop(0) for _ in jobs] for jobs in words]
+        missing = [
+            trial
+            for (search, _), own in zip(asked, of_points, strict=True)
+            for trial in own
+            if search.value_of(trial) is None
+        ]
+        if missing and begun.task.look_only:
+            return False
+        if missing:
+            _write(searches)  # what is searched stands there before it is trained
+            begun.launch(missing)
+        for (search, proposal), own in zip(asked, of_points, strict=True):
+            point = search.judge(proposal, own)
+            if missing:
+                came = "failed" if point.value is None else f"{point.value:.5g}"
+                where, number = ", ".join(words_of_values(point.settings)), len(search.points)
+                place = f"{search.home.name}: point {number} of {search.goal.points}"
+                log.info("%s: %s: %s %s", place, where, search.goal.metric, came)
+    if not begun.task.look_only:
+        _write(searches)
+    return True
 
 
-def _search(begun: Sweep, plan: Plan, first: int) -> TuningRecord:
-    """Search every arm's ranges, one point of each arm at a time; ``first`` is the number of the first job."""
-    make_runs_folder(checked_runs_folder(str(plan.home.parent)))
-    studies = {arm.name: plan.study(arm) for arm in plan.tuned}
-    by_name = {arm.name: arm for arm in plan.arms}
-    for study in studies.values():
-        make_home(study.home)
-    with hold(plan.home / f".{TUNING}.lock", "the tuning"):
-        while batch := {name: points for name, study in studies.items() if (points := study.next_points())}:
-            asked = [(name, number, values) for name, points in batch.items() for number, values in points.items()]
-            words = [by_name[name].trials(values, plan.seeds) for name, _, values in asked]
-            trials = begun.trials([job for jobs in words for job in jobs], first)
-            first += len(trials)
-            begun.launch(trials)
-            for (name, number, _), jobs in zip(asked, words, strict=True):
-                studies[name].judge(number, trials[: len(jobs)])
-                studies[name].write_record()
-                trials = trials[len(jobs) :]
-        record = _record(plan, {name: study.write_record() for name, study in studies.items()})
-        write_json(plan.home / TUNING, record.to_json())
-    return record
+def _write(searches: Sequence[Search]) -> None:
+    """Write what was found so far where the report looks for it."""
+    for search in searches:
+        make_runs_folder(checked_runs_folder(str(search.home.parent)))
+        make_home(search.home)
+        write_json(search.home / TUNING, search.record().to_json())
 
 
-def _record(plan: Plan, found: Mapping[str, SearchRecord]) -> TuningRecord:
-    arms = {}
-    for arm in plan.arms:
-        search = found.get(arm.name)
-        if search is None:
-            arms[arm.name] = TunedArm(ranges={})
-            continue
-        log.info("%s", best_words(search, arm.experiment))
-        if search.best is None:
-            raise GsbenchError(
-                f"{PLACE}: no point of {arm.name} has a {plan.goal.metric} (gsbench status {arm.experiment} says why)"
-            )
-        first = arm.as_it_is is not None
-        arms[arm.name] = TunedArm(ranges=dict(arm.texts), experiment=arm.experiment, as_it_is=first, search=search)
-    return TuningRecord(
-        hash=plan.hash, metric=plan.goal.metric, seeds=list(plan.seeds), scenes=list(plan.scenes), arms=arms
+def _best_words(search: Search) -> list[str]:
+    """The words of the best point of an arm."""
+    best, name = search.record().best, search.home.name
+    if best is None:
+        raise GsbenchError(
+            f"{PLACE}: no point of {search.arm} has a {search.goal.metric} (gsbench status {name} says why)"
+        )
+    words = words_of_values(best.settings)
+    failed = sum(point.value is None for point in search.points)
+    count = counted(len(search.points), "point") + (f", {failed} failed" if failed else "")
+    where = " ".join(words)
+    log.info("search: best %s %.5g at %s (%s); gsbench report %s", search.goal.metric, best.value, where, count, name)
+    return words
+
+
+def _describe(searches: Sequence[Search]) -> str:
+    """A line that a dry run prints of the searches."""
+    goal, scenes = searches[0].goal, searches[0].scenes
+    each = {search.arm: len(search.jobs) * len(goal.seeds) for search in searches if search.ranges}
+    left = [search.arm for search in searches if not search.ranges]
+    return (
+        f"tunes first: {counted(goal.points, 'point')} each for {listed(list(each))}, by {goal.metric} of validation "
+        f"views on {listed(scenes)} with {counted(len(goal.seeds), 'seed')}, {sum(each.values()) * goal.points} "
+        "trainings" + (f"; not tuned: {listed(left)}" if left else "")
     )
 
 
-def _with_chosen(begun: Sweep, jobs: Sequence[Sequence[str]], record: TuningRecord) -> list[list[str]]:
-    trials = begun.trials(jobs)
-    names = [arm_of(trial) for trial in trials]
-    return [[*job, *words_of_values(_chosen(record, name) or {})] for job, name in zip(jobs, names, strict=True)]
+# ---- the plan
 
 
-def _chosen(record: TuningRecord, arm: str) -> Values | None:
-    best = record.arms[arm].best
-    return None if best is None else dict(best.settings)
+def _plan(
+    begun: Sweep,
+    wanted: TuneSettings,
+    jobs: Sequence[Sequence[str]],
+    intervals: Sequence[Mapping[str, str]],
+    trials: Sequence[Trial],
+) -> list[Search]:
+    """The search of each arm of a sweep, without ranges where the arm stays as it is.
+
+    Raises InputError for settings that fit no arm.
+    """
+    _check_installed()
+    homes = {trial.files.home for trial in trials}
+    if len(homes) > 1:
+        raise InputError(f"{PLACE}: all trials of the sweep need one name, got {listed(sorted(h.name for h in homes))}")
+    if any(trial.values["scene"]["validation"] for trial in trials):
+        raise InputError(f"{PLACE} searches on validation views by itself: leave scene.validation out")
+    goal = _goal(wanted, trials)
+    names = [(str(trial.values["init"]["name"]), str(trial.values["densify"]["name"])) for trial in trials]
+    known = {name for init, densify in names for name in (densify, f"{init}-{densify}")}
+    if unknown := next((name for name in wanted.ranges if name not in known), None):
+        raise InputError(
+            f"{PLACE}.ranges.{unknown} is no arm of the sweep{closest(unknown, known)} (there are: "
+            f"{', '.join(sorted({densify for _, densify in names}))})"
+        )
+    searches = []
+    for pair in dict.fromkeys(names):
+        name = "-".join(pair)
+        places = [place for place, own in enumerate(names) if own == pair]
+        typed = {key: text for place in places for key, text in intervals[place].items()}
+        given = wanted.ranges.get(name, wanted.ranges.get(pair[1], typed or None))
+        if given is None:
+            raise InputError(
+                f"{PLACE}.ranges say nothing of {pair[1]}: give what is tuned of it, or {pair[1]}: {{}} to leave it "
+                "as it is, which each verdict will say"
+            )
+        texts = {str(key): str(value) for key, value in given.items()} | typed
+        ranges = _ranges(begun, name, texts, [word for place in places for word in jobs[place]])
+        own = [tuple(word for word in jobs[place] if key_of(word) not in REPLACED) for place in places]
+        first, home = trials[places[0]], trials[places[0]].files.home
+        searches.append(
+            Search(
+                arm=name,
+                home=home.with_name(f"{home.name}-tune-{name}"),
+                goal=goal,
+                texts=texts,
+                ranges=ranges,
+                jobs=list(dict.fromkeys(own)),
+                scenes=list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
+                first=_as_it_is(first.values, ranges),
+            )
+        )
+    if not any(search.ranges for search in searches):
+        raise InputError(f"{PLACE}.ranges name no setting of any arm: nothing is tuned")
+    return searches
+
+
+def _check_installed() -> None:
+    """Raise InputError, one line that says what to install, where Optuna is not."""
+    try:
+        import optuna  # noqa: F401
+    except ImportError:
+        raise InputError(f"a search needs Optuna: {install_command('search')}") from None
+
+
+def _goal(wanted: TuneSettings, trials: Sequence[Trial]) -> Goal:
+    declared = {str(trial.values["eval"].get("primary") or "") for trial in trials}
+    primary = metric_and_question(declared.pop())[0] if len(declared) == 1 else ""
+    metric = wanted.metric or primary or DEFAULT_METRIC
+    try:
+        seeds = tuple(int(text.partition("=")[2]) for (text,) in grid([parse_word(f"{SEED}={wanted.seed}")]))
+    except ValueError:
+        raise InputError(f"{PLACE}.seed must list whole numbers, as 100,101, got {wanted.seed!r}") from None
+    if both := sorted(set(seeds) & {trial.values["seed"] for trial in trials}):
+        raise InputError(f"{PLACE}.seed: {listed(list(map(str, both)))} is a seed of the sweep, too: tune with others")
+    return Goal(metric, _sign_of(metric, wanted.direction), wanted.points or 0, wanted.at_once, seeds)
+
+
+def _sign_of(metric: str, direction: str | None) -> Literal[-1, 1]:
+    """The sign of a metric, 1 where more of it is better, -1 where less: its own, else the ``direction`` given.
+
+    Raises InputError for a metric that is not known, and for one that goes the other way.
+    """
+    facts = find(metric)
+    own = direction if facts is None else DIRECTIONS.get(facts.direction, direction)
+    if own is None:
+        raise InputError(
+            f"{PLACE}.metric={metric} is no metric whose direction is known{closest(metric, known_keys())} "
+            f"(choose: {', '.join(known_keys())}; for a metric of your own give {PLACE}.direction, too)"
+        )
+    if facts is not None and direction not in (None, own):
+        raise InputError(f"{PLACE}.direction={direction}: {facts.label} is better the other way; leave direction out")
+    return 1 if own == DIRECTIONS[1] else -1
+
+
+# ---- ranges
+
+
+def _ranges(begun: Sweep, arm: str, texts: Mapping[str, str], words: Sequence[str]) -> dict[str, BaseDistribution]:
+    given = {key_of(word) for word in words}
+    found = {}
+    for key, text in texts.items():
+        bare = key.lstrip("+~")
+        if bare.partition(".")[0] in (*MEASURED_ON, *REPLACED):
+            raise InputError(f"{PLACE}.ranges: {key} is no setting of an arm, but of what all arms are measured by")
+        if bare in given:
+            raise InputError(f"{PLACE}.ranges: {key} of {arm} is tuned and given as well: leave one of them out")
+        try:
+            parse_word(f"{key}={text}")
+        except InputError as error:
+            raise InputError(f"{PLACE}.ranges of {arm}: {error}") from None
+        (override,) = begun.parse([f"{key}={text}"])
+        if not override.is_sweep_override():
+            raise InputError(f"{PLACE}.ranges: {key}={text} is one value: give an interval or a list of values")
+        found[key] = distribution(override)
+    return dict(sorted(found.items()))
+
+
+def distribution(override: Override) -> BaseDistribution:
+    """Return the range of a swept word's values; raises InputError for what makes no other trial."""
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+    check_makes_trials(override)
+    sweep: Any = override.value()
+    try:
+        if isinstance(sweep, IntervalSweep):
+            low, high = sweep.start, sweep.end
+            assert low is not None
+            assert high is not None
+            log_scale = "log" in sweep.tags
+            if not -math.inf < low < high < math.inf:
+                raise ValueError("an interval goes from a number to a larger one")
+            if log_scale and low <= 0:
+                raise ValueError("on a logarithmic scale an interval begins above 0")
+            if isinstance(low, int) and isinstance(high, int) and "int" in sweep.tags:
+                return IntDistribution(low, high, log=log_scale)
+            return FloatDistribution(float(low), float(high), log=log_scale)
+        if isinstance(sweep, RangeSweep) and not isinstance(sweep.step, float):
+            values = [int(str(value)) for value in override.sweep_iterator()]
+            return IntDistribution(values[0], values[-1], step=max(1, int(sweep.step)))
+        choices = list(dict.fromkeys(word.partition("=")[2] for (word,) in grid([override])))
+        return CategoricalDistribution(choices)
+    except (ValueError, IndexError) as error:
+        raise InputError(f"{override.input_line}: {error}") from error
+
+
+def _as_it_is(values: Mapping[str, Any], ranges: Mapping[str, BaseDistribution]) -> dict[str, Any] | None:
+    """The arm's own values of what is searched; None where the ranges lack one, or nothing is searched."""
+    found: dict[str, Any] = {}
+    for key, one in ranges.items():
+        value: Any = values
+        for part in key.lstrip("+~").split("."):
+            value = value.get(part) if isinstance(value, Mapping) else None
+        if (own := _in_range(value, one)) is None:
+            return None
+        found[key] = own
+    return found or None
+
+
+def _in_range(value: Any, one: Any) -> Any:
+    """The value as the range ``one`` has it; None where that lacks it."""
+    if hasattr(one, "choices"):
+        return next((choice for choice in one.choices if is_value(value, choice)), None)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not one.low <= value <= one.high:
+        return None
+    if isinstance(one.low, int):
+        return value if isinstance(value, int) and (value - one.low) % one.step == 0 else None
+    return float(value) if _rounded(float(value)) == value else None
+
+
+def words_of_values(values: Mapping[str, Any]) -> list[str]:
+    """A point as words of a command line."""
+    return [f"{key}={f'{value:.{DIGITS}g}' if isinstance(value, float) else value}" for key, value in values.items()]
+
+
+def _rounded(value: Any) -> Any:
+    """A value of a point as its trials have it."""
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value

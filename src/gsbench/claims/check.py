@@ -18,7 +18,7 @@ from gsbench.claims.archive import unpack_archive
 from gsbench.claims.file import Claim, ClaimsFile
 from gsbench.claims.looks import Planned, trials_of_look
 from gsbench.claims.published import resolve
-from gsbench.config.compose import TrialConfig, compose_one
+from gsbench.config.compose import Trial, compose_one
 from gsbench.config.jobs import with_seed
 from gsbench.errors import InputError
 from gsbench.records import read_if_sound
@@ -27,7 +27,7 @@ from gsbench.runs.layout import FAILED, SEED
 from gsbench.runs.trial_folder import Failure, TrialFolder
 from gsbench.words import closest, some_of, without_places
 
-Lacking = Callable[[TrialConfig, str], str]  # (trial, metric) -> why it cannot be had here, or ""
+Lacking = Callable[[Trial, str], str]  # (trial, metric) -> why it cannot be had here, or ""
 NOT_TESTABLE = "not testable here"
 
 
@@ -85,14 +85,14 @@ class Check:
     file: ClaimsFile
     runs: Path
     declaration: Declaration
-    first: Mapping[str, TrialConfig]  # by folder
+    first: Mapping[str, Trial]  # by folder
     only: tuple[str, ...] = ()
 
     @property
     def home(self) -> Path:
         return self.runs / self.file.name
 
-    def to_run(self, planned: Sequence[Planned]) -> list[TrialConfig]:
+    def to_run(self, planned: Sequence[Planned]) -> list[Trial]:
         """The trials of a look that are run here."""
         scenes = {self._scene_of(name) for name in self.only}
         return [
@@ -101,7 +101,7 @@ class Check:
             if not self.only or self.first[key].values["scene"]["name"] in scenes
         ]
 
-    def trials(self, seeds: int) -> list[TrialConfig]:
+    def trials(self, seeds: int) -> list[Trial]:
         """The trials to be run here for the first ``seeds`` seeds of every claim."""
         return self.to_run(trials_of_look(self.declaration, range(len(self.declaration.questions)), seeds))
 
@@ -149,8 +149,8 @@ def prepare(
         if scene not in file.scenes:
             near = closest(scene, file.scenes)
             raise InputError(f"{file.name} has no scene {scene}{near} (it has {', '.join(file.scenes)})")
-    first: dict[str, TrialConfig] = {}
-    known: dict[tuple[str, ...], TrialConfig] = {}
+    first: dict[str, Trial] = {}
+    known: dict[tuple[str, ...], Trial] = {}
     questions, missing = [], {}
     for claim in file.claims:
         scenes: dict[str, tuple[str, str]] = {}
@@ -264,15 +264,15 @@ def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
         raise InputError(f"claims were declared that the file lacks: {', '.join(sorted(unknown))}")
 
 
-def _folder_of(trial: TrialConfig) -> str:
+def _folder_of(trial: Trial) -> str:
     """The folder of the trial within its experiment, without the seed."""
     folder = TrialFolder.of(trial.values).path
     return "/".join(folder.parts[-3:]).rpartition(SEED)[0]
 
 
-def _composed(words: Sequence[str], runs: Path, where: str) -> TrialConfig:
+def _composed(words: Sequence[str], runs: Path, where: str) -> Trial:
     try:
         trial = compose_one(words)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    return TrialConfig(trial.values | {"runs": str(runs.resolve())}, trial.overrides)
+    return Trial(trial.values | {"runs": str(runs.resolve())}, trial.overrides)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
-from gsbench.config.compose import TrialConfig
+from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS
 
@@ -20,12 +20,12 @@ class Here:
     have to be fetched count as missing.
     """
 
-    def __init__(self, folders: Callable[[Sequence[TrialConfig]], Sequence[str]], download: bool) -> None:
+    def __init__(self, folders: Callable[[Sequence[Trial]], Sequence[str]], download: bool) -> None:
         self._folders, self._download = folders, download
         self._init = cache(self._missing_weights)
         self._metrics = cache(self._missing_metrics)
 
-    def __call__(self, trial: TrialConfig, metric: str) -> str:
+    def __call__(self, trial: Trial, metric: str) -> str:
         """Return why the trial cannot be run here or lacks the metric, in one line; "" where nothing is missing."""
         if missing := self._folders([trial]):
             return missing[0]

@@ -18,7 +18,7 @@ from gsbench.analysis.results import Arm, TrialResult, read_experiment
 from gsbench.analysis.statistics import FIRST_LOOK, plan_looks
 from gsbench.analysis.verdicts import WORDS
 from gsbench.claims.looks import Planned, trials_of_look
-from gsbench.config.compose import TrialConfig
+from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find
 from gsbench.runs.declaration import Declaration, Question, declared_now
@@ -28,7 +28,7 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted
 
-T = TypeVar("T", bound=TrialConfig)
+T = TypeVar("T", bound=Trial)
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def headline(verdict: Verdict) -> str:
     )
 
 
-def _expected(trial: TrialConfig) -> TrialResult:
+def _expected(trial: Trial) -> TrialResult:
     """The trial as if it had run: it has a configuration and no results."""
     values, folder = trial.values, TrialFolder.of(trial.values).path
     record = TrialRecord(

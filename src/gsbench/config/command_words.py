@@ -146,6 +146,11 @@ def parse_word(word: str) -> Override:
     return override
 
 
+def key_of(word: str) -> str:
+    """The setting that a word is about, whatever it does with it."""
+    return parse_word(word).get_key_element().lstrip("+~")
+
+
 def brackets(word: str) -> int:
     """The most brackets that are open at once: Hydra's parser goes down by recursion."""
     depth = deepest = 0

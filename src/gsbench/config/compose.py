@@ -33,6 +33,7 @@ from gsbench.config.schema import check, check_values, plain
 from gsbench.config.trust import PERMISSIONS, check_composed, check_permissions
 from gsbench.errors import InputError
 from gsbench.parsing import LOADER, MOST_VALUES
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.own_modules import allow_modules
 
 if TYPE_CHECKING:
@@ -42,8 +43,8 @@ ASKED = re.compile(r"\$\{hydra:\s*([\w.]+)\s*\}")
 
 
 @dataclass(frozen=True)
-class TrialConfig:
-    """The resolved values of the one trial that is asked for, and the overrides that give them.
+class Trial:
+    """A trial as it is asked for: its resolved values, the overrides that give them, and where its files lie.
 
     ``job`` is what Hydra knows of the trial where it runs as a job of a sweep. One that was ``recorded`` is read from
     its own ``config.yaml``, and no overrides give it. Raises InputError for values that would make run what their
@@ -62,6 +63,16 @@ class TrialConfig:
     def yaml(self) -> str:
         """The values as they are written to the trial's folder."""
         return OmegaConf.to_yaml(OmegaConf.create(self.values))
+
+    @cached_property
+    def files(self) -> TrialFolder:
+        """The trial's folder, with all that is in it."""
+        return TrialFolder.of(self.values)
+
+    @property
+    def folder(self) -> Path:
+        """The place of that folder."""
+        return self.files.path
 
 
 def compose_whole(words: Sequence[str], modules: str | None = None) -> DictConfig:
@@ -123,7 +134,7 @@ def look_at(config: DictConfig, allowed: Sequence[str]) -> DictConfig:
     return config
 
 
-def compose_one(overrides: Sequence[str], modules: str | None = None) -> TrialConfig:
+def compose_one(overrides: Sequence[str], modules: str | None = None) -> Trial:
     """The single trial that ``overrides`` describe.
 
     The user's own modules are looked for in the folder ``modules`` (default: the current one).
@@ -143,7 +154,7 @@ def compose_values(overrides: Sequence[str]) -> DictConfig:
     return values
 
 
-def ready_trial(config: DictConfig, overrides: Sequence[str], job: HydraJob | None = None) -> TrialConfig:
+def ready_trial(config: DictConfig, overrides: Sequence[str], job: HydraJob | None = None) -> Trial:
     """The trial of a composed configuration, checked; ``config`` stays as it is."""
     return resolved(settle(config, overrides), overrides, job)
 
@@ -157,10 +168,10 @@ def settle(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
     return trial
 
 
-def resolved(config: DictConfig, overrides: Sequence[str], job: HydraJob | None) -> TrialConfig:
+def resolved(config: DictConfig, overrides: Sequence[str], job: HydraJob | None) -> Trial:
     """The trial of a settled configuration."""
     with explained(overrides):
-        return TrialConfig(plain(config), tuple(overrides), job)
+        return Trial(plain(config), tuple(overrides), job)
 
 
 def without_hydra(config: DictConfig) -> DictConfig:

@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config.command_words import check_search_path, parse_word
 from gsbench.config.compose import (
-    TrialConfig,
+    Trial,
     asks_hydra,
     look_at,
     raw_text,
@@ -133,10 +133,10 @@ class _Base:
 
 def compose_jobs(
     context: HydraContext, sweep: DictConfig, jobs: Sequence[Sequence[str]], first: int = 0
-) -> list[TrialConfig]:
+) -> list[Trial]:
     """The trials of a ``sweep`` from the words of each, numbered from ``first`` on."""
     by_files: dict[tuple[str, ...], _Base] = {}
-    by_settings: dict[tuple[str, ...], TrialConfig] = {}
+    by_settings: dict[tuple[str, ...], Trial] = {}
     trials = []
     for_hydra = typed(sweep.hydra.overrides)[0]
     for number, words in enumerate(jobs, first):
@@ -177,7 +177,7 @@ def typed(overrides: DictConfig) -> tuple[list[str], list[str]]:
     return [word for word in given["hydra"] if word.partition("=")[0] not in ADDED], given["task"]
 
 
-def with_seed(trial: TrialConfig, seed: int) -> TrialConfig:
+def with_seed(trial: Trial, seed: int) -> Trial:
     """The same trial with another seed, for one whose other settings do not ask for it."""
     seed = checked(Config, {"seed": seed}, "")["seed"]
     words = tuple(f"seed={seed}" if word.startswith("seed=") else word for word in trial.overrides)

@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.declare import declare, declared_metrics, planned_trials
@@ -16,7 +17,6 @@ from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
 from gsbench.launch.preflight import borrowed_names, check_parts, check_trackers, missing_folders, missing_weights
 from gsbench.launch.serial import run_serial
-from gsbench.launch.trial import Trial, drop_parts
 from gsbench.runs.layout import STORE
 from gsbench.runs.stages import STAGES
 from gsbench.runs.store import Store
@@ -52,7 +52,6 @@ def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
     values = trials[0].values
     with storage_errors(checked_runs_folder(values["runs"])):
         _begin(trials, [trial for trial in trials if _why_not_done(trial)])
-        drop_parts(trials)  # Hydra composes each of its launcher's trials itself
 
 
 def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
@@ -63,8 +62,6 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
     if launcher != "slurm" and (missing := missing_folders(unfinished)):
         raise InputError("; ".join(missing))
     check_parts(unfinished, here=launcher != "slurm")
-    if launcher != "serial":  # the processes that run the trials make their own
-        drop_parts(unfinished)
     if launcher != "slurm":
         check_trackers(unfinished)
     for line in borrowed_names(unfinished):

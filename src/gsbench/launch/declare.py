@@ -6,9 +6,9 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import write_text
-from gsbench.launch.trial import Trial
 from gsbench.runs.declaration import (
     Declaration,
     Planned,

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gsbench.config.compose import Trial
 from gsbench.config.jobs import HydraJob
 from gsbench.files import require_own
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.queue import forget_submission
-from gsbench.launch.trial import Trial
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import JOBS
 from gsbench.runs.trial_folder import TrialFolder

@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import require_own
 from gsbench.launch.experience import Experience
 from gsbench.launch.queue import ask_queue, state_in_queue
-from gsbench.launch.trial import Trial
 from gsbench.runs.experiments import make_home
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import PLAN, RESULTS, STORE
@@ -99,6 +99,7 @@ def _stage_finder(trials: Sequence[Trial]) -> Callable[[Trial], list[str]]:
     store = trials[0].files.runs / STORE if trials else None
     if store is None or not store.is_dir():
         return lambda trial: []
+    from gsbench.pipeline.parts import Parts
     from gsbench.pipeline.wiring import StepFinder
     from gsbench.runs.store import Store
 
@@ -106,7 +107,7 @@ def _stage_finder(trials: Sequence[Trial]) -> Callable[[Trial], list[str]]:
 
     def built(trial: Trial) -> list[str]:
         try:
-            return finder.built_stages(trial.parts)
+            return finder.built_stages(Parts(trial.values))
         except GsbenchError:  # what is missing here is named elsewhere, or known where the trial will run
             return []
 

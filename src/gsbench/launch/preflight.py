@@ -8,15 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.config.command_words import options
-from gsbench.config.compose import TrialConfig
+from gsbench.config.compose import Trial
 from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
-from gsbench.launch.trial import Trial
 from gsbench.runs.code import OWN
 from gsbench.system.install import install_command
 
 
-def missing_folders(trials: Sequence[TrialConfig]) -> list[str]:
+def missing_folders(trials: Sequence[Trial]) -> list[str]:
     """A line for each folder of photographs, model or weights that trials name and that is not there, and the mend."""
     from gsbench.datasets.catalog import how_to_get
     from gsbench.scene.readers import missing_folder, missing_model
@@ -33,7 +32,7 @@ def missing_folders(trials: Sequence[TrialConfig]) -> list[str]:
     return lines + ([how_to_get(missing)] if missing else []) + missing_weights(trials)
 
 
-def missing_weights(trials: Sequence[TrialConfig]) -> list[str]:
+def missing_weights(trials: Sequence[Trial]) -> list[str]:
     """A line for each folder of weights that the trials name and that is not there."""
     named = {
         (group, str(folder))
@@ -49,12 +48,14 @@ def missing_weights(trials: Sequence[TrialConfig]) -> list[str]:
 
 
 def check_parts(trials: Sequence[Trial], here: bool) -> None:
-    """Refuse what the parts of the trials, which stay with them, do not take.
+    """Refuse what the parts of the trials do not take.
 
     With ``here``, the trials will run on this machine, whose devices are known. Raises InputError naming the key.
     """
+    from gsbench.pipeline.parts import Parts
+
     for trial in trials:
-        trial.parts.check(here)
+        Parts(trial.values).check(here)
 
 
 def check_trackers(trials: Sequence[Trial]) -> None:
@@ -64,7 +65,7 @@ def check_trackers(trials: Sequence[Trial]) -> None:
             raise InputError(f"tracking.sink={sink} needs a package: {install_command(sink)} (or pip install {sink})")
 
 
-def borrowed_names(trials: Sequence[TrialConfig]) -> list[str]:
+def borrowed_names(trials: Sequence[Trial]) -> list[str]:
     """A line for each class of the user's that would be shown under the name of one of gsbench's own."""
     named = {
         (group, str(part.get("name")), str(part["_target_"]))

@@ -6,8 +6,8 @@ import logging
 from collections.abc import Sequence
 from functools import partial
 
+from gsbench.config.compose import Trial
 from gsbench.launch.outcome import Outcome, objective, outcome_of_error, outcome_of_results
-from gsbench.launch.trial import Trial, drop_parts
 from gsbench.runs.layout import LOCK
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
@@ -22,21 +22,14 @@ def run_serial(trials: Sequence[Trial]) -> list[Outcome]:
     busy: list[Trial] = []
     for trial in trials:
         try:
-            outcomes.append(_run_to_its_end(trial, wait=len(trials) == 1))
+            outcomes.append(run_one(trial, wait=len(trials) == 1))
         except BusyError as error:
             log.info("%s; later", error)
             busy.append(trial)
             continue
         if outcomes[-1].fatal:
             return outcomes
-    outcomes += [_run_to_its_end(trial, wait=True) for trial in busy]
-    return outcomes
-
-
-def _run_to_its_end(trial: Trial, wait: bool) -> Outcome:
-    outcome = run_one(trial, wait)
-    drop_parts([trial])  # the other trials need the memory
-    return outcome
+    return outcomes + [run_one(trial, wait=True) for trial in busy]
 
 
 def run_one(trial: Trial, wait: bool) -> Outcome:
@@ -58,4 +51,4 @@ def run_one(trial: Trial, wait: bool) -> Outcome:
 def _run(trial: Trial, wait: bool) -> TrialRecord:
     from gsbench.pipeline.trial import run_trial  # here, because a sweep that is done needs no torch
 
-    return run_trial(trial.parts, trial.yaml, wait)
+    return run_trial(trial, wait)

@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.launch.jobs import SECONDS_BETWEEN_POLLS, collect, job_folder, job_of
 from gsbench.launch.outcome import Outcome
@@ -20,7 +21,6 @@ from gsbench.launch.queue import (
     read_submission,
     record_submission,
 )
-from gsbench.launch.trial import Trial
 from gsbench.system.locks import hold
 from gsbench.words import counted
 

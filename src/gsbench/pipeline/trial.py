@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 import pycolmap  # noqa: F401 - here, so that what its import does to signals can be undone
 import torch
 
+from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, TrainingError
 from gsbench.files import link_or_copy, remove_temporaries, require_own, storage_errors, write_json, write_text
 from gsbench.init.base import PICTURE_FILE, REPORT_FILE
@@ -40,24 +41,24 @@ PUBLISHED_TRAINING = (
 )  # fmt: skip
 
 
-def run_trial(parts: Parts, config_yaml: str, wait: bool = True) -> TrialRecord:
-    """Run the trial with these parts, or find it done; returns what ``results.json`` holds.
+def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
+    """Run the trial, or find it done; returns what ``results.json`` holds.
 
     On failure ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again. Where
     another process runs this trial, waits for it, or raises BusyError if ``wait`` is False.
     """
     take_signals_back()
-    folder = TrialFolder.of(parts.values)
+    folder = trial.files
     with storage_errors(folder.runs):
         folder.require_own()
         require_own(folder.runs, folder.runs / layout.STORE / layout.VIEWS)
         folder.path.mkdir(parents=True, exist_ok=True)
         with hold(folder.lock, folder.label, wait), log_to(folder.path / LOG):
-            if not folder.why_not_done(parts.values):
+            if not folder.why_not_done(trial.values):
                 log.info("%s: was done", folder.label)
                 return folder.record()
             remove_temporaries(folder.path)
-            return _run(parts, config_yaml, folder)
+            return _run(trial, folder)
 
 
 @contextmanager
@@ -103,10 +104,11 @@ def _record_failure(error: Exception, values: dict[str, Any], folder: TrialFolde
         write_json(folder.path / FAILED, record | {"time": time.time(), "seed": values["seed"]})
 
 
-def _run(parts: Parts, config_yaml: str, folder: TrialFolder) -> TrialRecord:
+def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
     """Build every step, show its files in the trial's folder, write the results."""
-    values = parts.values
+    values = trial.values
     with _recorded_failures(values, folder):
+        parts = Parts(values)
         parts.complete()
         torch.set_num_threads(parts.threads)
         mirror = Mirror(values["tracking"], folder.path)
@@ -115,23 +117,23 @@ def _run(parts: Parts, config_yaml: str, folder: TrialFolder) -> TrialRecord:
             write_json(folder.path / BUILDING, {"stage": stage.name, "folder": str(place)})
 
         store = Store(folder.runs / layout.STORE, announce)
-        write_text(folder.path / CONFIG, config_yaml)
+        write_text(folder.path / CONFIG, trial.yaml)
         (folder.path / FAILED).unlink(missing_ok=True)
-        trial = TrialSteps(parts, store)
+        pipeline = TrialSteps(parts, store)
     entries: dict[str, Entry] = {}
     code: dict[str, str] = {}
     with mirror, _recorded_failures(values, folder):
-        for step in trial.steps():
+        for step in pipeline.steps():
             entries[step.stage.name] = entry = store.get(step)
             code |= step.code
             if step.stage is INIT:
                 link_or_copy(entry.path / REPORT_FILE, folder.path / layout.INIT_REPORT)
-        scene = trial.views.scene
+        scene = pipeline.views.scene
         log.info("%s: %d training and %d test views", folder.label, len(scene.train), len(scene.test))
-        results = results_of(values, trial.capture, scene, parts.rasterizer.name, entries, code)
+        results = results_of(values, pipeline.capture, scene, parts.rasterizer.name, entries, code)
         published = _publish(folder.path, entries)
         made_of = {stage.name: entries[stage.name].path for stage in (INIT, TRAIN, GROUND_TRUTH, EVALUATE)}
-        again = folder.write_finished(values, results, source_files(trial.taken, store), made_of, published)
+        again = folder.write_finished(values, results, source_files(pipeline.taken, store), made_of, published)
         (folder.path / BUILDING).unlink(missing_ok=True)
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
     size = "" if results.num_gaussians is None else f"  {results.num_gaussians} Gaussians"

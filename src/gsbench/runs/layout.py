@@ -24,8 +24,7 @@ METRICS = "metrics.json"  # of an evaluation
 PLAN = "plan.json"  # the trials that were asked for
 DECLARED = "declared.jsonl"  # the metrics that verdicts were declared to be about, and when
 ABLATION = "ablation.json"  # which trials have which parts of a densifier switched on
-SEARCH, SEARCH_JOURNAL = "search.json", "search.journal"  # what a search found, and Optuna's own record of it
-TUNING = "tuning.json"  # what each arm was tuned to before the sweep, and by what
+TUNING = "tuning.json"  # of a search: what was searched for an arm of a sweep, and what was found
 SEED = "-seed"  # in the name of a trial's folder, between hash and seed
 TRIAL_GLOB = f"*/*/*{SEED}*"  # the trials that are there
 

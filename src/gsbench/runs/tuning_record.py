@@ -1,46 +1,75 @@
-"""``tuning.json``: to which values each arm of a sweep was tuned before its trials ran, and what was tried."""
+"""``tuning.json`` in the experiment of a search: what was searched for an arm of a sweep, and what was found."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-from gsbench.records import Count, Part, Text, read_typed
+from gsbench.records import Count, Number, Part, Text, Whole, read_typed
 from gsbench.runs.layout import TUNING
-from gsbench.runs.search_record import Point, SearchRecord
 
 
 @dataclass(frozen=True, kw_only=True)
-class TunedArm(Part):
-    """An arm's ranges, as they were given, and the search in them; without ranges it was left as it is.
+class Point(Part):
+    """A choice of values; ``value`` is the mean of the metric over its trials, None where one of them has none."""
 
-    ``experiment`` has the trials of the search; ``as_it_is`` tells whether its first point was the arm untuned.
-    """
-
-    ranges: dict[str, str]
-    experiment: str | None = None
-    as_it_is: bool = False
-    search: SearchRecord | None = None
-
-    @property
-    def best(self) -> Point | None:
-        """The point that was chosen; None of an arm that was left as it is."""
-        return None if self.search is None else self.search.best
+    settings: dict[str, bool | Whole | Number | str]
+    value: Number | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class TuningRecord(Part):
-    """Tuned values by the arm's name ``INIT-DENSIFY``; ``hash`` is that of the declared plan, ``seeds`` those of the
-    search's trials, ``scenes`` those that it was judged on.
+    """The search for the values of ``arm`` (INIT-DENSIFY) that the experiment ``sweep`` then trained.
+
+    ``ranges`` are what was searched, as it was given, those in ``log`` on a logarithmic scale; ``wanted`` is the number
+    of points, each judged by trials of ``seeds`` on validation views of ``scenes``. ``as_it_is`` tells whether the
+    first point was the arm with its own values.
     """
 
-    hash: Text
+    sweep: Text
+    arm: Text
     metric: Text
+    direction: Literal[-1, 1]
+    wanted: Count
     seeds: list[Count]
     scenes: list[str]
-    arms: dict[str, TunedArm]
+    ranges: dict[str, str]
+    log: list[str]
+    as_it_is: bool
+    points: list[Point]
+
+    def __post_init__(self) -> None:
+        if len({frozenset(point.settings) for point in self.points if point.value is not None}) > 1:
+            raise ValueError("the points have different settings")
+        on_scale = (point.settings.get(key) for point in self.points for key in self.log)
+        if any(isinstance(value, int | float) and value <= 0 for value in on_scale):
+            raise ValueError("a setting of a log scale is not above 0")
+
+    @property
+    def best(self) -> Point | None:
+        """The point of the best value, the first of several; None where none has a value."""
+        done = [point for point in self.points if point.value is not None]
+        return max(done, key=lambda point: self.direction * (point.value or 0.0), default=None)
 
 
 def read_tuning(home: Path) -> TuningRecord:
-    """The tuning of the experiment in ``home``; raises FileNotFoundError and DamagedError."""
+    """The search of the experiment in ``home``; raises FileNotFoundError and DamagedError."""
     return read_typed(home / TUNING, TuningRecord)
+
+
+def is_value(setting: object, of_point: object) -> bool:
+    """Return whether a setting has the value of a point, where a choice among words stands as it was typed.
+
+    Examples:
+        >>> is_value(True, "true"), is_value(0.3, "0.30"), is_value("soft", "soft"), is_value(True, 1)
+        (True, True, True, False)
+    """
+    if setting is None or isinstance(setting, bool):
+        return of_point == ("null" if setting is None else str(setting).lower())
+    if isinstance(setting, int | float) and isinstance(of_point, str):
+        try:
+            return float(of_point) == setting
+        except ValueError:
+            return False
+    return setting == of_point

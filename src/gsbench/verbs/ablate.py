@@ -20,9 +20,9 @@ from gsbench.claims.switches import (
     words_of,
     write_record,
 )
+from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.launch.plan import describe_plan
-from gsbench.launch.trial import Trial
 from gsbench.runs.layout import SEED
 from gsbench.settings import Switch
 from gsbench.verbs.arguments import ArgumentParser, names
@@ -117,7 +117,9 @@ def _only_densifier(trials: Sequence[Trial]) -> str:
 
 
 def _class_switches(trial: Trial) -> dict[str, Switch]:
-    return dict(getattr(type(trial.parts.trainer), "SWITCHES", {}))
+    from gsbench.pipeline.parts import Parts
+
+    return dict(getattr(type(Parts(trial.values).trainer), "SWITCHES", {}))
 
 
 def _off(settings: dict[str, Any], first: Trial) -> list[str]:

@@ -17,7 +17,6 @@ from gsbench.files import make_runs_folder, place_of, write_text
 from gsbench.launch.declare import declare_questions
 from gsbench.launch.plan import describe_plan
 from gsbench.launch.preflight import missing_folders
-from gsbench.launch.trial import Trial
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs.arguments import ArgumentParser, names, path
@@ -137,7 +136,7 @@ def describe(check: Check) -> list[str]:
         f"each test may err in {100 * file.error_rate / len(asked):.3g} % of such sweeps"
     )
     if most:
-        lines += describe_plan([Trial.of(trial) for trial in most], most[0].values["launch"]["parallel"])
+        lines += describe_plan(most, most[0].values["launch"]["parallel"])
     return lines
 
 
@@ -151,7 +150,7 @@ def _run(check: Check, all_seeds: bool) -> None:
     def run(planned: Sequence[Planned]) -> None:
         left = [one for one in check.to_run(planned) if TrialFolder.of(one.values).why_not_done(one.values)]
         if left:
-            run_batch([Trial.of(trial) for trial in left])
+            run_batch(left)
 
     if all_seeds:  # what an earlier look sees does not change by them
         run(trials_of_look(check.declaration, range(len(check.declaration.questions)), check.file.seeds))

@@ -7,13 +7,12 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.config.command_words import typed_permissions
-from gsbench.config.compose import TrialConfig, compose_one
+from gsbench.config.command_words import key_of, typed_permissions
+from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
-from gsbench.launch.trial import Trial
 from gsbench.runs.experiments import experiment_home
 from gsbench.runs.layout import CONFIG
 from gsbench.runs.trial_folder import TrialFolder
@@ -117,12 +116,7 @@ def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[s
     return Trial(values, (), recorded=True)
 
 
-def key_of(word: str) -> str:
-    """The setting that a word of a command line is about, whatever it does with it."""
-    return word.split("=")[0].lstrip("+~")
-
-
-def _identity(trial: TrialConfig) -> Path:
+def _identity(trial: Trial) -> Path:
     """The trial's place within any runs folder."""
     folder = TrialFolder.of(trial.values)
     return folder.path.relative_to(folder.runs)
