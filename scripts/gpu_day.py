@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-KERNELS_SHOWN = 12
 NOTHING = "-"
 MODEL = "bench-model"
 
@@ -67,9 +66,7 @@ def bits(device: str, width: int, height: int, count: int) -> list[str]:
 
 def table(results: Path) -> str:
     """All results as Markdown."""
-    return "\n\n".join(
-        part for part in (_head(results), _speed(results), _kernels(results), _training(results)) if part
-    )
+    return "\n\n".join(part for part in (_head(results), _speed(results), _training(results)) if part)
 
 
 def _head(results: Path) -> str:
@@ -122,25 +119,6 @@ def _speed(results: Path) -> str:
     names = ("forward", "loss", "backward", "Adam", "step", "steps/s", "peak MiB")
     header = "| scene | Gaussians | size | rasterizer | " + " | ".join(names) + " | of triton's step |"
     return "\n".join([header, "|" + "---|" * (5 + len(names)), *lines]) if lines else ""
-
-
-def _kernels(results: Path) -> str:
-    """Of the largest synthetic scenes, the kernels of ``triton``."""
-    tables = []
-    for scene, rows in _benches(results):
-        for row in rows:
-            if row["raster"] == "triton" and row.get("stages"):
-                tables.append((f"{scene}, {row['count']:,}", row["stages"]))
-    totals: dict[str, float] = {}
-    for _, stages in tables:
-        for name, ms in stages.items():
-            totals[name] = max(totals.get(name, 0.0), ms)
-    names = sorted(totals, key=lambda name: -totals[name])[:KERNELS_SHOWN]
-    lines = [
-        f"| `{name}` | " + " | ".join(_number(stages.get(name), 3) for _, stages in tables) + " |" for name in names
-    ]
-    header = "| kernel, ms a step | " + " | ".join(title for title, _ in tables) + " |"
-    return "\n".join([header, "|" + "---|" * (1 + len(tables)), *lines]) if tables else ""
 
 
 def _training(results: Path) -> str:

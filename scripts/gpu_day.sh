@@ -123,7 +123,7 @@ bench() { # NAME LIMIT ARGUMENT…
   shift 2
   rasters=$(IFS=, && echo "${RASTERS[*]}${PEERS:+,${PEERS[*]}}")
   step "bench-$name" "$limit" "$PYTHON" -m gsbench.cli bench --raster "$rasters" --size "$SIZE" --repeats "$REPEATS" \
-    --stages --json "$@"
+    --json "$@"
 }
 
 speed() {

@@ -57,7 +57,6 @@ def test_the_whole_day_in_the_interpreter(tmp_path: Path) -> None:
     assert "did not end well" not in said
     assert re.search(r"^\| trained \| 3 \| 16x16 \| `triton` \| [\d.]+ \|", said, re.MULTILINE)
     assert re.search(r"^\| a trained bonsai \| \d+ \| 16x16 \| `cpu` \|", said, re.MULTILINE)
-    assert re.search(r"^\| `composite_backward` \| [\d.]+ \| [\d.]+ \|$", said, re.MULTILINE)
     assert re.search(r"^\| `triton` \| 2 \| \d+ \| [\d.]+ \| \d+ \| [\d.]+ \| [\d.]+ \|$", said, re.MULTILINE)
 
 
@@ -80,7 +79,7 @@ def test_a_table_of_what_failed(tmp_path: Path) -> None:
     (results / "bits.out").write_text(json.dumps({"differing": ["image", "gradient of means"]}))
     (results / "bench-random-10.out").write_text("")
     row = {"raster": "triton", "scene": "random", "count": 1000, "size": "16x16", "step_ms": 1.234, "step_ratio": 1.0}
-    (results / "bench-random-1000.out").write_text(json.dumps([row | {"stages": {"composite": 0.5}}]))
+    (results / "bench-random-1000.out").write_text(json.dumps([row]))
     (results / "train-gsplat.json").write_text(json.dumps({"raster": "gsplat", "num_gaussians": 12345, "metrics": {}}))
     said = run(tmp_path, "table").stdout
     assert "- contract: yes (31 passed in 9 s)" in said
@@ -88,7 +87,6 @@ def test_a_table_of_what_failed(tmp_path: Path) -> None:
     assert "- memory checker: not tried" in said
     assert "**did not end well**: bits (1), bench-random-10 (late)" in said
     assert "| random | 1,000 | 16x16 | `triton` | - | - | - | - | 1.23 | - | - | 1.00 |" in said
-    assert "| `composite` | 0.500 |" in said
     assert "| `gsplat` | - | 12,345 | - | - | - | - |" in said
 
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import suppress
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
 
 from gsbench.bench import run_bench
-from gsbench.bench.counters import REST, short_name, stages_of_a_step, timed_kernels
 from gsbench.bench.measure import Setting, Stepper
 from gsbench.bench.scenes import (
     SCENES,
@@ -29,6 +27,7 @@ from gsbench.raster.cpu import CpuRasterizer
 from gsbench.raster.cpu import executor as cpu_executor
 from gsbench.raster.reference import project
 from gsbench.verbs.bench import main, parser
+from tests.benchmarks.counters import timed_kernels
 
 pytestmark = pytest.mark.slow
 
@@ -55,7 +54,6 @@ def test_turns_are_compared_with_the_first_and_whole_steps_are_made() -> None:
     assert (first["scene"], first["device"]) == ("random", "cpu")
     assert min(first["steps_per_second"], second["steps_per_second"]) > 0
     assert min(first["fps"], second["fps"]) > 0
-    assert first["waits_per_step"] is None  # there is no device to wait for
 
 
 def test_whole_steps_leave_the_scene_as_it_is() -> None:
@@ -131,69 +129,16 @@ def test_every_scene_can_be_chosen() -> None:
     assert tuple(choice.choices) == tuple(SCENES)
 
 
-def test_stages_name_the_kernels(capsys: pytest.CaptureFixture[str]) -> None:
+def test_kernels_are_timed_and_put_back_when_a_step_fails() -> None:
     kernel = cpu_executor.composite_tiles
-    arguments = ["--size", "40x30", "--count", "60", "--repeats", "2", "--no-memory", "--threads", "1", "--stages"]
-    assert main([*arguments, "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)
-    stages = row["stages"]
-    assert cpu_executor.composite_tiles is kernel  # as it was
-    assert {"project_shard", "composite_tiles", "composite_backward_tiles", "similarity_rows", REST} <= stages.keys()
-    assert min(stages.values()) >= 0
-    kernels = [ms for name, ms in stages.items() if name != REST]
-    assert kernels == sorted(kernels, reverse=True)
-    assert main(arguments) == 0
-    assert "%  composite_tiles" in capsys.readouterr().out
-
-
-def test_kernels_are_put_back_when_a_step_fails() -> None:
-    kernel = cpu_executor.composite_tiles
-
-    def step() -> None:
+    stepper = Stepper("cpu", Setting("trained", 40, 30, 60, threads=1))
+    with suppress(ArithmeticError), timed_kernels() as times:
+        stepper.step()
         assert cpu_executor.composite_tiles is not kernel
-        raise RuntimeError("step")
-
-    with pytest.raises(RuntimeError, match="step"), timed_kernels("cpu"):
-        step()
+        raise ArithmeticError
     assert cpu_executor.composite_tiles is kernel
-
-
-def test_what_a_gpu_ran_is_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On events as torch's profiler has them: real ones of this CPU, and the same as if of a GPU."""
-    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
-        torch.ones(3).sum()
-    on_cpu = profile.events()[0]
-    assert not on_cpu.is_user_annotation
-
-    def on_gpu(name: str, us: float, is_range: bool = False) -> SimpleNamespace:
-        device, time_range = SimpleNamespace(name="CUDA"), SimpleNamespace(elapsed_us=lambda: us)
-        return SimpleNamespace(name=name, device_type=device, time_range=time_range, is_user_annotation=is_range)
-
-    kernel = "void at::native::multi_tensor_apply_kernel<int>(int)"
-    events = [on_cpu, on_gpu(kernel, 1500), on_gpu(kernel, 500), on_gpu("Optimizer.step", 2000, True), on_gpu("f", 250)]
-    recording = nullcontext(SimpleNamespace(events=lambda: events))
-    monkeypatch.setattr(torch.profiler, "profile", lambda **_: recording)
-    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
-    sample = {"step_ms": 1.5, "cpu_ms": 9.0}
-    stages = stages_of_a_step(lambda: sample, "cuda", repeats=2)
-    assert stages == {"multi_tensor_apply_kernel": 1.0, "f": 0.125, REST: 0.375}
-
-
-@pytest.mark.parametrize(
-    ("kernel", "name"),
-    [
-        ("composite_backward", "composite_backward"),
-        ("void at::native::vectorized_elementwise_kernel<4, at::native::FillFunctor<float>>(int, float)",
-         "vectorized_elementwise_kernel"),
-        ("void cub::DeviceRadixSortOnesweepKernel<cub::Policy<int, long>::P800, false>(long*, int)",
-         "DeviceRadixSortOnesweepKernel"),
-        ("void (anonymous namespace)::f<(anonymous namespace)::g>(int)", "f"),
-        ("Memcpy DtoH (Device -> Pinned)", "Memcpy DtoH"),
-        ("<<<", "<<<"),
-    ],
-)  # fmt: skip
-def test_names_of_kernels(kernel: str, name: str) -> None:
-    assert short_name(kernel) == name
+    assert {"project_shard", "composite_tiles", "composite_backward_tiles", "similarity_rows"} <= times.keys()
+    assert min(times.values()) >= 0
 
 
 @pytest.mark.parametrize(

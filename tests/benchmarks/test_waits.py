@@ -10,8 +10,8 @@ import sys
 import pytest
 import torch
 
-from gsbench.bench.counters import counting_waits
 from gsbench.raster.readback import Readback
+from tests.benchmarks.counters import counting_waits
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.slow

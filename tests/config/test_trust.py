@@ -236,7 +236,6 @@ def test_a_search_path_imports_nothing(
 def test_nor_does_completion(monkeypatch: pytest.MonkeyPatch) -> None:
     line = "gsbench hydra.searchpath=[pkg://bombs] densify="
     monkeypatch.setenv("COMP_LINE", line)
-    cli.run(["completion", "query", line])
     assert cli.run(["-sc", "query=bash"]) == 2
     assert not Path("exploded").exists()
 

@@ -148,8 +148,8 @@ def test_its_model_is_one_as_any_other(
     assert len(viewed.gaussians) == 2000
     assert len(viewed.views) == 2
     assert (trial(home, "cloud") / "figures" / "ellipsoids.png").is_file()
-    assert run(["export", "three:garden:cloud:0", "--out", str(tmp_path / "x.spz")]) == 0
-    assert run(["export", "three:garden:painter:0", "--out", str(tmp_path / "y.spz")]) == 2
+    assert run(["export", "three:garden:cloud:0", "--out", str(tmp_path / "x.ply")]) == 0
+    assert run(["export", "three:garden:painter:0", "--out", str(tmp_path / "y.ply")]) == 2
     assert "it has no model" in capsys.readouterr().err
 
 

@@ -14,7 +14,6 @@ from pathlib import Path
 import torch
 
 import tests.raster.conftest  # noqa: F401 - makes the interpreter quicker
-from gsbench.bench.counters import counting_waits
 from gsbench.bench.measure import NEVER, standing_still
 from gsbench.bench.scenes import make_scene
 from gsbench.densify import ADC, MCMC
@@ -22,6 +21,7 @@ from gsbench.raster import create_rasterizer, validate
 from gsbench.raster.readback import Readback
 from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.trainer import Trainer
+from tests.benchmarks.counters import counting_waits
 
 DENSIFIERS = {
     "adc": ADC(start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER),

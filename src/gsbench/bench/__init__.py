@@ -1,4 +1,4 @@
-"""Costs of a training step with each rasterizer: times and their split, waits for a device, peak memory."""
+"""Costs of a training step with each rasterizer: times and their split, peak memory."""
 
 from gsbench.bench.measure import run_bench
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 import itertools
 import statistics
 import time
-from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from gsbench.bench.counters import counting_waits, stages_of_a_step
 from gsbench.bench.peer import PEERS
 from gsbench.bench.scenes import SEED, make_scene
 from gsbench.densify import ADC
@@ -116,19 +114,6 @@ class Stepper:
                 self.trainer.render(0)
         return frames / (self._now() - begin)
 
-    def waits(self) -> Counter[str] | None:
-        """Calls that made the host wait for the device in one whole training step; None for the peer and on a CPU."""
-        if self.peer is not None or self.device.type == "cpu":
-            return None
-        self.trainer.losses.settle()
-        with counting_waits() as counts:
-            self.trainer.iterate(NOWHERE)
-        return counts
-
-    def stages(self, repeats: int) -> dict[str, float]:
-        """ms a step by kernel, see `gsbench.bench.counters`."""
-        return stages_of_a_step(self.step, self.device.type, repeats)
-
     def _now(self) -> float:
         if self.device.type == "cuda":
             torch.cuda.synchronize()
@@ -182,7 +167,6 @@ def run_bench(
     threads: int | None = None,
     memory: bool = True,
     scene: str = "trained",
-    stages: bool = False,
 ) -> list[dict[str, Any]]:
     """Time the training step with each of ``rasters`` for each image size (width, height) and count of Gaussians.
 
@@ -190,23 +174,21 @@ def run_bench(
     ``backward_ms`` the backward pass of loss and render, ``step_ms`` everything; ``loss_ms`` and ``adam_ms`` are the
     rest, and ``cpu_ms`` is the processor time of the step on all threads. ``step_ratio`` is the median of the turns'
     quotients with the first of ``rasters``. ``steps_per_second`` is that of whole training steps, which nothing is
-    waited for in between; ``fps`` is frames a second, rendered alone; ``waits_per_step`` how often one of them makes
-    the host wait for a GPU. ``peak_memory_mb`` is that of a fresh process that makes the same steps (on a GPU: of
-    torch's allocations there), None if ``memory`` is false. With ``stages`` a row also has ms a
-    step by kernel, of further steps. With ``ply`` that model is timed, not ``counts``. Raises
-    InputError for a raster that cannot run here.
+    waited for in between; ``fps`` is frames a second, rendered alone. ``peak_memory_mb`` is that of a fresh process
+    that makes the same steps (on a GPU: of torch's allocations there), None if ``memory`` is false. With ``ply`` that
+    model is timed, not ``counts``. Raises InputError for a raster that cannot run here.
     """
     rows = []
     with progress("bench") as report:
         for width, height in sizes:
             for count in counts if ply is None else [0]:
                 setting = Setting(scene, width, height, count, ply, threads)
-                rows += _compare(rasters, setting, repeats, memory, stages, report)
+                rows += _compare(rasters, setting, repeats, memory, report)
     return rows
 
 
 def _compare(
-    rasters: list[str], setting: Setting, repeats: int, memory: bool, stages: bool, report: Progress
+    rasters: list[str], setting: Setting, repeats: int, memory: bool, report: Progress
 ) -> list[dict[str, Any]]:
     model = f"{setting.count:,} Gaussians" if setting.ply is None else setting.ply.name
     what, turns = f"{setting.width}x{setting.height}, {model}", WARM_UP_STEPS + repeats
@@ -224,7 +206,6 @@ def _compare(
                 speeds[raster] += [] if speed is None else [speed]
     rows = []
     for raster, stepper in steppers.items():
-        waits = stepper.waits()
         pairs = zip(parts[raster], parts[rasters[0]], strict=True)
         row: dict[str, Any] = {
             "raster": raster,
@@ -237,13 +218,9 @@ def _compare(
             "step_ratio": _median([own["step_ms"] / first["step_ms"] for own, first in pairs]),
             "steps_per_second": _median(speeds[raster]) if speeds[raster] else None,
             "fps": _median(frames[raster]),
-            "waits_per_step": None if waits is None else waits.total(),
             "threads": stepper.threads,
             "device": stepper.device.type,
         }
-        if stages:
-            report(f"{what}, stages", turns, turns, raster)
-            row["stages"] = stepper.stages(repeats)
         if raster in PEERS:
             row["note"] = PEERS[raster].note
         rows.append(row)

@@ -27,7 +27,6 @@ COLUMNS = (  # of the table
     "cpu_ms",
     "steps_per_second",
     "fps",
-    "waits_per_step",
     "peak_memory_mb",
 )
 RATIO_DIGITS = 2
@@ -57,7 +56,6 @@ def parser() -> ArgumentParser:
     made.add_argument("--ply", type=path, help="time this model instead of a synthetic scene")
     made.add_argument("--repeats", type=_count, default=5, help="turns that count (default 5)")
     made.add_argument("--threads", type=_count, help="CPU threads (default: as many as torch takes)")
-    made.add_argument("--stages", action="store_true", help="also the time of each kernel")
     made.add_argument("--json", action="store_true", help="print JSON")
     made.add_argument("--no-memory", action="store_true", help="leave out peak memory, which takes a process each")
     return made
@@ -89,11 +87,8 @@ def main(argv: Sequence[str], _runs: Path | None = None) -> int:
         options.threads,
         not options.no_memory,
         options.scene,
-        options.stages,
     )
     print(json.dumps(rows, indent=2) if options.json else table(rows))
-    for row in rows if options.stages and not options.json else ():
-        print("\n" + stage_table(row))
     return 0
 
 
@@ -105,14 +100,6 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = ["  ".join(text.rjust(width) for text, width in zip(line, widths, strict=True)) for line in cells]
     notes = {f"{row['raster']}: {row['note']}" for row in rows if "note" in row}
     return "\n".join([*lines, *sorted(notes)])
-
-
-def stage_table(row: dict[str, Any]) -> str:
-    """The kernels of one result, the longest first, with their share of the whole."""
-    whole = sum(row["stages"].values())
-    lines = [f"{row['raster']}, {row['size']}, {row['count']:,} Gaussians: {whole:.3f} ms"]
-    lines += [f"{ms:10.3f} ms {ms / whole:6.1%}  {name}" for name, ms in row["stages"].items()]
-    return "\n".join(lines)
 
 
 def _cell(key: str, value: Any) -> str:

@@ -32,6 +32,5 @@ VERBS = {
         "gsbench.verbs.video",
         "film a trained model: along its cameras, round the scene, or along a path of nerfstudio's",
     ),
-    "completion": ("gsbench.verbs.completion", "complete verbs, settings, experiments and trials on the Tab key"),
     "doctor": ("gsbench.verbs.doctor", "check this machine and say what is missing"),
 }
