@@ -264,16 +264,6 @@ def test_ui_serves_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None
     assert commands[0][commands[0].index("--host") + 1] == "127.0.0.1"
 
 
-def test_doctor_names_a_torchvision_that_does_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "torchvision.py").write_text("raise RuntimeError('operator torchvision::nms does not exist')\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    sys.modules.pop("torchvision", None)
-    (finding,) = doctor.check_torchvision()
-    assert finding.verdict == "bad"
-    assert "nms does not exist" in finding.text
-    assert "pip uninstall torchvision" in finding.text
-
-
 def test_doctor_names_the_packages_that_triton_compiles_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_version", lambda package: "3.7.1")
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -288,8 +278,7 @@ def test_doctor_names_the_packages_that_triton_compiles_with(tmp_path: Path, mon
     version = f"{sys.version_info.major}.{sys.version_info.minor}"
     assert f"Python.h: install the package python{version}-dev" in finding.text
     (tmp_path / "Python.h").write_text("")
-    (finding,) = doctor.check_triton()
-    assert finding.verdict == "ok"
+    assert not list(doctor.check_triton())
     monkeypatch.setenv("CC", "nosuchcc -O2")
     (finding,) = doctor.check_triton()
     assert "CC is nosuchcc -O2, which is not there" in finding.text
