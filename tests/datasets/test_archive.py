@@ -15,12 +15,10 @@ import pytest
 
 from gsbench.datasets.archive import (
     DamagedError,
-    RangesRefusedError,
     extract,
     members_of,
     open_archive,
-    open_local,
-    open_remote,
+    opened,
 )
 from gsbench.downloads import FetchError, Patience, download, retried
 from gsbench.errors import InputError
@@ -56,7 +54,7 @@ def test_an_archive_of_a_later_version_is_refused(version: int, tmp_path: Path) 
 def test_a_wrong_offset_is_damage(offset: int, layout: str, value: int, tmp_path: Path) -> None:
     data = patched(packed("s/images/a.jpg"), DIRECTORY, offset, layout, value)
     with open_archive(io.BytesIO(data), "x.zip") as archive:
-        (member,) = members_of(archive, "s", ["images"], "x.zip")
+        (member,) = members_of(archive, "s", ["images"], "x.zip").values()
         with pytest.raises(DamagedError):
             extract(archive, member, tmp_path / "a.jpg", lambda count: None)
     assert not (tmp_path / "a.jpg").exists()
@@ -67,7 +65,7 @@ def test_a_member_without_a_name_is_passed_over() -> None:
     data = patched(data, b"x" + data[data.rindex(b"x") + 1 :], 0, "<B", 0)  # zipfile takes a name up to the first NUL
     with open_archive(io.BytesIO(data), "x.zip") as archive:
         assert "" in archive.namelist()
-        assert [member.name for member in members_of(archive, "s", ["images"], "x.zip")] == ["images/a.jpg"]
+        assert list(members_of(archive, "s", ["images"], "x.zip")) == ["images/a.jpg"]
 
 
 @pytest.mark.parametrize(
@@ -94,7 +92,7 @@ def test_damaged_bytes_of_a_member_are_damage(compression: int, tmp_path: Path) 
     for place in range(begin, begin + 200):
         damaged = data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :]
         with open_archive(io.BytesIO(damaged), "x.zip") as archive:
-            (member,) = members_of(archive, "s", ["images"], "x.zip")
+            (member,) = members_of(archive, "s", ["images"], "x.zip").values()
             with contextlib.suppress(DamagedError, InputError):
                 extract(archive, member, tmp_path / "a.jpg", lambda count: None)
                 assert (tmp_path / "a.jpg").read_bytes() == content  # the byte was one that no reader looks at
@@ -114,8 +112,8 @@ def served(tmp_path: Path) -> Iterator[Server]:
 def fetched(server: Server, target: Path) -> bytes:
     """The bytes of the second member."""
     url = f"{server.url}/file.zip"
-    with open_remote(url, PATIENT) as archive:
-        (_, member) = members_of(archive, "s", ["images"], url)
+    with opened(url, PATIENT) as archive:
+        (_, member) = members_of(archive, "s", ["images"], url).values()
         retried(lambda: extract(archive, member, target, lambda count: None), url, PATIENT)
     return target.read_bytes()
 
@@ -145,7 +143,7 @@ def test_a_member_comes_whole_and_alone(served: Server, tmp_path: Path, manners:
         (Manners(stall_every=1), FetchError, "no answer in time"),
         (Manners(status={"/file.zip": 403}), InputError, r"403 Forbidden.*--mirror"),
         (Manners(status={"/file.zip": 503}), FetchError, r"3 failures in a row .*503"),
-        (Manners(ranges=False), RangesRefusedError, None),
+        (Manners(ranges=False), InputError, "whole files only.*--mirror FOLDER"),
         (Manners(claimed_size=590_000), (FetchError, InputError, DamagedError), None),
         (Manners(shift=7), DamagedError, None),
     ],
@@ -160,14 +158,14 @@ def test_says_what_the_server_did(
 
 
 def test_no_server_at_all() -> None:
-    with pytest.raises(FetchError, match="Connection refused"), open_remote("http://127.0.0.1:9/file.zip", PATIENT):
+    with pytest.raises(FetchError, match="Connection refused"), opened("http://127.0.0.1:9/file.zip", PATIENT):
         pass
 
 
 def test_a_file_that_changes_in_between_is_damage(served: Server, tmp_path: Path) -> None:
     url = f"{served.url}/file.zip"
-    with open_remote(url, PATIENT) as archive:
-        (_, member) = members_of(archive, "s", ["images"], url)
+    with opened(url, PATIENT) as archive:
+        (_, member) = members_of(archive, "s", ["images"], url).values()
         content = bytearray((served.folder / "file.zip").read_bytes())
         content[400_000:400_010] = bytes(10)
         (served.folder / "file.zip").write_bytes(content)
@@ -198,9 +196,9 @@ def test_offsets_beyond_four_gigabytes(tmp_path: Path) -> None:
         stream.seek(5 << 30)
         with zipfile.ZipFile(stream, "w") as archive:
             archive.writestr("garden/a.JPG", b"far out")
-    with serve(tmp_path) as server, open_remote(f"{server.url}/large.zip", PATIENT) as remote:
+    with serve(tmp_path) as server, opened(f"{server.url}/large.zip", PATIENT) as remote:
         assert remote.getinfo("garden/a.JPG").header_offset == 5 << 30
         assert remote.read("garden/a.JPG") == b"far out"
         assert server.sent < 1_000_000
-    with open_local(file) as local:
+    with opened(str(file), PATIENT) as local:
         assert local.read("garden/a.JPG") == b"far out"

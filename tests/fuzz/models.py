@@ -119,13 +119,13 @@ def _check_picture(path: Path) -> None:
 def _check_archive(path: Path, work: Path) -> None:
     with path.open("rb") as file, open_archive(file, str(path)) as archive:
         members = members_of(archive, "scene", ("images",), str(path))
-        for number, member in enumerate(members):
+        for number, member in enumerate(members.values()):
             target = work / f"member{number}"
             try:
                 extract(archive, member, target, lambda count: None)
             except DamagedError as error:
                 raise InputError(" ".join(str(error).split())) from error
-            assert target.stat().st_size == member.bytes
+            assert target.stat().st_size == member.file_size
 
 
 def _refused(read: Callable[[], None]) -> bool:

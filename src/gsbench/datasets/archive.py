@@ -11,7 +11,6 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from errno import EINVAL
 from pathlib import Path, PurePosixPath
 from typing import IO
@@ -27,25 +26,17 @@ class DamagedError(Exception):
     """Error of a file that is not what the archive's directory promises."""
 
 
-class RangesRefusedError(Exception):
-    """Error of a server that sends whole files only."""
-
-
-@dataclass(frozen=True)
-class Member:
-    """A wanted file: ``name`` below the scene's folder, and its entry in the archive's directory."""
-
-    name: str
-    info: zipfile.ZipInfo
-
-    @property
-    def bytes(self) -> int:
-        return self.info.file_size
-
-
 @contextmanager
-def open_local(path: Path) -> Iterator[zipfile.ZipFile]:
-    """The archive at ``path``. Raises `InputError` where it cannot be read or is none."""
+def opened(where: str, patience: Patience) -> Iterator[zipfile.ZipFile]:
+    """The archive at an address, read by ranges, or at a path of this machine.
+
+    Raises `InputError` where it cannot be read, is no archive, or lies on a server that sends whole files only.
+    """
+    if "://" in where:
+        with _remote(where, patience) as archive:
+            yield archive
+        return
+    path = Path(where).expanduser()
     require_regular(path)
     try:
         file = path.open("rb")
@@ -56,16 +47,17 @@ def open_local(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 @contextmanager
-def open_remote(url: str, patience: Patience) -> Iterator[zipfile.ZipFile]:
-    """The archive at ``url``, read by ranges. Raises `RangesRefusedError` where the server serves none."""
+def _remote(url: str, patience: Patience) -> Iterator[zipfile.ZipFile]:
     import remotezip
     import requests
 
-    def opened() -> zipfile.ZipFile:
+    def once() -> zipfile.ZipFile:
         try:
             return remotezip.RemoteZip(url, session=session, timeout=patience.timeout, headers=USER_AGENT)
         except remotezip.RangeNotSupported:
-            raise RangesRefusedError from None
+            raise InputError(
+                f"{url}: the server sends whole files only: get the file into a folder, and give --mirror FOLDER"
+            ) from None
         except remotezip.RemoteIOError as error:
             raise (error.__context__ or error) from None  # the library keeps the words of the cause alone
         except remotezip.RemoteZipError as error:
@@ -73,8 +65,10 @@ def open_remote(url: str, patience: Patience) -> Iterator[zipfile.ZipFile]:
 
     with requests.Session() as session:
         try:
-            archive = retried(opened, url, patience)
+            archive = retried(once, url, patience)
         except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
+            if isinstance(error, InputError):
+                raise
             raise _no_archive(url, error) from error
         with archive:
             yield archive
@@ -92,12 +86,12 @@ def _no_archive(where: str, error: Exception) -> InputError:
     return InputError(f"{where} is no whole zip archive ({error}): give another address with --mirror")
 
 
-def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], where: str) -> list[Member]:
-    """The files of the folders ``wanted`` below ``folder`` (and no others), sorted by name.
+def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], where: str) -> dict[str, zipfile.ZipInfo]:
+    """The files of the folders ``wanted`` below ``folder`` (and no others), by their names below it, sorted.
 
     Raises `InputError` where a wanted folder is empty, or a name would lead out of the scene's folder.
     """
-    members: dict[str, Member] = {}
+    members: dict[str, zipfile.ZipInfo] = {}
     for info in archive.infolist():
         if not info.filename.startswith(f"{folder}/") or info.is_dir():
             continue
@@ -110,14 +104,14 @@ def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], whe
             raise InputError(
                 f"{where}: the member {name!r:.80} has a name that no file can have: give another --mirror"
             )
-        members[name] = Member(name, info)
+        members[name] = info
     for name in members:
         if folder_of := next((str(above) for above in PurePosixPath(name).parents if str(above) in members), None):
             raise InputError(f"{where}: {folder_of} is a file and a folder in one: give another --mirror")
     for part in wanted:
         if not any(name.startswith(f"{part}/") for name in members):
             raise InputError(f"{where} has no files below {folder}/{part}: it is not the archive that was expected")
-    return [members[name] for name in sorted(members)]
+    return dict(sorted(members.items()))
 
 
 def holds(path: Path, size: int, crc: int) -> bool:
@@ -134,7 +128,7 @@ def holds(path: Path, size: int, crc: int) -> bool:
     return checksum == crc
 
 
-def extract(archive: zipfile.ZipFile, member: Member, target: Path, advance: Callable[[int], None]) -> None:
+def extract(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, advance: Callable[[int], None]) -> None:
     """Write the member to ``target``, which appears only when size and CRC-32 are right; ``advance`` gets bytes.
 
     Raises `DamagedError`, `InputError` for a member that the archive has packed in a way not known here, and what the
@@ -145,15 +139,15 @@ def extract(archive: zipfile.ZipFile, member: Member, target: Path, advance: Cal
     try:
         with (
             atomic(target, sync=False) as temporary,  # a later fetch reads what is here and compares its CRC
-            archive.open(member.info) as source,
+            archive.open(member) as source,
             temporary.open("wb") as file,
         ):
             while piece := source.read(CHUNK):  # checks the CRC at the end
                 file.write(piece)
                 written += len(piece)
                 advance(len(piece))
-            if written != member.bytes:
-                raise DamagedError(f"{written} bytes instead of {member.bytes}")
+            if written != member.file_size:
+                raise DamagedError(f"{written} bytes instead of {member.file_size}")
     except Exception as error:
         advance(-written)
         raise _cause(error, member) from error
@@ -163,7 +157,7 @@ def extract(archive: zipfile.ZipFile, member: Member, target: Path, advance: Cal
 DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, lzma.LZMAError, EOFError, ValueError, IndexError, TypeError)
 
 
-def _cause(error: Exception, member: Member) -> Exception:
+def _cause(error: Exception, member: zipfile.ZipInfo) -> Exception:
     """The error to raise for one that `extract` met: of the file, of gsbench, else the error itself."""
     from remotezip import RemoteIOError, RemoteZipError
 
@@ -176,5 +170,5 @@ def _cause(error: Exception, member: Member) -> Exception:
     if isinstance(error, (*DAMAGE, RemoteZipError)) or (isinstance(error, OSError) and error.errno in (None, EINVAL)):
         return DamagedError(str(error) or type(error).__name__)
     if isinstance(error, NotImplementedError | RuntimeError):
-        return InputError(f"{member.info.filename} is packed in a way that cannot be read here ({error})")
+        return InputError(f"{member.filename} is packed in a way that cannot be read here ({error})")
     return error

@@ -23,14 +23,13 @@ CATALOG_FILE = Path(__file__).with_name("catalog.yaml")
 
 @dataclass(frozen=True)
 class Archive:
-    """One zip file: its address, its approximate size in bytes, the folder of each of its scenes in it, and checksums
-    where they are published: of the whole file under ``archive``, of a scene under its record's name.
+    """One zip file: its address, its approximate size in words ("" where it is not known), and the folder of each of
+    its scenes in it.
     """
 
     url: str
-    bytes: int | None
+    size: str
     scenes: Mapping[str, str]
-    sha256: Mapping[str, str]
 
     @property
     def name(self) -> str:
@@ -61,11 +60,6 @@ class SceneFiles:
     folder: str
     parts: tuple[str, ...]  # images before the model: a model alone is no scene
 
-    @property
-    def key(self) -> str:
-        """The name of its record: a scene with other image folders is another record."""
-        return f"{self.scene}/{'+'.join(self.parts)}"
-
 
 def wanted_files(scene: str, images: str | None = None) -> SceneFiles:
     """The files that a scene file asks for; ``images`` names another image folder than it does."""
@@ -85,9 +79,7 @@ def read_catalog() -> dict[str, Dataset]:
 
 def _dataset(name: str, entry: Mapping[str, Any]) -> Dataset:
     texts = {key: entry[key] for key in ("title", "page", "licence", "citation")}
-    archives = tuple(
-        Archive(archive["url"], archive["bytes"], archive["scenes"], archive["sha256"]) for archive in entry["archives"]
-    )
+    archives = tuple(Archive(one["url"], one.get("size", ""), one["scenes"]) for one in entry["archives"])
     return Dataset(name=name, archives=archives, **texts)
 
 
