@@ -4,6 +4,9 @@ BIN    := $(VENV)/bin
 # Two tests at a time, each worker in a process of its own; one that has nothing left takes tests of the other.
 PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 INSTALL := $(BIN)/python scripts/install.py
+# Packages are installed without byte code, which Python keeps of what is used. Images for containers often forbid that by
+# this variable; each start of the program would then compile all its modules again, 8 CPU-seconds.
+unexport PYTHONDONTWRITEBYTECODE
 
 # Each library that chooses its instructions by the processor, told to choose the plainest. Compiled kernels keep a cache
 # for each processor, so the ordinary ones stay.

@@ -63,7 +63,7 @@ def test_every_500_iterations_opacities_are_lowered_to_the_ceiling() -> None:
     event = densifier.refine(500, trainable, torch.Generator())  # no round yet
     assert (before > 0.8).any()
     torch.testing.assert_close(trainable.values.opacities.detach(), before.clamp_max(0.8))
-    assert not trainable.optimizer.state[trainable.values.opacity_logits]["exp_avg"].any()
+    assert not trainable.adam["opacity_logits"].first.any()
     assert not event.opacity_reset
     assert densifier.refine(15_000, trainable, torch.Generator()) is None
     densifier.refine(3000, trainable, torch.Generator())

@@ -158,10 +158,9 @@ def test_mcmc_begins_the_moments_of_all_six_tensors_anew_at_the_sources(rule: st
     count = 30 if rule == "relocate" else 40  # who lived stands first, in order
     sources = (after[:count] != before[40 - count :]).numpy()
     assert 0 < sources.sum() < count
-    for name, tensor in trainable.values.tensors().items():
-        state = trainable.optimizer.state[tensor]
-        for moment in ("exp_avg", "exp_avg_sq"):
-            rows = state[moment].flatten(1) if state[moment].dim() > 1 else state[moment][:, None]
+    for name, state in trainable.adam.items():
+        for moment in (state.first, state.second):
+            rows = moment.flatten(1) if moment.dim() > 1 else moment[:, None]
             is_zero = (rows == 0).all(-1).numpy()
             assert is_zero[:count].tolist() == sources.tolist(), name
             assert is_zero[count:].all(), name

@@ -115,7 +115,7 @@ def test_from_the_end_of_the_first_phase_on_all_opacities_fade_every_500_iterati
         assert not event.opacity_reset
         if (ratio < 0.9).any():
             torch.testing.assert_close(ratio, torch.full_like(ratio, 0.8))
-            assert not trainable.optimizer.state[trainable.values.opacity_logits]["exp_avg"].any()
+            assert not trainable.adam["opacity_logits"].first.any()
             faded.append(step)
             if step >= 12_000:
                 pruned.append(event.pruned_opacity)

@@ -55,12 +55,11 @@ def observe(
 
 def to_rows(trainable: TrainableGaussians) -> list[restatement.Row]:
     tensors = trainable.values.tensors()
-    moments = {name: trainable.optimizer.state[tensor] for name, tensor in tensors.items()}
     rows = []
     for i in range(len(trainable)):
         row = {name: tensor[i].detach().numpy().copy() for name, tensor in tensors.items()}
-        row |= {"first " + name: state["exp_avg"][i].numpy().copy() for name, state in moments.items()}
-        row |= {"second " + name: state["exp_avg_sq"][i].numpy().copy() for name, state in moments.items()}
+        row |= {"first " + name: state.first[i].numpy().copy() for name, state in trainable.adam.items()}
+        row |= {"second " + name: state.second[i].numpy().copy() for name, state in trainable.adam.items()}
         rows.append(row)
     return rows
 
@@ -267,7 +266,7 @@ def test_optimizer_step_is_skipped_after_a_refinement_and_goes_on_after_it() -> 
     trainable.values.means.grad = torch.ones_like(trainable.values.means)
     trainable.optimizer_step()
     assert not torch.equal(before.means, trainable.values.means)
-    assert float(trainable.optimizer.state[trainable.values.means]["step"]) == 3
+    assert float(trainable.adam["means"].step) == 3
 
 
 def test_opacity_reset_zeroes_the_opacity_moments_only() -> None:
@@ -278,8 +277,8 @@ def test_opacity_reset_zeroes_the_opacity_moments_only() -> None:
     assert event.opacity_reset
     torch.testing.assert_close(trainable.values.opacities, before.opacities.clamp_max(0.01))
     assert torch.equal(trainable.values.means, before.means)
-    assert not trainable.optimizer.state[trainable.values.opacity_logits]["exp_avg"].any()
-    assert trainable.optimizer.state[trainable.values.means]["exp_avg"].all()
+    assert not trainable.adam["opacity_logits"].first.any()
+    assert trainable.adam["means"].first.all()
 
 
 def test_refinements_of_the_paper_schedule() -> None:

@@ -143,8 +143,8 @@ def test_a_state_goes_to_another_device_whole() -> None:
     gaussians.optimizer_step()
     moved = TrainableGaussians.load(to_host(gaussians.state_dict()), rates, 1.0, torch.device("meta"))
     assert {tensor.device.type for tensor in moved.values.tensors().values()} == {"meta"}
-    moments = moved.optimizer.state[moved.values.means]
-    assert {moments["exp_avg"].device.type, moments["exp_avg_sq"].device.type} == {"meta"}
+    moments = moved.adam["means"]
+    assert {moments.first.device.type, moments.second.device.type} == {"meta"}
 
 
 @pytest.mark.parametrize("background", [False, True])

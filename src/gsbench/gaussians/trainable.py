@@ -3,22 +3,38 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 
+ADAM_BETAS = (0.9, 0.999)  # torch's defaults, as 3DGS has them
 ADAM_EPSILON = 1e-15  # 3DGS
 
 
+@dataclass
+class AdamState:
+    """Adam's state of one parameter: its learning rate, the steps taken, and both moments in the parameter's shape."""
+
+    rate: float
+    step: Tensor  # [], as torch's fused kernel wants it
+    first: Tensor
+    second: Tensor
+
+
 class TrainableGaussians:
-    """Raw parameters as leaves of the graph, one Adam group each.
+    """Raw parameters as leaves of the graph, each with its state of Adam.
 
     Adding, removing or overwriting Gaussians goes through ``edit``: it keeps parameters and moments in step. As in
     3DGS, an edited parameter is a new leaf without gradient, so the optimiser step of that iteration passes it over.
+
+    `torch.optim.Adam` itself is not used: the first object of that class imports torch's compiler, 1.5 CPU-seconds in
+    each process that trains. Its function `adam` does the same arithmetic, and there are no groups to keep in step.
     """
 
     def __init__(self, gaussians: Gaussians, rates: LearningRates, spatial_scale: float) -> None:
@@ -34,13 +50,15 @@ class TrainableGaussians:
             "sh_dc": rates.sh_dc,
             "sh_rest": rates.sh_rest,
         }
-        fused = self.values.means.device.type in ("cpu", "cuda")
-        self.optimizer = torch.optim.Adam(
-            [{"params": [tensor], "lr": initial[name], "name": name} for name, tensor in self.values.tensors().items()],
-            lr=0.0,
-            eps=ADAM_EPSILON,
-            fused=fused,
-        )
+        self.adam = {
+            name: AdamState(
+                initial[name],
+                torch.zeros((), dtype=torch.float32, device=tensor.device),
+                torch.zeros_like(tensor, requires_grad=False),
+                torch.zeros_like(tensor, requires_grad=False),
+            )
+            for name, tensor in self.values.tensors().items()
+        }
 
     def __len__(self) -> int:
         return len(self.values)
@@ -52,16 +70,17 @@ class TrainableGaussians:
     @property
     def position_rate(self) -> float:
         """The present learning rate of the means, world units."""
-        return self._rate("means")
+        return self.adam["means"].rate
 
     def set_step(self, step: float) -> None:
         """Set the learning rate of the means for iteration ``step`` (1, 2, …)."""
-        self._group("means")["lr"] = self.rates.position(step) * self.spatial_scale
+        self.adam["means"].rate = self.rates.position(step) * self.spatial_scale
 
     def set_rate(self, name: str, rate: float) -> None:
         """Set the learning rate of the parameter ``name``; that of the means is set anew in each iteration."""
-        self._group(name)["lr"] = rate
+        self.adam[name].rate = rate
 
+    @torch.no_grad()
     def optimizer_step(self, sh_degree: int = MAX_SH_DEGREE, visible: Tensor | None = None) -> None:
         """Adam on every parameter that has a gradient, then forget the gradients.
 
@@ -71,39 +90,16 @@ class TrainableGaussians:
         """
         if sh_degree == 0 and self.values.means.grad is not None:
             self.values.sh_rest.grad = None
-            self._state(self.values.sh_rest)["step"] += 1
-        if visible is None:
-            self.optimizer.step()
-        else:
-            self._step_visible(visible.nonzero().squeeze(-1))
-        self.optimizer.zero_grad(set_to_none=True)
-
-    def _rate(self, name: str) -> float:
-        return float(self._group(name)["lr"])
-
-    def _state(self, parameter: Tensor) -> dict[str, Tensor]:
-        """Adam's state of ``parameter``, made as torch makes it if there is none yet."""
-        state = self.optimizer.state[parameter]
-        if not state:
-            state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        return state
-
-    @torch.no_grad()
-    def _step_visible(self, index: Tensor) -> None:
-        """Adam (Kingma and Ba 2015) on the rows ``index`` [V] alone; the count of steps is shared by all rows."""
-        for group in self.optimizer.param_groups:
-            parameter = group["params"][0]
+            self.adam["sh_rest"].step += 1
+        index = None if visible is None else visible.nonzero().squeeze(-1)  # [V]
+        for name, parameter in self.values.tensors().items():
             if parameter.grad is None:
                 continue
-            state, (beta1, beta2) = self._state(parameter), group["betas"]
-            state["step"] += 1
-            step, gradient = float(state["step"]), parameter.grad[index]
-            first = state["exp_avg"][index].lerp_(gradient, 1 - beta1)
-            second = state["exp_avg_sq"][index].mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
-            state["exp_avg"][index], state["exp_avg_sq"][index] = first, second
-            spread = (second / (1 - beta2**step)).sqrt_().add_(group["eps"])
-            parameter[index] -= group["lr"] / (1 - beta1**step) * first / spread
+            if index is None:
+                _step_all(parameter, self.adam[name])
+            else:
+                _step_rows(parameter, self.adam[name], index)
+            parameter.grad = None
 
     @torch.no_grad()
     def edit(self, keep: Tensor | None = None, append: Gaussians | None = None) -> None:
@@ -119,37 +115,26 @@ class TrainableGaussians:
         parameter = getattr(self.values, name)
         if values.shape != parameter.shape:
             raise ValueError(f"overwrite: {name} has shape {tuple(parameter.shape)}, got {tuple(values.shape)}")
-        state = self._replace(name, values.detach().clone())
-        for moment in ("exp_avg", "exp_avg_sq"):
-            if moment in state:
-                if where is None:
-                    state[moment].zero_()
-                else:
-                    state[moment][where] = 0
+        self._replace(name, values.detach().clone())
+        state = self.adam[name]
+        for moment in (state.first, state.second):
+            if where is None:
+                moment.zero_()
+            else:
+                moment[where] = 0
 
-    def _replace(
-        self, name: str, values: Tensor, keep: Tensor | None = None, added: Tensor | None = None
-    ) -> dict[str, Tensor]:
-        group = self._group(name)
-        state = self.optimizer.state.pop(group["params"][0], {})
-        for moment in ("exp_avg", "exp_avg_sq"):
-            if moment in state:
-                state[moment] = _edited(state[moment], keep, None if added is None else torch.zeros_like(added))
-        parameter = values.contiguous().requires_grad_(True)
-        group["params"][0] = parameter
-        if state:  # Adam's ``step`` is shared by a group and stays
-            self.optimizer.state[parameter] = state
-        setattr(self.values, name, parameter)
-        return state
-
-    def _group(self, name: str) -> dict[str, Any]:
-        return next(group for group in self.optimizer.param_groups if group["name"] == name)
+    def _replace(self, name: str, values: Tensor, keep: Tensor | None = None, added: Tensor | None = None) -> None:
+        """Make ``values`` the parameter ``name``, and bring its moments to the same rows; Adam's count stays."""
+        state = self.adam[name]
+        zeros = None if added is None else torch.zeros_like(added)
+        state.first, state.second = _edited(state.first, keep, zeros), _edited(state.second, keep, zeros)
+        setattr(self.values, name, values.contiguous().requires_grad_(True))
 
     def state_dict(self) -> dict[str, object]:
         """The state that a resumed training needs, sharing memory with this object: save it before the next step."""
         return {
             "gaussians": {name: tensor.detach() for name, tensor in self.values.tensors().items()},
-            "optimizer": self.optimizer.state_dict(),
+            "adam": {name: vars(state).copy() for name, state in self.adam.items()},
         }
 
     @classmethod
@@ -159,8 +144,45 @@ class TrainableGaussians:
         """The inverse of ``state_dict``, on ``device`` (None: where the state is); copies."""
         gaussians = Gaussians(**state["gaussians"]).map(lambda tensor: tensor.to(device))
         trainable = cls(gaussians, rates, spatial_scale)
-        trainable.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))  # torch itself would share the moments
+        for name, saved in state["adam"].items():
+            copied = copy.deepcopy(saved)
+            moved = {key: value.to(device) for key, value in copied.items() if isinstance(value, Tensor)}
+            trainable.adam[name] = AdamState(**copied | moved)
         return trainable
+
+
+def _step_all(parameter: Tensor, state: AdamState) -> None:
+    """Adam (Kingma and Ba 2015) on a whole parameter, by torch's fused kernel where it has one."""
+    assert parameter.grad is not None
+    adam(
+        [parameter],
+        [parameter.grad],
+        [state.first],
+        [state.second],
+        [],
+        [state.step],
+        fused=parameter.device.type in ("cpu", "cuda"),
+        amsgrad=False,
+        beta1=ADAM_BETAS[0],
+        beta2=ADAM_BETAS[1],
+        lr=state.rate,
+        weight_decay=0.0,
+        eps=ADAM_EPSILON,
+        maximize=False,
+    )
+
+
+def _step_rows(parameter: Tensor, state: AdamState, index: Tensor) -> None:
+    """Adam on the rows ``index`` [V] alone; the count of steps is shared by all rows."""
+    assert parameter.grad is not None
+    beta1, beta2 = ADAM_BETAS
+    state.step += 1
+    step, gradient = float(state.step), parameter.grad[index]
+    first = state.first[index].lerp_(gradient, 1 - beta1)
+    second = state.second[index].mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+    state.first[index], state.second[index] = first, second
+    spread = (second / (1 - beta2**step)).sqrt_().add_(ADAM_EPSILON)
+    parameter[index] -= state.rate / (1 - beta1**step) * first / spread
 
 
 def _edited(old: Tensor, keep: Tensor | None, added: Tensor | None) -> Tensor:
