@@ -28,7 +28,8 @@ from IPython.display import Markdown
 
 from gsbench.analysis import load_experiment, to_frame
 from gsbench.analysis.errors_by_region import errors_by_region
-from gsbench.analysis.judgement import judge, pair_trials
+from gsbench.analysis.judgement import judge
+from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.planning import seeds_needed
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table

@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.analysis import judgement
-from gsbench.analysis.judgement import Pairs, ScenePairs, Verdict
-from gsbench.analysis.measures import find_measure
+from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.pairing import Pairs, ScenePairs
+from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.statistics import answer_family
 from gsbench.runs.declaration import Question
 
@@ -137,7 +138,7 @@ def _claim(kind: Kind, effect: float, rng: np.random.Generator) -> tuple[Verdict
         tuple(scene_pairs(k, row, effect + own) for k, (row, own) in enumerate(zip(rows, effects, strict=True)))
     )
     question = Question(metric="psnr", sign=1, least=LEAST)
-    asked = Verdict(question, MEASURE, pairs)
+    asked = Verdict(question, QUANTITY, pairs)
     truth = float(effect + effects.mean() + shift.mean())
     if kind.looks:
         return judgement._at_looks(asked, kind.looks, RATE / kind.claims), truth
@@ -153,7 +154,7 @@ def scene_pairs(place: int, noise: Array, effect: float) -> ScenePairs:
     return ScenePairs(str(place), tuple(range(count)), trials, noise[0], noise[1] + effect)
 
 
-MEASURE = find_measure("psnr")
+QUANTITY = asked_quantity("psnr")
 PAGE = Path(__file__).parents[1] / "docs" / "verdict.md"
 SECTION = re.compile(r"(<!-- untruths -->\n).*?(<!-- end -->)", re.DOTALL)
 EFFECTS = (0.0, 0.5, 1.0, 2.0)

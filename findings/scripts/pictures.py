@@ -14,8 +14,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from gsbench.analysis.per_view import read_views
-from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.analysis.results import TrialResult, read_experiment, read_views
 
 PICTURES = Path(__file__).parents[1] / "pictures"
 DENSIFIERS = ("adc", "volumetric", "volumetric-1", "volumetric_once", "volumetric_once-1", "longaxis")

@@ -117,7 +117,7 @@ def verdicts(name: str) -> dict[str, ClaimVerdict]:
     """The verdicts on the claims ``NAME.yaml`` by the trials of ``NAME.zip``, by claim."""
     with tempfile.TemporaryDirectory() as folder:
         file = read_claims(FINDINGS / "claims" / f"{name}.yaml")
-        found, _, _ = recheck(file, [ARCHIVES / f"{name}.zip"], Path(folder))
+        found, _, _ = recheck(file, ARCHIVES / f"{name}.zip", Path(folder))
     return {verdict.claim.id: verdict for verdict in found}
 
 

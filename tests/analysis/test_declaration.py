@@ -18,7 +18,7 @@ from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import answer_family
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.verdicts import ArmVerdicts, judge
+from gsbench.analysis.verdicts import PairVerdicts, judge_pairs
 from gsbench.runs.declaration import STAMP, Arm, Declaration, Question, read_declarations, record_text
 from tests.analysis.synthetic import Plan, write_runs
 
@@ -37,10 +37,10 @@ def declared_experiment(runs: Path, *records: tuple[str, str], **plan: object) -
     return load_experiment(runs, "exp")
 
 
-def judged(experiment: Experiment) -> list[ArmVerdicts]:
+def judged(experiment: Experiment) -> list[PairVerdicts]:
     trials = experiment.trials
     pairs = choose_pairs(sorted({trial.arm for trial in trials}))
-    return list(judge(trials, pairs, standing(experiment.folder, trials)).values())
+    return judge_pairs(trials, pairs, standing(experiment.folder, trials))
 
 
 # --- families
@@ -49,8 +49,8 @@ def judged(experiment: Experiment) -> list[ArmVerdicts]:
 def test_of_one_pair_the_declared_metric_is_tested_as_it_is_and_the_others_by_holm(tmp_path: Path) -> None:
     (one,) = judged(declared_experiment(tmp_path, ("flip", EARLY), effect=CLEAR))
     assert [verdict.quantity.key for verdict in one.verdicts] == ["flip", "psnr", "ssim", "lpips_vgg_raw"]
-    assert [verdict.role for verdict in one.verdicts] == ["declared", *["secondary"] * 3]
-    first, *others = (verdict.verdict for verdict in one.verdicts)
+    assert [one.role(verdict) for verdict in one.verdicts] == ["declared", *["secondary"] * 3]
+    first, *others = one.verdicts
     assert first.family == 1
     assert first.p == pytest.approx(alone(first))
     # Holm by hand: times 3, 2, 1 from the smallest, never below the one before.
@@ -73,12 +73,12 @@ def alone(verdict: Verdict) -> float:
 def test_with_several_arms_the_declared_metric_is_adjusted_for_their_number(tmp_path: Path) -> None:
     arms = ("adc", "volumetric", "absgrad", "mcmc")
     found = judged(declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR, densifiers=arms))
-    firsts = [one.verdicts[0].verdict for one in found]
+    firsts = [one.verdicts[0] for one in found]
     assert [verdict.family for verdict in firsts] == [3, 3, 3]
     least = min(firsts, key=alone)
     assert least.p == pytest.approx(3 * alone(least))
     assert least.outcome == "supported"
-    assert all(one.verdict.family == 9 for arms in found for one in arms.verdicts[1:])
+    assert all(one.family == 9 for arms in found for one in arms.verdicts[1:])
 
 
 def test_a_verdict_that_only_a_single_test_would_give_is_none_in_a_family() -> None:
@@ -112,8 +112,8 @@ def test_where_nothing_was_declared_that_is_said_and_all_metrics_are_one_family(
     assert "No metric was declared beforehand (eval.primary): all metrics of all pairs of arms are one family" in page
     assert "4 tests adjusted by Holm" in page
     (one,) = judged(experiment)
-    assert {(v.role, v.verdict.family) for v in one.verdicts} == {("one of all", 4)}
-    least = min((v.verdict for v in one.verdicts), key=alone)
+    assert {(one.role(v), v.family) for v in one.verdicts} == {("", 4)}
+    least = min(one.verdicts, key=alone)
     assert least.p == pytest.approx(4 * alone(least))
     assert not any("declared" in note for note in build_table(experiment).notes)
 
@@ -133,7 +133,7 @@ def test_a_declared_metric_without_weights_is_undecided_and_no_other_takes_its_p
     experiment = declared_experiment(tmp_path, ("lpips_alex", EARLY), effect=CLEAR)
     (one,) = judged(experiment)
     assert "lpips_alex" not in [verdict.quantity.key for verdict in one.verdicts]
-    assert {verdict.role for verdict in one.verdicts} == {"secondary"}
+    assert {one.role(verdict) for verdict in one.verdicts} == {"secondary"}
     reason = "LPIPS Alex, which was declared, has no value (weights file alexnet.pth not found)"
     assert f"no verdict, since {reason}" in build_report(experiment)
     (note,) = (note for note in build_table(experiment).notes if note.startswith("Verdict"))
@@ -146,7 +146,7 @@ def test_a_declared_metric_without_weights_is_undecided_and_no_other_takes_its_p
 def test_a_declaration_after_results_is_said_and_gives_no_place_of_its_own(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, ("lpips_vgg_raw", LATE), effect=CLEAR, views=3)
     (one,) = judged(experiment)
-    assert {(verdict.role, verdict.verdict.family) for verdict in one.verdicts} == {("one of all", 4)}
+    assert {(one.role(verdict), verdict.family) for verdict in one.verdicts} == {("", 4)}
     page = build_report(experiment)
     assert "LPIPS VGG raw was declared when results were there" in page
     assert "12 of the 12 trials had been measured" in page
@@ -239,7 +239,7 @@ def test_trials_that_were_added_after_results_cost_the_metric_its_place(
     experiment = declared_experiment(tmp_path, effect=CLEAR, views=3)
     declare_trials(tmp_path, (EARLY, trials), *([(LATE, WHOLE)] if recorded else []))
     (one,) = judged(experiment)
-    assert {(verdict.role, verdict.verdict.family) for verdict in one.verdicts} == {("one of all", 4)}
+    assert {(one.role(verdict), verdict.family) for verdict in one.verdicts} == {("", 4)}
     assert any(words in note for note in build_table(experiment).notes)
 
 
@@ -312,9 +312,9 @@ def test_a_sweep_in_looks_has_one_verdict_and_it_is_that_of_the_looks(tmp_path: 
     declared = Declaration(time=EARLY, questions=(asked,), looks=(2, 3))
     (tmp_path / "exp" / "declared.jsonl").write_text(record_text([declared]))
     (one,) = judged(experiment)
-    assert one.verdicts[0].role == "declared"
-    assert one.verdicts[0].word == "better"
-    assert one.verdicts[0].verdict.p is None
+    assert one.role(one.verdicts[0]) == "declared"
+    assert one.verdicts[0].outcome == "supported"
+    assert one.verdicts[0].p is None
     page = build_report(experiment)
     assert "Seeds come in planned looks" in page
     assert page.count("better in LPIPS VGG raw") == 1

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbench.analysis.judgement import Pairs, find_outlying, folder_key, judge, pair
-from gsbench.analysis.pairing import choose_pairs
+from gsbench.analysis.judgement import find_outlying, judge
+from gsbench.analysis.pairing import Pairs, choose_pairs, pair
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.runs.declaration import Arm, Declaration, Question
 from tests.analysis.untruths import scene_pairs
@@ -22,7 +22,7 @@ EARLY, LATE = "2020-01-01T00:00:00Z", "2037-01-01T00:00:00Z"
 
 def named(trials: tuple[TrialResult, ...], seeds: tuple[int, ...] = (0, 1, 2)) -> Question:
     """The question about these trials by their folders."""
-    keys = {(trial.scene, trial.densify): folder_key(trial) for trial in trials}
+    keys = {(trial.scene, trial.densify): trial.key for trial in trials}
     scenes = {scene: (keys[scene, "adc"], keys[scene, "volumetric"]) for scene, _ in keys}
     return replace(PSNR, scenes=scenes, seeds=seeds, name="claim")
 

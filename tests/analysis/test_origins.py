@@ -6,10 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gsbench.analysis.explain import explain_cell
-from gsbench.analysis.judgement import pair_trials
-from gsbench.analysis.origins import cloud_lines, unlike_clouds
+from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.report.sections import compare_arms
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.runs.declaration import Arm
@@ -54,30 +52,11 @@ def test_one_initialiser_that_gave_two_clouds_is_noted(tmp_path: Path) -> None:
         "garden: trials of init sfm started from 2 different clouds "
         "(aaaaaaaa: adc seed 0; volumetric seed 0; bbbbbbbb: adc seed 1)."
     ) in notes_of(tmp_path)
-    assert cloud_lines(load_experiment(tmp_path, "exp").trials) == [
-        "garden, sfm: cloud aaaaaaaa (stage result init1, 3,000 points); "
-        "cloud bbbbbbbb (stage result init1, 3,000 points)"
-    ]
 
 
-def test_compared_arms_with_unlike_clouds_are_named(tmp_path: Path) -> None:
-    for scene, clouds in (("garden", (A, B)), ("room", (A, A)), ("truck", (None, A))):
-        for densify, cloud in zip(("adc", "volumetric"), clouds, strict=True):
-            one_trial(tmp_path, 0, psnr=27.0, _densify=densify, _scene=scene, _hashes=hashes(cloud))
-    trials = load_experiment(tmp_path, "exp").trials
-    arms = (Arm("sfm", "adc"), Arm("sfm", "volumetric"))
-    expected = "garden: the arms started from different clouds (aaaaaaaa and bbbbbbbb)"
-    assert unlike_clouds(pair_trials(trials, *arms)) == [expected]
-    assert expected in compare_arms(trials, *arms).notes
-
-
-def test_without_recorded_clouds_the_stage_result_tells_them_apart(tmp_path: Path) -> None:
-    one_trial(tmp_path, 0, psnr=27.0, _hashes=hashes(None, "init1"))
-    one_trial(tmp_path, 0, psnr=27.0, _densify="volumetric", _hashes=hashes(None, "init2"))
-    trials = load_experiment(tmp_path, "exp").trials
-    assert len(unlike_clouds(pair_trials(trials, Arm("sfm", "adc"), Arm("sfm", "volumetric")))) == 1
-
-
-def test_the_report_shows_the_clouds(make_experiment: Make) -> None:
-    report = build_report(make_experiment())
-    assert "garden, sfm: cloud not recorded (stage result init-gar, 3,000 points)" in report
+def test_compared_arms_with_unlike_clouds_are_marked_in_their_sheet(tmp_path: Path) -> None:
+    for densify, cloud in (("adc", A), ("volumetric", B)):
+        one_trial(tmp_path, 0, psnr=27.0, _densify=densify, _hashes=hashes(cloud))
+    sheet = fairness_table(load_experiment(tmp_path, "exp").trials, Arm("sfm", "adc"), Arm("sfm", "volumetric"))
+    (row,) = [row for row in sheet.rows if row.labels == ("initial cloud (hash)",)]
+    assert [entry.text for entry in row.entries] == [A[:12], B[:12], "≠"]

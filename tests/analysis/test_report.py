@@ -14,18 +14,18 @@ from PIL import Image
 from plyfile import PlyData
 
 from gsbench.analysis.errors_by_region import errors_by_region, texture_energy
-from gsbench.analysis.judgement import pair_trials
+from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.report.build import build_report, trial_figures
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
-from gsbench.analysis.report.models import log10_volumes, share_above, volume_histogram
 from gsbench.analysis.report.pictures import choose_pictures
-from gsbench.analysis.report.sections import compare_arms, mean_by_step
-from gsbench.analysis.report.setting_charts import sweep_charts
+from gsbench.analysis.report.sections import mean_by_step
+from gsbench.analysis.report.volumes import log10_volumes, share_above, volume_histogram
 from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.analysis.verdicts import by_scene_lines, headline, judge_pairs
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Arm
 from gsbench.verbs import report
-from tests.analysis.synthetic import TEXTURED, Plan, trial_data, write_runs, write_trial
+from tests.analysis.synthetic import TEXTURED, Plan, write_runs
 
 ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
 
@@ -305,7 +305,6 @@ def test_swept_settings_become_arms_of_their_own(tmp_path: Path) -> None:
             path.rename(target)
     page = build_report(load_experiment(tmp_path, "exp"))
     assert "sfm-volumetric max_gaussians=10000 against sfm-adc max_gaussians=10000" in page
-    assert "of sfm-volumetric at the same Gaussians as sfm-adc" in page
 
 
 def test_arms_that_never_differed_are_called_equal_and_not_undecided(tmp_path: Path) -> None:
@@ -315,62 +314,13 @@ def test_arms_that_never_differed_are_called_equal_and_not_undecided(tmp_path: P
     assert "never acted" in page
 
 
-def test_a_sweep_of_one_setting_is_drawn_by_its_values_relative_to_each_scene(tmp_path: Path) -> None:
-    for scene, level in (("courtyard", 30.0), ("garden", 20.0)):
-        for threshold, psnr in ((0.3, 0.0), (0.03, 2.0), (1e6, 1.0)):
-            views = {"psnr": np.array([level + psnr])}
-            data = trial_data(Plan(), scene, "sfm", f"volumetric-{threshold:g}", 0, views)
-            settings = {"densify__volume_threshold": threshold, "densify___target_": "gsbench.densify.Volumetric"}
-            write_trial(tmp_path, data, views, f"{scene[0]}{threshold:g}".encode().hex()[:8].rjust(8, "0"), **settings)
-    charts = sweep_charts(load_experiment(tmp_path, "exp").trials)
-    psnr = next(chart for chart in charts if "PSNR" in chart)
-    words = re.search(r'aria-label="([^"]*)"', psnr)
-    assert words is not None
-    # each scene's mean is one above its lowest value; values stand in order of size, whatever their names
-    assert "courtyard 1 at 0.03, −1 at 0.3, 0 at 1M; garden 1 at 0.03, −1 at 0.3, 0 at 1M" in words.group(1)
-    assert "densify.volume_threshold" in words.group(1)
-
-
-def test_the_baseline_stands_beside_the_values_of_a_setting_that_it_has_not(tmp_path: Path) -> None:
-    for arm, psnr, settings in (
-        ("adc", 1.0, {"densify___target_": "gsbench.densify.ADC"}),
-        ("volumetric-0.1", 0.0, {"densify___target_": "gsbench.densify.Volumetric", "densify__volume_threshold": 0.1}),
-        (
-            "volumetric-0.01",
-            2.0,
-            {"densify___target_": "gsbench.densify.Volumetric", "densify__volume_threshold": 0.01},
-        ),
-    ):
-        views = {"psnr": np.array([20.0 + psnr])}
-        data = trial_data(Plan(), "courtyard", "sfm", arm, 0, views)
-        folder = write_trial(tmp_path, data, views, arm.encode().hex()[-8:].rjust(8, "0"), **settings)
-        if arm == "adc":
-            config = json.loads((folder / "config.yaml").read_text())
-            del config["densify"]["volume_threshold"]
-            (folder / "config.yaml").write_text(json.dumps(config))
-    (psnr_chart,) = [chart for chart in sweep_charts(load_experiment(tmp_path, "exp").trials) if "PSNR" in chart]
-    words = re.search(r'aria-label="([^"]*)"', psnr_chart)
-    assert words is not None
-    assert "courtyard 1 at 0.01, −1 at 0.1, 0 at adc" in words.group(1)
-
-
-def test_no_chart_by_setting_where_nothing_or_more_than_one_was_varied(tmp_path: Path, runs: Path) -> None:
-    assert sweep_charts(load_experiment(runs, "exp").trials) == []
-    for index, settings in enumerate(({"a__x": 1, "a__y": 1}, {"a__x": 2, "a__y": 2})):
-        views = {"psnr": np.array([20.0])}
-        data = trial_data(Plan(), "garden", "sfm", "volumetric", 0, views)
-        write_trial(tmp_path, data, views, f"{index:08d}", **settings)
-    assert sweep_charts(load_experiment(tmp_path, "exp").trials) == []
-
-
 def test_scenes_that_disagree_are_named_under_a_verdict_on_their_mean(tmp_path: Path) -> None:
     write_runs(tmp_path, Plan(scenes=("courtyard",), effect={"psnr": 2.0}, views=3))
     write_runs(tmp_path, Plan(scenes=("garden",), effect={"psnr": -2.0}, views=3))
     write_runs(tmp_path, Plan(scenes=("stump",), views=3))
-    trials = load_experiment(tmp_path, "exp").trials
-    versus = compare_arms(trials, ADC, VOLUMETRIC)
-    assert "too small to matter in PSNR" in versus.headline
-    line = next(line for line in versus.by_scene if line.startswith("PSNR"))
+    (judged,) = judge_pairs(load_experiment(tmp_path, "exp").trials, [(ADC, VOLUMETRIC)])
+    assert "too small to matter in PSNR" in headline(judged)
+    line = next(line for line in by_scene_lines(judged.verdicts) if line.startswith("PSNR"))
     assert (
         line
         == "PSNR (dB) by scene: better on courtyard, worse on garden: the scenes disagree, so their mean says little"
@@ -380,7 +330,8 @@ def test_scenes_that_disagree_are_named_under_a_verdict_on_their_mean(tmp_path: 
 
 def test_no_scene_is_named_where_none_is_decided(tmp_path: Path) -> None:
     write_runs(tmp_path, Plan(trial_noise=0, residual_noise=0, views=3))
-    assert compare_arms(load_experiment(tmp_path, "exp").trials, ADC, VOLUMETRIC).by_scene == ()
+    (judged,) = judge_pairs(load_experiment(tmp_path, "exp").trials, [(ADC, VOLUMETRIC)])
+    assert by_scene_lines(judged.verdicts) == []
 
 
 def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> None:

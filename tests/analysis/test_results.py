@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.analysis.per_view import read_views
-from gsbench.analysis.results import load_experiment
+from gsbench.analysis.results import load_experiment, read_views
 from gsbench.errors import InputError
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.rows import read_rows
@@ -119,7 +118,7 @@ def test_json_lines_end_at_a_damaged_line(tmp_path: Path) -> None:
 
 
 def test_reading_and_tabulating_load_no_torch() -> None:
-    modules = "verbs.tables, verbs.explain, analysis.statistics, analysis.tradeoffs, analysis.errors_by_region, "
+    modules = "verbs.tables, verbs.explain, analysis.statistics, analysis.errors_by_region, "
     modules += "verbs.report, analysis.report.build"
     imports = "; ".join(f"import gsbench.{module}" for module in modules.split(", "))
     code = f"import sys; {imports}; sys.exit('torch' in sys.modules or 'mlflow' in sys.modules)"

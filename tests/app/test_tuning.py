@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gsbench.analysis.report.setting_charts import search_part
 
 from gsbench import cli
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.report.setting_charts import search_part
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.app.tuning import TuneSettings

@@ -1,91 +1,182 @@
-"""Shapley shares against their definition over all orders, known games, and simulated trials."""
+"""Switches of densifiers: which are on, which runs they make, and verdicts from result files with known gains."""
 
 from __future__ import annotations
 
-import itertools
+from collections.abc import Mapping
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from gsbench.analysis.statistics import Run, shapley
-from gsbench.claims.ablation import ablate, plan_runs
+from gsbench.analysis.results import load_experiment
+from gsbench.claims.ablation import (
+    Run,
+    choose_switches,
+    declared_switches,
+    effective,
+    judge_runs,
+    runs_to_train,
+    table,
+    words_of,
+)
+from gsbench.cli import run
+from gsbench.config.command_words import options
+from gsbench.config.compose import compose_one
+from gsbench.densify.volumetric import Volumetric
 from gsbench.errors import InputError
+from gsbench.pipeline.components import build
+from gsbench.runs.hashing import config_hash
+from gsbench.settings import Switch
+from tests.analysis.synthetic import Plan, trial_data, write_trial
+from tests.launch.test_declare import TINY
 
-NAMES = tuple("ABCDEFGH")
-
-
-def subsets(switches: tuple[str, ...]) -> list[Run]:
-    return [frozenset(c) for size in range(len(switches) + 1) for c in itertools.combinations(switches, size)]
-
-
-def by_orders(switches: tuple[str, ...], values: dict[Run, float]) -> dict[str, float]:
-    """The definition: what each adds when its turn comes, averaged over all orders."""
-    totals = dict.fromkeys(switches, 0.0)
-    orders = list(itertools.permutations(switches))
-    for order in orders:
-        for place, name in enumerate(order):
-            totals[name] += values[frozenset(order[: place + 1])] - values[frozenset(order[:place])]
-    return {name: total / len(orders) for name, total in totals.items()}
+NESTED = {
+    "rule": Switch({"stop": 0}),
+    "shrink": Switch({"of": 1}, within="rule"),
+    "once": Switch({"b": 2}, within="rule"),
+}
 
 
-@given(st.lists(st.floats(-10, 10), min_size=16, max_size=16))
-def test_shares_are_those_of_the_definition_and_add_up(numbers: list[float]) -> None:
-    switches = NAMES[:4]
-    values = dict(zip(subsets(switches), numbers, strict=True))
-    shares = shapley(switches, values)
-    assert shares == pytest.approx(by_orders(switches, values), abs=1e-9)
-    assert sum(shares.values()) == pytest.approx(values[frozenset(switches)] - values[frozenset()], abs=1e-9)
+def on(*names: str) -> Run:
+    return frozenset(names)
 
 
-def test_the_glove_game() -> None:
-    """Two left gloves and a right one: the right one gets two thirds (Shapley's own kind of example)."""
-    values = {run: float("R" in run and bool(run & {"L", "M"})) for run in subsets(("L", "M", "R"))}
-    assert shapley(("L", "M", "R"), values) == pytest.approx({"L": 1 / 6, "M": 1 / 6, "R": 2 / 3})
+def test_what_acts_within_another_is_trained_only_where_that_is_on() -> None:
+    runs = runs_to_train(NESTED)
+    assert runs == [on("rule", "shrink", "once"), on("once", "rule"), on("rule", "shrink"), on("rule"), on()]
+    assert effective(on("shrink", "once"), NESTED) == on()
+    alone = {"shrink": NESTED["shrink"]}  # where the rule is not asked about it stays as it is: on
+    assert runs_to_train(alone) == [on("shrink"), on()]
+    assert words_of(on("rule"), NESTED) == {"of": 1, "b": 2}
+    assert words_of(on("rule", "shrink", "once"), NESTED) == {}
 
 
-@pytest.mark.parametrize("count", range(1, 9))
-def test_plans_hold_all_combinations(count: int) -> None:
-    assert set(plan_runs(NAMES[:count])) == set(subsets(NAMES[:count]))
+def test_switches_within_each_other_are_refused() -> None:
+    circle = {"a": Switch({"x": 1}, within="b"), "b": Switch({"y": 1}, within="a")}
+    with pytest.raises(InputError, match="circle"):
+        runs_to_train(circle)
+    chain = {"a": Switch({"x": 1}), "b": Switch({"y": 1}, within="a"), "c": Switch({"z": 1}, within="b")}
+    assert [sorted(found) for found in runs_to_train(chain)] == [
+        ["a", "b", "c"],
+        ["a", "b"],
+        ["a"],
+        [],
+    ]
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
-    """Of all three shares together: intervals are adjusted for their number."""
-    rng, held = np.random.default_rng(0), 0
-    runs = plan_runs(("volume", "shrink", "once"))
-    for _ in range(400):
-        results = {run: 1.0 * ("volume" in run) + rng.normal(0, 0.3, (2, 3)) for run in runs}
-        found = ablate(("volume", "shrink", "once"), results)
-        intervals = [share.interval for share in found.shares]
-        truths = (1.0, 0.0, 0.0)
-        held += all(one is not None and one.low <= t <= one.high for one, t in zip(intervals, truths, strict=True))
-    assert held / 400 > 0.95 - 3 * (0.05 * 0.95 / 400) ** 0.5
+@pytest.mark.parametrize("arm", [name for name in options("densify") if name != "none" and "/" not in name])
+def test_every_declared_switch_of_every_arm_makes_another_densifier(arm: str) -> None:
+    """Its settings are those of the class, allowed there, and act on the arm as configured."""
+    values = compose_one([f"densify={arm}"]).values["densify"]
+    own = type(build("densify", values, [])).SWITCHES
+    found = declared_switches(own, values)
+    for switch in found.values():
+        made = build("densify", values | switch.off, [])
+        assert all(getattr(made, key) == value for key, value in switch.off.items())
+    assert all(switch.within in {"", *own} for switch in own.values())
 
 
-def test_a_share_is_a_part_only_of_a_sure_gain() -> None:
-    runs = plan_runs(("a", "b"))
-    sure = ablate(("a", "b"), {run: np.array([[len(run) + 0.01 * k for k in range(3)]]) for run in runs})
-    assert [share.part for share in sure.shares] == pytest.approx([0.5, 0.5])
-    assert [(share.alone, share.last) for share in sure.shares] == [pytest.approx((1, 1))] * 2
-    rng = np.random.default_rng(1)
-    unsure = ablate(("a", "b"), {run: rng.normal(0, 1, (1, 3)) for run in runs})
-    assert [share.part for share in unsure.shares] == [None, None]
-    assert ablate(("a", "b"), {run: np.array([[1.0]]) for run in runs}).interval is None
+def test_the_paper_rule_has_the_three_that_matter_and_only_those_that_are_on() -> None:
+    once = compose_one(["densify=volumetric_once"]).values["densify"]
+    assert list(declared_switches(Volumetric.SWITCHES, once)) == ["volume_rule", "shrink", "no_resplit"]
+    plain = compose_one(["densify=volumetric"]).values["densify"]
+    assert list(declared_switches(Volumetric.SWITCHES, plain)) == ["volume_rule", "shrink"]
+    defaults = {entry.name: entry.default for entry in fields(Volumetric) if entry.default is not MISSING}
+    assert set().union(*(switch.off for switch in Volumetric.SWITCHES.values())) <= set(defaults)
 
 
-def test_what_cannot_be_shared_is_refused() -> None:
-    both = np.array([[1.0, 2.0]])
-    runs = dict.fromkeys(plan_runs(("a", "b")), both)
-    for broken, message in (
-        ({run: values for run, values in runs.items() if run}, "no switch on"),
-        ({run: values for run, values in runs.items() if len(run) < 2}, "a, b on is missing"),
-        (runs | {frozenset("a"): np.array([[1.0]])}, "same scenes and seeds"),
-        (runs | {frozenset("a"): np.array([[1.0, float("nan")]])}, "finite"),
-        (runs | {frozenset(("a", "bb")): both}, "'bb' is none of the switches"),
-    ):
-        with pytest.raises(InputError, match=message):
-            ablate(("a", "b"), broken)
-    for switches in ((), ("a", "a"), tuple("abcdefghi")):
-        with pytest.raises(InputError):
-            plan_runs(switches)
+def test_a_yaml_declares_switches_that_are_no_part_of_a_result() -> None:
+    values: dict[str, Any] = {"grow": 1, "switches": {"growth": {"off": {"grow": 0}, "words": "it grows"}}}
+    assert declared_switches({}, values) == {"growth": Switch({"grow": 0}, "it grows")}
+    plain = compose_one(["densify=adc"]).values
+    named = compose_one(["densify=adc", "+densify.switches={mine: {off: {split_shrink: 2}}}"]).values
+    assert config_hash(named) == config_hash(plain)
+    assert build("densify", named["densify"], []).split_shrink == 1.6
+    for wrong in ({"a": {}}, {"a": 1}, [1], {"a": {"off": 3}}, {"a": {"off": {"x": 1}, "of": 2}}):
+        with pytest.raises(InputError, match=r"densify\.switches"):
+            declared_switches({}, {"switches": wrong})
+
+
+def test_a_name_that_is_no_switch_is_named_with_the_nearest() -> None:
+    with pytest.raises(InputError, match="did you mean shrink"):
+        choose_switches(NESTED, ["shrnk"], "x")
+    with pytest.raises(InputError, match="declares no switch"):
+        choose_switches({}, [], "x")
+    assert list(choose_switches(NESTED, ["once"], "x")) == ["once"]
+
+
+def write_ablation(runs: Path, gains: Mapping[str, float], seeds: int = 3) -> dict[Run, dict[str, str]]:
+    """Trials in which each part of `NESTED` adds its gain in PSNR, where it acts; their folders by run and scene."""
+    keys = {}
+    for number, chosen in enumerate(runs_to_train(NESTED)):
+        for seed in range(seeds):
+            noise = 0.001 * np.random.default_rng([number, seed]).normal()
+            views = {"psnr": 26 + sum(gains[name] for name in chosen) + noise + np.zeros(3)}
+            write_trial(runs, trial_data(Plan(), "courtyard", "sfm", "volumetric", seed, views), views, f"{number:08x}")
+        keys[chosen] = {"courtyard": f"courtyard/sfm-volumetric/{number:08x}"}
+    return keys
+
+
+def test_each_combination_is_judged_against_all_parts(tmp_path: Path) -> None:
+    keys = write_ablation(tmp_path, {"rule": 1.0, "shrink": 0.4, "once": 0.0})
+    verdicts = judge_runs(load_experiment(tmp_path, "exp").trials, keys, "psnr")
+    found = {str(one.question.arm): (round(one.mean or 0.0, 2), one.outcome) for one in verdicts}
+    assert found == {
+        "without shrink": (-0.4, "refuted"),
+        "without once": (0.0, "too small to matter"),
+        "without once and shrink": (-0.4, "refuted"),
+        "without once, rule and shrink": (-1.4, "refuted"),
+    }
+    assert verdicts[0].family == 4
+    lines = table(verdicts)
+    assert lines[0] == "| run | difference in PSNR (dB) from all parts | interval | verdict |"
+    assert lines[2].startswith("| without once | ") or lines[2].startswith("| without shrink | −0.4")
+
+
+def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path: Path) -> None:
+    keys = write_ablation(tmp_path, {"rule": 1.0, "shrink": 0.4, "once": -0.2})
+    last = list(keys)[-1]
+    for path in (tmp_path / "exp").glob(f"{keys[last]['courtyard']}-seed*/results.json"):
+        path.unlink()
+    verdicts = judge_runs(load_experiment(tmp_path, "exp").trials, keys, "psnr")
+    assert verdicts[-1].answer is None
+    assert table(verdicts)[-1].endswith("| unknown | unknown | courtyard: seed 0 has no partner |")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["densify=none"], "declares no switch"),
+        (["densify=adc,volumetric"], "one densifier"),
+        (["densify=adc", "densify.split_shrink=1.5,2"], "only scene and seed"),
+        (["densify=adc", "--switches", "opacity_rest"], "did you mean opacity_reset"),
+        (["densify=adc", "--switch", "a:split_shrink"], "NAME:KEY=VALUE"),
+        (["densify=adc", "--switch", "a:split_shrnk=2"], "split_shrnk"),
+        (["densify=adc", "--fast"], "--fast is not an option"),
+        (["densify=adc", "launch.stop_when_decided=true", "eval.primary=psnr", "seed=0,1"], "stop_when_decided"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_bad_words_are_refused_in_a_line(
+    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    assert run(["ablate", *(word for word in TINY if word != "densify=none"), *words]) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: ")]
+    assert message in line
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.slow
+def test_the_verb_trains_each_run_once_and_judges_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    words = [*(word for word in TINY if word != "densify=none"), "densify=adc", "seed=0,1", "name=parts"]
+    words += ["--switch", "size:split_size=0.5", "--switches", "size"]
+    assert run(["ablate", *words]) == 0
+    out = capsys.readouterr().out
+    assert "adc: 1 part (size), 2 runs, 4 trials" in out
+    assert "| without size | " in out

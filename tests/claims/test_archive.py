@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from gsbench.analysis.per_view import read_views
-from gsbench.analysis.results import load_experiment
+from gsbench.analysis.results import load_experiment, read_views
 from gsbench.claims.archive import unpack_archive, write_archive
 from gsbench.cli import run
 from gsbench.errors import InputError

@@ -14,8 +14,8 @@ import yaml
 
 from gsbench.claims.check import Check, ClaimVerdict, prepare
 from gsbench.claims.file import parse_claims
-from gsbench.claims.looks import Planned, run_looks
-from gsbench.claims.page import make_page, to_html, to_markdown
+from gsbench.claims.page import make_page, to_html
+from gsbench.claims.stopping import Planned, run_looks
 from gsbench.cli import run
 from gsbench.config.compose import Trial
 from gsbench.config.jobs import with_seed
@@ -36,7 +36,7 @@ def content(**changes: Any) -> dict[str, Any]:
 
 
 def check_of(tmp_path: Path, **changes: Any) -> Check:
-    return prepare(parse_claims(content(**changes)), tmp_path, lambda trial, metric: "")
+    return prepare(parse_claims(content(**changes)), tmp_path, lambda trials: [])
 
 
 class FakeRunner:
@@ -107,12 +107,12 @@ def test_a_failed_seed_makes_its_claim_wait_and_its_return_decides(tmp_path: Pat
 
 def test_what_is_missing_here_is_named_and_nothing_is_run_for_it(tmp_path: Path) -> None:
     file = parse_claims(content() | {"scenes": {"courtyard": None, "garden": None}})
-    check = prepare(file, tmp_path, lambda trial, metric: "no data" * (trial.values["scene"]["name"] == "garden"))
+    check = prepare(file, tmp_path, lambda trials: ["no data"] * (trials[0].values["scene"]["name"] == "garden"))
     assert list(check.declaration.questions[0].scenes) == ["courtyard"]
     (verdict,) = looked(check, FakeRunner(noise=0.001))
     assert verdict.word == "supported"
     assert verdict.missing == ("garden: no data",)
-    nothing = prepare(file, tmp_path / "b", lambda trial, metric: "no data")
+    nothing = prepare(file, tmp_path / "b", lambda trials: ["no data"])
     assert looked(nothing, FakeRunner(0.1))[0].reason == "courtyard, garden: no data"
     assert "not testable here  lpips: courtyard, garden: no data" in describe(nothing)
     assert nothing.declaration.hash != check.declaration.hash  # what can be tested here is a part of it
@@ -127,7 +127,7 @@ def test_settings_that_do_not_compose_name_their_place(tmp_path: Path) -> None:
     ):
         bad["scenes"] = {"courtyard": None}
         with pytest.raises(InputError, match=message):
-            prepare(parse_claims(bad), tmp_path, lambda trial, metric: "")
+            prepare(parse_claims(bad), tmp_path, lambda trials: [])
 
 
 def test_another_seed_is_another_folder_and_the_same_settings(tmp_path: Path) -> None:
@@ -139,21 +139,13 @@ def test_another_seed_is_another_folder_and_the_same_settings(tmp_path: Path) ->
     assert "seed=7" in other.overrides
 
 
-def test_the_page_says_all_in_both_formats(tmp_path: Path) -> None:
+def test_the_page_says_all(tmp_path: Path) -> None:
     check = check_of(tmp_path, says="it is <better> | by far")
     verdicts = looked(check, FakeRunner(noise=0.001))
     older = replace(check.declaration, time="2019-01-01T00:00:00Z", error_rate=0.1)
     page = make_page(check.file, verdicts, check.declaration, [older, check.declaration])
-    for text in (to_markdown(page), to_html(page)):
-        for part in (
-            "supported",
-            "PSNR",
-            "courtyard",
-            "1 other declaration",
-            "looks planned at 2, 3, 4 seeds",
-            "abstract",
-        ):
-            assert part in text
+    for part in ("supported", "PSNR", "courtyard", "1 other declaration", "looks planned at 2, 3, 4 seeds", "abstract"):
+        assert part in to_html(page)
     assert "<better>" not in to_html(page)
     assert "<svg" in to_html(page)
     assert "http" not in to_html(page).replace("http://www.w3.org", "")  # one file, no network
@@ -184,14 +176,13 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     measured = [json.loads(file.read_text())["measured"] for file in home.glob("*/*/*/results.json")]
     assert len(measured) == 4
     assert min(measured) >= declared.time
-    first = (home / "claims.md").read_text(), (home / "claims.html").read_text()
-    for text in first:
-        assert "opacity=0.03 differs from" in text
-        assert "by init.count and learning rates; no arm at hand isolates one of them." in text
-        assert text.index("Fairness sheet: ") < text.index("what would refute it")
-    assert "| init.count | 200 | 300 | ≠ |" in first[0]
+    first = (home / "claims.html").read_text()
+    assert "opacity=0.03 differs from" in first
+    assert "by init.count and learning rates" in first
+    assert first.index("Fairness sheet: ") < first.index("what would refute it")
+    assert '<th scope="row">init.count</th><td>200</td><td>300</td><td>≠</td>' in first
     assert run(["check", str(path)]) == 0
-    assert ((home / "claims.md").read_text(), (home / "claims.html").read_text()) == first
+    assert (home / "claims.html").read_text() == first
     assert read_declarations(home) == [declared]
     archive = tmp_path / "published" / "check_it.zip"
     assert run(["export", "--results", "check_it", "--out", str(archive)]) == 0
@@ -202,14 +193,11 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     printed = capsys.readouterr().out
     assert len(printed.splitlines()) < 15
     assert "?  claim" not in printed
-    for end, text in zip((".md", ".html"), first, strict=True):
-        page = tmp_path / "pages" / f"claims{end}"
-        assert run([*recheck, "--out", str(page)]) == 0
-        if end == ".md":
-            assert page.read_text() == text
-        assert page.read_text().count("Fairness sheet: ") == text.count("Fairness sheet: ")
-        assert capsys.readouterr().out.endswith(f"{page}\n")
-    for wrong in ([*recheck, "--out", "claims.txt"], ["check", str(path), "--out", "claims.md"]):
+    page = tmp_path / "pages" / "claims.html"
+    assert run([*recheck, "--out", str(page)]) == 0
+    assert page.read_text().count("Fairness sheet: ") == first.count("Fairness sheet: ")
+    assert capsys.readouterr().out.endswith(f"{page}\n")
+    for wrong in ([*recheck, "--out", "claims.txt"], ["check", str(path), "--out", "claims.html"]):
         assert run(wrong) == 2
     assert not (tmp_path / "elsewhere").exists()
 
@@ -224,6 +212,6 @@ def test_a_file_of_claims_allows_no_code(tmp_path: Path, key: str, monkeypatch: 
     arms = {"adc": None, "volumetric": {"densify": "adc", "densify._target_": "stranger.Mine", "densify.name": "mine"}}
     file = parse_claims(content() | {"arms": arms})
     with pytest.raises(InputError, match=r"stranger\.Mine is not gsbench's own"):
-        prepare(file, tmp_path, lambda trial, metric: "")
-    check = prepare(file, tmp_path, lambda trial, metric: "", ["allow_targets=[stranger]"])
+        prepare(file, tmp_path, lambda trials: [])
+    check = prepare(file, tmp_path, lambda trials: [], ["allow_targets=[stranger]"])
     assert check.trials(2)[1].values["densify"]["_target_"] == "stranger.Mine"

@@ -1,15 +1,25 @@
-"""The mean of many studies: Student's t over them, refused where protocols are unlike."""
+"""The mean of many studies: Student's t over them, refused where protocols are unlike; archives as studies."""
 
 from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from gsbench.analysis.statistics import Interval
-from gsbench.claims.pooling import Study, describe, pool, pooled_forest
+from gsbench.analysis.results import load_experiment
+from gsbench.analysis.statistics import Interval, student
+from gsbench.claims.archive import write_archive
+from gsbench.claims.pooling import Study, Wanted, describe, pool, read_studies
+from gsbench.cli import run
 from gsbench.errors import InputError
+from tests.analysis.synthetic import Plan, write_runs
 
+WANTED = Wanted(("volumetric", "new"), ("adc", "gaussian-splatting"), "psnr")
 EFFECTS = (0.5, 0.9, 0.4, 0.7)
 STUDIES = [Study(f"trial {k}", effect, Interval(effect - 0.1, effect + 0.1)) for k, effect in enumerate(EFFECTS)]
 
@@ -42,7 +52,6 @@ def test_no_mean_where_protocols_differ() -> None:
     assert found.mean is None
     assert found.refusal == "the studies differ in protocol (a: paper-1; b: standard-1)"
     assert describe(found) == [f"no mean: {found.refusal}"]
-    assert "all together" not in pooled_forest(found, "t", "x")
     unknown = pool([studies[0], Study("c", 1.0)])
     assert "c: unknown" in unknown.refusal
     assert pool([studies[0], Study("c", 1.0, None, {"protocol": "paper-1"})]).mean == pytest.approx(1.0)
@@ -57,8 +66,152 @@ def test_one_study_is_no_pool_and_two_of_one_name_are_refused() -> None:
         pool([Study("a", float("nan")), STUDIES[0]])
 
 
-def test_the_forest_plot_has_a_row_for_each_study_and_the_mean() -> None:
-    text = pooled_forest(pool(STUDIES), "BCG", "log risk ratio", -1)
-    assert all(f"trial {k}" in text for k in range(4))
-    assert "all together" in text
+def test_a_mean_says_where_a_further_study_would_lie() -> None:
     assert any("a further one" in line for line in describe(pool(STUDIES)))
+
+
+def archive(
+    tmp_path: Path,
+    name: str,
+    seed: int = 0,
+    protocol: str = "paper-1",
+    budget: dict[str, Any] | None = None,
+    **plan: Any,
+) -> Path:
+    """A lab's archive, in which volumetric gains 1 dB."""
+    runs = tmp_path / f"runs_{name}_{seed}"
+    paths = write_runs(runs, Plan(effect={"psnr": 1.0}, random_seed=seed, **plan))
+    for number, path in enumerate(paths):
+        results = json.loads((path / "results.json").read_text())
+        results["protocol"] = protocol if protocol != "both" else ("paper-1", "standard-1")["garden" in str(path)]
+        results["budget"] = budget or results["budget"]
+        results["seconds"]["train"] += seed + number / 1000  # no two trainings take one and the same time
+        (path / "results.json").write_text(json.dumps(results))
+    file = tmp_path / f"{name}.zip"
+    write_archive(load_experiment(runs, "exp"), file)
+    return file
+
+
+def test_an_archive_is_a_study_of_its_pairs(tmp_path: Path) -> None:
+    file = archive(tmp_path, "lab")
+    (study,) = read_studies(file, WANTED, "lab").studies
+    trials = load_experiment(tmp_path / "runs_lab_0", "exp").trials
+    by_arm = {(one.densify, one.scene, one.seed): one.metrics["psnr"] for one in trials}
+    pairs = np.array(
+        [
+            [by_arm["volumetric", scene, k] - by_arm["adc", scene, k] for k in range(3)]
+            for scene in ("courtyard", "garden")
+        ]
+    )
+    assert study.effect == pytest.approx(pairs.mean())
+    test = student(pairs)
+    assert test is not None
+    assert study.interval is not None
+    assert (study.interval.low, study.interval.high) == pytest.approx((test.interval().low, test.interval().high))
+    assert study.conditions == {"protocol": "paper-1", "metric": "psnr"}
+    assert study.name == "lab"
+
+
+def test_where_each_scene_has_one_initialiser_they_are_one_study(tmp_path: Path) -> None:
+    both = archive(tmp_path, "both", inits=("sfm", "dataset"))
+    assert [study.name for study in read_studies(both, WANTED, "both").studies] == ["both (dataset)", "both (sfm)"]
+    trials = load_experiment(tmp_path / "runs_both_0", "exp")
+    kept = [trial for trial in trials.trials if (trial.init == "sfm") == (trial.scene == "garden")]
+    write_archive(replace(trials, trials=tuple(kept)), tmp_path / "one.zip")
+    found = read_studies(tmp_path / "one.zip", WANTED, "one")
+    (study,) = found.studies
+    by_arm = {(trial.densify, trial.scene, trial.seed): trial.metrics["psnr"] for trial in kept}
+    pairs = np.array([by_arm["volumetric", *key[1:]] - value for key, value in by_arm.items() if key[0] == "adc"])
+    assert study.effect == pytest.approx(pairs.mean())
+    assert study.interval is not None
+    assert [("sfm" in note, "dataset" in note) for note in found.notes] == [(False, True), (True, False)]
+
+
+def test_trials_of_archives_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As where one archive holds two initialisers, or two splits, under one name."""
+    files = [str(archive(tmp_path, name, seed, inits=("sfm", "random"))) for seed, name in enumerate("ab")]
+    assert run(["pool", *files, "--arm", "volumetric", "--where", "init=sfm"]) == 0
+    out = capsys.readouterr().out
+    assert "of 2 studies" in out
+    assert "| a |" in out
+    assert out.startswith("volumetric against adc, difference in PSNR (dB), more is better\n")
+    assert "caution" not in out
+    assert run(["pool", *files, "--arm", "volumetric", "--where", "init=none"]) == 2
+
+
+def test_unlike_budgets_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    steered = archive(tmp_path, "steered", budget={"max_gaussians": 20_000, "cap": "governor"})
+    growing = archive(tmp_path, "growing", seed=1, budget={"max_gaussians": None, "cap": None})
+    assert run(["pool", str(steered), str(growing), "--arm", "volumetric"]) == 0
+    sentence = "caution: unlike budgets (steered: 20,000 Gaussians (governor); growing: none)"
+    assert sentence in capsys.readouterr().out
+
+
+def test_three_labs_make_a_mean(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [str(archive(tmp_path, f"lab{k}", k)) for k in range(3)]
+    assert run(["pool", *files, "--arm", "volumetric"]) == 0
+    out = capsys.readouterr().out
+    assert "| lab0 | +" in out
+    assert "of 3 studies" in out
+    assert "a further one would lie between" in out
+
+
+def test_two_protocols_have_no_mean_and_one_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Between archives and within one: every study is shown, and none is lost."""
+    files = [str(archive(tmp_path, "a", 0)), str(archive(tmp_path, "b", 1, "both")), str(archive(tmp_path, "c", 2))]
+    assert run(["pool", *files, "--arm", "volumetric"]) == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in ("| a |", "| b (paper-1) |", "| b (standard-1) |", "| c |"))
+    assert "no mean: the studies differ in protocol" in out
+    assert run(["pool", *files, "--arm", "volumetric", "--protocol", "paper-1"]) == 0
+    out = capsys.readouterr().out
+    assert "of 3 studies" in out
+    assert "b (standard-1): not asked for" in out
+
+
+def test_bad_sources_are_a_line_each_and_the_others_are_pooled(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good = [archive(tmp_path, "good", 0), archive(tmp_path, "fine", 1)]
+    cut = archive(tmp_path, "cut", 2)
+    cut.write_bytes(cut.read_bytes()[:-500])
+    twin = tmp_path / "twin.zip"
+    twin.write_bytes(good[0].read_bytes())
+    other = archive(tmp_path, "other", 3, densifiers=["adc", "mcmc"])
+    single = archive(tmp_path, "single", 4, scenes=["garden"], seeds=[0])
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    sources = map(str, [*good, cut, twin, other, single, empty, tmp_path / "none.zip"])
+    assert run(["pool", *sources, "--arm", "volumetric"]) == 1
+    captured = capsys.readouterr()
+    assert "of 2 studies" in captured.out
+    lines = captured.err.splitlines()
+    for name, reason in (
+        ("cut.zip", "no whole zip"),
+        ("twin.zip", "would count twice"),
+        ("other.zip", "has no pair of volumetric and adc (there are sfm-adc, sfm-mcmc)"),
+        ("single", "has one pair"),
+        ("empty", "it is a folder"),
+        ("none.zip", "no such file"),
+    ):
+        (line,) = [line for line in lines if name in line]
+        assert reason in line
+    assert len(lines) == 6
+    assert run(["pool", str(cut), "--arm", "volumetric"]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_labs_that_name_their_files_alike_are_told_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for lab, seed in (("one", 0), ("two", 1)):
+        (tmp_path / lab).mkdir()
+        archive(tmp_path / lab, "results", seed)
+    sources = [str(tmp_path / lab / "results.zip") for lab in ("one", "two")]
+    assert run(["pool", *sources, "--arm", "volumetric"]) == 0
+    assert f"| {sources[1]} |" in capsys.readouterr().out
+
+
+def test_a_metric_that_a_source_lacks_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["pool", str(archive(tmp_path, "lab")), "--arm", "volumetric", "--metric", "lpips_alex"]) == 2
+    assert "can be paired in lpips_alex" in capsys.readouterr().err
+    assert run(["pool", str(tmp_path / "lab.zip")]) == 2
+    assert "--arm" in capsys.readouterr().err

@@ -182,9 +182,9 @@ def test_a_killed_tuning_goes_on_and_its_values_are_trained(
 
 def page_of(runs: Path) -> list[str]:
     """The page without the minute in which its claims were declared, and without what is measured of a machine."""
-    lines = (runs / "check_it" / "claims.md").read_text().splitlines()
+    lines = (runs / "check_it" / "claims.html").read_text().splitlines()
     assert sum(" were declared " in line for line in lines) == 1
-    measured = (" were declared ", "| seconds of training |", "| memory (MB) |")
+    measured = (" were declared ", "seconds of training</th>", "memory (MB)</th>")
     assert all(sum(words in line for line in lines) == 1 for words in measured)
     return [line for line in lines if not any(words in line for words in measured)]
 
@@ -212,7 +212,7 @@ def test_a_killed_check_goes_on_and_ends_with_the_same_page(tmp_path: Path) -> N
         process.kill()
         assert process.wait() == -signal.SIGKILL
         assert count_done(killed) >= trials
-        assert not (killed / "check_it" / "claims.md").exists()
+        assert not (killed / "check_it" / "claims.html").exists()
     before = {path: path.read_bytes() for path in killed.glob("check_it/*/*/*/results.json")}
     subprocess.run(check, env=os.environ | {"GSBENCH_RUNS": str(killed)}, check=True, timeout=2 * PATIENCE)
     assert page_of(killed) == page_of(whole)

@@ -21,12 +21,12 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+from gsbench.analysis.report.setting_charts import search_part
+
 from gsbench.analysis.explain import explain_cell
 from gsbench.analysis.frame import to_frame
-from gsbench.analysis.per_view import read_views
 from gsbench.analysis.report.sections import event_charts, training_charts, volume_charts
-from gsbench.analysis.report.setting_charts import search_part
-from gsbench.analysis.results import load_experiment
+from gsbench.analysis.results import load_experiment, read_views
 from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.tuning import tuning_lines

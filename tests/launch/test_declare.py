@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from gsbench.analysis.declaration import standing
-from gsbench.analysis.judgement import measured
 from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import Trial, compose_one
@@ -110,7 +109,7 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path: 
     found = standing(experiment.folder, experiment.trials)
     assert found is not None
     assert found.beforehand
-    assert measured(experiment.trials[0]) >= declared.moment
+    assert experiment.trials[0].measured >= declared.moment
 
     time.sleep(1.1)  # moments are kept in whole seconds
     store = {path: path.stat().st_mtime_ns for path in tmp_path.glob("store/*/*")}

@@ -12,9 +12,6 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from gsbench.analysis.results import load_experiment
-from gsbench.analysis.table_formats import to_markdown
-from gsbench.analysis.tables import build_table
-from gsbench.analysis.translations import by_protocol
 from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, quantize
@@ -159,26 +156,6 @@ def test_trials_are_measured_by_all_and_shown_by_one(
         record["gsplat-2"]["metrics"]["psnr"] - trial.metrics["psnr"], abs=1e-6
     )
     assert record["mipnerf360-1"]["metrics"]["psnr"] == pytest.approx(trial.metrics["psnr"], abs=1e-6)
-
-
-def test_protocols_never_share_a_cell(home: Path) -> None:
-    experiment = load_experiment(home / "runs", "small")
-    run(["evaluate", "small", "--protocol", "gsplat", "--json"])
-    translated = by_protocol(experiment, "gsplat")
-    both = [*experiment.trials, *translated.trials]
-    with pytest.raises(InputError, match="protocol"):
-        build_table(experiment, both, rows=["scene"])
-    assert "gsplat-2" in to_markdown(build_table(translated))
-
-
-def test_what_was_measured_of_other_renders_is_not_shown(home: Path) -> None:
-    experiment = load_experiment(home / "runs", "small")
-    path = experiment.trials[0].path / PROTOCOLS
-    record = json.loads(path.read_text())
-    path.write_text(json.dumps(record | {"made_of": "others"}))
-    with pytest.raises(InputError, match="was not measured by gsplat-2"):
-        by_protocol(experiment, "gsplat")
-    path.write_text(json.dumps(record))
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from gsbench import cli
-from gsbench.analysis.per_view import read_views
-from gsbench.analysis.results import load_experiment
+from gsbench.analysis.results import load_experiment, read_views
 from gsbench.errors import InputError
 from gsbench.launch.states import states_of_experiment
 from gsbench.runs.trial_folder import TrialFolder

@@ -11,10 +11,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gsbench.analysis.cells import by_key
 from gsbench.analysis.configurations import departures, resolved, shipped_arms
 from gsbench.analysis.differences import IGNORED_SETTINGS, differing_code
-from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.results import Arm, TrialResult, by_key
 from gsbench.words import listed
 
 MOST_NAMED = 6  # ingredients that a headline names before it counts

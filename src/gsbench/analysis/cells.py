@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -14,7 +14,7 @@ from gsbench.analysis.differences import (
     differing_settings,
 )
 from gsbench.analysis.quantities import Quantity
-from gsbench.analysis.results import TrialResult
+from gsbench.analysis.results import TrialResult, by_key
 from gsbench.errors import InputError
 from gsbench.runs.hashing import NOT_HASHED
 
@@ -149,14 +149,6 @@ def best_cells(cells: Mapping[K, Cell], quantity: Quantity) -> set[K]:
     if len(set(means.values())) == 1:
         return set()
     return {key for key, mean in means.items() if mean == best}
-
-
-def by_key(trials: Iterable[TrialResult], key: Callable[[TrialResult], K]) -> dict[K, list[TrialResult]]:
-    """Trials grouped by ``key(trial)``, in order of appearance."""
-    groups: dict[K, list[TrialResult]] = {}
-    for trial in trials:
-        groups.setdefault(key(trial), []).append(trial)
-    return groups
 
 
 def _code_refusal(where: str, code: Mapping[str, Mapping[str, Sequence[TrialResult]]], experiment: str) -> InputError:

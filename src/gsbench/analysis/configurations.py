@@ -28,33 +28,31 @@ from gsbench.system.install import conf_dir
 ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
 GROUPS = ("scene", "init", "densify")  # of a configuration: what every trial has
 
-Kind = tuple[str, str, str, str]  # scene, initialiser, densifier, hash of the configuration
-
 
 class Configurations:
-    """The settings that determine the results of an experiment's trials, read once for all of one kind.
+    """The settings that determine the results of an experiment's trials, read once for all seeds of a trial.
 
-    Those that are ``known`` are not read: of trials that have not run.
+    Those that are ``known`` are not read: of trials that have not run. ``trial`` is the key that seeds share.
     """
 
-    def __init__(self, known: Mapping[Kind, Mapping[str, Any]] | None = None) -> None:
-        self._known: dict[Kind, Mapping[str, Any]] = dict(known or {})
-        self._texts: dict[Kind, Mapping[str, str]] = {}
+    def __init__(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+        self._known: dict[str, Mapping[str, Any]] = dict(known or {})
+        self._texts: dict[str, Mapping[str, str]] = {}
 
-    def texts(self, kind: Kind, folder: Path) -> Mapping[str, str]:
+    def texts(self, trial: str, folder: Path) -> Mapping[str, str]:
         """The same as `shared`, each as comparable text."""
-        if kind not in self._texts:
-            self._texts[kind] = {key: canonical(value) for key, value in self.shared(kind, folder).items()}
-        return self._texts[kind]
+        if trial not in self._texts:
+            self._texts[trial] = {key: canonical(value) for key, value in self.shared(trial, folder).items()}
+        return self._texts[trial]
 
-    def shared(self, kind: Kind, folder: Path) -> Mapping[str, Any]:
-        """The settings of the trial in ``folder``, as those of any other of its ``kind``; {} where unreadable."""
-        if kind not in self._known:
-            self.find(kind, [folder])
-        return self._known[kind]
+    def shared(self, trial: str, folder: Path) -> Mapping[str, Any]:
+        """The settings of the trial in ``folder``, as those of its other seeds; {} where they cannot be read."""
+        if trial not in self._known:
+            self.find(trial, [folder])
+        return self._known[trial]
 
-    def find(self, kind: Kind, folders: Iterable[Path]) -> str:
-        """Read the settings of a kind from the first of ``folders`` that has them; else why the last has not."""
+    def find(self, trial: str, folders: Iterable[Path]) -> str:
+        """Read the settings of a trial from the first of ``folders`` that has them; else why the last has not."""
         fault = ""
         for folder in folders:
             try:
@@ -65,9 +63,9 @@ class Configurations:
                 fault = f"{error.path.name} {error.reason}"
             else:
                 own = {key: value for key, value in found.items() if key.split(".")[0] not in NOT_HASHED}
-                self._known[kind] = own
+                self._known[trial] = own
                 return ""
-        self._known.setdefault(kind, {})
+        self._known.setdefault(trial, {})
         return fault
 
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gsbench.analysis.judgement import folder_key, measured
 from gsbench.analysis.results import TrialResult
 from gsbench.runs.declaration import Declaration, Planned, Question, read_declarations
 from gsbench.words import counted, listed
@@ -89,7 +88,7 @@ class ActiveDeclaration:
         seeds = {seed for own in planned.values() for seed in own}
         news = {
             "scene": {trial.scene for trial in self.added} - scenes,
-            "arm": {str(trial.arm) for trial in self.added if folder_key(trial).split("/", 1)[1] not in arms},
+            "arm": {str(trial.arm) for trial in self.added if trial.key.split("/", 1)[1] not in arms},
             "seed": {str(trial.seed) for trial in self.added if trial.seed not in seeds},
         }
         parts = [f"{what if len(new) == 1 else what + 's'} {listed(sorted(new))}" for what, new in news.items() if new]
@@ -107,21 +106,21 @@ def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration |
         return None
     others = [one for one in declared if one.primary != declared[-1].primary]
     since = [one for one in declared if not others or one.moment > others[-1].moment or one is declared[-1]]
-    first_result = min((measured(trial) for trial in trials), default=math.inf)
+    first_result = min((trial.measured for trial in trials), default=math.inf)
     whole = since[0]
     for later in since[1:]:
         if later.moment <= first_result:
             whole = later
     named = replace(whole, time=since[0].time)
-    seen = tuple(trial for trial in trials if measured(trial) < named.moment)
+    seen = tuple(trial for trial in trials if trial.measured < named.moment)
     if named.names_trials:
         planned = named.planned
         added = tuple(trial for trial in trials if not _is_planned(trial, planned))
     else:  # the first record may be lost but for what its trials repeat: all since the next may have been added
         again = next((one.moment for one in since if one.names_trials), math.inf)
-        added = tuple(trial for trial in trials if measured(trial) >= again)
+        added = tuple(trial for trial in trials if trial.measured >= again)
     return ActiveDeclaration(named, seen, added, len(trials), tuple(others))
 
 
 def _is_planned(trial: TrialResult, planned: Planned) -> bool:
-    return trial.seed in planned.get(folder_key(trial), ())
+    return trial.seed in planned.get(trial.key, ())

@@ -45,9 +45,9 @@ def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
     """
     if len({trial.config_hash for trial in trials}) == 1:
         return {}
-    kinds = {trial.kind: trial.config_texts for trial in trials}.values()
-    keys = {key for texts in kinds for key in texts if not key.startswith(IGNORED_SETTINGS)}
-    values = {key: {texts.get(key, canonical(None)) for texts in kinds} for key in keys}
+    known = {trial.key: trial.config_texts for trial in trials}.values()
+    keys = {key for texts in known for key in texts if not key.startswith(IGNORED_SETTINGS)}
+    values = {key: {texts.get(key, canonical(None)) for texts in known} for key in keys}
     return {key: sorted(found) for key, found in sorted(values.items()) if len(found) > 1}
 
 

@@ -15,16 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from gsbench.analysis.cells import by_key
-from gsbench.analysis.results import TrialResult
+from gsbench.analysis.results import TrialResult, by_key
 from gsbench.analysis.statistics import Answer, answer_family
 from gsbench.errors import InputError
-from gsbench.runs.layout import GROUND_TRUTH, MAPS, MASKS, RENDERS
+from gsbench.records import Number, Part, read_if_sound
+from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, MAPS, MASKS, RENDERS
 from gsbench.scene.masks import read_mask
 
 BINS = 5
 TEXTURE_SIGMA = 2.0  # px: texture energy is the gradient's square averaged over such a Gaussian
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
+TEXTURED_SHARE = 0.2  # of a photograph's pixels, those with the most texture
 SAMPLES = 200_000  # pixels of a scene from which the bins' edges are taken
 
 Array = NDArray[np.float64]
@@ -74,6 +75,32 @@ def read_ignored(trial: TrialResult, view: str) -> NDArray[np.bool_] | None:
 def absolute_error(render: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Array:
     """Mean absolute difference over channels, [H, W], in 8-bit levels."""
     return np.abs(render.astype(np.float64) - truth.astype(np.float64)).mean(axis=-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FromPixels(Part):
+    """Measures of a trial's pictures, as an archive keeps them, which has no pictures."""
+
+    error_textured: Number
+
+
+def textured_error(trial: TrialResult) -> float:
+    """Mean absolute error (8-bit levels) over the most textured fifth of each held-out photograph, mean over views.
+
+    Grass, foliage, fabric and gravel lie there. Raises InputError where renders are missing, and so is their measure.
+    """
+    kept = read_if_sound(trial.path / FROM_PIXELS, FromPixels)
+    if kept is not None:
+        return float(kept.error_textured)
+    errors = []
+    for view in view_names(trial):
+        truth = read_image(trial.path / GROUND_TRUTH / f"{view}.png")
+        texture = texture_energy(truth)  # [H, W]
+        ignored = read_ignored(trial, view)
+        counts = np.ones(texture.shape, dtype=bool) if ignored is None else ~ignored
+        inside = counts & (texture >= np.quantile(texture[counts], 1 - TEXTURED_SHARE))
+        errors.append(float(absolute_error(read_image(trial.path / RENDERS / f"{view}.png"), truth)[inside].mean()))
+    return float(np.mean(errors))
 
 
 def errors_by_region(

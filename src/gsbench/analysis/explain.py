@@ -7,7 +7,6 @@ from pathlib import Path
 
 from gsbench.analysis.cells import Cell, check_averageable, make_cell, swept_settings
 from gsbench.analysis.differences import differing_settings, short_version
-from gsbench.analysis.origins import machine_of
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.paper import load_paper
 from gsbench.analysis.paper_tables import agreement, layout_of, paper_init
@@ -129,7 +128,7 @@ def _origin(trial: TrialResult) -> dict[str, str]:
     origin |= {key: str(value) for key, value in record.hashes.items() if key not in trial.conditions}
     if record.trained_by is not None:
         origin["program"] = f"{record.trained_by.version}: {' '.join(record.trained_by.command)}"
-    if machine := machine_of(trial):
+    if machine := trial.machine:
         origin["machine"] = machine
     if trial.code:
         origin["code"] = ", ".join(f"{part} {short_version(version)}" for part, version in trial.code.items())

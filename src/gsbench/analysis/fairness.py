@@ -18,8 +18,7 @@ from gsbench.analysis.attribution import (
 )
 from gsbench.analysis.configurations import REFERENCE, canonical, notes_of, resolved, shipped_arms, shipped_name
 from gsbench.analysis.differences import CODE, short_version
-from gsbench.analysis.judgement import pair_trials
-from gsbench.analysis.origins import cloud_of, machine_of
+from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.tables import Column, Entry, Row, Table
 from gsbench.analysis.tuning import tuning_lines
@@ -191,7 +190,7 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "pictures": _each(_resolution),
     "photographs (hash)": _each(lambda trial: trial.record.hashes.get("data", "")[:12]),
     "initial points": _span(_recorded(lambda record: record.num_init_points)),
-    "initial cloud (hash)": _each(lambda trial: (cloud_of(trial) or "")[:12]),
+    "initial cloud (hash)": _each(lambda trial: trial.cloud[:12]),
     "iterations": _span(_recorded(lambda record: record.iterations)),
     "rounds of the densifier": _span(_rounds),
     "last round (iteration)": _span(_last_round),
@@ -201,6 +200,6 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "memory (MB)": _span(_recorded(lambda record: record.peak_memory_mb)),
     "rasterizer": _each(lambda trial: trial.record.raster),
     "protocol": _each(lambda trial: trial.record.protocol),
-    "machine": _each(machine_of),
+    "machine": _each(lambda trial: trial.machine),
     "code": _each(_code),
 }

@@ -1,24 +1,20 @@
-"""The one engine of evidence: `pair` finds the trials that a question compares, `judge` says what they say.
+"""The one engine of evidence: `judge` says what the pairs of trials say that a declaration's questions compare.
 
-Reports, tables, checks of claims, sweeps that stop when decided, planning, ablation and pooling call these two.
+Reports, tables, checks of claims, sweeps that stop when decided, planning, ablation and pooling call it and
+`gsbench.analysis.pairing.pair`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import takewhile
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gsbench.analysis.cells import by_key, check_averageable
-from gsbench.analysis.differences import differing_conditions
-from gsbench.analysis.measures import Measure, find_measure, read_measure
-from gsbench.analysis.results import TrialResult
+from gsbench.analysis.pairing import Pairs, TrialPair, pair
+from gsbench.analysis.quantities import Quantity, asked_quantity
+from gsbench.analysis.results import TrialResult, by_key
 from gsbench.analysis.statistics import (
     TOO_SMALL,
     UNDECIDED,
@@ -31,84 +27,12 @@ from gsbench.analysis.statistics import (
     look_levels,
     student,
 )
-from gsbench.errors import InputError
-from gsbench.runs.declaration import Arm, Declaration, Question, trial_key, unix_time
-from gsbench.words import counted, signed, some_of
+from gsbench.runs.declaration import Declaration, Question
+from gsbench.words import counted, signed
 
 OUTLYING = 5.0  # deviations of other trials of its scene and arm, beyond which a trial is named
 LEAST_OTHERS = 2  # trials that one must be held against
 FEW = 1.2  # the deviation in medians of the deviations of three trials, which come out too small
-
-Array = NDArray[np.float64]
-TrialPair = tuple[TrialResult, TrialResult]  # of the baseline, and of the arm
-
-
-@dataclass(frozen=True)
-class ScenePairs:
-    """The pairs of trials of one scene by seed, in the order in which seeds are added, with both arms' values [K]."""
-
-    scene: str
-    seeds: tuple[int, ...]
-    trials: tuple[TrialPair, ...]
-    before: Array
-    after: Array
-
-    def kept(self, places: Sequence[int]) -> ScenePairs:
-        chosen = list(places)
-        return ScenePairs(
-            self.scene,
-            tuple(self.seeds[k] for k in chosen),
-            tuple(self.trials[k] for k in chosen),
-            self.before[chosen],
-            self.after[chosen],
-        )
-
-
-@dataclass(frozen=True)
-class Pairs:
-    """The trials that a question compares, scene by scene, and in one line each what could not be paired."""
-
-    rows: tuple[ScenePairs, ...]
-    left_out: tuple[str, ...] = ()
-    relative: bool = False  # differences are of logarithms
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        return tuple(row.scene for row in self.rows)
-
-    @property
-    def seeds(self) -> int:
-        """The number of seeds that all scenes have."""
-        return min((len(row.seeds) for row in self.rows), default=0)
-
-    @cached_property
-    def differences(self) -> Array:
-        """Arm minus baseline [S, K] over the seeds that all scenes have: further ones would weigh scenes unlike."""
-        change = [np.log(row.after / row.before) if self.relative else row.after - row.before for row in self.rows]
-        return np.array([values[: self.seeds] for values in change])
-
-    @property
-    def baseline(self) -> float:
-        """The baseline's mean over the same trials, in the metric's own unit."""
-        return float(np.mean([row.before[: self.seeds].mean() for row in self.rows]))
-
-    @property
-    def trials(self) -> tuple[TrialResult, ...]:
-        """The trials that count, pair by pair."""
-        return tuple(trial for row in self.rows for pair in row.trials[: self.seeds] for trial in pair)
-
-    def first(self, seeds: int) -> Pairs:
-        """The pairs of the first ``seeds`` seeds of every scene."""
-        return replace(self, rows=tuple(row.kept(range(min(seeds, len(row.seeds)))) for row in self.rows))
-
-    def without(self, outlying: Sequence[TrialResult]) -> Pairs:
-        """The pairs of which neither trial is ``outlying``; a scene that has no other is left out."""
-        paths = {trial.path for trial in outlying}
-        rows = [
-            row.kept([k for k, pair in enumerate(row.trials) if not paths & {one.path for one in pair}])
-            for row in self.rows
-        ]
-        return replace(self, rows=tuple(row for row in rows if row.seeds))
 
 
 @dataclass(frozen=True)
@@ -137,7 +61,7 @@ class Verdict:
     """
 
     question: Question
-    measure: Measure
+    quantity: Quantity
     pairs: Pairs
     outcome: Outcome = "undecided"
     answer: Answer | None = None
@@ -192,7 +116,7 @@ class Verdict:
         """A difference as people read it: ``−0.0123``, or ``+28.4 %`` of one that is a part of the baseline's."""
         if self.question.relative:
             return f"{signed(100 * math.expm1(value), '.1f')} %"
-        return signed(value, f".{self.measure.decimals + 1}f")
+        return signed(value, f".{self.quantity.decimals + 1}f")
 
     def shown_interval(self, interval: Interval) -> str:
         return f"{self.shown(interval.low)} to {self.shown(interval.high)}"
@@ -203,114 +127,13 @@ def margin(question: Question) -> float | None:
     return math.log1p(question.least) if question.relative and question.least is not None else question.least
 
 
-def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
-    """Pair the trials that a question compares by scene and seed, and say what has no partner or cannot be compared.
-
-    Trials under unlike conditions are not compared; unlike budgets are no hindrance where the question names its
-    trials itself, since a claim may be about arms with budgets of their own. Of seeds in planned order none beyond the
-    first that is missing counts: one that comes late never changes what an earlier look saw.
-    """
-    rows, left_out = [], list[str]()
-    for scene, sides in _sides(trials, question).items():
-        try:
-            row, faults = _row(scene, *sides, question)
-        except InputError as error:
-            left_out.append(str(error))
-            continue
-        left_out += faults
-        rows += [row] if row.seeds else []
-    if uneven := {len(row.seeds) for row in rows if len(row.seeds) > min(len(row.seeds) for row in rows)}:
-        least = min(len(row.seeds) for row in rows)
-        few = some_of([row.scene for row in rows if len(row.seeds) == least])
-        left_out.append(
-            f"{counted(least, 'seed')} of each scene count, since {few} has no more (others up to {max(uneven)})"
-        )
-    return Pairs(tuple(rows), tuple(left_out), question.relative)
-
-
-def _sides(trials: Sequence[TrialResult], question: Question) -> dict[str, tuple[list[TrialResult], list[TrialResult]]]:
-    """The trials of the baseline and of the arm by scene."""
-    if question.scenes:
-        by_folder = by_key(trials, folder_key)
-        return {
-            scene: (by_folder.get(one, []), by_folder.get(other, [])) for scene, (one, other) in question.scenes.items()
-        }
-    return {
-        scene: ([t for t in own if t.arm == question.baseline], [t for t in own if t.arm == question.arm])
-        for scene, own in by_key(trials, lambda trial: trial.scene).items()
-    }
-
-
-def folder_key(trial: TrialResult) -> str:
-    """The trial's folder within its experiment, without the seed."""
-    return trial_key(trial.scene, f"{trial.init}-{trial.densify}", trial.config_hash)
-
-
-def pair_trials(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> list[TrialPair]:
-    """The pairs of trials of two arms, sorted by scene and seed, whatever their metrics are."""
-    question = Question(metric="", baseline=baseline, arm=arm)
-    found: list[TrialPair] = []
-    for scene, sides in sorted(_sides(trials, question).items()):
-        with suppress(InputError):  # said where the arms are judged
-            found += _matched(scene, *sides, question)[0].values()
-    return found
-
-
-def _matched(
-    scene: str, baseline: Sequence[TrialResult], arm: Sequence[TrialResult], question: Question
-) -> tuple[dict[int, TrialPair], list[str]]:
-    """The pairs of one scene by seed, in the planned order, and the seeds that have no partner.
-
-    Raises InputError where trials of one arm cannot be averaged, or the arms' conditions are unlike.
-    """
-    for own in (baseline, arm):
-        if own:
-            check_averageable(own, f"scene={scene} {own[0].arm}")
-    one, other = ({trial.seed: trial for trial in own} for own in (baseline, arm))
-    wanted = question.seeds or sorted(one.keys() | other.keys())
-    both = {seed: (one[seed], other[seed]) for seed in wanted if seed in one and seed in other}
-    if both:
-        differing = differing_conditions([*baseline, *arm])
-        if question.scenes:
-            differing.pop("budget", None)
-        if differing:
-            raise InputError(f"{scene}: the arms differ in {', '.join(differing)}, so they are not compared")
-    alone = () if question.seeds else tuple(seed for seed in wanted if seed not in both)
-    return both, [f"{scene}: seed {seed} has no partner" for seed in alone]
-
-
-def _row(
-    scene: str, baseline: Sequence[TrialResult], arm: Sequence[TrialResult], question: Question
-) -> tuple[ScenePairs, list[str]]:
-    both, faults = _matched(scene, baseline, arm, question)
-    values: dict[int, tuple[float, float]] = {}
-    reasons: dict[str, list[str]] = {}
-    for seed, trials in both.items():
-        try:
-            values[seed] = _values(question, *trials)
-        except InputError as error:
-            reasons.setdefault(str(error), []).append(f"{scene} seed {seed}")
-    faults += [f"{some_of(places)}: {reason}" for reason, places in reasons.items()]
-    seeds = list(takewhile(values.__contains__, question.seeds)) if question.seeds else list(values)
-    before, after = (np.array([values[seed][side] for seed in seeds]) for side in (0, 1))
-    return ScenePairs(scene, tuple(seeds), tuple(both[seed] for seed in seeds), before, after), faults
-
-
-def _values(question: Question, one: TrialResult, other: TrialResult) -> tuple[float, float]:
-    measure = find_measure(question.metric, [one, other])
-    before, after = read_measure(measure, one), read_measure(measure, other)
-    if question.relative and min(before, after) <= 0:
-        raise InputError(f"{measure.name} is {min(before, after):g}, of which no ratio can be taken")
-    return before, after
-
-
 def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdict]:
     """The verdict on each question of ``declaration`` from those of ``trials`` that it compares, in their order.
 
     Questions share the error rate. Where seeds come in looks, they share it equally, and each is answered at the first
     look that decides it; otherwise they are one family by Holm's method. Secondary questions have a rate of their own.
     """
-    by_arm, by_folder = by_key(trials, lambda trial: trial.arm), by_key(trials, folder_key)
+    by_arm, by_folder = by_key(trials, lambda trial: trial.arm), by_key(trials, lambda trial: trial.key)
 
     def own(question: Question) -> list[TrialResult]:
         """The trials that the question can be about: a look at all for each of many would take long."""
@@ -339,9 +162,9 @@ def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdi
 def _asked(trials: Sequence[TrialResult], question: Question, declaration: Declaration) -> Verdict:
     """The question with its pairs, before it is answered."""
     pairs = pair(trials, question)
-    measure = find_measure(question.metric, trials)
-    late = sum(measured(trial) < declaration.moment for trial in pairs.trials)
-    verdict = Verdict(question, measure, pairs, notes=pairs.left_out, late=late, final=not declaration.looks)
+    late = sum(trial.measured < declaration.moment for trial in pairs.trials)
+    quantity = asked_quantity(question.metric, trials)
+    verdict = Verdict(question, quantity, pairs, notes=pairs.left_out, late=late, final=not declaration.looks)
     if not pairs.rows and pairs.left_out and question.scenes:
         return replace(verdict, untestable=pairs.left_out[0], notes=pairs.left_out[1:], final=True)
     if pairs.rows and question.scenes and all(_is_equal(both) for row in pairs.rows for both in row.trials):
@@ -362,12 +185,6 @@ def _candidates(verdict: Verdict) -> int:
     if not verdict.late:
         return 1
     return len({name for trial in verdict.pairs.trials for name in trial.metrics} | {verdict.question.metric})
-
-
-def measured(trial: TrialResult) -> float:
-    """The Unix time at which the trial's metrics were there; of results that do not say it, that of the file."""
-    moment = None if trial.record.measured is None else unix_time(trial.record.measured)
-    return trial.finished if moment is None else moment
 
 
 def _at_looks(asked: Verdict, looks: tuple[int, ...], rate: float) -> Verdict:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 from gsbench.analysis.attribution import attribute, attribution_sentence
-from gsbench.analysis.cells import by_key, with_variants
+from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.pairing import choose_pairs, controls_of
-from gsbench.analysis.results import Arm, Experiment, TrialResult
+from gsbench.analysis.results import Arm, Experiment, TrialResult, by_key
 from gsbench.analysis.tuning import tuning_sentence
+from gsbench.runs.code import SHOWN
 from gsbench.runs.layout import TUNING
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
+from gsbench.words import counted
 
 _BY_PROGRAM = (
     ("Trained here by another program, its model rendered by gsbench", FROM_MODEL),
@@ -45,12 +48,12 @@ def declared_notes(experiment: Experiment) -> list[str]:
     Which trials a table shows has no say in it, so that nobody can choose a verdict by choosing trials.
     """
     declared = standing(experiment.folder, experiment.trials)
-    if declared is None or any(trial.translated_from for trial in experiment.trials):
+    if declared is None:
         return []
-    from gsbench.analysis.verdicts import declared_lines, judge  # here, for a quick start of what needs no test
+    from gsbench.analysis.verdicts import declared_lines, judge_pairs  # here, for a quick start of what needs no test
 
     trials, pairs = compared_pairs(experiment)
-    return declared_lines(declared, judge(trials, pairs, declared))
+    return declared_lines(declared, judge_pairs(trials, pairs, declared))
 
 
 def caveat_notes(experiment: Experiment) -> list[str]:
@@ -118,4 +121,70 @@ def counts_sentence(trials: Sequence[TrialResult], first: Arm, second: Arm) -> s
     return (
         f"{second} has {more} Gaussians than {first}: this is no comparison at one count, which "
         "densify.cap=governor makes."
+    )
+
+
+def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
+    """A line that names the kinds of machine, where trials ran on several."""
+    kinds = Counter(trial.machine for trial in trials)
+    unknown = kinds.pop(None, 0)
+    if len(kinds) < 2:
+        return []
+    listed = "; ".join(f"{kind}: {counted(count, 'trial')}" for kind, count in kinds.most_common())
+    rest = f"; not recorded: {unknown}" if unknown else ""
+    return [
+        f"The trials ran on {len(kinds)} kinds of machine, on which equal settings give unlike last digits and, after "
+        f"thousands of iterations, unlike trials: {listed}{rest}."
+    ]
+
+
+def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
+    """A line for each scene and initialiser whose trials, by the same settings, started from several clouds."""
+    notes = []
+    groups = by_key(trials, lambda trial: (trial.scene, trial.init, trial.record.hashes.get("init")))
+    for (scene, init, _), group in groups.items():
+        clouds = by_key([trial for trial in group if trial.cloud], lambda trial: trial.cloud)
+        if len(clouds) > 1:
+            listed = "; ".join(f"{cloud[:SHOWN]}: {_arms(own)}" for cloud, own in clouds.items())
+            notes.append(f"{scene}: trials of init {init} started from {len(clouds)} different clouds ({listed}).")
+    return notes
+
+
+def held_out_notes(trials: Sequence[TrialResult]) -> list[str]:
+    """A line for each way in which views were held out, with the scenes where there are several."""
+    notes = []
+    told = [trial for trial in trials if trial.record.held_out]
+    ways = by_key(told, lambda trial: (trial.question, trial.record.held_out))
+    for (question, words), group in sorted(ways.items(), key=lambda item: (-len(item[1]), item[0])):
+        scenes = sorted({trial.scene for trial in group})
+        counts = sorted({(trial.record.test_views or 0, trial.record.train_views or 0) for trial in group})
+        views = " and ".join(f"{test} of {test + train} views" for test, train in counts)
+        where = f", {', '.join(scenes)}" if len(ways) > 1 and len({trial.scene for trial in told}) > 1 else ""
+        notes.append(f"Held out{f' ({question})' if question else ''}{where}: {words}; {views}.")
+    return notes
+
+
+def points_notes(trials: Sequence[TrialResult]) -> list[str]:
+    """A line for each initialiser and choice of the views that made its points; none where photographs made none."""
+    notes = []
+    for init, choice in sorted({(trial.init, _points_from(trial)) for trial in trials}):
+        if choice == "all":
+            notes.append(f"Initial points of {init}: from all views, test views too (init.points_from=all).")
+        elif choice:
+            notes.append(f"Initial points of {init}: from training views alone (init.points_from={choice}).")
+    return notes
+
+
+def _points_from(trial: TrialResult) -> str:
+    """The views that made the trial's initial points: all, train or retriangulated; "" where no observations did."""
+    if "init.points_from" in trial.config:
+        return str(trial.config["init.points_from"])
+    return "all" if trial.record.init_report.get("mean_track_length") is not None else ""
+
+
+def _arms(trials: Sequence[TrialResult]) -> str:
+    """``adc seeds 0, 1; volumetric seed 0``"""
+    return "; ".join(
+        f"{densify} {'seed' if len(own) == 1 else 'seeds'} {', '.join(str(trial.seed) for trial in own)}"
+        for densify, own in by_key(trials, lambda trial: trial.densify).items()
     )

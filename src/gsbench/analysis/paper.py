@@ -15,7 +15,6 @@ from typing import Any
 
 import yaml
 
-from gsbench.analysis.origins import machine_of
 from gsbench.analysis.results import TrialResult
 from gsbench.eval.facts import LPIPS, find
 from gsbench.eval.protocol import PAPER, protocol_of
@@ -201,7 +200,7 @@ TOPICS = (
     Topic("placement", "Their places", _volume("placement", PLACES.__getitem__)),
     Topic("order", "Order of the volume rule", _volume("volume_order", ORDERS.__getitem__)),
     Topic("window", "Window of the volume rule", _window),
-    Topic("hardware", "Hardware", lambda trial: machine_of(trial) or NOT_RECORDED),
+    Topic("hardware", "Hardware", lambda trial: trial.machine or NOT_RECORDED),
     Topic("lpips", "LPIPS weights", _lpips),
 )
 

@@ -1,9 +1,13 @@
-"""Quantities that a table can show of a trial: metrics, counts and costs, with their names, directions and formats."""
+"""Quantities of a trial: metrics, counts and costs, with their names, directions and formats.
+
+Tables show counts and times in a unit that suits the trials; a question asks about them in their own unit, since only
+their ratios mean something.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 from gsbench.analysis.results import TrialResult
@@ -13,22 +17,25 @@ from gsbench.eval.protocol import PAPER, protocol_of
 
 MILLION, THOUSAND, MINUTE = 1e6, 1e3, 60.0
 
+Reader = Callable[[TrialResult], float | None]
+
 
 @dataclass(frozen=True)
 class Quantity:
     """One number of a trial.
 
     ``direction`` is +1 where more is better, -1 where less is and 0 where that is not known; a ``cost`` is never set in
-    bold, since fewer Gaussians or seconds are no aim in themselves.
+    bold, since fewer Gaussians or seconds are no aim in themselves. ``worthwhile`` is the smallest difference worth
+    resolving, in the quantity's own unit.
     """
 
     key: str
     name: str
     direction: int
     decimals: int
-    read: Callable[[TrialResult], float | None]
+    read: Reader = field(compare=False, repr=False)
     cost: bool = False
-    worthwhile: float | None = None  # the smallest difference worth resolving
+    worthwhile: float | None = None
 
     @property
     def heading(self) -> str:
@@ -38,8 +45,28 @@ class Quantity:
         return f"{value:.{self.decimals}f}"
 
 
-COSTS = ("gaussians", "train_time", "init_points", "total_time", "peak_memory_mb")
+def total_seconds(trial: TrialResult) -> float | None:
+    """The seconds of all stages; None for what another program made."""
+    return None if trial.made_elsewhere else sum(trial.record.seconds.values())
+
+
+def _textured(trial: TrialResult) -> float:
+    from gsbench.analysis.errors_by_region import textured_error  # here, since only claims about it read pictures
+
+    return textured_error(trial)
+
+
+COSTS: dict[str, tuple[str, Reader]] = {  # name, and the value in its own unit
+    "gaussians": ("Gaussians", lambda trial: trial.record.num_gaussians),
+    "train_time": ("training time", lambda trial: trial.record.seconds.get("train")),
+    "init_points": ("initial points", lambda trial: trial.record.num_init_points),
+    "total_time": ("total time", total_seconds),
+    "peak_memory_mb": ("peak memory", lambda trial: trial.record.peak_memory_mb),
+}
+COUNTS = ("gaussians", "init_points")
+FIXED_UNITS = {"gaussians_millions": ("gaussians", "M", MILLION, 2), "train_minutes": ("train_time", "min", MINUTE, 1)}
 ALIASES = {"num_gaussians": "gaussians", "seconds": "train_time", "train": "train_time"}
+TEXTURED = Quantity("error_textured", "error in textured parts (levels)", -1, 2, _textured)
 AT = "@"  # psnr@7000 is the PSNR at iteration 7000 (eval.at)
 
 
@@ -62,30 +89,46 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
     metric, _, step = key.partition(AT)
     if metric == "lpips":
         metric = _protocol_lpips(trials[0]) if trials else f"{LPIPS}{PAPER.lpips}"
-    if find(metric) is not None:
+    if find(metric) is not None or any(metric in trial.metrics for trial in trials):  # the latter: a user's own
         return _metric(metric, step, trials)
-    if key == "gaussians":
-        return _count(key, "Gaussians", "num_gaussians", trials)
-    if key == "gaussians_millions":
-        return _count(key, "Gaussians", "num_gaussians", trials, unit=("M", MILLION, 2))
-    if key == "train_minutes":
-        return _time(key, "train", lambda trial: trial.record.seconds.get("train"), trials, unit=("min", MINUTE))
-    if key == "init_points":
-        return _count(key, "initial points", "num_init_points", trials)
-    if key == "train_time":
-        return _time(key, "train", lambda trial: trial.record.seconds.get("train"), trials)
-    if key == "total_time":
-        return _time(key, "total", _total_seconds, trials)
+    if key in FIXED_UNITS:
+        cost, symbol, scale, decimals = FIXED_UNITS[key]
+        return _scaled(key, cost, symbol, scale, decimals)
     if key == "peak_memory_mb":
-        return Quantity(key, "peak memory (MB)", -1, 0, lambda trial: trial.record.peak_memory_mb, cost=True)
-    if any(metric in trial.metrics for trial in trials):  # a user's own
-        return _metric(metric, step, trials)
-    raise InputError(f"unknown metric {name!r}; choose among {', '.join([*metric_keys(trials, known_keys()), *COSTS])}")
+        return _scaled(key, key, "MB", 1.0, 0)
+    if key not in COSTS:
+        known = [*metric_keys(trials, known_keys()), *COSTS]
+        raise InputError(f"unknown metric {name!r}; choose among {', '.join(known)}")
+    largest = max((COSTS[key][1](trial) or 0.0 for trial in trials), default=0.0)
+    if key in COUNTS:
+        return _scaled(key, key, "M", MILLION, 2) if largest >= MILLION else _scaled(key, key, "k", THOUSAND, 1)
+    return _scaled(key, key, "min", MINUTE, 1) if largest >= 10 * MINUTE else _scaled(key, key, "s", 1.0, 1)
 
 
-def metric_quantity(key: str, trials: Iterable[TrialResult]) -> Quantity:
-    """The metric ``key`` at the end of trials; of a user's own that no trial has, nothing but the key is known."""
+def asked_quantity(key: str, trials: Iterable[TrialResult] = ()) -> Quantity:
+    """What a question about ``key`` compares: a metric at the end of trials, or a cost in its own unit.
+
+    Of a user's own metric that no trial has, nothing but the key is known.
+    """
+    if key == TEXTURED.key:
+        return TEXTURED
+    if key in COSTS:
+        name, read = COSTS[key]
+        return Quantity(key, name, -1, 3, lambda trial: read(trial) or None, cost=True)
     return _metric(key, "", list(trials))
+
+
+def askable_names() -> tuple[str, ...]:
+    """The names that the ``metric`` of a question may have, apart from a user's own."""
+    return (*known_keys(), TEXTURED.key, *COSTS)
+
+
+def value_of(asked: Quantity, trial: TrialResult) -> float:
+    """The trial's value; raises InputError that says why there is none."""
+    value = asked.read(trial)
+    if value is None:
+        raise InputError(trial.unavailable.get(asked.key, f"{trial.label} has no {asked.name}"))
+    return float(value)
 
 
 def metric_keys(trials: Iterable[TrialResult], wanted: Container[str] = ()) -> list[str]:
@@ -133,35 +176,13 @@ def _lpips_asked_for(trial: TrialResult) -> list[str]:
     return asked if asked and protocols not in asked else [protocols]
 
 
-def _total_seconds(trial: TrialResult) -> float | None:
-    return None if trial.made_elsewhere else sum(trial.record.seconds.values())
+def _scaled(key: str, cost: str, symbol: str, scale: float, decimals: int) -> Quantity:
+    """A cost in a unit, as tables show it."""
+    name, read = COSTS[cost]
 
-
-def _count(
-    key: str, name: str, field: str, trials: list[TrialResult], unit: tuple[str, float, int] | None = None
-) -> Quantity:
-    largest = max((getattr(trial.record, field) or 0 for trial in trials), default=0)
-    symbol, scale, decimals = unit or (("M", MILLION, 2) if largest >= MILLION else ("k", THOUSAND, 1))
-
-    def read(trial: TrialResult) -> float | None:
-        value = getattr(trial.record, field)
+    def scaled(trial: TrialResult) -> float | None:
+        value = read(trial)
         return None if value is None else value / scale
 
-    return Quantity(key, f"{name} ({symbol})", -1, decimals, read, cost=True)
-
-
-def _time(
-    key: str,
-    name: str,
-    seconds: Callable[[TrialResult], float | None],
-    trials: list[TrialResult],
-    unit: tuple[str, float] | None = None,
-) -> Quantity:
-    longest = max((seconds(trial) or 0.0 for trial in trials), default=0.0)
-    symbol, scale = unit or (("min", MINUTE) if longest >= 10 * MINUTE else ("s", 1.0))
-
-    def read(trial: TrialResult) -> float | None:
-        value = seconds(trial)
-        return None if value is None else value / scale
-
-    return Quantity(key, f"{name} ({symbol})", -1, 1, read, cost=True)
+    shown = {"train_time": "train", "total_time": "total"}.get(cost, name)
+    return Quantity(key, f"{shown} ({symbol})", -1, decimals, scaled, cost=True)

@@ -6,29 +6,30 @@ says that it is complete. Nothing here needs torch, so that tables over thousand
 
 from __future__ import annotations
 
-import logging
+import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from gsbench.analysis.configurations import Configurations, Kind, canonical, load_flat_config
+from gsbench.analysis.configurations import Configurations, canonical, load_flat_config
 from gsbench.errors import InputError
 from gsbench.files import require_own
 from gsbench.parsing import DamagedError, one_line
-from gsbench.runs.declaration import QUESTIONS
+from gsbench.runs.declaration import QUESTIONS, trial_key, unix_time
 from gsbench.runs.declaration import Arm as Arm
 from gsbench.runs.experiments import experiment_home, places_of_trials
-from gsbench.runs.layout import CONFIG, FAILED, RESULTS, SEED
-from gsbench.runs.translation_record import Translation
+from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError, split_text
+from gsbench.system.machine import kind_of_machine
 
-log = logging.getLogger(__name__)
+K = TypeVar("K", bound=Hashable)
 
+MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
 TRIAL_FOLDER = re.compile(rf"(?P<hash>[0-9a-f]{{8}}){SEED}(?P<seed>\d+)")
 
 
@@ -44,8 +45,6 @@ class TrialResult:
     record: TrialRecord = field(repr=False)
     variant: tuple[tuple[str, str], ...] = ()  # swept settings that tell the arm from others of the same two names
     settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
-    translation: Translation | None = None  # of the metrics, where they are those of another protocol
-    translated_from: str = ""  # the trial's own protocol then
 
     @property
     def experiment(self) -> str:
@@ -93,17 +92,20 @@ class TrialResult:
 
         They are read once for all trials that share them: a trial's own are `whole_config`.
         """
-        return self.settings.shared(self.kind, self.path)
+        return self.settings.shared(self.key, self.path)
 
     @property
     def config_texts(self) -> Mapping[str, str]:
         """The settings of `config` as comparable text."""
-        return self.settings.texts(self.kind, self.path)
+        return self.settings.texts(self.key, self.path)
 
     @cached_property
-    def kind(self) -> Kind:
-        """The identity that trials share which differ in their seeds alone."""
-        return self.scene, self.init, self.densify, self.config_hash
+    def key(self) -> str:
+        """The trial's folder within its experiment without the seed, ``<scene>/<init>-<densify>/<hash8>``.
+
+        Trials that differ in their seeds alone share it.
+        """
+        return trial_key(self.scene, f"{self.init}-{self.densify}", self.config_hash)
 
     @cached_property
     def whole_config(self) -> Mapping[str, Any]:
@@ -139,6 +141,25 @@ class TrialResult:
     def finished(self) -> float:
         """The Unix time at which the trial was finished."""
         return (self.path / RESULTS).stat().st_mtime
+
+    @cached_property
+    def machine(self) -> str | None:
+        """The kind of machine that trained the trial, in a phrase; None where it was not recorded."""
+        try:
+            return None if self.record.machine is None else kind_of_machine(self.record.machine)
+        except KeyError:
+            return None
+
+    @property
+    def cloud(self) -> str:
+        """The hash of the initial model's files (cameras, poses, points); "" where it was not recorded."""
+        return self.record.hashes.get("cloud", "")
+
+    @property
+    def measured(self) -> float:
+        """The Unix time at which the metrics were there; that of the file where the results do not say it."""
+        moment = None if self.record.measured is None else unix_time(self.record.measured)
+        return self.finished if moment is None else moment
 
     @cached_property
     def conditions(self) -> Mapping[str, str]:
@@ -223,6 +244,14 @@ class Experiment:
         return {trial.path.relative_to(self.folder).as_posix(): trial for trial in self.trials}
 
 
+def by_key(trials: Iterable[TrialResult], key: Callable[[TrialResult], K]) -> dict[K, list[TrialResult]]:
+    """Trials grouped by ``key(trial)``, in order of appearance."""
+    groups: dict[K, list[TrialResult]] = {}
+    for trial in trials:
+        groups.setdefault(key(trial), []).append(trial)
+    return groups
+
+
 def load_experiment(runs_dir: Path, name: str) -> Experiment:
     """Read every trial of the experiment ``name``; raises ``InputError`` where there is no usable one."""
     experiment = read_experiment(experiment_home(runs_dir, name))
@@ -259,14 +288,37 @@ def _with_known_settings(
 
     Settings are needed where trials of one scene, initialiser and densifier differ in them.
     """
-    folders: dict[Kind, list[Path]] = {}
-    variants: dict[tuple[str, ...], set[str]] = {}
+    folders: dict[str, dict[str, list[Path]]] = {}  # by arm on a scene, and by trial without the seed
     for trial in trials:
-        folders.setdefault(trial.kind, []).append(trial.path)
-        variants.setdefault(trial.kind[:3], set()).add(trial.config_hash)
-    faults = {kind: settings.find(kind, found) for kind, found in folders.items() if len(variants[kind[:3]]) > 1}
-    known = [trial for trial in trials if not faults.get(trial.kind)]
-    return known, [(trial, faults[trial.kind]) for trial in trials if faults.get(trial.kind)]
+        folders.setdefault(trial.key.rpartition("/")[0], {}).setdefault(trial.key, []).append(trial.path)
+    several = [found for found in folders.values() if len(found) > 1]
+    faults = {key: settings.find(key, paths) for found in several for key, paths in found.items()}
+    known = [trial for trial in trials if not faults.get(trial.key)]
+    return known, [(trial, faults[trial.key]) for trial in trials if faults.get(trial.key)]
+
+
+def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
+    """The metrics of every test view, ``{view: {metric: value}}``; raises ``InputError`` where the file is damaged.
+
+    The file must average to the trial's own metrics, so that a truncated one cannot pass.
+    """
+    path = trial.path / PER_VIEW
+    try:
+        views = trial.folder.views()
+    except FileNotFoundError:
+        raise InputError(f"{path} is missing: give the trial's own command again") from None
+    except DamagedError as error:
+        raise InputError(f"{error}: delete it, and give the trial's own command again") from None
+    for key, expected in trial.metrics.items():
+        values = [view[key] for view in views.values() if key in view]
+        mean = math.fsum(values) / len(values) if values else math.nan
+        if len(values) != len(views) or not math.isclose(
+            mean, expected, rel_tol=MEAN_TOLERANCE, abs_tol=MEAN_TOLERANCE
+        ):
+            raise InputError(
+                f"{path} does not average to the {key} of its trial ({mean:.6g}, not {expected:.6g}): damaged"
+            )
+    return views
 
 
 class _UnusableError(Exception):

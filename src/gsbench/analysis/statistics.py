@@ -12,9 +12,8 @@ others.
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -286,24 +285,3 @@ def look_levels(scenes: int, looks: tuple[int, ...], alpha: float) -> tuple[floa
         found.append(level)
         before = seeds
     return tuple(found)
-
-
-Run = frozenset[str]  # the switches that are on
-
-
-def shapley(switches: Sequence[str], values: Mapping[Run, float]) -> dict[str, float]:
-    """The share of each switch in ``values[all] - values[none]``, from the values of all 2^n sets (Shapley 1953).
-
-    It is the mean, over all orders of turning switches on, of what one adds when its turn comes. The shares add up to
-    the whole difference, and interactions are split evenly among those that have them.
-    """
-    count, shares = len(switches), {}
-    for switch in switches:
-        others = [name for name in switches if name != switch]
-        total = 0.0
-        for size in range(count):
-            weight = 1 / (count * math.comb(count - 1, size))
-            for chosen in itertools.combinations(others, size):
-                total += weight * (values[frozenset((*chosen, switch))] - values[frozenset(chosen)])
-        shares[switch] = total
-    return shares

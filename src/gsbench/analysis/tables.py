@@ -14,7 +14,6 @@ from types import MappingProxyType
 from gsbench.analysis.cells import (
     Cell,
     best_cells,
-    by_key,
     check_averageable,
     check_fields,
     field_value,
@@ -23,15 +22,23 @@ from gsbench.analysis.cells import (
     with_variants,
 )
 from gsbench.analysis.differences import differing_conditions
-from gsbench.analysis.notes import caveat_notes, declared_notes, equal_notes, origin_notes
-from gsbench.analysis.origins import cloud_notes, held_out_notes, machine_notes, points_notes
+from gsbench.analysis.notes import (
+    caveat_notes,
+    cloud_notes,
+    declared_notes,
+    equal_notes,
+    held_out_notes,
+    machine_notes,
+    origin_notes,
+    points_notes,
+)
 from gsbench.analysis.pairing import BASELINE, choose_pairs
-from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import Experiment, TrialResult
-from gsbench.analysis.translations import translation_notes
+from gsbench.analysis.quantities import COSTS, Quantity, choose_quantities
+from gsbench.analysis.results import Experiment, TrialResult, by_key
 from gsbench.words import counted, signed
 
 DEFAULT_ROWS = ("scene", "init", "densify")
+COSTS_COMPARED = ("gaussians", "train_time")
 SIDE_BY_SIDE = ("scene.split", "scene.sector")
 
 
@@ -138,7 +145,6 @@ def build_table(
         + equal_notes(experiment)
         + caveat_notes(experiment)
         + _cost_notes(trials)
-        + translation_notes(trials)
         + held_out_notes(trials)
         + points_notes(trials)
         + machine_notes(trials)
@@ -278,12 +284,12 @@ def _cost_notes(trials: Sequence[TrialResult]) -> list[str]:
             continue
         shared = f", {other}" if other and one == other else ""
         names = (name, baseline) if one == other else (str(replace(second, init="")), str(replace(first, init="")))
-        for what, read in _COSTS.items():
+        for key in COSTS_COMPARED:
+            what, read = COSTS[key]
             change = cost_change(arms[first], arms[second], read)
             if change is not None:
-                notes.append(
-                    f"{what}, {' against '.join(names)} (init {second.init}{shared}): {change_words(*change)}."
-                )
+                names_said = f"{what[0].upper()}{what[1:]}, {' against '.join(names)} (init {second.init}{shared})"
+                notes.append(f"{names_said}: {change_words(*change)}.")
     return notes
 
 
@@ -313,12 +319,6 @@ def change_words(of_totals: float, of_scenes: float, scenes: int) -> str:
     if scenes == 1:
         return totals
     return f"{totals} as a ratio of totals, {ratios} as the mean of {scenes} scenes"
-
-
-_COSTS: dict[str, Callable[[TrialResult], float | None]] = {
-    "Gaussians": lambda trial: trial.record.num_gaussians,
-    "Training time": lambda trial: trial.record.seconds.get("train"),
-}
 
 
 def _left_out(experiment: Experiment) -> list[str]:

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from gsbench.analysis.attribution import TARGET, differing_keys
-from gsbench.analysis.cells import by_key
 from gsbench.analysis.configurations import canonical, resolved, shipped_arms, shipped_name
-from gsbench.analysis.judgement import measured
-from gsbench.analysis.results import Arm, TrialResult, read_experiment
+from gsbench.analysis.results import Arm, TrialResult, by_key, read_experiment
 from gsbench.records import read_if_sound
 from gsbench.runs.layout import TUNING
 from gsbench.runs.tuning_record import Point, TuningRecord, is_value
@@ -112,10 +110,10 @@ def _tuned_here(own: Sequence[TrialResult]) -> list[str]:
 
 def _when(own: Sequence[TrialResult], experiment: str) -> str:
     """Say whether the trials of the tuning's ``experiment`` were measured before these, by their files."""
-    times = [measured(trial) for trial in read_experiment(own[0].path.parents[3] / experiment).trials]
+    times = [trial.measured for trial in read_experiment(own[0].path.parents[3] / experiment).trials]
     if not times:
         return "whose own trials are not there"
-    later = sum(measured(trial) < max(times) for trial in own)
+    later = sum(trial.measured < max(times) for trial in own)
     return f"ended when {later} of these {len(own)} trials had been measured" if later else "before any of these trials"
 
 
@@ -131,7 +129,7 @@ def _points(search: TuningRecord) -> str:
 
 def _tried_here(trials: Sequence[TrialResult], own: TrialResult) -> list[str]:
     """The settings in which arms made from one differ within an experiment: values that were tried."""
-    configurations = [group[0] for group in by_key(trials, lambda trial: trial.kind).values()]
+    configurations = [group[0] for group in by_key(trials, lambda trial: trial.key).values()]
     kin = [trial for trial in configurations if trial.init == own.init and _kind(trial) == _kind(own)]
     choices = [group[0] for group in by_key(kin, lambda trial: trial.arm).values()]
     if len(choices) < 2 or not own.config:

@@ -14,22 +14,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
-from gsbench.analysis import judgement
-from gsbench.analysis.cells import by_key, in_brief
+from gsbench.analysis.cells import in_brief
 from gsbench.analysis.declaration import ActiveDeclaration
-from gsbench.analysis.judgement import folder_key
+from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.planning import seeds_needed
-from gsbench.analysis.quantities import Quantity, choose_quantities, metric_quantity
-from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import TOO_SMALL, Outcome
+from gsbench.analysis.quantities import Quantity, asked_quantity, choose_quantities
+from gsbench.analysis.results import Arm, TrialResult, by_key
+from gsbench.analysis.statistics import ALPHA, TOO_SMALL, Outcome
 from gsbench.runs.declaration import Declaration, Question
-from gsbench.words import counted, signed, some_of
+from gsbench.words import counted, some_of
 
-Role = Literal["declared", "secondary", "one of all"]
 Pair = tuple[Arm, Arm]
 VERDICT = "Verdict, "  # how a line below a table begins that says one
+DECLARED, SECONDARY = "declared", "secondary"
 WORDS: dict[Outcome, str] = {
     "supported": "better",
     "refuted": "worse",
@@ -40,49 +38,37 @@ SYMBOLS: dict[Outcome, str] = {"supported": "▲", "refuted": "▼", "too small 
 
 
 @dataclass(frozen=True)
-class ArmVerdict:
-    """The verdict on two arms in one metric, with what it takes to read it and the family that it is one of."""
+class PairVerdicts:
+    """The verdicts on two arms, the declared metric's first; ``notes`` say what could not be had.
 
-    quantity: Quantity
-    verdict: judgement.Verdict
-    role: Role = "one of all"
-
-    @property
-    def word(self) -> str:
-        """Better, worse, too small to matter, or undecided."""
-        return WORDS[self.verdict.outcome]
-
-    @property
-    def symbol(self) -> str:
-        return SYMBOLS[self.verdict.outcome]
-
-    @property
-    def seeds(self) -> int | None:
-        """The number of seeds that would resolve the worthwhile difference; None: unknown or beyond reach."""
-        if self.verdict.deviation is None or self.quantity.worthwhile is None:
-            return None
-        return seeds_needed(self.verdict.deviation, len(self.verdict.scenes), self.quantity.worthwhile)
-
-
-@dataclass(frozen=True)
-class ArmVerdicts:
-    """The verdicts of one pair of arms, the declared metric first; ``notes`` say what could not be had.
-
-    ``missing`` says, of a declared metric that has no verdict here, why.
+    ``declared`` is the metric that was declared, ``beforehand`` whether it was before any result; ``missing`` says why
+    it has no verdict here.
     """
 
-    verdicts: tuple[ArmVerdict, ...]
+    first: Arm
+    second: Arm
+    verdicts: tuple[Verdict, ...]
     notes: tuple[str, ...]
     declared: Quantity | None = None
+    beforehand: bool = False
     missing: str = ""
 
+    def role(self, verdict: Verdict) -> str:
+        """Declared, secondary, or "" of one of all."""
+        return SECONDARY if verdict.question.secondary else DECLARED if self.beforehand else ""
 
-def judge(
+    @property
+    def primary(self) -> tuple[Verdict, ...]:
+        """The verdicts that are not secondary."""
+        return tuple(one for one in self.verdicts if not one.question.secondary)
+
+
+def judge_pairs(
     trials: Sequence[TrialResult], pairs: Sequence[Pair], declared: ActiveDeclaration | None = None
-) -> dict[Pair, ArmVerdicts]:
+) -> list[PairVerdicts]:
     """Judge each pair of arms in every metric that has a direction, in the families that ``declared`` makes."""
     by_arm = by_key(trials, lambda trial: trial.arm)
-    primary = None if declared is None else declared_quantity(trials, declared)
+    primary = None if declared is None else asked_quantity(declared.metric, trials)
     asked: list[tuple[Pair, Quantity]] = []
     for pair in pairs:
         own = [trial for arm in pair for trial in by_arm.get(arm, [])]
@@ -91,15 +77,15 @@ def judge(
             shown = [primary, *(one for one in shown if one.key != primary.key)]
         asked += [(pair, one) for one in shown if one.direction]
     questions = [_question(by_arm, pair, one, declared) for pair, one in asked]
-    answers = judgement.judge(trials, _declaration(questions, declared))
-    judged = {}
+    answers = judge(trials, _declaration(questions, declared))
+    judged = []
     for pair in pairs:
         found, notes, missing = [], list[str](), ""
         for (arms, one), answer in zip(asked, answers, strict=True):
             if arms != pair:
                 continue
             if answer.pairs.rows:
-                found.append(ArmVerdict(one, answer, _role(answer.question, declared)))
+                found.append(answer)
                 notes += [f"{one.name}: {line}" for line in answer.notes]
                 continue
             own = [trial for arm in pair for trial in by_arm.get(arm, [])]
@@ -110,7 +96,8 @@ def judge(
         if primary is not None and not primary.direction:
             missing = "whether more of it is better is not known"
             notes.append(f"{primary.name}: {missing}")
-        judged[pair] = ArmVerdicts(tuple(found), tuple(notes), primary, missing)
+        alone = declared is not None and declared.beforehand
+        judged.append(PairVerdicts(*pair, tuple(found), tuple(notes), primary, alone, missing))
     return judged
 
 
@@ -125,7 +112,7 @@ def _question(
     asks = next((trial.question for trial in by_arm.get(baseline, [])), "")
     primary = declared.question in ("", asks) and one.key == declared.metric
     for planned in declared.declaration.questions:
-        keys = [{folder_key(trial) for trial in by_arm.get(side, [])} for side in pair]
+        keys = [{trial.key for trial in by_arm.get(side, [])} for side in pair]
         if planned.scenes and all(a in keys[0] and b in keys[1] for a, b in planned.scenes.values()):
             question = replace(question, scenes=planned.scenes, seeds=planned.seeds)
             question = replace(question, least=planned.least) if primary else question
@@ -140,25 +127,100 @@ def _declaration(questions: Sequence[Question], declared: ActiveDeclaration | No
     return Declaration(time=one.time, questions=tuple(questions), error_rate=one.error_rate, looks=looks)
 
 
-def _role(question: Question, declared: ActiveDeclaration | None) -> Role:
-    if declared is None or not declared.beforehand:
-        return "one of all"
-    return "secondary" if question.secondary else "declared"
+def seeds_to_resolve(verdict: Verdict) -> int | None:
+    """The number of seeds that would resolve the worthwhile difference; None: unknown or beyond reach."""
+    if verdict.deviation is None or verdict.quantity.worthwhile is None:
+        return None
+    return seeds_needed(verdict.deviation, len(verdict.scenes), verdict.quantity.worthwhile)
 
 
-def declared_quantity(trials: Sequence[TrialResult], declared: ActiveDeclaration) -> Quantity:
-    """The declared metric; also one of the user's own that no trial could compute."""
-    return metric_quantity(declared.metric, trials)
+def headline(judged: PairVerdicts) -> str:
+    """The verdicts on two arms in one sentence, the declared metric's alone where there is one."""
+    verdicts, against = judged.verdicts, f"{judged.second} against {judged.first}"
+    if not verdicts:
+        return f"{judged.second} and {judged.first} cannot be compared: no metric has paired trials."
+    where = _scope(verdicts[0])
+    if all(one.equal for one in verdicts):
+        return (
+            f"{against}, on {where}: equal in every metric, to the last bit. What they differ in never acted: look at "
+            "the events, and at train.densify_start and densify_stop."
+        )
+    if all(one.interval is None for one in verdicts):
+        return f"{against}: no verdict, one trial of each on {where}; run more seeds."
+    if judged.missing and judged.declared is not None:
+        return (
+            f"{against}: no verdict, since {judged.declared.name}, which was declared, has no value ({judged.missing})."
+        )
+    if judged.role(verdicts[0]) == DECLARED:
+        return f"{against}, on {where}: {_by_word(verdicts[:1])}, which was declared beforehand."
+    adjusted = "" if judged.declared is None else ", all metrics adjusted for their number"
+    return f"{against}, on {where}{adjusted}: {_by_word(verdicts)}."
 
 
-def declared_lines(declared: ActiveDeclaration, judged: dict[Pair, ArmVerdicts]) -> list[str]:
+def secondary(judged: PairVerdicts) -> str:
+    """The secondary metrics in one sentence, where one was declared and they can be decided."""
+    others = [one for one in judged.verdicts if one.question.secondary]
+    decidable = any(one.interval is not None for one in others)
+    return f"Secondary, adjusted for their number: {_by_word(others)}." if decidable else ""
+
+
+def _by_word(verdicts: Sequence[Verdict]) -> str:
+    """``better in PSNR; undecided in SSIM, FLIP``"""
+    found = {
+        word: [f"{one.quantity.name}{_known_sign(one)}" for one in verdicts if WORDS[one.outcome] == word]
+        for word in WORDS.values()
+    }
+    return "; ".join(f"{word} in {', '.join(names)}" for word, names in found.items() if names)
+
+
+def _known_sign(verdict: Verdict) -> str:
+    """``, though better`` of a difference that is too small to matter and whose sign is known."""
+    known = verdict.outcome == TOO_SMALL and verdict.interval is not None and verdict.interval.excludes_zero()
+    if not known or verdict.mean is None or not verdict.question.sign:
+        return ""
+    return f", though {'better' if verdict.mean * verdict.question.sign > 0 else 'worse'}"
+
+
+def _scope(verdict: Verdict) -> str:
+    """The scenes that the verdict speaks of."""
+    return "these scenes" if len(verdict.pairs.rows) > 1 else "this scene"
+
+
+def detail_lines(verdicts: Sequence[Verdict]) -> list[str]:
+    """A line for each metric that says more than its row: scenes like these, trials far outside the others."""
+    return [
+        f"{one.quantity.name}: {line}"
+        for one in verdicts
+        for line in (like_these_words(one, WORDS, "it helps"), outlying_words(one))
+        if line
+    ]
+
+
+def by_scene_lines(verdicts: Sequence[Verdict]) -> list[str]:
+    """A line for each metric in which single scenes are decided (p below 5 %, adjusted), which names them.
+
+    A mean over scenes that disagree hides both sides of what was found.
+    """
+    lines = []
+    for one in verdicts:
+        decided = [scene for scene in one.scenes if scene.p is not None and scene.p < ALPHA]
+        better = [scene.scene for scene in decided if scene.mean * one.question.sign > 0]
+        worse = [scene.scene for scene in decided if scene.mean * one.question.sign < 0]
+        found = [f"{word} on {', '.join(names)}" for word, names in (("better", better), ("worse", worse)) if names]
+        if len(one.scenes) > 1 and found:
+            warning = ": the scenes disagree, so their mean says little" if len(found) > 1 else ""
+            lines.append(f"{one.quantity.name} by scene: {', '.join(found)}{warning}")
+    return lines
+
+
+def declared_lines(declared: ActiveDeclaration, judged: Sequence[PairVerdicts]) -> list[str]:
     """Lines below a table that say what was declared, and the verdict on it for each pair of arms."""
-    quantity = next(iter(judged.values())).declared if judged else None
+    quantity = judged[0].declared if judged else None
     lines = declared.sentences(declared.metric if quantity is None else quantity.name)
-    for (first, second), one in judged.items():
-        against = f"{second} against {first}"
-        found = [verdict for verdict in one.verdicts if verdict.quantity.key == declared.metric]
-        if found and found[0].role == "secondary":
+    for one in judged:
+        against = f"{one.second} against {one.first}"
+        found = [verdict for verdict in one.verdicts if verdict.question.metric == declared.metric]
+        if found and found[0].question.secondary:
             continue  # the other question
         lines += [f"{VERDICT}{against}: {in_words(verdict)}." for verdict in found]
         if not found:
@@ -166,86 +228,67 @@ def declared_lines(declared: ActiveDeclaration, judged: dict[Pair, ArmVerdicts])
     return lines
 
 
-def families(judged: Sequence[ArmVerdicts]) -> list[str]:
+def families(judged: Sequence[PairVerdicts]) -> list[str]:
     """Lines that say how many tests each family had, and how it was adjusted."""
-    sizes: dict[Role, int] = {}
+    sizes: dict[str, int] = {}
     looks = False
     for one in judged:
         for verdict in one.verdicts:
-            sizes[verdict.role] = max(sizes.get(verdict.role, 0), verdict.verdict.family)
-            looks |= bool(verdict.verdict.question.seeds)
+            role = one.role(verdict)
+            sizes[role] = max(sizes.get(role, 0), verdict.family)
+            looks |= bool(verdict.question.seeds)
     lines = []
-    if "declared" in sizes:
-        how = "tested as it is" if sizes["declared"] == 1 else f"adjusted by Holm for {sizes['declared']} pairs of arms"
+    if DECLARED in sizes:
+        how = "tested as it is" if sizes[DECLARED] == 1 else f"adjusted by Holm for {sizes[DECLARED]} pairs of arms"
         lines.append(f"The declared metric is {'judged at each planned look' if looks else how}.")
-    if "secondary" in sizes:
-        how = "sharing 5 % equally at each look" if looks else f"{sizes['secondary']} tests adjusted by Holm"
+    if SECONDARY in sizes:
+        how = "sharing 5 % equally at each look" if looks else f"{sizes[SECONDARY]} tests adjusted by Holm"
         lines.append(
             f"Secondary: all other metrics of all pairs of arms, {how} among themselves; they do not make the verdict."
         )
-    if "one of all" in sizes:
-        number = counted(sizes["one of all"], "test")
+    if "" in sizes:
         none = any(one.declared is None for one in judged)
         opening = "No metric was declared beforehand (eval.primary): all" if none else "All"
+        number = counted(sizes[""], "test")
         lines.append(f"{opening} metrics of all pairs of arms are one family, {number} adjusted by Holm.")
     return lines
 
 
-def in_words(one: ArmVerdict) -> str:
-    """``better in LPIPS VGG raw on these scenes: −0.0123 (95 % interval −0.0200 to −0.0046), p 0.012``"""
-    verdict, spec = one.verdict, f".{one.quantity.decimals + 1}f"
-    word = f"{one.word} in" if one.word in ("better", "worse") else f"{one.word}, in"
-    text = f"{word} {one.quantity.name} on {scope(verdict)}: {signed(verdict.mean or 0.0, spec)}"
+def in_words(verdict: Verdict) -> str:
+    """``better in LPIPS VGG raw on these scenes: −0.0123 (interval −0.0200 to −0.0046, p 0.012)``"""
+    word, name = WORDS[verdict.outcome], verdict.quantity.name
+    text = f"{word} in {name} on {_scope(verdict)}: {verdict.shown(verdict.mean or 0.0)}"
     if verdict.interval is None:
         return f"{text}, no test: no trial was repeated with another seed or scene"
-    text += f" (interval {signed(verdict.interval.low, spec)} to {signed(verdict.interval.high, spec)}"
+    text += f" (interval {verdict.shown_interval(verdict.interval)}"
     if verdict.p is not None:
         text += f", p {p_text(verdict.p)}"
     text += f", adjusted for {verdict.family} tests)" if verdict.family > 1 else ")"
-    return "; ".join([text, *beyond_words(verdict), *outlying_words(verdict)])
+    return "; ".join(filter(None, [text, like_these_words(verdict, WORDS, "it helps"), outlying_words(verdict)]))
 
 
-def scope(verdict: judgement.Verdict) -> str:
-    """The scenes that the verdict speaks of."""
-    return "these scenes" if len(verdict.pairs.rows) > 1 else "this scene"
-
-
-def sign_words(verdict: judgement.Verdict) -> str:
-    """``, and better`` of a difference that is too small to matter and whose sign is known."""
-    known = verdict.outcome == TOO_SMALL and verdict.interval is not None and verdict.interval.excludes_zero()
-    if not known or verdict.mean is None or not verdict.question.sign:
+def like_these_words(verdict: Verdict, words: Mapping[Outcome, str], what: str) -> str:
+    """``scenes like these: undecided; it helps in 7 of 8 (sign test p 0.070, …)``; "" of too few scenes."""
+    found = verdict.like_these
+    if found is None:
         return ""
-    return f", though {'better' if verdict.mean * verdict.question.sign > 0 else 'worse'}"
-
-
-def beyond_words(verdict: judgement.Verdict) -> list[str]:
-    """``it helps in 7 of 8 scenes (p 0.070; 8 would suffice)``: what is said of scenes like these, if anything."""
-    one = verdict.like_these
-    if one is None:
-        return []
-    needed = "no count would" if one.needed is None else f"{one.needed} would"
-    power = f"{needed} suffice, which is seen in {one.power():.0%} where it helps in nine of ten".replace("%", " %")
-    share = f"{one.share.low:.0%} to {one.share.high:.0%}".replace("%", " %")
-    beyond = "" if one.beyond is None else f", in {one.beyond} by the least that matters"
-    median = ""
-    if one.median is not None:
-        median = f"; median effect {verdict.shown(one.median.low)} to {verdict.shown(one.median.high)}"
-    return [
-        f"scenes like these: {WORDS[one.outcome]}, it helps in {one.helped} of {one.scenes}{beyond} (p "
-        f"{p_text(one.p)}; {share} "
-        f"of such scenes{median}; {power})"
-    ]
-
-
-def outlying_words(verdict: judgement.Verdict) -> list[str]:
-    """``far outside the other seeds: garden/sfm-adc/…-seed3; without it: undecided``."""
-    if not verdict.outlying:
-        return []
-    labels = some_of([trial.label for trial in verdict.outlying])
-    words = (
-        f"far outside the other seeds of its scene and arm: {labels}; without: {WORDS[verdict.without or 'undecided']}"
+    least = "" if found.beyond is None else f", by the least that matters in {found.beyond}"
+    median = "" if found.median is None else f"; median effect {verdict.shown_interval(found.median)}"
+    needed = "no number of them would" if found.needed is None else f"{found.needed} of them would"
+    seen = f", which {100 * found.power():.0f} % of sweeps see where nine of ten do" if found.needed else ""
+    return (
+        f"scenes like these: {words[found.outcome]}; {what} in {found.helped} of {found.scenes}{least} (sign test p "
+        f"{p_text(found.p)}, {100 * found.share.low:.0f} to {100 * found.share.high:.0f} % of such scenes{median}); "
+        f"{needed} suffice at {100 * (1 - found.level):.3g} %{seen}"
     )
-    return [words]
+
+
+def outlying_words(verdict: Verdict) -> str:
+    """``far outside the other seeds: garden/sfm-adc/…-seed3; without it: undecided``; "" where none is."""
+    if not verdict.outlying:
+        return ""
+    labels, word = some_of([trial.label for trial in verdict.outlying]), WORDS[verdict.without or "undecided"]
+    return f"far outside the other seeds of its scene and arm: {labels}; without: {word}"
 
 
 def p_text(p: float) -> str:

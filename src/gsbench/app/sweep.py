@@ -22,8 +22,7 @@ from omegaconf import DictConfig
 from gsbench.app.command import OWN, Task
 from gsbench.app.grids import checked_grids, grid, intervals_of, is_interval, words_of_grids
 from gsbench.app.tuning import tuned_jobs
-from gsbench.claims.looks import Planned, run_looks
-from gsbench.claims.stopping import headline, plan_sweep
+from gsbench.claims.stopping import Planned, headline, plan_sweep, run_looks
 from gsbench.config.compose import Trial
 from gsbench.config.jobs import JobContext, begin_sweep, compose_jobs
 from gsbench.config.messages import explained

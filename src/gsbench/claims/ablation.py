@@ -1,110 +1,136 @@
-"""Shares of ingredients in a gain: every combination of named switches, and each switch's share of the whole gain.
+"""Which part of a densifier carries its gain: its switches, the runs of all their combinations, and what these show.
 
-Each switch is off or on; a run is a set of switches that are on. The gain of a set is its value minus that of the empty
-set. Shapley's value (1953) shares the gain of the full set among the switches: the mean, over all orders of turning
-them on, of what each adds when its turn comes. The shares add up to the gain exactly, and interactions are split evenly
-among those that have them.
+A switch is declared by the densifier's class (``SWITCHES``), by its YAML (``switches``), or on the command line. It is
+on as the densifier is configured; its ``off`` settings take that part out. Runs that differ only in what does nothing
+there (the scales of children where nothing is split) are one and the same, and trained once.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from gsbench.analysis.statistics import ALPHA, Interval, Run, shapley, student
+from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.quantities import asked_quantity
+from gsbench.analysis.results import TrialResult
+from gsbench.analysis.verdicts import WORDS
 from gsbench.errors import InputError
-from gsbench.words import closest
+from gsbench.runs.declaration import Arm, Declaration, Question
+from gsbench.settings import Switch, checked
+from gsbench.words import closest, listed
 
 MAX_SWITCHES = 8
+_ABSENT = object()  # unlike any value
 
-Array = NDArray[np.float64]
+Run = frozenset[str]  # the switches that are on
+Keys = Mapping[str, str]  # of a run, by scene: the folder of its trials without the seed
 
 
-@dataclass(frozen=True)
-class Share:
-    """Mean gain from a switch over all orders of turning switches on; ``part`` is that of the whole gain.
+def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> dict[str, Switch]:
+    """The switches of a densifier's class, and those of its settings ``values``, that take something out there.
 
-    ``interval`` is adjusted for the number of switches. ``alone`` is what the switch adds to nothing, ``last`` what it
-    adds to all others. ``part`` is None where the gain's interval holds zero, since a part of nothing means nothing.
+    Raises InputError for a switch that is none.
     """
-
-    switch: str
-    value: float
-    interval: Interval | None
-    alone: float
-    last: float
-    part: float | None
-
-
-@dataclass(frozen=True)
-class Ablation:
-    """The shares of all switches, and the gain of all together over none, which they add up to."""
-
-    shares: tuple[Share, ...]
-    gain: float
-    interval: Interval | None
+    listed_there = values.get("switches") or {}
+    if not isinstance(listed_there, Mapping):
+        raise InputError(f"densify.switches must be a mapping NAME: {{off: {{KEY: VALUE}}}}, got {listed_there!r}")
+    found = dict(own)
+    for name, entry in listed_there.items():
+        where = f"densify.switches.{name}"
+        if not isinstance(entry, Mapping) or "off" not in entry:
+            raise InputError(f"{where} must be {{off: {{KEY: VALUE}}}}, got {entry!r}")
+        found[str(name)] = Switch(**checked(Switch, dict(entry), where))
+    return {
+        name: switch
+        for name, switch in found.items()
+        if any(values.get(key, _ABSENT) != value for key, value in switch.off.items())
+    }
 
 
-def plan_runs(switches: Sequence[str]) -> list[Run]:
-    """All sets of switches; raises InputError for too many switches or one that stands twice."""
-    if len(set(switches)) < len(switches) or not switches:
-        raise InputError(f"switches must be different names, got {', '.join(switches) or 'none'}")
-    if len(switches) > MAX_SWITCHES:
-        raise InputError(f"{len(switches)} switches make {2 ** len(switches)} runs: choose at most {MAX_SWITCHES}")
-    sizes = range(len(switches) + 1)
-    return [frozenset(chosen) for size in sizes for chosen in itertools.combinations(sorted(switches), size)]
-
-
-def ablate(switches: Sequence[str], results: Mapping[Run, Array]) -> Ablation:
-    """The shares from trials: for each run of `plan_runs` its values [S, K], by scene and seed, in one order for all.
-
-    Shares are linear in the values, so each scene and seed has its own, and intervals are those of every difference
-    here (`analysis.statistics.student`). Raises InputError for missing runs and values.
-    """
-    _check_runs(switches, results)
-    every, none = frozenset(switches), frozenset[str]()
-    shape = results[none].shape
-    flat = {run: values.ravel() for run, values in results.items()}
-    by_trial = [
-        shapley(switches, {run: float(values[k]) for run, values in flat.items()}) for k in range(flat[none].size)
-    ]
-    gains = results[every] - results[none]  # [S, K]
-    whole = _interval(gains, ALPHA)
-    sure = whole is not None and whole.excludes_zero()
-    shares = []
-    for switch in switches:
-        own = np.array([shares_of[switch] for shares_of in by_trial]).reshape(shape)
-        one, rest = frozenset((switch,)), every - {switch}
-        shares.append(
-            Share(
-                switch,
-                float(own.mean()),
-                _interval(own, ALPHA / len(switches)),
-                float((results[one] - results[none]).mean()),
-                float((results[every] - results[rest]).mean()),
-                float(own.mean() / gains.mean()) if sure else None,
+def choose_switches(found: Mapping[str, Switch], names: Sequence[str], densify: str) -> dict[str, Switch]:
+    """Choose the switches of ``names``, or all; raises InputError for an unknown name, for none, and for too many."""
+    for name in names:
+        if name not in found:
+            raise InputError(
+                f"{name!r} is no switch of densify={densify}{closest(name, found)} (there are "
+                f"{', '.join(found) or 'none'})"
             )
+    if not found:
+        raise InputError(
+            f"densify={densify} declares no switch that is on: name one by --switch NAME:KEY=VALUE, the setting that "
+            "takes it out (docs/claims.md)"
         )
-    return Ablation(tuple(shares), float(gains.mean()), whole)
+    chosen = {name: found[name] for name in names or found}
+    if len(chosen) > MAX_SWITCHES:
+        raise InputError(f"{len(chosen)} switches make {2 ** len(chosen)} runs: choose at most {MAX_SWITCHES}")
+    return chosen
 
 
-def _interval(values: Array, alpha: float) -> Interval | None:
-    test = student(values)
-    return None if test is None else test.interval(alpha)
+def effective(run: Run, switches: Mapping[str, Switch]) -> Run:
+    """The run without the switches that do nothing in it, because that within which they act is off."""
+    return frozenset(name for name in run if _acts(name, run, switches))
 
 
-def _check_runs(switches: Sequence[str], results: Mapping[Run, Array]) -> None:
-    for run in results:
-        for name in sorted(run - set(switches)):
-            raise InputError(f"{name!r} is none of the switches{closest(name, switches)} ({', '.join(switches)})")
-    if missing := [run for run in plan_runs(switches) if run not in results]:
-        raise InputError(f"the run with {', '.join(sorted(missing[0])) or 'no switch'} on is missing")
-    if len({values.shape for values in results.values()}) > 1 or not all(values.size for values in results.values()):
-        raise InputError("every run needs the same scenes and seeds: some run lacks trials that another has")
-    if not all(math.isfinite(value) for values in results.values() for value in values.ravel()):
-        raise InputError("every value of a run must be a finite number")
+def _acts(name: str, run: Run, switches: Mapping[str, Switch]) -> bool:
+    within = switches[name].within
+    return within not in switches or (within in run and _acts(within, run, switches))
+
+
+def runs_to_train(switches: Mapping[str, Switch]) -> list[Run]:
+    """All combinations, each once, all switches on first; raises InputError for switches within each other."""
+    for name in switches:
+        seen, place = [name], switches[name].within
+        while place in switches:
+            if place in seen:
+                raise InputError(f"the switches {', '.join(seen)} stand within each other in a circle")
+            seen, place = [*seen, place], switches[place].within
+    sizes = range(len(switches) + 1)
+    every = [Run(chosen) for size in sizes for chosen in itertools.combinations(switches, size)]
+    runs = dict.fromkeys(effective(run, switches) for run in every)
+    return sorted(runs, key=lambda run: (-len(run), sorted(run)))
+
+
+def words_of(run: Run, switches: Mapping[str, Switch]) -> dict[str, Any]:
+    """The settings of ``densify`` that take out what is off in the run."""
+    settings: dict[str, Any] = {}
+    for name, switch in switches.items():
+        if name not in run:
+            settings |= switch.off
+    return settings
+
+
+def without(run: Run, switches: Sequence[str]) -> str:
+    """``without shrink``, or that all parts are on."""
+    off = [name for name in switches if name not in run]
+    return f"without {listed(off)}" if off else "with all of them"
+
+
+def judge_runs(trials: Sequence[TrialResult], runs: Mapping[Run, Keys], metric: str) -> list[Verdict]:
+    """The verdict on each run, held against the one with all switches on, in the order of ``runs``; one family."""
+    quantity = asked_quantity(metric, trials)
+    full = max(runs, key=len)
+    questions = [
+        Question(
+            metric=metric,
+            sign=quantity.direction or 1,
+            least=quantity.worthwhile,
+            baseline=Arm("", without(full, sorted(full))),
+            arm=Arm("", without(run, sorted(full))),
+            scenes={scene: (runs[full][scene], key) for scene, key in keys.items()},
+        )
+        for run, keys in runs.items()
+        if run != full
+    ]
+    return judge(trials, Declaration(time="1970-01-01T00:00:00Z", questions=tuple(questions)))
+
+
+def table(verdicts: Sequence[Verdict]) -> list[str]:
+    """The verdicts as lines of a Markdown table."""
+    name = verdicts[0].quantity.name
+    lines = [f"| run | difference in {name} from all parts | interval | verdict |", "|---|---|---|---|"]
+    for one in verdicts:
+        mean = "unknown" if one.mean is None else one.shown(one.mean)
+        interval = "unknown" if one.interval is None else one.shown_interval(one.interval)
+        lines.append(f"| {one.question.arm} | {mean} | {interval} | {one.untestable or WORDS[one.outcome]} |")
+    return lines

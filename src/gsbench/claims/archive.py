@@ -31,9 +31,9 @@ from typing import Any
 import yaml
 
 from gsbench import __version__
-from gsbench.analysis.measures import REGIONS, FromPixels, textured_error
-from gsbench.analysis.per_view import read_views
-from gsbench.analysis.results import Experiment, TrialResult, read_experiment
+from gsbench.analysis.errors_by_region import FromPixels, textured_error
+from gsbench.analysis.quantities import TEXTURED
+from gsbench.analysis.results import Experiment, TrialResult, read_experiment, read_views
 from gsbench.claims.crate import crate_metadata
 from gsbench.errors import InputError
 from gsbench.files import atomic
@@ -83,7 +83,7 @@ def write_archive(experiment: Experiment, out: Path) -> list[str]:
         ),
         PER_VIEW: _table(rows),
     } | ({DECLARED: read_bytes(declared)} if declared.is_file() else {})
-    if any(metric in REGIONS for one in read_declarations(experiment.folder) for metric in _metrics(one)):
+    if any(metric == TEXTURED.key for one in read_declarations(experiment.folder) for metric in _metrics(one)):
         contents[PIXELS] = _json_lines(_measured_in_pictures(kept))
     manifest = {
         "format": FORMAT,

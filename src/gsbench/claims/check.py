@@ -10,14 +10,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gsbench.analysis.judgement import Pairs, Verdict, folder_key, judge
-from gsbench.analysis.measures import find_measure
-from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.pairing import Pairs
+from gsbench.analysis.quantities import asked_quantity
+from gsbench.analysis.results import read_experiment
 from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.file import Claim, ClaimsFile
-from gsbench.claims.looks import Planned, trials_of_look
 from gsbench.claims.published import resolve
+from gsbench.claims.stopping import Planned, trials_of_look
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.jobs import with_seed
 from gsbench.errors import InputError
@@ -25,9 +26,9 @@ from gsbench.records import read_if_sound
 from gsbench.runs.declaration import Declaration, declared_now, read_declarations, standing_one
 from gsbench.runs.layout import FAILED, SEED
 from gsbench.runs.trial_folder import Failure, TrialFolder
-from gsbench.words import closest, some_of, without_places
+from gsbench.words import some_of, without_places
 
-Lacking = Callable[[Trial, str], str]  # (trial, metric) -> why it cannot be had here, or ""
+Lacking = Callable[[Sequence[Trial]], Sequence[str]]  # a line for each thing that is not here
 NOT_TESTABLE = "not testable here"
 
 
@@ -78,31 +79,24 @@ class ClaimVerdict:
 class Check:
     """A file of claims in a runs folder: its declaration, and the first trial of each folder that it names.
 
-    ``missing`` says by claim what cannot be tested here. Trials of ``only`` these scenes are run here, of all where
-    none are named.
+    ``missing`` says by claim what cannot be tested here.
     """
 
     file: ClaimsFile
     runs: Path
     declaration: Declaration
     first: Mapping[str, Trial]  # by folder
-    only: tuple[str, ...] = ()
 
     @property
     def home(self) -> Path:
         return self.runs / self.file.name
 
     def to_run(self, planned: Sequence[Planned]) -> list[Trial]:
-        """The trials of a look that are run here."""
-        scenes = {self._scene_of(name) for name in self.only}
-        return [
-            with_seed(self.first[key], seed)
-            for key, seed in planned
-            if not self.only or self.first[key].values["scene"]["name"] in scenes
-        ]
+        """The trials of a look."""
+        return [with_seed(self.first[key], seed) for key, seed in planned]
 
     def trials(self, seeds: int) -> list[Trial]:
-        """The trials to be run here for the first ``seeds`` seeds of every claim."""
+        """The trials of the first ``seeds`` seeds of every claim."""
         return self.to_run(trials_of_look(self.declaration, range(len(self.declaration.questions)), seeds))
 
     def judged(self) -> list[Verdict]:
@@ -126,29 +120,14 @@ class Check:
         failures = [read_if_sound(folder / FAILED, Failure) for folder in ([] if verdict.final else folders)]
         return list(dict.fromkeys(failure.reason for failure in failures if failure is not None))
 
-    def _scene_of(self, name: str) -> str:
-        """The scene that the file calls so, as its trials call it."""
-        for question in self.declaration.questions:
-            if name in question.scenes:
-                return str(self.first[question.scenes[name][0]].values["scene"]["name"])
-        return name
 
-
-def prepare(
-    file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequence[str] = (), only: Sequence[str] = ()
-) -> Check:
+def prepare(file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequence[str] = ()) -> Check:
     """Compose the first trial of every scene and arm of every claim; ``lacking`` says what cannot be had here.
 
-    ``permissions`` are words such as ``allow_targets=[mine]`` that were typed: a file of claims can give none. Where
-    ``only`` some scenes are run here, nobody asks whether the others could be.
+    ``permissions`` are words such as ``allow_targets=[mine]`` that were typed: a file of claims can give none.
 
-    Raises InputError, naming claim, scene and arm, for settings that do not compose, for an unknown scene, and for one
-    of ``only`` that cannot be run here: the declaration would be another one than that of the other machines.
+    Raises InputError, naming claim, scene and arm, for settings that do not compose.
     """
-    for scene in only:
-        if scene not in file.scenes:
-            near = closest(scene, file.scenes)
-            raise InputError(f"{file.name} has no scene {scene}{near} (it has {', '.join(file.scenes)})")
     first: dict[str, Trial] = {}
     known: dict[tuple[str, ...], Trial] = {}
     questions, missing = [], {}
@@ -162,13 +141,7 @@ def prepare(
                 if words not in known:
                     known[words] = _composed(words, runs, f"claim {claim.id}, scene {scene}, arm {arm}")
                 trials.append(known[words])
-            asked = trials if scene in (only or (scene,)) else []
-            reason = next((why for trial in asked if (why := lacking(trial, claim.metric))), "")
-            if reason and only:
-                raise InputError(
-                    f"claim {claim.id} cannot be tested here on {scene}, which --scene names: {reason}; mend that, "
-                    "or give the claim the reason on all machines (not_testable)"
-                )
+            reason = next((why for trial in trials for why in lacking([trial])), "")
             if reason:
                 reasons.setdefault(reason, []).append(scene)
                 continue
@@ -184,7 +157,7 @@ def prepare(
     declaration = declared_now(
         questions=tuple(questions), error_rate=file.error_rate, looks=file.looks, missing=missing
     )
-    return Check(file, runs, declaration, first, tuple(only))
+    return Check(file, runs, declaration, first)
 
 
 def claim_verdicts(file: ClaimsFile, declaration: Declaration, judged: Sequence[Verdict]) -> list[ClaimVerdict]:
@@ -196,51 +169,29 @@ def claim_verdicts(file: ClaimsFile, declaration: Declaration, judged: Sequence[
         verdict = by_name.get(claim.id)
         if verdict is None or claim.not_testable:
             why = claim.not_testable or "; ".join(reasons) or "it was not tested"
-            measure = find_measure(claim.metric)
-            verdict = Verdict(file.question(claim, {}), measure, Pairs(()), untestable=why)
+            quantity = asked_quantity(claim.metric)
+            verdict = Verdict(file.question(claim, {}), quantity, Pairs(()), untestable=why)
             reasons = ()
         found.append(ClaimVerdict(claim, verdict, reasons))
     return found
 
 
-def recheck(
-    file: ClaimsFile, archives: Sequence[Path], folder: Path
-) -> tuple[list[ClaimVerdict], Declaration, list[Declaration]]:
-    """Judge the claims of ``file`` by the trials in ``archives`` alone, unpacked into the empty folder ``folder``.
+def recheck(file: ClaimsFile, archive: Path, folder: Path) -> tuple[list[ClaimVerdict], Declaration, list[Declaration]]:
+    """Judge the claims of ``file`` by the trials in ``archive`` alone, unpacked into the empty folder ``folder``.
 
-    Returns the verdicts, the declaration that they follow, and all of the same experiment. Raises InputError, one line,
-    for a damaged archive, one of another experiment or without declared claims, where archives were made under several
-    declarations, and where the file's claims are not those that were declared.
+    Returns the verdicts, the declaration that they follow, and all of the experiment. Raises InputError, one line, for
+    a damaged archive, one of another experiment or without declared claims, and where the file's claims are not those
+    that were declared.
     """
-    trials: dict[tuple[str, int], TrialResult] = {}
-    every: list[Declaration] = []
-    standing: dict[str, Path] = {}
-    for place, archive in enumerate(archives):
-        share = unpack_archive(archive, folder / str(place))
-        if share.name != file.name:
-            raise InputError(f"{archive} is of the experiment {share.name}, not of {file.name}")
-        declared = [one for one in read_declarations(share.folder) if one.of_claims]
-        if not declared:
-            raise InputError(f"{archive}: no claims were declared in it: it is no archive of a gsbench check")
-        every += declared
-        standing.setdefault(_questions_hash(declared[-1]), archive)
-        for trial in share.trials:
-            other = trials.setdefault((folder_key(trial), trial.seed), trial)
-            if other.metrics != trial.metrics:
-                raise InputError(
-                    f"{archive}: {trial.label} has other results in another archive: leave one of them out"
-                )
-    if len(standing) > 1:
-        raise InputError(f"{' and '.join(map(str, standing.values()))} were made under unlike declarations of claims")
-    every.sort(key=lambda one: one.moment)
-    declaration = resolve(standing_one(every), list(trials.values()))
+    experiment = unpack_archive(archive, folder)
+    if experiment.name != file.name:
+        raise InputError(f"{archive} is of the experiment {experiment.name}, not of {file.name}")
+    every = [one for one in read_declarations(experiment.folder) if one.of_claims]
+    if not every:
+        raise InputError(f"{archive}: no claims were declared in it: it is no archive of a gsbench check")
+    declaration = resolve(standing_one(every), experiment.trials)
     _check_same_claims(file, declaration)
-    verdicts = claim_verdicts(file, declaration, judge(list(trials.values()), declaration))
-    return verdicts, declaration, every
-
-
-def _questions_hash(declaration: Declaration) -> str:
-    return str(declaration.plan) if declaration.plan else declaration.hash
+    return claim_verdicts(file, declaration, judge(experiment.trials, declaration)), declaration, every
 
 
 def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:

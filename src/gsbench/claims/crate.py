@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gsbench import __version__
-from gsbench.analysis.judgement import measured
 from gsbench.analysis.results import TrialResult
 
 SPECIFICATION = "https://w3id.org/ro/crate/1.1"
@@ -29,7 +28,7 @@ def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str,
     scenes = sorted({trial.scene for trial in trials})
     arms = sorted({f"{trial.init}-{trial.densify}" for trial in trials})
     protocols = sorted({trial.record.protocol for trial in trials})
-    when = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime(max(map(measured, trials))))
+    when = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime(max(trial.measured for trial in trials)))
     root = {
         "@id": "./",
         "@type": "Dataset",

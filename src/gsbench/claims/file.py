@@ -31,7 +31,7 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Interval, MinLen, Predicate, doc
 
-from gsbench.analysis.measures import find_measure, measure_names
+from gsbench.analysis.quantities import askable_names, asked_quantity
 from gsbench.analysis.statistics import ALPHA, FIRST_LOOK, plan_looks
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
@@ -266,7 +266,7 @@ def _check_claim(claim: Claim, file: ClaimsFile) -> None:
 
 
 def _check_metric(claim: Claim, file: ClaimsFile) -> None:
-    where, names = f"claim {claim.id}", measure_names()
+    where, names = f"claim {claim.id}", askable_names()
     own = f"eval.extra.{claim.metric}."
     if claim.metric not in names and not any(key.lstrip("+").startswith(own) for key in file.settings):
         raise InputError(
@@ -274,7 +274,7 @@ def _check_metric(claim: Claim, file: ClaimsFile) -> None:
             f"of your own by settings: {{{own}_target_: mine.MyMetric}})"
         )
     effect = claim.effect
-    if find_measure(claim.metric).cost and not effect.relative:
+    if asked_quantity(claim.metric).cost and not effect.relative:
         raise InputError(f"{where}: least of {claim.metric} must be a part, such as 10%, got {effect}")
     if claim.metric in ("ssim", "flip") and not effect.relative and effect.size >= 1:
         raise InputError(f"{where}: least {effect} is more than {claim.metric} can differ by")

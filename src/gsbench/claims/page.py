@@ -1,25 +1,24 @@
-"""The page at the end of a check, in Markdown and HTML: claim by claim the verdict and all that it rests on."""
+"""The page at the end of a check: claim by claim the verdict and all that it rests on."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from typing import get_args
 
 from jinja2 import Environment, StrictUndefined
 
-from gsbench.analysis.cells import by_key, with_variants
+from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import fairness_table
-from gsbench.analysis.notes import caveats
-from gsbench.analysis.origins import cloud_notes, machine_notes
+from gsbench.analysis.notes import caveats, cloud_notes, machine_notes
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.report.pictures import Crop, choose_pictures
-from gsbench.analysis.results import TrialResult
-from gsbench.analysis.statistics import plan_looks
+from gsbench.analysis.results import TrialResult, by_key
+from gsbench.analysis.statistics import Outcome, plan_looks
 from gsbench.analysis.table_formats import to_html as table_to_html
-from gsbench.analysis.table_formats import to_markdown as table_to_markdown
 from gsbench.analysis.tables import Table
-from gsbench.analysis.verdicts import outlying_words, p_text
+from gsbench.analysis.verdicts import like_these_words, outlying_words
 from gsbench.claims.check import NOT_TESTABLE, ClaimVerdict
 from gsbench.claims.file import ClaimsFile
 from gsbench.runs.declaration import Declaration
@@ -28,6 +27,7 @@ from gsbench.words import counted
 
 LARGE = 1000.0  # numbers from here on are counts or seconds, and shown whole
 CROPS = 2  # pictures each for and against an arm
+OUTCOMES: dict[Outcome, str] = {word: word for word in get_args(Outcome)}
 SYMBOLS = {"supported": "✔", "refuted": "✘", "too small to matter": "≈", "undecided": "?", NOT_TESTABLE: "–"}
 
 
@@ -45,7 +45,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """Content of the verdicts' page, for both formats."""
+    """Content of the verdicts' page, for HTML and the terminal."""
 
     title: str
     lines: tuple[str, ...]
@@ -90,29 +90,8 @@ def to_text(page: Page) -> str:
     for section in page.sections:
         one = section.verdict
         verdicts.append(f"{one.word:<19}  {one.claim.id}: {section.headline}")
-        verdicts += [f"{'':<19}  {line}" for line in [_judged_on(one), *_like_these(one)] if line]
+        verdicts += [f"{'':<19}  {line}" for line in [_judged_on(one), _like_these(one)] if line]
     return "\n".join([page.title, *page.lines, *verdicts]) + "\n"
-
-
-def to_markdown(page: Page) -> str:
-    """The page as GitHub-flavoured Markdown."""
-    parts = [f"# {page.title}", "", *(line + "\n" for line in page.lines)]
-    parts += ["| | claim | verdict |", "|---|---|---|"]
-    for section in page.sections:
-        one = section.verdict
-        parts.append(f"| {SYMBOLS[one.word]} | {one.claim.id} | **{one.word}**: {_pipe(section.headline)} |")
-    for section in page.sections:
-        claim = section.verdict.claim
-        parts += ["", f"## {claim.id}: {section.verdict.word}", "", f"> {claim.says}", ">", f"> {claim.where}", ""]
-        parts += [section.headline + "\n"]
-        parts += map(table_to_markdown, section.fairness)
-        parts += [f"- {line}" for line in section.evidence]
-        if section.scenes:
-            parts += ["", "| scene | difference |", "|---|---|"]
-            parts += [f"| {scene} | {value} |" for scene, value in section.scenes]
-        if section.trials:
-            parts += ["", "Trials:", "", *(f"- `{folder}` {seeds}" for folder, seeds in section.trials)]
-    return "\n".join(parts).rstrip() + "\n"
 
 
 def to_html(page: Page) -> str:
@@ -133,24 +112,24 @@ def _section(one: ClaimVerdict) -> Section:
     headline = one.reason
     if answer is not None and answer.interval is not None:
         headline = (
-            f"{verdict.measure.name} of {claim.arm} against {claim.baseline}: {verdict.shown(answer.mean)} "
+            f"{verdict.quantity.name} of {claim.arm} against {claim.baseline}: {verdict.shown(answer.mean)} "
             f"({100 * (1 - answer.level):.3g} % interval {verdict.shown_interval(answer.interval)}); {one.reason}"
         )
         evidence += [
             f"least effect that matters: {claim.effect}; baseline's mean {_number(verdict.pairs.baseline)}",
             _judged_on(one),
-            *_like_these(one),
+            _like_these(one),
         ]
-    if verdict.final and one.word == "undecided" and not verdict.measure.cost:
+    if verdict.final and one.word == "undecided" and not verdict.quantity.cost:
         evidence.append(f"how many seeds and scenes would decide, where the trials are: {_plan_words(one)}")
-    evidence += [*outlying_words(verdict), *_late_words(one), *one.missing, *verdict.notes]
+    evidence += [outlying_words(verdict), _late_words(one), *one.missing, *verdict.notes]
     fairness, mixed = _fairness(one)
     if mixed:
         headline += f". {mixed}"
     return Section(
         one,
         headline,
-        tuple(evidence),
+        tuple(filter(None, evidence)),
         tuple((scene.scene, verdict.shown(scene.mean)) for scene in verdict.scenes),
         fairness,
         _folders(verdict.pairs.trials),
@@ -169,34 +148,19 @@ def _judged_on(one: ClaimVerdict) -> str:
     )
 
 
-def _like_these(one: ClaimVerdict) -> list[str]:
-    """The statement about scenes like these, where the scenes are enough for one."""
-    verdict, found = one.verdict, one.verdict.like_these
-    if found is None:
-        return []
+def _like_these(one: ClaimVerdict) -> str:
+    """The statement about scenes like these; "" where the scenes are too few for one."""
     word = one.claim.direction if one.claim.sign else "higher"
-    least = "" if found.beyond is None else f", by the least that matters in {found.beyond}"
-    median = "" if found.median is None else f"; median effect {verdict.shown_interval(found.median)}"
-    needed = "no number of them would" if found.needed is None else f"{found.needed} of them would"
-    seen = (
-        f"; were it {word} in nine of ten, {100 * found.power():.0f} % of checks would see it" if found.needed else ""
-    )
-    return [
-        f"scenes like these: {found.outcome}; it is {word} in {found.helped} of {found.scenes}{least} (sign test p "
-        f"{p_text(found.p)}, {100 * found.share.low:.0f} to {100 * found.share.high:.0f} % of such scenes{median}); "
-        f"{needed} "
-        f"suffice at {100 * (1 - found.level):.3g} %{seen}"
-    ]
+    return like_these_words(one.verdict, OUTCOMES, f"it is {word}")
 
 
-def _late_words(one: ClaimVerdict) -> list[str]:
+def _late_words(one: ClaimVerdict) -> str:
     if not one.verdict.late:
-        return []
-    return [
-        f"{counted(one.verdict.late, 'trial')} had been measured before this was declared: the metric is one of "
-        "those that "
-        "could have been chosen, which share the error rate"
-    ]
+        return ""
+    return (
+        f"{counted(one.verdict.late, 'trial')} had been measured before this was declared: the metric is one of those "
+        "that could have been chosen, which share the error rate"
+    )
 
 
 def _plan_words(one: ClaimVerdict) -> str:
@@ -246,13 +210,13 @@ def _chart(one: ClaimVerdict) -> str:
     rows.append(ForestRow("all", answer.mean, answer.interval.low, answer.interval.high))
     unit = "log ratio" if one.claim.effect.relative else "difference"
     title = f"{one.claim.arm} against {one.claim.baseline}"
-    return forest_plot(title, rows, f"{verdict.measure.name}, {unit}", one.claim.sign)
+    return forest_plot(title, rows, f"{verdict.quantity.name}, {unit}", one.claim.sign)
 
 
 def _crops(one: ClaimVerdict) -> tuple[list[Crop], list[Crop]]:
     """Places where the arm is closer to the photographs, and where the baseline is."""
     pairs = _pairs(one.verdict.pairs.trials)
-    if not pairs or one.verdict.measure.cost:
+    if not pairs or one.verdict.quantity.cost:
         return [], []
     found = choose_pictures(pairs, CROPS)
     return list(found.gained), list(found.lost)
@@ -275,10 +239,6 @@ def _folders(trials: Sequence[TrialResult]) -> tuple[tuple[str, str], ...]:
 def _number(value: float) -> str:
     """Four digits, and none of powers of ten in large counts."""
     return f"{value:,.0f}" if abs(value) >= LARGE else f"{value:.4g}"
-
-
-def _pipe(text: str) -> str:
-    return text.replace("|", "\\|")
 
 
 def _resource(package: str, name: str) -> str:

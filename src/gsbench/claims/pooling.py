@@ -1,22 +1,31 @@
 """Results of many laboratories in one: a mean of their effects, with an interval whose error rate is known.
 
-The units are studies, each with the same weight, by Student's t. Weights from the studies' own standard errors would
-take as known what two or three seeds estimate: with the usual random-effects methods 7 to 10 % of intervals then miss
-the mean (docs/verdict.md). A mean only where protocols agree.
+A study is one archive's mean difference of two arms in one metric, over the pairs of trials of each scene, as every
+difference here (docs/verdict.md). The units are studies, each with the same weight, by Student's t. Weights from the
+studies' own standard errors would take as known what two or three seeds estimate: with the usual random-effects methods
+7 to 10 % of intervals then miss the mean. A mean only where protocols agree.
 """
 
 from __future__ import annotations
 
 import math
+import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from scipy import special
 
-from gsbench.analysis.report.charts import ForestRow, forest_plot
+from gsbench.analysis.cells import select_trials, with_variants
+from gsbench.analysis.fairness import budget_words
+from gsbench.analysis.pairing import Pairs, pair
+from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import ALPHA, Interval, student
+from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
+from gsbench.runs.declaration import Question
+from gsbench.runs.hashing import sha256_of
 
 MIN_STUDIES = 2
 
@@ -69,18 +78,6 @@ def pool(studies: Sequence[Study]) -> Pooled:
     return Pooled(tuple(studies), "", test.mean, test.interval(), test.p, deviation, prediction)
 
 
-def pooled_forest(pooled: Pooled, title: str, label: str, better: int = 0) -> str:
-    """The forest plot as SVG: a row for each study, and one for their mean where there is one."""
-    rows = [ForestRow(one.name, one.effect, *_bounds(one.interval)) for one in pooled.studies]
-    if pooled.mean is not None:
-        rows.append(ForestRow("all together", pooled.mean, *_bounds(pooled.interval)))
-    return forest_plot(title, rows, label, better)
-
-
-def _bounds(interval: Interval | None) -> tuple[float | None, float | None]:
-    return (None, None) if interval is None else (interval.low, interval.high)
-
-
 def describe(pooled: Pooled) -> list[str]:
     """The result in sentences."""
     if pooled.mean is None or pooled.interval is None or pooled.prediction is None:
@@ -121,3 +118,120 @@ def _refusal(studies: Sequence[Study]) -> str:
             shown = "; ".join(f"{name}: {value}" for name, value in values.items())
             return f"the studies differ in {key} ({shown})"
     return ""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """The pooled question: names that ``arm`` and ``baseline`` go by in the sources, and our key of the metric.
+
+    ``where``: only trials of archives with these values of settings count.
+    """
+
+    arm: tuple[str, ...]
+    baseline: tuple[str, ...]
+    metric: str
+    where: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Studies of one source, what they say of themselves, and ``trials`` as marks: none is to be counted twice."""
+
+    studies: tuple[Study, ...]
+    notes: tuple[str, ...] = ()
+    trials: frozenset[str] = frozenset()
+
+
+def read_studies(path: Path, wanted: Wanted, name: str) -> Found:
+    """The studies in the archive ``path``, one for each protocol, called ``name``.
+
+    Raises InputError, one line, where there is none.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        every = unpack_archive(path, Path(folder)).trials
+        trials = with_variants(select_trials(every, wanted.where))
+        studies, notes = [], []
+        protocols = sorted({trial.record.protocol for trial in trials})
+        for protocol in protocols:
+            own = [trial for trial in trials if trial.record.protocol == protocol]
+            groups = _groups(own, _pairs(own, wanted, path))
+            for pairs in groups:
+                told_apart = [protocol] * (len(protocols) > 1) + [pairs[0][0].init] * (len(groups) > 1)
+                label = f"{name} ({', '.join(told_apart)})" if told_apart else name
+                found = [
+                    pair(own, Question(metric=wanted.metric, baseline=first, arm=second)) for first, second in pairs
+                ]
+                together = Pairs(tuple(row for one in found for row in one.rows))
+                if not together.rows:
+                    reason = next((f" ({line})" for one in found for line in one.left_out), "")
+                    raise InputError(f"{path}: no trials can be paired in {wanted.metric}{reason}")
+                test = student(together.differences)
+                mean, interval = float(together.differences.mean()), None if test is None else test.interval()
+                studies.append(Study(label, mean, interval, _conditions(protocol, wanted.metric), _budgets(own, pairs)))
+                for (first, second), paired in zip(pairs, found, strict=True):
+                    count = sum(len(row.seeds) for row in paired.rows)
+                    notes.append(
+                        f"{label}: {second} against {first}, {count} pairs of trials on "
+                        f"{', '.join(paired.scenes)}; {_size(own)}"
+                    )
+                    notes += [f"{label}: left out, {line}" for line in paired.left_out]
+        return Found(tuple(studies), tuple(notes), frozenset(map(_mark, trials)))
+
+
+def _groups(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> list[list[tuple[Arm, Arm]]]:
+    """Group pairs into studies: all are one where each scene has one initialiser, else each is its own."""
+    scenes = [{trial.scene for trial in trials if trial.arm in pair} for pair in pairs]
+    disjoint = sum(map(len, scenes)) == len(set().union(*scenes))
+    return [list(pairs)] if disjoint else [[pair] for pair in pairs]
+
+
+def _pairs(trials: Sequence[TrialResult], wanted: Wanted, path: Path) -> list[tuple[Arm, Arm]]:
+    """(baseline, arm) under each initialiser that has both; a name is that of a densifier, with its variant or not."""
+    arms = sorted({trial.arm for trial in trials})
+
+    def named(init: str, names: Sequence[str]) -> list[Arm]:
+        own = [arm for arm in arms if arm.init == init]
+        return [arm for arm in own if {str(replace(arm, init="")), arm.densify, str(arm)} & {*names}]
+
+    found = []
+    for init in sorted({arm.init for arm in arms}):
+        ones, others = named(init, wanted.baseline), named(init, wanted.arm)
+        if len(ones) > 1 or len(others) > 1:
+            several = ones if len(ones) > 1 else others
+            raise InputError(
+                f"{path}: {' and '.join(map(str, several))} go by one name: choose trials with --where "
+                "KEY=VALUE, or give the whole name of one"
+            )
+        if ones and others:
+            found.append((ones[0], others[0]))
+    if not found:
+        raise InputError(
+            f"{path} has no pair of {' or '.join(wanted.arm)} and {' or '.join(wanted.baseline)} (there are "
+            f"{', '.join(map(str, arms))})"
+        )
+    return found
+
+
+def _conditions(protocol: str, metric: str) -> dict[str, str]:
+    return {"protocol": protocol, "metric": metric}
+
+
+def _budgets(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> str:
+    """``20,000 Gaussians (governor)``: what limited the growth in these pairs of arms."""
+    arms = {arm for pair in pairs for arm in pair}
+    return " or ".join(sorted({budget_words(trial) or "not known" for trial in trials if trial.arm in arms}))
+
+
+def _size(trials: Sequence[TrialResult]) -> str:
+    """In which trials of archives may differ without being refused, for people to judge."""
+    sizes = sorted({f"{size[0]}×{size[1]}" for trial in trials if (size := trial.record.resolution)})
+    steps = sorted({f"{trial.record.iterations:,}" for trial in trials})
+    versions = sorted({trial.record.versions.get("gsbench", "?") for trial in trials})
+    return f"{' or '.join(steps)} iterations, {' or '.join(sizes)} px, gsbench {' or '.join(versions)}"
+
+
+def _mark(trial: TrialResult) -> str:
+    """Mark that tells a trial from every other: made again elsewhere, it has other seconds."""
+    record = trial.record
+    told = [trial.config_hash, trial.seed, record.hashes, record.seconds, dict(trial.metrics)]
+    return sha256_of(told)

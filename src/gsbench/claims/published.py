@@ -10,9 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from gsbench.analysis.cells import by_key
-from gsbench.analysis.judgement import folder_key
-from gsbench.analysis.results import TrialResult
+from gsbench.analysis.results import TrialResult, by_key
 from gsbench.claims.file import DIRECTIONS, read_least
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Arm, Declaration, Question
@@ -28,7 +26,7 @@ def resolve(declaration: Declaration, trials: Sequence[TrialResult]) -> Declarat
     if not declaration.plan:
         return declaration
     plan = declaration.plan
-    kinds = {key: own[0] for key, own in by_key(trials, folder_key).items()}
+    kinds = {key: own[0] for key, own in by_key(trials, lambda trial: trial.key).items()}
     try:
         questions = [_question(claim, plan, kinds) for claim in plan["claims"]]
         return replace(

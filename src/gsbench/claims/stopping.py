@@ -1,23 +1,25 @@
-"""A sweep that stops when decided: every two arms are a question about ``eval.primary``, with seeds in planned
-looks."""
+"""Adding seeds in planned looks until every question is decided, of a check and of a sweep that stops when decided.
+
+In such a sweep every two arms are a question about ``eval.primary``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import logging
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import yaml
 
-from gsbench.analysis.cells import by_key, with_variants
+from gsbench.analysis.cells import with_variants
 from gsbench.analysis.configurations import Configurations
-from gsbench.analysis.judgement import Verdict, folder_key, judge
+from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.pairing import choose_pairs
-from gsbench.analysis.results import Arm, TrialResult, read_experiment
+from gsbench.analysis.results import Arm, TrialResult, by_key, read_experiment
 from gsbench.analysis.statistics import FIRST_LOOK, plan_looks
 from gsbench.analysis.verdicts import WORDS
-from gsbench.claims.looks import Planned, trials_of_look
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find
@@ -28,7 +30,47 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted
 
+log = logging.getLogger(__name__)
+
 T = TypeVar("T", bound=Trial)
+Planned = tuple[str, int]  # folder of a trial within its experiment, without the seed; and the seed
+
+
+def trials_of_look(declaration: Declaration, places: Sequence[int], seeds: int) -> list[Planned]:
+    """The trials that the questions at ``places`` need for their first ``seeds`` seeds, a seed after the other."""
+    questions = [declaration.questions[k] for k in places]
+    needed = [
+        (question.seeds[rank], rank, key)
+        for question in questions
+        for rank in range(min(seeds, len(question.seeds)))
+        for both in question.scenes.values()
+        for key in both
+    ]
+    return list(dict.fromkeys((key, seed) for seed, _, key in sorted(needed, key=lambda one: one[1])))
+
+
+def run_looks(
+    declaration: Declaration,
+    judged: Callable[[], list[Verdict]],
+    run: Callable[[list[Planned]], object],
+) -> list[Verdict]:
+    """The verdicts, with seeds added look by look; ``judged`` gives those so far, ``run`` runs trials that are not
+    done.
+
+    A question whose trials failed waits; the others go on.
+    """
+    waiting: set[int] = set()
+    verdicts = judged()
+    for seeds in declaration.looks:
+        left = [k for k, verdict in enumerate(verdicts) if not verdict.final and k not in waiting]
+        if not left:
+            break
+        if needed := trials_of_look(declaration, left, seeds):
+            log.info("seeds up to %d: %s for %s", seeds, counted(len(needed), "trial"), counted(len(left), "question"))
+            run(needed)
+        verdicts = judged()
+        waiting |= {k for k in left if not verdicts[k].final and verdicts[k].pairs.seeds < seeds}
+    return verdicts
 
 
 @dataclass(frozen=True)
@@ -86,7 +128,7 @@ def plan_sweep(trials: Sequence[T]) -> Stopping[T]:
             Question(metric=metric, sign=sign, least=least, baseline=baseline, arm=arm, scenes=scenes, seeds=seeds)
         )
     declaration = declared_now(questions=tuple(questions), looks=plan_looks(len(seeds)))
-    by_folder = {(folder_key(one), one.seed): trial for one, trial in zip(expected, trials, strict=True)}
+    by_folder = {(one.key, one.seed): trial for one, trial in zip(expected, trials, strict=True)}
     return Stopping(declaration, home, by_folder)
 
 
@@ -101,7 +143,7 @@ def headline(verdict: Verdict) -> str:
     if verdict.outcome == "undecided":
         word = f"undecided after all {seeds} seeds" if verdict.final else "not decided yet"
     return (
-        f"{against}: {word} in {verdict.measure.name}, {verdict.shown(answer.mean)} ({100 * (1 - answer.level):.3g} % "
+        f"{against}: {word} in {verdict.quantity.name}, {verdict.shown(answer.mean)} ({100 * (1 - answer.level):.3g} % "
         f"interval over all looks {verdict.shown_interval(answer.interval)}) with {seeds} of at most {most} seeds"
         + "".join(f"; {note}" for note in verdict.notes)
     )
@@ -130,7 +172,7 @@ def _expected(trial: Trial) -> TrialResult:
         versions={},
     )
     found = TrialResult(folder, folder.name.partition(SEED)[0], record)
-    return replace(found, settings=Configurations({found.kind: flatten(yaml.safe_load(trial.yaml))}))
+    return replace(found, settings=Configurations({found.key: flatten(yaml.safe_load(trial.yaml))}))
 
 
 def _facts(metric: str, values: Mapping[str, Any]) -> MetricFacts:
@@ -164,7 +206,7 @@ def _scenes(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> dict[str,
     """The folders of both arms' trials on each scene that has both."""
     scenes = {}
     for scene, group in by_key(trials, lambda trial: trial.scene).items():
-        one, other = ({folder_key(trial) for trial in group if trial.arm == side} for side in (baseline, arm))
+        one, other = ({trial.key for trial in group if trial.arm == side} for side in (baseline, arm))
         if len(one) == len(other) == 1:
             scenes[scene] = one.pop(), other.pop()
     return scenes

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.per_view import read_views
-from gsbench.analysis.results import TrialResult
+from gsbench.analysis.results import TrialResult, read_views
 from gsbench.config.command_words import options
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import combinations
@@ -15,7 +16,6 @@ import torch
 from numpy.typing import NDArray
 
 from gsbench.analysis.results import TrialResult, load_experiment
-from gsbench.analysis.statistics import Run, shapley
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, quantize, summarize
 from gsbench.eval.protocol import OTHERS, Protocol, get_protocol, protocol_of
@@ -45,6 +45,7 @@ SHARED_METRICS = ("psnr", "ssim")  # whose difference is shared; LPIPS by anothe
 WITHOUT_EFFECT = {"psnr": ("SSIM padding",)}
 ROUNDING_TOLERANCE = 1  # 8-bit levels by which a render that is made again may differ from its file
 
+Run = frozenset[str]  # the conventions that are those of the other program
 Picture = NDArray[np.uint8]
 Pictures = Mapping[str, Picture]  # by view
 
@@ -139,6 +140,24 @@ def translate(
         shares=shares,
         unknown=unknown,
     )
+
+
+def shapley(switches: Sequence[str], values: Mapping[Run, float]) -> dict[str, float]:
+    """The share of each switch in ``values[all] - values[none]``, from the values of all 2^n sets (Shapley 1953).
+
+    It is the mean, over all orders of turning switches on, of what one adds when its turn comes. The shares add up to
+    the whole difference, and interactions are split evenly among those that have them.
+    """
+    count, shares = len(switches), {}
+    for switch in switches:
+        others = [name for name in switches if name != switch]
+        total = 0.0
+        for size in range(count):
+            weight = 1 / (count * math.comb(count - 1, size))
+            for chosen in combinations(others, size):
+                total += weight * (values[frozenset((*chosen, switch))] - values[frozenset(chosen)])
+        shares[switch] = total
+    return shares
 
 
 def material_of(trial: TrialResult, runs: Path) -> Material:

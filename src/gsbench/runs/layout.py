@@ -23,7 +23,6 @@ METRICS = "metrics.json"  # of an evaluation
 # in an experiment's folder
 PLAN = "plan.json"  # the trials that were asked for
 DECLARED = "declared.jsonl"  # the metrics that verdicts were declared to be about, and when
-ABLATION = "ablation.json"  # which trials have which parts of a densifier switched on
 TUNING = "tuning.json"  # of a search: what was searched for an arm of a sweep, and what was found
 SEED = "-seed"  # in the name of a trial's folder, between hash and seed
 TRIAL_GLOB = f"*/*/*{SEED}*"  # the trials that are there

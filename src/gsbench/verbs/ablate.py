@@ -9,16 +9,16 @@ from typing import Any
 
 import yaml
 
+from gsbench.analysis.results import read_experiment
 from gsbench.app.command import compose_trials, run_trials
-from gsbench.claims.switches import (
-    Record,
+from gsbench.claims.ablation import (
     choose_switches,
     declared_switches,
+    judge_runs,
     runs_to_train,
-    shares_of,
     table,
+    without,
     words_of,
-    write_record,
 )
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
@@ -26,7 +26,7 @@ from gsbench.launch.plan import describe_plan
 from gsbench.runs.layout import SEED
 from gsbench.settings import Switch
 from gsbench.verbs.arguments import ArgumentParser, names
-from gsbench.words import counted, listed
+from gsbench.words import counted
 
 DEFAULT_METRIC = "psnr"
 
@@ -50,29 +50,26 @@ def main(argv: Sequence[str], runs: Path) -> int:
         f"{counted(len(flat), 'trial')}"
     )
     for run, group in trials.items():
-        left_out = [name for name in switches if name not in run]
         hashes = ", ".join(dict.fromkeys(trial.folder.name.partition(SEED)[0] for trial in group))
-        print(f"  {hashes}: {f'without {listed(left_out)}' if left_out else 'with all of them'}")
+        print(f"  {hashes}: {without(run, list(switches))}")
     if options.dry_run:
         print("\n".join(describe_plan(flat, flat[0].values["launch"]["parallel"])))
         return 0
     home = flat[0].files.home
     code = run_trials(flat)
-    folders = {run: tuple(t.folder.relative_to(home).as_posix() for t in group) for run, group in trials.items()}
-    record = Record(densify, switches, tuple(folders.items()))
-    write_record(home, record)
     if code == 0:
+        keys = {run: {t.values["scene"]["name"]: _key(t, home) for t in group} for run, group in trials.items()}
         metric = options.metric or flat[0].values["eval"].get("primary") or DEFAULT_METRIC
-        print("\n".join(table(shares_of(record, home, metric), metric)))
-        print(f"drawn for every metric: gsbench report {home.name}")
+        print("\n".join(table(judge_runs(read_experiment(home).trials, keys, metric))))
+        print(f"all metrics and pictures: gsbench report {home.name}")
     return code
 
 
 def _parser() -> ArgumentParser:
     parser = ArgumentParser(
         prog="gsbench ablate",
-        description="Train a densifier with its parts switched off in all combinations (docs/claims.md), and say what "
-        "each part adds.",
+        description="Train a densifier with its parts switched off in all combinations (docs/claims.md), and judge "
+        "each against the densifier with all of them.",
         epilog="All other words are settings, as of a sweep: densify=volumetric_once scene=courtyard seed=0,1,2 …",
     )
     parser.add_argument(
@@ -105,6 +102,11 @@ def _trials(words: Sequence[str]) -> list[Trial]:
     if trials[0].values["launch"]["stop_when_decided"]:
         raise InputError("ablate needs all seeds of all runs: leave launch.stop_when_decided out")
     return trials
+
+
+def _key(trial: Trial, home: Path) -> str:
+    """The trial's folder within the experiment, without the seed."""
+    return trial.folder.relative_to(home).as_posix().rpartition(SEED)[0]
 
 
 def _only_densifier(trials: Sequence[Trial]) -> str:

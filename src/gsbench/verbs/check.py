@@ -9,8 +9,7 @@ from pathlib import Path
 
 from gsbench.claims.check import Check, prepare, recheck
 from gsbench.claims.file import ClaimsFile, direction_is_odd, read_claims
-from gsbench.claims.here import Here
-from gsbench.claims.looks import Planned, run_looks, trials_of_look
+from gsbench.claims.stopping import Planned, run_looks
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, place_of, write_text
@@ -19,11 +18,10 @@ from gsbench.launch.plan import describe_plan
 from gsbench.launch.preflight import missing_folders
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.verbs.arguments import ArgumentParser, names, path
+from gsbench.verbs.arguments import ArgumentParser, path
 from gsbench.words import counted
 
-MARKDOWN, HTML = "claims.md", "claims.html"
-PAGE_ENDINGS = (".md", ".html")
+HTML = "claims.html"
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -43,62 +41,45 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("--dry-run", action="store_true", help="show trials, time and what is not testable here")
     parser.add_argument(
         "--from",
-        dest="archives",
+        dest="archive",
         type=path,
-        nargs="+",
-        action="extend",
         metavar="ARCHIVE",
         help="make the verdicts again from what gsbench export --results wrote; runs nothing, needs no photographs",
     )
-    parser.add_argument(
-        "--scene",
-        dest="scenes",
-        type=names,
-        action="extend",
-        default=[],
-        metavar="NAME,…",
-        help="run the trials of these scenes alone, where other machines run the others",
-    )
-    parser.add_argument(
-        "--all-seeds",
-        action="store_true",
-        help="run all planned seeds at once, where looks at the trials would wait for other machines",
-    )
-    parser.add_argument("--out", type=path, metavar="PAGE", help="with --from: write the whole page, as .md or .html")
+    parser.add_argument("--out", type=path, metavar="PAGE", help="with --from: write the whole page, a .html file")
     options = parser.parse_args(argv)
     file = read_claims(options.claims)
-    if options.archives is not None:
-        if options.dry_run or options.scenes or options.all_seeds:
+    if options.archive is not None:
+        if options.dry_run:
             raise InputError("check --from runs nothing, so no other option than --out goes with it")
-        return _recheck(file, options.archives, options.out)
+        return _recheck(file, options.archive, options.out)
     if options.out is not None:
-        raise InputError(f"--out goes with --from; what is run here writes {MARKDOWN} and {HTML} beside its trials")
-    here = Here(missing_folders, download=not options.dry_run)
-    check = prepare(file, runs, here, _permissions(options.permissions), options.scenes)
+        raise InputError(f"--out goes with --from; what is run here writes {HTML} beside its trials")
+    check = prepare(file, runs, missing_folders, _permissions(options.permissions))
     if options.dry_run:
         print("\n".join(describe(check)))
     else:
-        _run(check, options.all_seeds)
+        _run(check)
     return 0
 
 
-def _recheck(file: ClaimsFile, archives: Sequence[Path], out: Path | None) -> int:
-    """Print the verdicts that the archives' trials make, and write their page; 0 whatever the verdicts are.
+def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> int:
+    """Print the verdicts that the archive's trials make, and write their page; 0 whatever the verdicts are.
 
-    Raises InputError for an ``out`` of neither format.
+    Raises InputError for an ``out`` of another format.
     """
-    from gsbench.claims.page import make_page, to_html, to_markdown, to_text
+    from gsbench.claims.page import make_page, to_html, to_text
 
-    if out is not None and out.suffix not in PAGE_ENDINGS:
-        raise InputError(f"--out {out}: a page ends in {' or '.join(PAGE_ENDINGS)}")
+    if out is not None and out.suffix != ".html":
+        raise InputError(f"--out {out}: a page ends in .html")
     with tempfile.TemporaryDirectory() as folder:
-        page = make_page(file, *recheck(file, archives, Path(folder)))
+        page = make_page(file, *recheck(file, archive, Path(folder)))
         print(to_text(page), end="")
         if out is None:
-            print("What each verdict rests on is on the whole page: --out PAGE.html (or .md)")
+            print("The whole page says what each verdict rests on: --out PAGE.html")
         else:
             with place_of(out):
-                write_text(out, to_html(page) if out.suffix == ".html" else to_markdown(page))
+                write_text(out, to_html(page))
             print(out)
     return 0
 
@@ -125,8 +106,6 @@ def describe(check: Check) -> list[str]:
         scenes, looks = ", ".join(asked[claim.id].scenes), ", ".join(map(str, declaration.looks))
         lines.append(f"to be tested       {claim.id}: {what}; on {scenes}; looks at {looks} seeds")
         lines += [f"                   without {reason}" for reason in missing]
-        if others := [scene for scene in asked[claim.id].scenes if check.only and scene not in check.only]:
-            lines.append(f"                   left to others: {', '.join(others)}")
         lines += [f"                   {remark}" for remark in [direction_is_odd(claim)] if remark]
     if not asked:
         return lines
@@ -140,8 +119,8 @@ def describe(check: Check) -> list[str]:
     return lines
 
 
-def _run(check: Check, all_seeds: bool) -> None:
-    from gsbench.claims.page import make_page, to_html, to_markdown
+def _run(check: Check) -> None:
+    from gsbench.claims.page import make_page, to_html
     from gsbench.launch.batch import run_batch
 
     make_runs_folder(check.runs)
@@ -152,12 +131,9 @@ def _run(check: Check, all_seeds: bool) -> None:
         if left:
             run_batch(left)
 
-    if all_seeds:  # what an earlier look sees does not change by them
-        run(trials_of_look(check.declaration, range(len(check.declaration.questions)), check.file.seeds))
     verdicts = check.verdicts(run_looks(check.declaration, check.judged, run))
     page = make_page(check.file, verdicts, check.declaration, read_declarations(check.home))
-    for name, text in ((MARKDOWN, to_markdown(page)), (HTML, to_html(page))):
-        write_text(check.home / name, text)
+    write_text(check.home / HTML, to_html(page))
     for verdict in verdicts:
         print(f"{verdict.word:<19}  {verdict.claim.id}: {verdict.reason}")
     print(check.home / HTML)

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.judgement import pair
-from gsbench.analysis.pairing import BASELINE, choose_pairs
+from gsbench.analysis.pairing import BASELINE, choose_pairs, pair
 from gsbench.analysis.planning import (
     Components,
     Size,

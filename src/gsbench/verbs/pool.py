@@ -5,16 +5,12 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from html import escape
-from importlib.resources import files
 from pathlib import Path
 
 from gsbench.analysis.pairing import BASELINE
-from gsbench.analysis.quantities import metric_quantity
-from gsbench.claims.pooling import Pooled, describe, pool, pooled_forest
-from gsbench.claims.studies import Wanted, read_source
+from gsbench.analysis.quantities import asked_quantity
+from gsbench.claims.pooling import Pooled, Wanted, describe, pool, read_studies
 from gsbench.errors import InputError
-from gsbench.files import place_of, write_text
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 
 DONE, LEFT_OUT = 0, 1
@@ -25,31 +21,24 @@ def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: 0, or 1 where a source was left out; raises InputError where none can be read."""
     parser = ArgumentParser(
         prog="gsbench pool",
-        description="A mean over many sources, each with the same weight: archives of `gsbench export --results`, and "
-        "folders of "
-        "nerfbaselines' result files.",
+        description="A mean over many archives of `gsbench export --results`, each with the same weight.",
     )
-    parser.add_argument("sources", nargs="+", type=path, metavar="SOURCE")
+    parser.add_argument("sources", nargs="+", type=path, metavar="ARCHIVE")
     parser.add_argument("--arm", type=names, required=True, help="a densifier; names it goes by, comma between")
     parser.add_argument("--baseline", type=names, default=(BASELINE,), help=f"what it is held against ({BASELINE})")
     parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_vgg")
     add_where(parser)
     parser.add_argument("--protocol", help="only studies by this one, such as paper-1")
-    parser.add_argument("--out", type=path, metavar="FILE", help="also write this HTML file, with the forest plot")
     options = parser.parse_args(argv)
     wanted = Wanted(options.arm, options.baseline, options.metric, dict(options.where))
     pooled, notes, faults = pool_sources(options.sources, wanted, options.protocol)
     title = f"{options.arm[0]} against {options.baseline[0]}"
-    shown = metric_quantity(options.metric, ())
+    shown = asked_quantity(options.metric)
     lines = [f"{title}, difference in {shown.name}{BETTER[shown.direction]}", "", *_rows(pooled), ""]
     lines += [*describe(pooled), *notes, *faults]
     print("\n".join(lines))
     for fault in faults:
         print(f"gsbench: {fault}", file=sys.stderr)
-    if options.out is not None:
-        title += f": {options.metric}"
-        _write_page(options.out, title, _forest(title, pooled, options.metric), [*describe(pooled), *notes, *faults])
-        print(options.out)
     return LEFT_OUT if faults else DONE
 
 
@@ -65,7 +54,7 @@ def pool_sources(
     names_of = Counter(source.stem for source in sources)
     for source in sources:
         try:
-            found = read_source(source, wanted, source.stem if names_of[source.stem] == 1 else str(source))
+            found = read_studies(source, wanted, source.stem if names_of[source.stem] == 1 else str(source))
         except InputError as error:
             faults.append(f"left out: {error}")
             continue
@@ -92,21 +81,3 @@ def _rows(pooled: Pooled) -> list[str]:
         interval = "unknown" if study.interval is None else f"{study.interval.low:+.4g} to {study.interval.high:+.4g}"
         lines.append(f"| {study.name} | {study.effect:+.4g} | {interval} | {study.conditions['protocol']} |")
     return lines
-
-
-def _forest(title: str, pooled: Pooled, metric: str) -> str:
-    shown = metric_quantity(metric, ())
-    return pooled_forest(pooled, title, f"difference in {shown.name}{BETTER[shown.direction]}", shown.direction)
-
-
-def _write_page(out: Path, title: str, chart: str, lines: Sequence[str]) -> None:
-    """Write the page to the file ``out``; ``chart`` is SVG. Raises InputError where it cannot be written."""
-    style = files("gsbench.analysis.report").joinpath("style.css").read_text(encoding="utf-8")
-    listed = "".join(f"<li>{escape(line)}</li>" for line in lines)
-    page = (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
-        f'<link rel="icon" href="data:,"><style>{style}</style></head>\n'
-        f'<body><main><h1>{escape(title)}</h1><div class="charts">{chart}</div><ul>{listed}</ul></main></body></html>\n'
-    )
-    with place_of(out):
-        write_text(out, page)

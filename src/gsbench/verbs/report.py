@@ -8,7 +8,6 @@ from pathlib import Path
 
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.results import load_experiment
-from gsbench.claims.switches import ablation_part
 from gsbench.errors import InputError
 from gsbench.files import place_of, write_text
 from gsbench.verbs.arguments import ArgumentParser, path
@@ -35,7 +34,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     file = experiment.folder / REPORT_NAME if options.out is None else file_at(options.out, experiment.name)
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
-    text = build_report(experiment, options.baseline or BASELINE, ablation_part(experiment.folder))
+    text = build_report(experiment, options.baseline or BASELINE)
     with place_of(file):
         write_text(file, text)
     print(file)

@@ -18,7 +18,7 @@ VERBS = {
     "ablate": ("gsbench.verbs.ablate", "which part of a densifier carries its gain: its switches in all combinations"),
     "pool": (
         "gsbench.verbs.pool",
-        "one answer from the results of many: archives by export --results, nerfbaselines' files",
+        "one answer from the results of many, which export --results wrote",
     ),
     "explain": ("gsbench.verbs.explain", "how a table's number came about; with --stale, why a stage is computed anew"),
     "status": ("gsbench.verbs.status", "what an experiment has done, runs, failed and misses"),

@@ -18,9 +18,7 @@ from gsbench.analysis.published import published_names, published_table
 from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experiment
 from gsbench.analysis.table_formats import FORMATS
 from gsbench.analysis.tables import DEFAULT_ROWS, build_table
-from gsbench.analysis.translations import by_protocol
 from gsbench.errors import InputError
-from gsbench.eval.protocol import ALL
 from gsbench.files import place_of, write_text
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 
@@ -39,8 +37,6 @@ def main(argv: Sequence[str], runs: Path) -> int:
     experiment = load_experiment(runs, options.experiment)
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
-    if options.protocol is not None:
-        experiment = by_protocol(experiment, options.protocol)
     trials = select_trials(experiment.trials, dict(options.where))
     texts = _trials(trials, options) if options.format == TRIALS else _tables(experiment, trials, options)
     _write(texts, options.out, experiment.name)
@@ -131,12 +127,6 @@ def _parser() -> ArgumentParser:
         "--paper",
         metavar="NAME",
         help=f"also compare the trials with published numbers: {', '.join(published_names())}",
-    )
-    parser.add_argument(
-        "--protocol",
-        choices=list(ALL),
-        help="the metrics of the same renders by this protocol, once `gsbench evaluate EXPERIMENT --protocol all` "
-        "measured them",
     )
     parser.add_argument(
         "--layout",

@@ -10,11 +10,11 @@ from importlib.resources import files
 
 import yaml
 
-from gsbench.analysis.cells import by_key, check_averageable, make_cell
+from gsbench.analysis.cells import check_averageable, make_cell
 from gsbench.analysis.paper import PaperChoice, Printed, choice_lines, read_setup
 from gsbench.analysis.paper_tables import Agreement, compare_with_printed, legend
 from gsbench.analysis.quantities import quantity
-from gsbench.analysis.results import TrialResult
+from gsbench.analysis.results import TrialResult, by_key
 from gsbench.analysis.tables import Column, Entry, Row, Table
 from gsbench.errors import InputError
 from gsbench.words import closest

@@ -3,61 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
 
-from gsbench.analysis.cells import by_key, with_variants
+from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.errors_by_region import read_image
-from gsbench.analysis.origins import cloud_lines
-from gsbench.analysis.pairing import BASELINE, ViewCache, choose_pairs, controls_of
+from gsbench.analysis.pairing import BASELINE, choose_pairs, controls_of
 from gsbench.analysis.paper import load_paper
 from gsbench.analysis.paper_tables import layout_of, paper_tables
-from gsbench.analysis.report.models import agreements
 from gsbench.analysis.report.pictures import data_uri
-from gsbench.analysis.report.question_charts import question_part
 from gsbench.analysis.report.sections import (
     compare_arms,
     event_charts,
     provenance,
+    search_part,
     training_charts,
     volume_charts,
 )
-from gsbench.analysis.report.setting_charts import search_part, sweep_charts, tradeoff_charts, tradeoff_gaps
-from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.analysis.results import Experiment, TrialResult, by_key
 from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import Table, build_table
-from gsbench.analysis.verdicts import VERDICT, families, judge
+from gsbench.analysis.verdicts import (
+    SYMBOLS,
+    VERDICT,
+    WORDS,
+    by_scene_lines,
+    detail_lines,
+    families,
+    headline,
+    judge_pairs,
+    secondary,
+    seeds_to_resolve,
+)
 from gsbench.runs.layout import FIGURES
 from gsbench.words import signed
 
 
-@dataclass(frozen=True)
-class AblationPart:
-    """Descriptions of the runs in lines, and charts as SVG."""
-
-    lines: Sequence[str]
-    charts: Sequence[str]
-
-
-def build_report(experiment: Experiment, baseline: str = BASELINE, ablation: AblationPart | None = None) -> str:
-    """The report as HTML, with every densifier held against ``baseline``; a pure function of the experiment's files.
-
-    ``ablation`` is what switching parts of a densifier off has shown.
-    """
+def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
+    """The report as HTML, with every densifier held against ``baseline``; a pure function of the experiment's files."""
     trials = with_variants(experiment.trials)
     arms = sorted({trial.arm for trial in trials})
-    views = ViewCache()
     declared = standing(experiment.folder, trials)
     search = search_part(experiment.folder)
     # Among points of a search, which were chosen by results, no test holds.
     pairs = [] if search else choose_pairs(arms, baseline, controls_of(trials))
-    judged = judge(trials, pairs, declared)
-    questions = question_part(trials, judged, views)
-    versus = [compare_arms(trials, *pair, own) for pair, own in judged.items()]
-    quantity = next((one.declared for one in judged.values() if one.declared is not None), None)
+    judged = judge_pairs(trials, pairs, declared)
+    versus = [compare_arms(trials, own) for own in judged]
+    quantity = next((one.declared for one in judged if one.declared is not None), None)
     layout = layout_of(experiment.name)
     tables = [build_table(experiment)] if layout is None else paper_tables(experiment, layout)
     volumes, volume_notes = volume_charts(trials, arms)
@@ -74,24 +69,24 @@ def build_report(experiment: Experiment, baseline: str = BASELINE, ablation: Abl
         trials=trials,
         versus=versus,
         declared=declared.sentences(quantity.name) if declared and quantity else [],
-        families=families(list(judged.values())),
-        ablation=ablation,
+        families=families(judged),
         tables=[to_html(_without_verdicts(table)) for table in tables],
         contradictions=[] if layout is None else load_paper().contradictions,
         search=search,
-        questions=questions,
-        sweeps=[] if search else sweep_charts(trials),
-        tradeoffs=tradeoff_charts(trials),
-        gaps=tradeoff_gaps(trials, baseline),
-        agreements=agreements(trials),
         to_html=to_html,
+        words=WORDS,
+        symbols=SYMBOLS,
+        headline=headline,
+        secondary=secondary,
+        by_scene_lines=by_scene_lines,
+        detail_lines=detail_lines,
+        seeds_to_resolve=seeds_to_resolve,
         training=training_charts(trials, arms),
         events=event_charts(trials, arms),
         volumes=volumes,
         volume_notes=volume_notes,
         figures=trial_figures(trials),
         provenance=rows,
-        clouds=cloud_lines(trials),
         columns=list(dict.fromkeys(key for row in rows for key in row)),
         warnings=experiment.warnings,
     )

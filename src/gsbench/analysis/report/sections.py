@@ -2,32 +2,36 @@
 
 from __future__ import annotations
 
+import logging
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from gsbench.analysis.cells import by_key
 from gsbench.analysis.differences import short_version
 from gsbench.analysis.errors_by_region import MAP_PROPERTIES, RegionErrors, errors_by_region
 from gsbench.analysis.fairness import fairness_table
-from gsbench.analysis.judgement import pair_trials
+from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.notes import caveats
-from gsbench.analysis.origins import machine_of, unlike_clouds
-from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart, short_number
-from gsbench.analysis.report.headlines import by_scene_lines, detail_lines, headline, secondary
-from gsbench.analysis.report.models import share_above, volume_histogram
+from gsbench.analysis.pairing import pair_trials
+from gsbench.analysis.quantities import COSTS
+from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
 from gsbench.analysis.report.pictures import Pictures, choose_pictures
-from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.tables import Table, change_words, cost_change
-from gsbench.analysis.tradeoffs import COST_READERS, CurveGap, curve_gap, training_curve
-from gsbench.analysis.verdicts import ArmVerdict, ArmVerdicts, judge
+from gsbench.analysis.report.volumes import share_above, volume_histogram
+from gsbench.analysis.results import Arm, TrialResult, by_key
+from gsbench.analysis.tables import COSTS_COMPARED, Table, change_words, cost_change
+from gsbench.analysis.verdicts import PairVerdicts
 from gsbench.errors import InputError
+from gsbench.eval.facts import find
 from gsbench.events import Cause, RefineEvent
+from gsbench.parsing import DamagedError
 from gsbench.runs import layout
-from gsbench.words import signed
+from gsbench.runs.tuning_record import read_tuning
+from gsbench.words import counted
+
+log = logging.getLogger(__name__)
 
 CROPS = 4  # places of each kind
-COST_LABELS = {"gaussians": "Gaussians", "seconds": "training time"}
 EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)
 CURVES = (  # key of metrics.jsonl, title, y axis
     ("num_gaussians", "Gaussians during training", "Gaussians"),
@@ -38,17 +42,11 @@ CURVES = (  # key of metrics.jsonl, title, y axis
 
 @dataclass(frozen=True)
 class Versus:
-    """All results about one pair of arms."""
+    """All results about one pair of arms, beside its verdicts (``judged``)."""
 
-    first: Arm
-    second: Arm
-    verdicts: tuple[ArmVerdict, ...]
-    headline: str
+    judged: PairVerdicts
     caveats: str  # what else than the idea may have made the difference
     fairness: Table
-    secondary: str  # what else was found, where a metric was declared
-    by_scene: tuple[str, ...]
-    details: tuple[str, ...]  # scenes like these, and trials far outside the others
     costs: tuple[str, ...]
     forests: tuple[str, ...]
     regions: tuple[tuple[RegionErrors, str], ...]
@@ -57,23 +55,18 @@ class Versus:
 
     @property
     def title(self) -> str:
-        return f"{self.second} against {self.first}"
+        return f"{self.judged.second} against {self.judged.first}"
 
     @property
     def beyond(self) -> bool:
         """Return whether there are scenes enough to ask about scenes like these."""
-        return any(one.verdict.like_these is not None for one in self.verdicts)
+        return any(one.like_these is not None for one in self.judged.verdicts)
 
 
-def compare_arms(trials: Sequence[TrialResult], first: Arm, second: Arm, judged: ArmVerdicts | None = None) -> Versus:
-    """Verdicts, costs, forest plots, regions and crops of two arms; what cannot be had is said in the notes.
-
-    ``judged`` are the pair's verdicts as one of several; without it, the pair is judged by itself.
-    """
+def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> Versus:
+    """Costs, forest plots, regions and crops of two arms; what cannot be had is said in the notes."""
+    first, second = judged.first, judged.second
     own = [trial for trial in trials if trial.arm in (first, second)]
-    if judged is None:
-        judged = judge(own, [(first, second)])[first, second]
-    verdicts, notes = judged.verdicts, list(judged.notes)
     pairs = pair_trials(own, first, second)
     pictures = choose_pictures(pairs, CROPS)
     regions = []
@@ -84,22 +77,16 @@ def compare_arms(trials: Sequence[TrialResult], first: Arm, second: Arm, judged:
             regions.append((found, _region_chart(found, first, second)))
         except InputError as error:
             without.setdefault(str(error), []).append(name)
-    notes += [f"Errors by {', '.join(names)}: not shown, {reason}" for reason, names in without.items()]
+    faults = [f"Errors by {', '.join(names)}: not shown, {reason}" for reason, names in without.items()]
     return Versus(
-        first,
-        second,
-        verdicts,
-        headline(judged, first, second),
+        judged,
         caveats(trials, first, second),
         fairness_table(trials, first, second),
-        secondary(judged),
-        tuple(by_scene_lines([one for one in verdicts if one.role in ("one of all", "declared")])),
-        tuple(detail_lines(verdicts)),
         tuple(_costs(own, first, second)),
-        tuple(_forest(verdict) for verdict in verdicts),
+        tuple(_forest(verdict) for verdict in judged.verdicts),
         tuple(regions),
         pictures,
-        tuple(dict.fromkeys([*notes, *unlike_clouds(pairs), *pictures.faults])),
+        tuple(dict.fromkeys([*judged.notes, *faults, *pictures.faults])),
     )
 
 
@@ -216,7 +203,7 @@ def provenance(trials: Sequence[TrialResult]) -> list[dict[str, str]]:
             "iterations": str(trial.record.iterations),
             **{f"{key} hash": str(value)[:12] for key, value in trial.record.hashes.items()},
             "code": ", ".join(f"{part} {short_version(version)}" for part, version in trial.code.items()),
-            "machine": machine_of(trial) or "",
+            "machine": trial.machine or "",
             "versions": ", ".join(f"{key} {value}" for key, value in trial.record.versions.items()),
         }
         for trial in trials
@@ -224,34 +211,27 @@ def provenance(trials: Sequence[TrialResult]) -> list[dict[str, str]]:
 
 
 def _costs(trials: Sequence[TrialResult], first: Arm, second: Arm) -> list[str]:
+    """Say how counts and training times changed over the scenes that both arms have."""
     arms = [[trial for trial in trials if trial.arm == arm] for arm in (first, second)]
     lines = []
-    for name, key in (("Gaussians", "gaussians"), ("Training time", "seconds")):
-        change = cost_change(arms[0], arms[1], COST_READERS[key])
+    for key in COSTS_COMPARED:
+        name, read = COSTS[key]
+        change = cost_change(arms[0], arms[1], read)
         if change is not None:
-            caution = _unsteady_times(arms) if key == "seconds" else ""
-            lines.append(f"{name} {change_words(*change)}{caution}")
-        gap = curve_gap(*(training_curve(own, key, "psnr") for own in arms))
-        if gap is not None:
-            lines.append(_gap_words(gap, COST_LABELS[key]))
+            caution = _unsteady_times(arms) if key == "train_time" else ""
+            lines.append(f"{name[0].upper()}{name[1:]} {change_words(*change)}{caution}")
     return lines
 
 
 def _unsteady_times(arms: Sequence[Sequence[TrialResult]]) -> str:
     """Say how far the training times of equal trials differ, without which a change of them says little."""
     cells = by_key([trial for arm in arms for trial in arm], lambda trial: (trial.arm, trial.scene)).values()
-    times = [[t for trial in cell if (t := COST_READERS["seconds"](trial))] for cell in cells]
+    times = [[t for trial in cell if (t := COSTS["train_time"][1](trial))] for cell in cells]
     spread = max((max(own) / min(own) - 1 for own in times if own), default=0.0)
     return f"; times of equal trials differ by up to {spread:.0%}" if spread else ""
 
 
-def _gap_words(gap: CurveGap, cost: str) -> str:
-    span = f"{short_number(gap.low)} to {short_number(gap.high)}"
-    return f"PSNR at equal {cost} during training {signed(gap.gap, '.2f')} dB on average ({span})"
-
-
-def _forest(one: ArmVerdict) -> str:
-    verdict = one.verdict
+def _forest(verdict: Verdict) -> str:
     rows = [
         ForestRow(s.scene, s.mean, s.interval.low if s.interval else None, s.interval.high if s.interval else None)
         for s in verdict.scenes
@@ -260,8 +240,8 @@ def _forest(one: ArmVerdict) -> str:
         interval = verdict.interval
         bounds = (interval.low, interval.high) if interval else (None, None)
         rows.append(ForestRow("mean of scenes", verdict.mean or 0.0, *bounds))
-    better = "right of zero is better" if one.quantity.direction > 0 else "left of zero is better"
-    return forest_plot(f"{one.quantity.name}: {better}", rows, "difference", one.quantity.direction)
+    better = "right of zero is better" if verdict.quantity.direction > 0 else "left of zero is better"
+    return forest_plot(f"{verdict.quantity.name}: {better}", rows, "difference", verdict.quantity.direction)
 
 
 def _region_chart(errors: RegionErrors, first: Arm, second: Arm) -> str:
@@ -299,3 +279,28 @@ def _threshold(trials: Sequence[TrialResult]) -> float | None:
         if config.get("densify.threshold_mode", "absolute") == "absolute" and "densify.volume_threshold" in config
     }
     return float(found.pop()) if len(found) == 1 and all(map(_is_number, found)) else None
+
+
+def search_part(home: Path) -> tuple[str, str] | None:
+    """A line on the search of an experiment and its chart as SVG; None where there was none, or it cannot be read."""
+    try:
+        record = read_tuning(home)
+    except FileNotFoundError:
+        return None
+    except DamagedError as error:
+        log.warning("left out: %s", error)
+        return None
+    done = [(number, point, point.value) for number, point in enumerate(record.points, 1) if point.value is not None]
+    failed = len(record.points) - len(done)
+    count = f"{len(record.points)} of {counted(record.wanted, 'point')}, each {counted(len(record.seeds), 'seed')}"
+    count += f"; {failed} failed" if failed else ""
+    if not done:
+        return f"{count}; none has a result yet.", ""
+    facts = find(record.metric)
+    name, decimals = (facts.name, facts.decimals + 1) if facts else (record.metric, 4)
+    number, best, highest = max(done, key=lambda found: record.direction * found[2])
+    where = ", ".join(f"{key} = {value}" for key, value in best.settings.items())
+    line = f"Best {name}: {highest:.{decimals}f} at {where} (point {number}). {count}. "
+    line += "Judged by validation views; no test view was looked at."
+    each = [(float(place), value) for place, _, value in done]
+    return line, line_chart("The search", [Series("each point", each)], "point", name)
