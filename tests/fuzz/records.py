@@ -21,11 +21,9 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from gsbench.analysis.report.setting_charts import search_part
-
 from gsbench.analysis.explain import explain_cell
 from gsbench.analysis.frame import to_frame
-from gsbench.analysis.report.sections import event_charts, training_charts, volume_charts
+from gsbench.analysis.report.sections import event_charts, search_part, training_charts, volume_charts
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import build_table

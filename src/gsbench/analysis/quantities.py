@@ -106,7 +106,7 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
 
 
 def asked_quantity(key: str, trials: Iterable[TrialResult] = ()) -> Quantity:
-    """What a question about ``key`` compares: a metric at the end of trials, or a cost in its own unit.
+    """The number that a question about ``key`` compares: a metric at the end of trials, or a cost in its own unit.
 
     Of a user's own metric that no trial has, nothing but the key is known.
     """

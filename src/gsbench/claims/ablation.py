@@ -1,4 +1,4 @@
-"""Which part of a densifier carries its gain: its switches, the runs of all their combinations, and what these show.
+"""Ablation of a densifier: its switches, the runs of all their combinations, and the verdicts on them.
 
 A switch is declared by the densifier's class (``SWITCHES``), by its YAML (``switches``), or on the command line. It is
 on as the densifier is configured; its ``off`` settings take that part out. Runs that differ only in what does nothing
