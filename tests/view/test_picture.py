@@ -1,4 +1,4 @@
-"""Photographs, frustums and the page's camera, against the cameras that they come from."""
+"""Photographs and the page's camera, against the cameras that they come from."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
-from gsbench.view.picture import FRUSTUM_DEPTH, draw_cameras, photograph_at, side_by_side
+from gsbench.view.picture import photograph_at, side_by_side
 from gsbench.view.server import fitting_fov, level_up, mean_up, page_camera
 
 
@@ -41,28 +41,6 @@ def test_photograph_follows_the_focal_length_and_the_principal_point(scale: floa
     got = photograph_at(camera, view).astype(int)
     assert np.abs(got - expected)[4:-4, 4:-4].mean() < 3
     assert np.abs(got[:, ::-1] - expected).mean() > 15
-
-
-def test_frustum_lies_where_the_plane_of_the_photograph_projects() -> None:
-    """From b behind a view, the corners at depth d are the view's own picture, d / (d + b) times as large."""
-    first, second = make_view(0.0), make_view(40.0)  # 20 from their mean
-    depth, behind = FRUSTUM_DEPTH * 20, 0.5
-    camera = Camera(80, 60, 70.0, 70.0, 38.0, 31.0, np.eye(3), np.array([0.0, 0.0, behind]))
-    drawn = draw_cameras(np.zeros((60, 80, 3), np.uint8), camera, [first, second]).any(axis=-1)
-    scale = depth / (depth + behind)
-    corners = [(scale * (u - 38) + 38, scale * (v - 31) + 31) for u in (0, 80) for v in (0, 60)]
-    for x, y in corners:
-        assert drawn[round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2].any()
-    (low_x, low_y), (high_x, high_y) = np.min(corners, axis=0), np.max(corners, axis=0)
-    rows, columns = np.nonzero(drawn)
-    assert low_x - 2 <= columns.min() <= columns.max() <= high_x + 2
-    assert low_y - 2 <= rows.min() <= rows.max() <= high_y + 2
-
-
-def test_camera_behind_the_page_is_not_drawn() -> None:
-    page = Camera(80, 60, 70.0, 70.0, 40.0, 30.0, np.eye(3), np.array([0.0, 0.0, -50.0]))
-    image = smooth_image(60, 80)
-    np.testing.assert_array_equal(draw_cameras(image, page, [make_view(0.0), make_view(40.0)]), image)
 
 
 def test_panes_stand_side_by_side_with_labels() -> None:

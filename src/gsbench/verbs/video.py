@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gsbench.errors import InputError
 from gsbench.logs import Progress, progress
 from gsbench.verbs.arguments import ArgumentParser, path
 from gsbench.view import ADDRESS
@@ -26,50 +25,39 @@ def main(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if the video was written."""
     parser = ArgumentParser(
         prog="gsbench video",
-        description="Film a trained model: along its cameras, round the scene, or along a path of nerfstudio's viewer.",
+        description="Film a trained model: along its cameras, or round the scene.",
     )
     parser.add_argument("trial", metavar="TRIAL", help=ADDRESS)
-    parser.add_argument("--out", type=path, metavar="FILE", help=".mp4 (needs the extra video), .webp or .gif")
-    parser.add_argument("--path", type=path, metavar="JSON", help="camera path of nerfstudio's viewer (render tab)")
+    parser.add_argument("--out", type=path, metavar="FILE", help=".mp4 (needs the extra video) or .webp")
     parser.add_argument(
-        "--transforms", type=path, metavar="JSON", help="dataparser_transforms.json of the training it was made with"
+        "--along",
+        choices=("cameras", "ellipse"),
+        default="cameras",
+        help="a smooth way along the cameras, or an ellipse round the scene",
     )
-    parser.add_argument(
-        "--along", choices=("cameras", "ellipse"), help="a made path: a smooth way along the cameras, or an ellipse"
-    )
-    parser.add_argument("--frames", type=_frames, help=f"of a made path ({FRAMES})")
-    parser.add_argument("--fps", type=_fps, help=f"frames a second (the path's own, else {FPS:g})")
-    parser.add_argument("--size", type=_size, metavar="WxH", help="px (the path's own, else that of the test views)")
+    parser.add_argument("--frames", type=_frames, default=FRAMES, help=f"({FRAMES})")
+    parser.add_argument("--fps", type=_fps, default=FPS, help=f"frames a second ({FPS:g})")
+    parser.add_argument("--size", type=_size, metavar="WxH", help="px (that of the test views)")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:1")
     options = parser.parse_args(argv)
-    if options.path is not None and options.frames is not None:
-        raise InputError("--frames is of a made path: a file has its own")
-    if options.path is not None and options.along is not None:
-        raise InputError("--along and --path both say where the camera goes: give one")
-    if options.path is None and options.transforms is not None:
-        raise InputError("--transforms belongs to a path: give --path")
 
     from gsbench.raster import create_rasterizer
     from gsbench.train.device import select_device
     from gsbench.view.picture import TrialPainter
     from gsbench.view.trials import find_trial, load_viewed, placed_cameras
-    from gsbench.view.video import CameraPath, check_file, ellipse, has_mp4, read_camera_path, through, write_video
+    from gsbench.view.video import check_file, ellipse, has_mp4, through, write_video
 
     trial = find_trial(options.trial, runs)
     out = options.out or Path(f"{trial.scene}-{trial.densify}{'.mp4' if has_mp4() else '.webp'}")
     check_file(out)
-    given = None if options.path is None else read_camera_path(options.path, options.transforms, options.size)
     device = select_device(options.device)
     viewed = load_viewed(trial, device)
-    like = viewed.views[0].camera
-    if given is None:
-        if options.size is not None:
-            like = _resized(like, *options.size)
-        make = ellipse if options.along == "ellipse" else through
-        given = CameraPath(make(placed_cameras(trial), like, options.frames or FRAMES))
-    painter, cameras = TrialPainter(viewed, create_rasterizer("auto", device)), given.cameras
+    like = viewed.views[0].camera if options.size is None else _resized(viewed.views[0].camera, *options.size)
+    make = ellipse if options.along == "ellipse" else through
+    cameras = make(placed_cameras(trial), like, options.frames)
+    painter = TrialPainter(viewed, create_rasterizer("auto", device))
     with progress("video") as report:
-        write_video(out, _film(painter, cameras, report), options.fps or given.fps or FPS)
+        write_video(out, _film(painter, cameras, report), options.fps)
     log.info("%s: %d frames of %dx%d px", trial.label, len(cameras), cameras[0].width, cameras[0].height)
     print(out)
     return 0

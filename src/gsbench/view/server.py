@@ -79,10 +79,9 @@ class Viewer:
         """The layers that the controls ask for."""
         return Layers(
             sh_degree=min(max(int(self._degree.value), 0), MAX_SH_DEGREE),
-            ellipsoids=bool(self._ellipsoids.value),
+            causes=bool(self._causes.value),
             log10_volume=float(self._threshold.value),
             cloud=bool(self._cloud.value),
-            cameras=bool(self._cameras.value),
         )
 
     def photograph(self) -> View | None:
@@ -102,17 +101,16 @@ class Viewer:
         with gui.add_folder("Test views"):
             self._view = gui.add_dropdown("View", (FREE_VIEW, *self.views), initial_value=next(iter(self.views)))
             self._beside = gui.add_checkbox("Photograph beside", True)
-            self._cameras = gui.add_checkbox("Cameras", False)
         with gui.add_folder("Gaussians", expand_by_default=False):
             self._degree = gui.add_slider("SH degree", 0, 3, 1, 3)
             self._share = gui.add_slider("Most opaque, %", *SHARES, 1, 100)
         with gui.add_folder("Growth", expand_by_default=False):
             self._cloud = gui.add_checkbox("Initial cloud", False)
-            self._ellipsoids = gui.add_checkbox("Ellipsoids by cause", False)
+            self._causes = gui.add_checkbox("Large ones by cause", False)
             self._threshold = gui.add_slider("log10 volume >", lowest, highest, 0.001, round(DEFAULT_THRESHOLD, 3))
             self._legend = gui.add_markdown(self._legend_text())
         self._height = gui.add_dropdown("Picture height, px", HEIGHTS, initial_value=HEIGHTS[1])
-        changes = (self._cameras, self._degree, self._share, self._cloud, self._ellipsoids, self._height)
+        changes = (self._degree, self._share, self._cloud, self._causes, self._height)
         for control in changes:
             control.on_update(lambda _: self._redraw())
         self._threshold.on_update(lambda _: self._update_threshold())

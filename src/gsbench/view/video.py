@@ -1,4 +1,4 @@
-"""Videos: cameras along a path (nerfstudio's file, or made from a trial's cameras), and their pictures as a file.
+"""Videos: cameras along a path that is made from a trial's cameras, and their pictures as a file.
 
 The MP4 holds VP9, which browsers and players know, since the encoder of H.264 that wheels bring (x264, in those of
 PyAV and imageio-ffmpeg) is under the GPL; the FFmpeg in OpenCV's wheels is under the LGPL, without it.
@@ -9,34 +9,26 @@ from __future__ import annotations
 import importlib.util
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from annotated_types import Len
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.interpolate import CubicSpline
 
 from gsbench.errors import InputError
 from gsbench.files import atomic, place_of
-from gsbench.parsing import resolved
-from gsbench.records import Number, Part, read_typed
 from gsbench.scene.camera import Camera
 from gsbench.scene.hold_out import arrange, looked_at, scene_up
-from gsbench.scene.transforms import OPENGL, Matrix, Undo, rotation_of
 from gsbench.system.install import install_command
 
 Picture = NDArray[np.uint8]
 Array = NDArray[np.float64]
-T = TypeVar("T")
 
-SUFFIXES = (".mp4", ".webp", ".gif")
+SUFFIXES = (".mp4", ".webp")
 PACKAGE, EXTRA = "cv2", "video"
 CODEC = "vp09"
 WEBP_QUALITY = 80  # Pillow's default
-GIF_STEP = 10  # ms: GIF counts in hundredths of a second
 REACH = 0.95  # quantile of the cameras' places along an axis of the ellipse, which outliers do not stretch
 MAX_SIDE, MAX_FRAMES = 8192, 36_000  # px; 20 minutes at 30 frames a second
 MIN_FPS, MAX_FPS = 1.0, 240.0
@@ -54,7 +46,7 @@ def check_file(file: Path) -> None:
     if file.suffix.lower() not in SUFFIXES:
         raise InputError(f"--out {file}: a video ends with {', '.join(SUFFIXES)}")
     if file.suffix.lower() == ".mp4" and not has_mp4():
-        raise InputError(f"--out {file}: MP4 needs OpenCV: {install_command(EXTRA)}; or name a file .webp or .gif")
+        raise InputError(f"--out {file}: MP4 needs OpenCV: {install_command(EXTRA)}; or name a file .webp")
     if file.is_dir():
         raise InputError(f"--out {file} is a folder: name the file to write")
 
@@ -74,7 +66,7 @@ def write_video(file: Path, pictures: Iterable[Picture], fps: float) -> None:
             finally:
                 named.unlink(missing_ok=True)
         else:
-            _write_animation(temporary, file.suffix.lower(), pictures, fps)
+            _write_webp(temporary, pictures, fps)
 
 
 def _write_mp4(file: Path, pictures: Iterable[Picture], fps: float) -> None:
@@ -92,76 +84,12 @@ def _write_mp4(file: Path, pictures: Iterable[Picture], fps: float) -> None:
         writer.release()
 
 
-def _write_animation(file: Path, suffix: str, pictures: Iterable[Picture], fps: float) -> None:
+def _write_webp(file: Path, pictures: Iterable[Picture], fps: float) -> None:
     frames: Iterator[Image.Image] = (Image.fromarray(picture) for picture in pictures)
-    options: dict[str, Any] = {"format": suffix[1:].upper(), "save_all": True, "append_images": frames, "loop": 0}
-    duration = 1000 / fps  # ms
-    if suffix == ".gif":
-        options["duration"] = max(2, round(duration / GIF_STEP)) * GIF_STEP  # browsers slow down what is quicker
-    else:
-        options |= {"duration": round(duration), "quality": WEBP_QUALITY}
-    next(frames).save(file, **options)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PathFrame(Part):
-    """A camera of nerfstudio's path: camera to world in OpenGL's axes, row by row; the vertical angle in degrees."""
-
-    camera_to_world: Annotated[list[Number], Len(16, 16)]
-    fov: Number
-    aspect: Number | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class CameraPathRecord(Part):
-    """The file that nerfstudio's viewer exports."""
-
-    camera_path: Annotated[list[PathFrame], Len(1, MAX_FRAMES)]
-    render_width: Number
-    render_height: Number
-    fps: Number | None = None
-    camera_type: str = "perspective"
-
-
-@dataclass(frozen=True, kw_only=True)
-class DataparserTransforms(Part):
-    """nerfstudio's ``dataparser_transforms.json``: what was done to the coordinates of the original data."""
-
-    transform: Matrix
-    scale: Number
-
-
-@dataclass(frozen=True)
-class CameraPath:
-    """Cameras, one for each frame; ``fps`` where the file says it."""
-
-    cameras: list[Camera] = field(repr=False)
-    fps: float | None = None
-
-
-def read_camera_path(path: Path, transforms: Path | None = None, size: tuple[int, int] | None = None) -> CameraPath:
-    """Read nerfstudio's file of a camera path; ``size`` (width, height) in px instead of the file's.
-
-    nerfstudio turns and scales a scene before it trains; ``transforms`` is the ``dataparser_transforms.json`` of that
-    training, which takes the path back to the coordinates of the data. Raises InputError naming what is wrong.
-    """
-    record = _read(path, CameraPathRecord)
-    if record.camera_type.lower() != "perspective":
-        raise InputError(f"{path}: camera_type {record.camera_type} is not rendered here, perspective is")
-    if record.fps is not None and not MIN_FPS <= record.fps <= MAX_FPS:
-        raise InputError(f"{path}: fps must be from {MIN_FPS:g} to {MAX_FPS:g}, got {record.fps:g}: mend it")
-    width, height = size or (_side(path, record.render_width), _side(path, record.render_height))
-    undo = Undo() if transforms is None else _undo(transforms)
-    cameras = []
-    for place, frame in enumerate(record.camera_path):
-        what = f"{path}: camera_to_world of frame {place}"
-        matrix = np.array(frame.camera_to_world).reshape(4, 4)
-        if not 0 < frame.fov < 180:
-            raise InputError(f"{path}: fov of frame {place} must be between 0 and 180 degrees, got {frame.fov}")
-        world_from_camera = undo.rotation.T @ rotation_of(matrix[:3, :3], what) @ OPENGL
-        focal = height / (2 * math.tan(math.radians(frame.fov) / 2))
-        cameras.append(_camera(width, height, focal, focal, world_from_camera, undo.points(matrix[None, :3, 3])[0]))
-    return CameraPath(cameras, record.fps)
+    duration = round(1000 / fps)  # ms
+    next(frames).save(
+        file, format="WEBP", save_all=True, append_images=frames, loop=0, duration=duration, quality=WEBP_QUALITY
+    )
 
 
 def through(cameras: Sequence[Camera], like: Camera, frames: int) -> list[Camera]:
@@ -210,33 +138,8 @@ def _looking(like: Camera, center: Array, ahead: Array, up: Array) -> Camera:
     right = np.cross(ahead, up)
     length = float(np.linalg.norm(right))
     if length < STEEP * float(np.linalg.norm(ahead)) or length == 0:
-        raise InputError("this way through the cameras looks straight up or down: give a camera path (--path)")
+        raise InputError("this way through the cameras looks straight up or down: give the other --along")
     forward, right = ahead / np.linalg.norm(ahead), right / length
-    axes = np.column_stack([right, np.cross(forward, right), forward])  # x right, y down, z ahead
-    return _camera(like.width, like.height, like.fx, like.fy, axes, center)
-
-
-def _camera(width: int, height: int, fx: float, fy: float, world_from_camera: Array, center: Array) -> Camera:
-    rotation = world_from_camera.T
-    return Camera(width, height, fx, fy, width / 2, height / 2, rotation, -rotation @ center)
-
-
-def _undo(path: Path) -> Undo:
-    record = _read(path, DataparserTransforms)
-    if not record.scale > 0:
-        raise InputError(f"{path}: scale must be positive, got {record.scale}")
-    matrix = np.array(record.transform[:3])  # [3, 4]
-    return Undo(rotation_of(matrix[:, :3], f"{path}: transform"), matrix[:, 3], record.scale)
-
-
-def _read(path: Path, kind: type[T]) -> T:
-    try:
-        return read_typed(resolved(path), kind)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-
-
-def _side(path: Path, value: float) -> int:
-    if value != int(value) or not 1 <= value <= MAX_SIDE:
-        raise InputError(f"{path}: render_width and render_height must be whole numbers up to {MAX_SIDE}, got {value}")
-    return int(value)
+    rotation = np.stack([right, np.cross(forward, right), forward])  # x right, y down, z ahead
+    size = (like.width, like.height)
+    return Camera(*size, like.fx, like.fy, like.width / 2, like.height / 2, rotation, -rotation @ center)
