@@ -35,29 +35,28 @@ def half(width: int = 40, height: int = 30) -> np.ndarray:
     return mask
 
 
-def with_masks(root: Path, naming: Callable[[str], str] = lambda name: f"{name}.png") -> Path:
+def with_masks(root: Path) -> Path:
     for path in sorted((root / "images").rglob("*.*")):
-        save(root / "masks" / naming(path.relative_to(root / "images").as_posix()), half(*Image.open(path).size))
+        name = path.relative_to(root / "images").as_posix()
+        save(root / "masks" / f"{name}.png", half(*Image.open(path).size))
     return root
 
 
-@pytest.mark.parametrize("naming", [lambda name: f"{name}.png", lambda name: f"{name.rpartition('.')[0]}.png"])
 @pytest.mark.parametrize("read", [read_colmap, read_photos])
-def test_masks_are_found_by_the_names_of_colmap_and_of_nerfstudio(make_scene: MakeScene, naming, read) -> None:
+def test_masks_are_found_by_the_names_of_colmap(make_scene: MakeScene, read) -> None:
     names = tuple(f"cam/{k}.jpg" for k in range(4))
-    capture = read("toy", with_masks(make_scene(names=names), naming), masks="masks")
+    capture = read("toy", with_masks(make_scene(names=names)), masks="masks")
     root = capture.images.parent
-    assert capture.masks == {name: root / "masks" / naming(name) for name in names}
+    assert capture.masks == {name: root / "masks" / f"{name}.png" for name in names}
     assert capture.image_names == names
 
 
-def test_colmaps_name_wins_and_a_shared_stem_is_refused(tmp_path: Path) -> None:
-    for name in ("a.jpg.png", "a.png"):
+def test_a_mask_of_another_name_is_none(tmp_path: Path) -> None:
+    for name in ("a.jpg.png", "b.png"):
         save(tmp_path / name, half())
-    assert find_masks(tmp_path, ["a.jpg"], ["a.jpg"]) == {"a.jpg": tmp_path / "a.jpg.png"}
-    assert find_masks(tmp_path, ["a.jpg"], ["a.jpg", "a.tif"]) == {"a.jpg": tmp_path / "a.jpg.png"}
-    with pytest.raises(InputError, match=r"a\.png fits several images: name that of a\.tif a\.tif\.png"):
-        find_masks(tmp_path, ["a.jpg", "a.tif"], ["a.jpg", "a.tif"])
+    assert find_masks(tmp_path, ["a.jpg"]) == {"a.jpg": tmp_path / "a.jpg.png"}
+    with pytest.raises(InputError, match=r"no mask of b\.jpg in .*: add b\.jpg\.png"):
+        find_masks(tmp_path, ["a.jpg", "b.jpg"])
 
 
 def test_masks_below_bare_photographs_are_no_photographs(make_scene: MakeScene) -> None:

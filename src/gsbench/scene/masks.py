@@ -8,8 +8,7 @@ is replaced before anything looks at a photograph, so that not one bit of it can
 from __future__ import annotations
 
 import shutil
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.scene.images import image_size, open_image, read_image
-from gsbench.scene.names import stem_of
 from gsbench.scene.options import Behind
 from gsbench.words import some_of
 
@@ -32,25 +30,12 @@ NEARLY_ONE = 1 - 1e-6  # a mean of ones in float32
 _FAST_PNG = 1  # zlib's level
 
 
-def find_masks(folder: Path, names: Sequence[str], among: Iterable[str]) -> dict[str, Path]:
-    """The mask in ``folder`` of each image in ``names``, which are paths below the images' folder.
-
-    For ``a/b.jpg`` this is ``a/b.jpg.png``, as COLMAP names it, or else ``a/b.png``, if no other image ``among`` all
-    of them has that stem. Raises InputError naming an image that has none, or whose mask is not of its size.
+def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """The mask in ``folder`` of each image in ``names``, paths below the images' folder: for ``a/b.jpg`` the file
+    ``a/b.jpg.png``, as COLMAP names it. Raises InputError naming the images that have none.
     """
-    stems = Counter(stem_of(name) for name in among)
-    found, missing = {}, []
-    for name in names:
-        own, shared = folder / f"{name}{SUFFIX}", folder / f"{stem_of(name)}{SUFFIX}"
-        if own.is_file():
-            found[name] = own
-        elif shared.is_file() and stems[stem_of(name)] == 1:
-            found[name] = shared
-        elif shared.is_file():
-            raise InputError(f"scene.masks: {shared} fits several images: name that of {name} {own.name}")
-        else:
-            missing.append(name)
-    if missing:
+    found = {name: folder / f"{name}{SUFFIX}" for name in names}
+    if missing := [name for name, mask in found.items() if not mask.is_file()]:
         raise InputError(
             f"scene.masks: no mask of {some_of(missing)} in {folder}: add {missing[0]}{SUFFIX} (all white where every "
             "pixel counts)"

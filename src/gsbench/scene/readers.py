@@ -65,7 +65,7 @@ def read_colmap(
     files = {file: image for image, file in matches.items()}
     return _capture(
         name, folder, sorted(matches.values()), model_folder, exact_poses, max_images, split, root,
-        lambda names: reference_cameras(model, [files[file] for file in names]), mask_folder, there,
+        lambda names: reference_cameras(model, [files[file] for file in names]), mask_folder,
     )  # fmt: skip
 
 
@@ -81,19 +81,20 @@ def read_transforms(
     """Read the photographs that ``transforms.json`` in ``path`` names, with the cameras in the COLMAP folder ``model``.
 
     ``said`` is what `gsbench.scene.transforms.read_transforms` reads of the file, ``model`` what
-    `gsbench.scene.colmap.write_frames` makes of that. ``split=list`` takes the views that the file, or
-    its part in Blender's scenes, says. ``masks`` is a folder of masks; without it those that the file names are taken.
+    `gsbench.scene.colmap.write_frames` makes of that. ``split=list`` takes the views of Blender's file of test views.
+    ``masks`` is the folder of their masks. Raises InputError where the file names masks and no folder was given.
     """
     from gsbench.scene.colmap import read_model, reference_cameras
 
     root = existing_folder(name, path)
     names = list(said.frames)
     _require_enough(len(names), root, "that its transforms.json names are")
-    own = {image: frame.mask for image, frame in said.frames.items() if frame.mask is not None}
+    if said.names_masks and masks is None:
+        raise InputError(f"{said.files[0]}: mask_path is not read: give the folder of the masks as scene.masks")
     capture = _capture(
         name, root, names, model, False, max_images, split, root,
         lambda chosen: reference_cameras(read_model(model), chosen),
-        None if masks is None else _subfolder(root, masks, "scene.masks"), names, own, said.split,
+        None if masks is None else _subfolder(root, masks, "scene.masks"), said.split,
     )  # fmt: skip
     return replace(capture, read_from=said.sources)
 
@@ -120,7 +121,7 @@ def read_photos(
         folder = root / "images" if (root / "images").is_dir() else root
     mask_folder, names = _beside_masks(root, folder, masks)
     _require_enough(len(names), folder, f"({', '.join(sorted(s[1:] for s in IMAGE_SUFFIXES))})")
-    return _capture(name, folder, names, None, False, max_images, split, root, None, mask_folder, names)
+    return _capture(name, folder, names, None, False, max_images, split, root, None, mask_folder)
 
 
 def _beside_masks(root: Path, folder: Path, masks: str | None) -> tuple[Path | None, list[str]]:
@@ -235,8 +236,6 @@ def _capture(
     root: Path,
     cameras: Cameras | None = None,
     mask_folder: Path | None = None,
-    there: Sequence[str] = (),
-    own_masks: Mapping[str, Path] = MappingProxyType({}),
     own_split: tuple[list[str], list[str]] | None = None,
 ) -> Capture:
     lists = own_split if own_split and split.asks_the_capture else _read_lists(root, split)
@@ -247,9 +246,7 @@ def _capture(
     kept = tuple(sorted([*held_out.train, *held_out.test]))
     check_picture_names(held_out.test, folder)
     _require_enough(len(kept), folder, "in the split lists" if split.by_lists else "left by the split")
-    masks = {image: own_masks[image] for image in kept if image in own_masks}
-    if mask_folder is not None:
-        masks = find_masks(mask_folder, kept, there)
+    masks = {} if mask_folder is None else find_masks(mask_folder, kept)
     check_sizes(folder, masks)
     return Capture(
         name=name,

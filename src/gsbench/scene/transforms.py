@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated
 
 import numpy as np
@@ -37,7 +36,7 @@ ONE_FILE = "transforms.json"
 SPLIT_FILES = {"train": "transforms_train.json", "test": "transforms_test.json", "val": "transforms_val.json"}
 OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera axes in OpenGL's, and back
 ROTATION_TOLERANCE = 1e-3  # of a matrix that was written with few digits
-PERSPECTIVE, FISHEYE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"), ("OPENCV_FISHEYE",)
+PERSPECTIVE, FISHEYE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV_FISHEYE"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +52,6 @@ class Intrinsics(Part):
     cx: Number | None = None
     cy: Number | None = None
     camera_angle_x: Number | None = None  # of the whole picture, radians
-    camera_angle_y: Number | None = None
     k1: Number | None = None
     k2: Number | None = None
     k3: Number | None = None
@@ -79,9 +77,6 @@ class TransformsRecord(Intrinsics):
     applied_transform: Matrix | None = None
     applied_scale: Number | None = None
     ply_file_path: Text | None = None
-    train_filenames: list[Text] | None = None
-    val_filenames: list[Text] | None = None
-    test_filenames: list[Text] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,15 +87,14 @@ class Frame:
     camera: CameraModel
     rotation: Array
     translation: Array
-    mask: Path | None
 
 
 @dataclass(frozen=True)
 class Transforms:
     """Content of a folder's files: ``frames`` by name, the views that they hold out, and their points.
 
-    ``split`` are the names for training and for testing, None where the files do not say. ``points`` is a PLY file,
-    whose coordinates ``undo`` takes to those of the cameras.
+    ``split`` are the names for training and for testing, None where one file has all. ``points`` is a PLY file, whose
+    coordinates ``undo`` takes to those of the cameras. ``names_masks``: some image has a mask of its own there.
     """
 
     files: tuple[Path, ...]
@@ -108,6 +102,7 @@ class Transforms:
     split: tuple[list[str], list[str]] | None
     points: Path | None
     undo: Undo
+    names_masks: bool
 
     @property
     def sources(self) -> tuple[Path, ...]:
@@ -147,81 +142,58 @@ def find_files(folder: Path) -> dict[str, Path]:
 def read_transforms(folder: Path) -> Transforms:
     """Read the cameras in ``folder``; raises InputError, one line, for what cannot be understood."""
     files = find_files(folder)
+    records = {part: read_typed(resolved(path), TransformsRecord) for part, path in files.items()}
     frames: dict[str, Frame] = {}
-    by_part: dict[str, list[str]] = {}
-    split, points, undo = None, None, Undo()
-    for part, path in files.items():
-        record = read_typed(resolved(path), TransformsRecord)
+    by_part: dict[str, list[str]] = {part: [] for part in files}
+    points, undo = None, Undo()
+    for part, record in records.items():
+        path, missing = files[part], []
         undo = _undo(path, record)
-        found = {frame.name: frame for frame in _frames(folder, path, record, undo)}
-        if twice := sorted(found.keys() & frames.keys()):
-            raise InputError(f"{path}: {twice[0]} is in {_other(files, part)} as well: name each image once")
-        frames |= found
-        by_part[part] = sorted(found)
-        split = split or _own_split(folder, path, record)
+        for entry in record.frames:
+            name = _image_name(folder, path, entry.file_path)
+            if name is None:
+                missing.append(entry.file_path)
+                continue
+            if name in frames:
+                raise InputError(f"{path}: {name} stands there twice: name each image once")
+            frames[name] = Frame(name, _camera(folder / name, path, record, entry), *_pose(path, entry, undo))
+            by_part[part].append(name)
+        if missing:
+            log.warning(
+                "%s: %d of %d images have no file: %s", path, len(missing), len(record.frames), some_of(missing)
+            )
         if record.ply_file_path is not None:
-            points = _existing(folder, path, record.ply_file_path)
-    if "train" in by_part and len(by_part) > 1:
-        split = by_part["train"], by_part["test" if "test" in by_part else "val"]
-    masked = [name for name, frame in frames.items() if frame.mask is not None]
-    if masked and len(masked) < len(frames):
-        missing = sorted(frames.keys() - set(masked))
-        raise InputError(
-            f"{next(iter(files.values()))}: no mask_path for {some_of(missing)}: give all images one, or none"
-        )
-    return Transforms(tuple(files.values()), dict(sorted(frames.items())), split, points, undo)
+            points = folder / _inside(path, record.ply_file_path)
+            if not points.is_file():
+                raise InputError(f"{path} names {record.ply_file_path}, which is not there")
+    held_out = next((sorted(by_part[part]) for part in ("test", "val") if part in files), None)
+    return Transforms(
+        tuple(files.values()),
+        dict(sorted(frames.items())),
+        None if held_out is None else (sorted(by_part["train"]), held_out),
+        points,
+        undo,
+        any(entry.mask_path for record in records.values() for entry in record.frames),
+    )
 
 
-def _other(files: Mapping[str, Path], part: str) -> str:
-    return next((path.name for name, path in files.items() if name != part), ONE_FILE)
-
-
-def _frames(folder: Path, path: Path, record: TransformsRecord, undo: Undo) -> Iterator[Frame]:
-    seen: set[str] = set()
-    missing = []
-    for frame in record.frames:
-        name = _image_name(folder, path, frame.file_path)
-        if name is None:
-            missing.append(frame.file_path)
-            continue
-        if name in seen:
-            raise InputError(f"{path}: {name} stands there twice: name each image once")
-        seen.add(name)
-        rotation, translation = _pose(path, frame, undo)
-        mask = None if frame.mask_path is None else _existing(folder, path, frame.mask_path)
-        yield Frame(name, _camera(folder / name, path, record, frame), rotation, translation, mask)
-    if missing:
-        log.warning("%s: %d of %d images have no file: %s", path, len(missing), len(record.frames), some_of(missing))
-
-
-def _inside(folder: Path, path: Path, named: str) -> PurePosixPath:
-    """The path that a file names, below its folder."""
-    place = Path(named.replace("\\", "/"))
-    if place.is_absolute():
-        if not place.is_relative_to(folder):
-            raise InputError(f"{path}: {named} lies outside the folder of the file: name images relative to it")
-        place = place.relative_to(folder)
-    if ".." in place.parts:
+def _inside(path: Path, named: str) -> PurePosixPath:
+    """The place that the file ``path`` names, below its folder."""
+    place = PurePosixPath(named.replace("\\", "/"))
+    if place.is_absolute() or ".." in place.parts or PureWindowsPath(named).drive:
         raise InputError(f"{path}: {named} lies outside the folder of the file: name images relative to it")
-    return PurePosixPath(*place.parts)
+    return place
 
 
 def _image_name(folder: Path, path: Path, named: str) -> str | None:
     """The image that ``file_path`` means, whose extension Blender's files leave out; None where it is not there."""
-    place = _inside(folder, path, named)
+    place = _inside(path, named)
     if place.suffix.lower() in IMAGE_SUFFIXES and (folder / place).is_file():
         return place.as_posix()
     there = [f"{place}{suffix}" for suffix in sorted(IMAGE_SUFFIXES) if (folder / f"{place}{suffix}").is_file()]
     if len(there) > 1:
         raise InputError(f"{path}: {named} may be {' or '.join(there)}: add the extension")
     return there[0] if there else None
-
-
-def _existing(folder: Path, path: Path, named: str) -> Path:
-    place = folder / _inside(folder, path, named)
-    if not place.is_file():
-        raise InputError(f"{path} names {named}, which is not there")
-    return place
 
 
 def _undo(path: Path, record: TransformsRecord) -> Undo:
@@ -266,19 +238,15 @@ def _camera(image: Path, path: Path, record: TransformsRecord, frame: FrameRecor
         width, height = image_size(image)
     if width != int(width) or height != int(height) or min(width, height) < 1:
         raise InputError(f"{whose}: w and h must be whole numbers of px, got {width} and {height}")
-    focal_x = _focal(value("fl_x"), width, value("camera_angle_x"))
-    focal_y = _focal(value("fl_y"), height, value("camera_angle_y")) or focal_x
+    focal_x, angle = value("fl_x"), value("camera_angle_x")
+    if focal_x is None and angle is not None and 0 < angle < math.pi:
+        focal_x = width / (2 * math.tan(angle / 2))
+    focal_y = value("fl_y") or focal_x
     if focal_x is None or focal_y is None or min(focal_x, focal_y) <= 0:
         raise InputError(f"{whose}: no focal length: fl_x, or camera_angle_x between 0 and pi, must be given")
     center = [half if said is None else said for said, half in ((value("cx"), width / 2), (value("cy"), height / 2))]
     model, distortion = _distortion(whose, record, frame)
     return CameraModel(model, int(width), int(height), (focal_x, focal_y, *center, *distortion))
-
-
-def _focal(said: float | None, side: float, angle: float | None) -> float | None:
-    if said is not None:
-        return said
-    return side / (2 * math.tan(angle / 2)) if angle is not None and 0 < angle < math.pi else None
 
 
 def _distortion(whose: str, record: TransformsRecord, frame: FrameRecord) -> tuple[str, tuple[float, ...]]:
@@ -287,27 +255,11 @@ def _distortion(whose: str, record: TransformsRecord, frame: FrameRecord) -> tup
     own = any(getattr(frame, name) is not None for name in names)
     k1, k2, k3, k4, p1, p2 = (getattr(frame if own else record, name) or 0.0 for name in names)
     fisheye = record.is_fisheye if frame.is_fisheye is None else frame.is_fisheye
-    model = frame.camera_model or record.camera_model or ("OPENCV_FISHEYE" if fisheye else "OPENCV")
-    if model in FISHEYE:
-        return "OPENCV_FISHEYE", (k1, k2, k3, k4)
+    model = frame.camera_model or record.camera_model or (FISHEYE if fisheye else "OPENCV")
+    if model == FISHEYE:
+        return model, (k1, k2, k3, k4)
     if model not in PERSPECTIVE:
-        raise InputError(f"{whose}: camera_model {model} is not known here ({', '.join((*PERSPECTIVE, *FISHEYE))})")
-    if k4:
-        raise InputError(f"{whose}: k4 of a camera that is no fisheye has no counterpart in COLMAP: leave it out")
-    if k3:
-        return "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+        raise InputError(f"{whose}: camera_model {model} is not known here ({', '.join((*PERSPECTIVE, FISHEYE))})")
+    if k3 or k4:
+        raise InputError(f"{whose}: k3 and k4 are read of {FISHEYE} alone: leave them out, or make a COLMAP model")
     return ("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())
-
-
-def _own_split(folder: Path, path: Path, record: TransformsRecord) -> tuple[list[str], list[str]] | None:
-    """Names for training and for testing by nerfstudio's lists of a file, None where it has none."""
-    held_out = record.test_filenames or record.val_filenames
-    if not record.train_filenames or not held_out:
-        return None
-    lists = []
-    for names in (record.train_filenames, held_out):
-        found = {named: _image_name(folder, path, named) for named in names}
-        if absent := [named for named, name in found.items() if name is None]:
-            raise InputError(f"{path}: {some_of(absent)} of its split is not there")
-        lists.append(sorted(name for name in found.values() if name is not None))
-    return lists[0], lists[1]
