@@ -91,10 +91,12 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 def gsbench(environment: dict[str, str], tmp_path: Path) -> Run:
     """Call ``gsbench`` with arguments; returns the finished process with its output as text."""
 
-    def run(*arguments: str, timeout: float = 240, **changes: str) -> subprocess.CompletedProcess[str]:
+    def run(
+        *arguments: str, timeout: float = 240, cwd: Path = tmp_path, **changes: str
+    ) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [sys.executable, "-m", "gsbench.cli", *arguments],
-            cwd=tmp_path,
+            cwd=cwd,
             env=environment | changes,
             capture_output=True,
             text=True,

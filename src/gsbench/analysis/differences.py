@@ -22,8 +22,8 @@ IGNORED_SETTINGS = (
 CODE = "code of "  # how the keys of ``TrialResult.code`` start that are a user's modules
 
 
-def differing_conditions(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
-    """The conditions in which trials differ, with their values; the code that made them is one.
+def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> dict[str, list[str]]:
+    """The conditions in which trials differ, with their values; the ``code`` that made them is one, where it counts.
 
     Unlike budgets of which none acted are no difference: all of the trials grew as they liked.
     """
@@ -31,7 +31,7 @@ def differing_conditions(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
     for trial in trials:
         for key, value in trial.conditions.items():
             seen[key].add(value)
-    for part, versions in differing_code(trials).items():
+    for part, versions in (differing_code(trials) if code else {}).items():
         seen[part] = {short_version(version) for version in versions}
     if not any(trial.budget_acted for trial in trials):
         seen.pop("budget", None)

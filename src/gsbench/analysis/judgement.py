@@ -162,11 +162,14 @@ def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdi
 def _asked(trials: Sequence[TrialResult], question: Question, declaration: Declaration) -> Verdict:
     """The question with its pairs, before it is answered."""
     pairs = pair(trials, question)
-    late = sum(trial.measured < declaration.moment for trial in pairs.trials)
+    new = pairs.trials[1::2] if question.versions else pairs.trials  # a baseline alone tells no difference
+    late = sum(trial.measured < declaration.moment for trial in new)
     quantity = asked_quantity(question.metric, trials)
     verdict = Verdict(question, quantity, pairs, notes=pairs.left_out, late=late, final=not declaration.looks)
     if not pairs.rows and pairs.left_out and question.scenes:
         return replace(verdict, untestable=pairs.left_out[0], notes=pairs.left_out[1:], final=True)
+    if question.scenes and len(pairs.rows) < len(question.scenes):  # a look waits for every scene
+        return replace(verdict, pairs=replace(pairs, rows=()))
     if pairs.rows and question.scenes and all(_is_equal(both) for row in pairs.rows for both in row.trials):
         count = sum(len(row.trials) for row in pairs.rows)
         reason = (
@@ -175,8 +178,6 @@ def _asked(trials: Sequence[TrialResult], question: Question, declaration: Decla
             "at this size"
         )
         return replace(verdict, untestable=reason, final=True)
-    if question.scenes and len(pairs.rows) < len(question.scenes):  # a look waits for every scene
-        return replace(verdict, pairs=replace(pairs, rows=()))
     return verdict
 
 

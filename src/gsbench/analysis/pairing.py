@@ -160,7 +160,7 @@ def _matched(
     wanted = question.seeds or sorted(one.keys() | other.keys())
     both = {seed: (one[seed], other[seed]) for seed in wanted if seed in one and seed in other}
     if both:
-        differing = differing_conditions([*baseline, *arm])
+        differing = differing_conditions([*baseline, *arm], code=not question.versions)
         if question.scenes:
             differing.pop("budget", None)
         if differing:

@@ -1,12 +1,13 @@
 """An experiment's results as one small file that others can read: a zip archive, and an RO-Crate 1.1 at once.
 
-It holds, without any pixels:
+It holds, without any pixels but where pictures are asked for:
 
 - ``results.jsonl``: the ``results.json`` of every trial, one a line, with the folder that it lay in;
 - ``configurations.jsonl``: every configuration, with the folders of the trials that had it (their seeds apart);
 - ``per_view.csv``: the metrics of every test view;
 - ``declared.jsonl``: what was declared before trials ran, where something was;
 - ``from_pixels.jsonl``: what declared claims ask of the trials' pictures, where they ask something;
+- ``pictures/``: renders and photographs of test views by trial, where they were asked for;
 - ``archive.json``: the version of this format and the sha256 of the files above;
 - ``ro-crate-metadata.json``: the same in the terms of RO-Crate (w3id.org/ro/crate/1.1), for other tools.
 
@@ -39,7 +40,7 @@ from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_bytes, read_yaml
 from gsbench.runs.declaration import Declaration, read_declarations
-from gsbench.runs.layout import CONFIG, DECLARED, FROM_PIXELS, PER_VIEW, RESULTS
+from gsbench.runs.layout import CONFIG, DECLARED, FROM_PIXELS, GROUND_TRUTH, PER_VIEW, RENDERS, RESULTS
 from gsbench.settings import is_folder_name
 from gsbench.words import without_places
 
@@ -47,6 +48,7 @@ FORMAT, VERSION = "gsbench results", 1
 PIXELS = "from_pixels.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
+PICTURES_FOLDER, PICTURES = "pictures", (RENDERS, GROUND_TRUTH)
 MOST_BYTES = 1 << 28  # of a file when unpacked; more than any experiment has
 FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # of the files within: the earliest that zip knows
 PRIVATE = ("runs", "tracking")  # settings that say where somebody's files and servers are, and nothing else
@@ -57,10 +59,10 @@ NO_CONFIGURATION = f"it has no {CONFIG}"
 NAMED = ("scene", "init", "densify")  # groups of settings whose names a record repeats
 
 
-def write_archive(experiment: Experiment, out: Path) -> list[str]:
+def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> list[str]:
     """Write the experiment's results to the file ``out``; returns a line for each trial that is left out, with why.
 
-    Raises InputError where none is left.
+    With ``pictures``, those of the test views too. Raises InputError where none is left.
     """
     kept, rows, left_out = [], [], list(experiment.warnings)
     configurations: dict[str, list[tuple[str, int]]] = {}  # each once, with its trials
@@ -85,6 +87,10 @@ def write_archive(experiment: Experiment, out: Path) -> list[str]:
     } | ({DECLARED: read_bytes(declared)} if declared.is_file() else {})
     if any(metric == TEXTURED.key for one in read_declarations(experiment.folder) for metric in _metrics(one)):
         contents[PIXELS] = _json_lines(_measured_in_pictures(kept))
+    for trial in kept if pictures else ():
+        for kind in PICTURES:
+            for path in trial.folder.pictures(kind):
+                contents[f"{PICTURES_FOLDER}/{_folder(trial)}/{kind}/{path.name}"] = read_bytes(path)
     manifest = {
         "format": FORMAT,
         "version": VERSION,
@@ -222,8 +228,20 @@ def _unpack(home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: 
     for line in _lines(contents.get(PIXELS, b"")):
         if line["folder"] in known:
             (home / line["folder"] / FROM_PIXELS).write_text(json.dumps(line["measures"]), encoding="utf-8")
+    for name in contents:
+        if name.startswith(f"{PICTURES_FOLDER}/"):
+            _unpack_picture(home, name, contents[name])
     if DECLARED in contents:
         (home / DECLARED).write_bytes(contents[DECLARED])
+
+
+def _unpack_picture(home: Path, name: str, content: bytes) -> None:
+    """Write a picture of a test view into its trial's folder; raises InputError for a name that leads elsewhere."""
+    folder, kind, file = name.removeprefix(f"{PICTURES_FOLDER}/").rsplit("/", 2)
+    if kind not in PICTURES or not is_folder_name(file) or not (home / _place(folder) / RESULTS).is_file():
+        raise InputError(f"{name!r} can be no picture of a trial")
+    (home / folder / kind).mkdir(exist_ok=True)
+    (home / folder / kind / file).write_bytes(content)
 
 
 def _folder(trial: TrialResult) -> str:

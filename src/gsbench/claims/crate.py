@@ -21,6 +21,7 @@ FILES = {  # media type, and in words what it is
     "declared.jsonl": ("application/jsonl", "What was declared before the trials were run"),
     "archive.json": ("application/json", "Version of the archive, and the sha256 of its files"),
 }
+PICTURE = ("image/png", "A test view of a trial: its render, or the photograph")
 
 
 def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str, int]) -> dict[str, Any]:
@@ -34,7 +35,7 @@ def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str,
         "@type": "Dataset",
         "name": f"{name}: results of gsbench",
         "description": f"{len(trials)} trainings of 3D Gaussian Splatting: {', '.join(arms)} on {', '.join(scenes)}, "
-        f"measured by {', '.join(protocols)}. No images and no models.",
+        f"measured by {', '.join(protocols)}. No models.",
         "datePublished": when[:10],
         "keywords": ["3D Gaussian Splatting", *arms, *scenes],
         "hasPart": [{"@id": file} for file in sizes],
@@ -45,8 +46,8 @@ def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str,
             "@id": file,
             "@type": "File",
             "name": file,
-            "description": FILES[file][1],
-            "encodingFormat": FILES[file][0],
+            "description": FILES.get(file, PICTURE)[1],
+            "encodingFormat": FILES.get(file, PICTURE)[0],
             "contentSize": str(size),
         }
         for file, size in sizes.items()

@@ -107,7 +107,7 @@ def plan_sweep(trials: Sequence[T]) -> Stopping[T]:
     if metric is None:
         raise InputError("launch.stop_when_decided needs the metric that decides, as eval.primary=psnr")
     values = trials[0].values
-    facts = _facts(metric, values)
+    facts = facts_for(metric, values)
     least = values["launch"]["least_difference"] or facts.worthwhile
     if least is None:
         raise InputError(
@@ -175,7 +175,8 @@ def _expected(trial: Trial) -> TrialResult:
     return replace(found, settings=Configurations({found.key: flatten(yaml.safe_load(trial.yaml))}))
 
 
-def _facts(metric: str, values: Mapping[str, Any]) -> MetricFacts:
+def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
+    """Facts of a metric that trials with the configuration ``values`` have; raises InputError for an unknown one."""
     known = find(metric)
     if known is not None:
         return known

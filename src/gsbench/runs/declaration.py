@@ -71,7 +71,8 @@ class Question(Part):
     without the seed (`trial_key`); without it, the trials are those of the two arms, on all scenes. ``seeds`` are in
     the order in which they are added; without them, all that both arms have count. A question without arms is about
     every two arms that are compared, in the metric's own direction, ``about`` interpolation or extrapolation where it
-    says so.
+    says so. Of two ``versions`` of one trainer the code may differ, and the baseline's trials may be older than the
+    question.
     """
 
     metric: str
@@ -84,6 +85,7 @@ class Question(Part):
     seeds: tuple[Count, ...] = ()
     about: str = ""
     secondary: bool = False
+    versions: bool = False
     name: str = ""
 
     @property

@@ -5,12 +5,18 @@ from __future__ import annotations
 import os
 import re
 import subprocess
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from gsbench.errors import InputError
+
 SECONDS_FOR_GIT = 10
+SECONDS_FOR_A_TREE = 300
+# Variables by which a hook of another repository, in which gsbench may run, names that repository.
+OF_ANOTHER = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE", "GIT_PREFIX", "GIT_OBJECT_DIRECTORY", "GIT_COMMON_DIR")
 STARTS_NOTHING = ("core.fsmonitor=false", f"core.hooksPath={os.devnull}", "protocol.allow=never")
 
 
@@ -53,17 +59,76 @@ def _has_filters(folder: Path) -> bool:
     return any(re.match(r"(local|worktree)\s+filter\.", line, re.I) for line in listed.splitlines())
 
 
-def _git(folder: Path, *words: str) -> str | None:
-    """Answer of git; None where there is no git, no repository, or no answer. It starts no other program."""
+class WorkTrees:
+    """Work trees of commits of the repository that ``folder`` is in, made below the empty folder ``place``.
+
+    They belong to a repository of their own that only borrows the objects: the user's checkout and its list of work
+    trees stay as they are, and no hook, filter or other program runs that the repository's own configuration names.
+    """
+
+    def __init__(self, folder: Path, place: Path) -> None:
+        self.prefix = run_git(folder, "rev-parse", "--show-prefix")  # of the folder, within the work tree
+        self._folder, self._place = folder, place
+        objects = run_git(folder, "rev-parse", "--path-format=absolute", "--git-path", "objects")
+        run_git(place, "init", "--quiet", "--template=", "own")
+        (place / "own" / ".git" / "objects" / "info").mkdir(parents=True, exist_ok=True)
+        (place / "own" / ".git" / "objects" / "info" / "alternates").write_text(f"{objects}\n", encoding="utf-8")
+
+    def commits(self, first: str, last: str) -> list[tuple[str, str, str]]:
+        """(hash, date, subject) of the commit ``first`` and those up to ``last``, merges from the outside only.
+
+        Raises InputError where one is none, and where the first does not come before the last.
+        """
+        names = [
+            run_git(self._folder, "rev-parse", "--verify", "--end-of-options", f"{one}^{{commit}}")
+            for one in (first, last)
+        ]
+        log = ("log", "--no-show-signature", "--no-color", "--format=%H%x09%cs%x09%s")
+        found = run_git(self._folder, *log, "-1", names[0])
+        between = f"{names[0]}..{names[1]}"
+        later = run_git(self._folder, *log, "--first-parent", "--ancestry-path", "--reverse", between)
+        if not later:
+            raise InputError(f"{last} does not come after {first}: give the good commit first")
+        parts = [[*line.split("\t", 2), "", ""] for line in (found, *later.split("\n"))]
+        return [(commit, date, subject) for commit, date, subject, *_ in parts]
+
+    def tree(self, commit: str) -> Path:
+        """The work tree of a commit."""
+        path = self._place / commit
+        if not path.exists():
+            run_git(self._place / "own", "worktree", "add", "--quiet", "--detach", str(path), commit)
+        return path
+
+
+def run_git(folder: Path, *words: str) -> str:
+    """The answer of git; raises InputError with its words where it has none. It starts no other program."""
     try:
-        done = subprocess.run(
-            ["git", *(word for setting in STARTS_NOTHING for word in ("-c", setting)), "-C", str(folder), *words],
-            env=os.environ | {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"},  # look, and touch nothing
-            capture_output=True,
-            text=True,
-            timeout=SECONDS_FOR_GIT,
-            check=True,
-        )
+        return _answer(folder, words, SECONDS_FOR_A_TREE).stdout.strip()
+    except OSError as error:
+        raise InputError(f"git cannot be started ({error.strerror or error}): install it") from None
+    except subprocess.TimeoutExpired:
+        raise InputError(f"git {words[0]} took more than {SECONDS_FOR_A_TREE} s in {folder}") from None
+    except subprocess.CalledProcessError as error:
+        raise InputError(f"git {words[0]}: {(error.stderr or error.stdout).strip() or 'it failed'}") from None
+
+
+def _git(folder: Path, *words: str) -> str | None:
+    """Answer of git; None where there is no git, no repository, or no answer."""
+    try:
+        return _answer(folder, words, SECONDS_FOR_GIT).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip()
+
+
+def _answer(folder: Path, words: Sequence[str], seconds: float) -> subprocess.CompletedProcess[str]:
+    """Run git in ``folder``; it starts no other program, and takes the repository from nowhere else."""
+    here = {key: value for key, value in os.environ.items() if key not in OF_ANOTHER}
+    return subprocess.run(
+        ["git", *(word for setting in STARTS_NOTHING for word in ("-c", setting)), "-C", str(folder), *words],
+        env=here | {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"},  # look, and touch nothing
+        capture_output=True,
+        encoding="utf-8",
+        errors="replace",  # a subject may be in any encoding
+        timeout=seconds,
+        check=True,
+    )

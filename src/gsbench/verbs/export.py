@@ -30,18 +30,21 @@ def main(argv: Sequence[str], runs: Path) -> int:
         prog="gsbench export",
         description="Write a trained model for other programs; `gsbench export init TRIAL --out DIR` copies the COLMAP "
         "model that the trial started from; `gsbench export --results EXPERIMENT` writes results, configurations and "
-        "hashes, without pixels, as one small archive.",
+        "hashes as one small archive, without pixels unless --pictures is given.",
     )
     parser.add_argument("--results", metavar="EXPERIMENT", help="the archive of its results (default: EXPERIMENT.zip)")
     parser.add_argument("trial", nargs="*", metavar="TRIAL", help=f"{ADDRESS}; after the word init: its initial model")
     parser.add_argument(
         "--out", type=path, metavar="PATH", help="the file, or for init the folder, to write; needed for a TRIAL"
     )
+    parser.add_argument("--pictures", action="store_true", help="with --results: the pictures of the test views, too")
     options = parser.parse_args(argv)
     if options.results is not None:
         if options.trial:
-            raise InputError("export --results takes an experiment and --out alone")
-        return export_results(options.results, runs, options.out)
+            raise InputError("export --results takes an experiment, --out and --pictures alone")
+        return export_results(options.results, runs, options.out, options.pictures)
+    if options.pictures:
+        raise InputError("--pictures goes with --results")
     if not options.trial or options.out is None:
         raise InputError("export needs a TRIAL and --out PATH, or --results EXPERIMENT (see gsbench export --help)")
     from gsbench.view.trials import find_trial, model_file
@@ -67,7 +70,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
-def export_results(name: str, runs: Path, out: Path | None) -> int:
+def export_results(name: str, runs: Path, out: Path | None, pictures: bool = False) -> int:
     """Write the archive of an experiment's results, and say what is not in it; 0."""
     from gsbench.claims.archive import write_archive
 
@@ -77,7 +80,7 @@ def export_results(name: str, runs: Path, out: Path | None) -> int:
     if file.is_dir():
         file = file / f"{name}.zip"
     with place_of(file):
-        left_out = write_archive(load_experiment(runs, name), file)
+        left_out = write_archive(load_experiment(runs, name), file, pictures)
     for line in left_out:
         log.warning("left out: %s", line)
     print(f"{file}: results of {name}, {readable_bytes(file.stat().st_size)}")

@@ -1,0 +1,157 @@
+"""A gate: is a new version of a trainer worse than the version whose trials are at hand?
+
+One question about two versions, asked in planned looks (`gsbench.claims.stopping`), with three answers: the new version
+passes, is worse, or is not decided after the seeds that were allowed. It passes where it is better, where any
+difference is too small to matter, or where it is at least shown not to be worse by the least that matters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.quantities import COSTS
+from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.statistics import FIRST_LOOK, REFUTED, SUPPORTED, TOO_SMALL, plan_looks
+from gsbench.claims.file import read_least
+from gsbench.claims.stopping import facts_for
+from gsbench.errors import InputError
+from gsbench.eval.facts import known_keys
+from gsbench.runs.declaration import ERROR_RATE, Declaration, Question, declared_now, trial_key
+from gsbench.words import closest, counted, listed
+
+BASELINE, NEW = "baseline", "new"  # in keys of trials, in the place of the hash of settings that both may share
+PASSED, WORSE, NOT_DECIDED = "passed", "worse", "undecided"
+
+Trials = Callable[[], Iterable[TrialResult]]
+
+
+@dataclass(frozen=True)
+class Gate:
+    """A declared question about two versions, with what gives the trials of each that are done."""
+
+    declaration: Declaration
+    baseline: Trials
+    new: Trials
+
+    def judged(self) -> list[Verdict]:
+        """The verdict so far; final also where the new version is not worse, as no further seed has to show more."""
+        trials = [*_called(BASELINE, self.baseline()), *_called(NEW, self.new())]
+        return [replace(one, final=one.final or result_of(one) == PASSED) for one in judge(trials, self.declaration)]
+
+
+def ask(
+    metric: str,
+    least: str | None,
+    scenes: Mapping[str, tuple[str, str]],
+    seeds: Sequence[int],
+    values: Mapping[str, Any],
+    error_rate: float = ERROR_RATE,
+) -> Declaration:
+    """The declaration of a gate about ``metric`` on ``scenes``, each with the names of both arms, such as ``sfm-adc``.
+
+    ``least`` is text such as ``0.1`` or ``10%``, None for what is known of the metric; ``seeds`` are in the order in
+    which they are added; ``values`` the configuration of a trial, which may hold metrics of the user's own. Raises
+    InputError, one line, for a metric that cannot be judged, and for too few seeds.
+    """
+    own = values["eval"].get("extra") or {}
+    known = (*known_keys(), *COSTS, *own)
+    if metric not in known:
+        raise InputError(f"--metric {metric}: there is no such metric{closest(metric, known)}")
+    sign, usual = -1, None  # of counts and times less is better
+    if metric not in COSTS:
+        facts = facts_for(metric, values)
+        sign, usual = facts.direction, facts.worthwhile
+    if not sign:
+        raise InputError(f"--metric {metric}: whether more or less of it is better is not known")
+    if least is None and usual is None:
+        raise InputError(f"what of {metric} matters is not known: give --least, such as 0.1 or 10%")
+    size = read_least(str(usual) if least is None else least, "--least")
+    if metric in COSTS and not size.relative:
+        raise InputError(f"--least of {metric} must be a part, such as 10%, got {size}")
+    if len(seeds) < FIRST_LOOK:
+        raise InputError(f"a gate needs {FIRST_LOOK} seeds at least, of which there is {len(seeds)}: allow more")
+    question = Question(
+        metric=metric,
+        sign=sign,
+        least=size.size,
+        relative=size.relative,
+        baseline=Arm("", BASELINE),
+        arm=Arm("", NEW),
+        scenes={
+            scene: (trial_key(scene, baseline, BASELINE), trial_key(scene, new, NEW))
+            for scene, (baseline, new) in scenes.items()
+        },
+        seeds=tuple(seeds),
+        versions=True,
+        name="gate",
+    )
+    return declared_now(questions=(question,), looks=plan_looks(len(seeds)), error_rate=error_rate)
+
+
+def result_of(verdict: Verdict) -> str:
+    """``passed``, ``worse``, or ``undecided``, which may change as long as the verdict is not final."""
+    if verdict.untestable:  # no pair differs, or none can be compared
+        return PASSED if verdict.equal else NOT_DECIDED
+    if verdict.outcome in (SUPPORTED, TOO_SMALL):
+        return PASSED
+    if verdict.outcome == REFUTED:
+        return WORSE
+    return PASSED if _not_worse(verdict) else NOT_DECIDED
+
+
+def describe(verdict: Verdict) -> str:
+    """The result in a sentence: ``worse in PSNR (dB): −1.20 (95 % interval over all looks −1.50 to −0.90); …``"""
+    answer, question = verdict.answer, verdict.question
+    if verdict.untestable:
+        same = f"equal to the last bit in all {counted(len(verdict.pairs.trials) // 2, 'pair')} of trials"
+        return f"{PASSED}: {same}" if verdict.equal else f"not testable: {verdict.untestable}"
+    if answer is None or answer.interval is None:
+        return f"{NOT_DECIDED}: {'; '.join(('trials are missing', *verdict.notes))}"
+    least = f"{100 * question.least:g} %" if question.relative else f"{question.least:g}"  # type: ignore[operator]
+    words = {
+        SUPPORTED: f"{PASSED}, better",
+        TOO_SMALL: f"{PASSED}, any difference is below {least}",
+        REFUTED: WORSE,
+    }
+    word = words.get(verdict.outcome, f"{PASSED}, not worse by {least}" if _not_worse(verdict) else NOT_DECIDED)
+    return (
+        f"{word} in {verdict.quantity.name}: {verdict.shown(answer.mean)} ({100 * (1 - answer.level):.3g} % interval "
+        f"over all looks {verdict.shown_interval(answer.interval)}) on {counted(len(verdict.pairs.rows), 'scene')}, "
+        f"with {verdict.pairs.seeds} of at most {counted(len(question.seeds), 'seed')}"
+        + "".join(f"; {note}" for note in verdict.notes)
+    )
+
+
+def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> list[str]:
+    """A line for each way in which the two versions were run unlike, beside their code: machine, and libraries."""
+    lines = []
+    kinds = [sorted({trial.machine or "not recorded" for trial in own}) for own in (baseline, new)]
+    if kinds[0] != kinds[1]:
+        lines.append(
+            f"deviation: the baseline was made on another kind of machine ({listed(kinds[0])}) than the new trials "
+            f"({listed(kinds[1])}), by which alone last digits and, after long training, trials differ"
+        )
+    libraries = {name for trial in (*baseline, *new) for name in trial.record.versions} - {"gsbench"}
+    for name in sorted(libraries):
+        known = [sorted({trial.record.versions.get(name, "none") for trial in own}) for own in (baseline, new)]
+        if known[0] != known[1]:
+            lines.append(
+                f"deviation: the baseline was made with {name} {listed(known[0])}, the new trials with "
+                f"{listed(known[1])}"
+            )
+    return lines
+
+
+def _not_worse(verdict: Verdict) -> bool:
+    """Return whether the interval holds no loss as large as the least that matters, and hangs on no outlying trial."""
+    if verdict.interval is None or verdict.least is None or verdict.hangs:
+        return False
+    sign = verdict.question.sign
+    return min(sign * verdict.interval.low, sign * verdict.interval.high) > -verdict.least
+
+
+def _called(version: str, trials: Iterable[TrialResult]) -> list[TrialResult]:
+    return [replace(trial, config_hash=version) for trial in trials]

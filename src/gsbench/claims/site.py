@@ -1,0 +1,163 @@
+"""A static site from archives of results: a page of arms and scenes with all verdicts, and a report of each archive.
+
+Archives are strangers' files: their words come into the pages as text alone, and into no name of a file.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from itertools import groupby
+from pathlib import Path
+
+from jinja2 import Environment, StrictUndefined
+from PIL import Image
+
+from gsbench.analysis.cells import swept_settings
+from gsbench.analysis.declaration import standing
+from gsbench.analysis.errors_by_region import read_image
+from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.notes import compared_pairs
+from gsbench.analysis.report.build import build_report
+from gsbench.analysis.results import Experiment
+from gsbench.analysis.table_formats import to_html
+from gsbench.analysis.tables import Table, build_table
+from gsbench.analysis.verdicts import headline, judge_pairs
+from gsbench.claims.archive import unpack_archive
+from gsbench.claims.published import resolve
+from gsbench.errors import InputError
+from gsbench.runs.declaration import read_declarations, standing_one
+from gsbench.runs.layout import RENDERS
+
+INDEX, REPORTS, PICTURES = "index.html", "reports", "pictures"
+WIDTH = 480  # px of a picture, at most
+QUALITY = 85  # of its JPEG
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The first test view of a trial, as a file of the site."""
+
+    file: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class Part:
+    """What the first page says of one archive."""
+
+    name: str
+    key: str  # in names of files and anchors: letters, digits, - and _
+    facts: tuple[tuple[str, str], ...]
+    claims: tuple[Verdict, ...]  # declared ones, with their verdicts
+    lines: tuple[str, ...]  # verdicts on every two arms that are compared
+    tables: tuple[tuple[str, str], ...]  # quantity, and its arms × scenes as HTML
+    pictures: tuple[Picture, ...]
+    notes: tuple[str, ...] = ()
+
+
+def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -> list[str]:
+    """Write the site into the folder ``out``; returns a line for each archive that is left out, with the reason.
+
+    ``scratch`` is an empty folder for what is unpacked. Raises InputError where no archive can be read.
+    """
+    parts: list[Part] = []
+    left_out: list[str] = []
+    (out / REPORTS).mkdir(parents=True, exist_ok=True)
+    for number, archive in enumerate(archives):
+        try:
+            experiment = unpack_archive(archive, scratch / str(number))
+            key = _key(experiment.name, {part.key for part in parts})
+            report, part = build_report(experiment), _part(experiment, key, out)
+        except InputError as error:
+            left_out.append(str(error))
+            continue
+        (out / REPORTS / f"{key}.html").write_text(report, encoding="utf-8")
+        parts.append(part)
+    if not parts:
+        raise InputError(f"no archive can be shown ({left_out[0]})")
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    script = _resource("gsbench.claims", "site.js")
+    page = environment.from_string(_resource("gsbench.claims", "site.html.j2")).render(
+        title=title,
+        parts=parts,
+        left_out=left_out,
+        style=_resource("gsbench.analysis.report", "style.css"),
+        script=script,
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+    )
+    (out / INDEX).write_text(page, encoding="utf-8")
+    return left_out
+
+
+def _part(experiment: Experiment, key: str, out: Path) -> Part:
+    trials, notes = experiment.trials, list[str]()
+    claims: tuple[Verdict, ...] = ()
+    tables: tuple[tuple[str, str], ...] = ()
+    try:
+        claims = _claims(experiment)
+    except InputError as error:
+        notes.append(f"Its declared claims cannot be judged: {error}")
+    try:
+        rows = ("init", "densify", *swept_settings(trials))
+        tables = tuple(_by_quantity(build_table(experiment, rows=rows, columns=("scene",))))
+    except InputError as error:
+        notes.append(f"No table: {error}")
+    arms, pairs = compared_pairs(experiment)
+    judged = judge_pairs(arms, pairs, standing(experiment.folder, trials))
+    facts = {
+        "trials": str(len(trials)),
+        "scenes": ", ".join(sorted({trial.scene for trial in trials})),
+        "seeds": ", ".join(map(str, experiment.seeds)),
+        "protocol": ", ".join(sorted({trial.record.protocol for trial in trials})),
+        "iterations": ", ".join(map(str, sorted({trial.record.iterations for trial in trials}))),
+        "machine": ", ".join(sorted({trial.machine or "not recorded" for trial in trials})),
+        "gsbench": ", ".join(sorted({trial.record.versions.get("gsbench", "unknown") for trial in trials})),
+    }
+    lines = tuple(headline(own) for own in judged)
+    pictures = tuple(_pictures(experiment, key, out))
+    return Part(experiment.name, key, tuple(facts.items()), claims, lines, tables, pictures, tuple(notes))
+
+
+def _claims(experiment: Experiment) -> tuple[Verdict, ...]:
+    """The verdicts on claims that were declared, as `gsbench check --from` makes them."""
+    declared = [one for one in read_declarations(experiment.folder) if one.of_claims]
+    if not declared:
+        return ()
+    return tuple(judge(experiment.trials, resolve(standing_one(declared), experiment.trials)))
+
+
+def _by_quantity(table: Table) -> Iterator[tuple[str, str]]:
+    """A table of arms × scenes for each quantity of one that has all."""
+    for name, places in groupby(range(len(table.columns)), key=lambda place: table.columns[place].group):
+        first, *rest = places
+        kept = slice(first, first + 1 + len(rest))
+        columns = tuple(replace(column, group="") for column in table.columns[kept])
+        rows = tuple(replace(row, entries=row.entries[kept], rule_above=False) for row in table.rows)
+        yield name, to_html(replace(table, title=name, columns=columns, rows=rows, notes=()))
+
+
+def _pictures(experiment: Experiment, key: str, out: Path) -> Iterator[Picture]:
+    """The first view of each trial whose archive has pictures, written anew: what a stranger sent is not passed on."""
+    for number, trial in enumerate(experiment.trials):
+        for path in trial.folder.pictures(RENDERS)[:1]:
+            image = Image.fromarray(read_image(path))
+            image.thumbnail((WIDTH, WIDTH))
+            file = f"{PICTURES}/{key}-{number}.jpg"
+            (out / PICTURES).mkdir(exist_ok=True)
+            image.save(out / file, quality=QUALITY)
+            yield Picture(file, f"{trial.scene}, {trial.arm}, seed {trial.seed}: {path.stem}")
+
+
+def _key(name: str, taken: set[str]) -> str:
+    """A name of a file that no other archive has, also where capitals are no difference."""
+    plain = re.sub(r"[^a-z0-9_-]+", "-", name.lower()).strip("-") or "experiment"
+    return next(key for n in range(1, len(taken) + 2) if (key := plain if n == 1 else f"{plain}-{n}") not in taken)
+
+
+def _resource(package: str, name: str) -> str:
+    return files(package).joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,189 @@
+"""The gate on made-up trials: what passes, what is worse, what is not decided, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.claims.archive import write_archive
+from gsbench.claims.bisect import SPARE, first_worse, most_steps
+from gsbench.claims.gate import NOT_DECIDED, PASSED, WORSE, Gate, ask, describe, deviations, result_of
+from gsbench.claims.stopping import run_looks
+from gsbench.cli import run
+from gsbench.errors import InputError
+from gsbench.runs.declaration import Declaration
+from gsbench.runs.trial_record import Code
+from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
+
+VALUES: dict[str, Any] = {"eval": {"extra": {}}}
+SCENES = dict.fromkeys(("courtyard", "garden"), ("sfm-adc", "sfm-adc"))
+
+
+def asked(metric: str = "psnr", least: str | None = "0.1", seeds: int = 4, **scenes: tuple[str, str]) -> Declaration:
+    return replace(ask(metric, least, scenes or SCENES, range(seeds), VALUES), time="2020-01-01T00:00:00Z")
+
+
+def trials(runs: Path, effect: float, noise: float, seeds: int = 4, scenes: Sequence[str] = tuple(SCENES)) -> Any:
+    """Trials of one version, whose PSNR is 26 + ``effect`` with that noise (dB)."""
+    for scene in scenes:
+        for seed in range(seeds):
+            rng = np.random.default_rng([seed, len(scene), int(1000 * abs(effect))])
+            views = {"psnr": 26 + effect + rng.normal(0, noise) + np.zeros(3), "flip": 0.1 + np.zeros(3)}
+            write_trial(runs, trial_data(Plan(experiment="gate"), scene, "sfm", "adc", seed, views), views)
+    return load_experiment(runs, "gate").trials
+
+
+def gate(tmp_path: Path, effect: float, noise: float, declared: Declaration | None = None) -> tuple[Verdict, int]:
+    """The verdict on a version with that effect, and the most seeds that were asked for."""
+    old, new = (trials(tmp_path / str(k), k * effect, noise) for k in (0, 1))
+    most = [0]
+
+    def run_them(planned: Sequence[tuple[str, int]]) -> None:
+        most[0] = max(seed for _, seed in planned) + 1
+
+    found = Gate(declared or asked(), lambda: old, lambda: [one for one in new if one.seed < most[0]])
+    (verdict,) = run_looks(found.declaration, found.judged, run_them)
+    return verdict, most[0]
+
+
+@pytest.mark.parametrize(
+    ("effect", "noise", "result", "words", "seeds"),
+    [
+        (-1.0, 0.01, WORSE, "worse in PSNR (dB): −0.99", 2),
+        (1.0, 0.01, PASSED, "passed, better in PSNR", 2),
+        (0.01, 0.002, PASSED, "any difference is below 0.1", 2),
+        (-0.3, 1.0, NOT_DECIDED, "with 4 of at most 4 seeds", 4),
+        (0.0, 1.0, PASSED, "equal to the last bit in all 4 pairs of trials", 2),
+    ],
+)
+def test_results(tmp_path: Path, effect: float, noise: float, result: str, words: str, seeds: int) -> None:
+    verdict, most = gate(tmp_path, effect, noise)
+    assert (result_of(verdict), most) == (result, seeds)
+    assert words in describe(verdict)
+
+
+def test_what_is_shown_not_to_be_worse_passes_though_it_may_be_better(tmp_path: Path) -> None:
+    verdict, most = gate(tmp_path, 0.3, 0.02, asked(least="0.35"))
+    assert (verdict.outcome, result_of(verdict)) == ("undecided", PASSED)
+    assert "not worse by 0.35 in PSNR" in describe(verdict)
+    assert most < 4
+    assert result_of(replace(verdict, hangs=True)) == NOT_DECIDED
+
+
+def test_a_look_waits_for_every_scene_also_where_the_first_is_equal(tmp_path: Path) -> None:
+    old = trials(tmp_path, 0, 0.1)
+    (verdict,) = Gate(asked(), lambda: old, lambda: [one for one in old if one.scene == "garden"]).judged()
+    assert not verdict.final
+    assert result_of(verdict) == NOT_DECIDED
+    assert "trials are missing" in describe(verdict)
+
+
+def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(tmp_path: Path) -> None:
+    def made_by(own: Sequence[TrialResult], state: str, measured: str) -> list[TrialResult]:
+        code = Code(rooms={"densify": state})
+        return [replace(one, record=replace(one.record, code=code, measured=measured)) for one in own]
+
+    old = made_by(trials(tmp_path / "a", 0, 0.01), "one", "2019-01-01T00:00:00Z")
+    new = made_by(trials(tmp_path / "b", -1, 0.01), "two", "2021-01-01T00:00:00Z")
+    (verdict,) = Gate(asked(), lambda: old, lambda: new).judged()
+    assert (result_of(verdict), verdict.late) == (WORSE, 0)
+    (other,) = Gate(asked(), lambda: new, lambda: old).judged()
+    assert other.late == 8
+    mixed = [*new[:1], *made_by(new[1:], "three", "2021-01-01T00:00:00Z")]
+    (refused,) = Gate(asked(), lambda: old, lambda: mixed).judged()
+    assert "different versions" in refused.notes[0]
+    assert result_of(refused) == NOT_DECIDED
+
+
+def test_deviations_name_machines_and_libraries(tmp_path: Path) -> None:
+    own = trials(tmp_path, 0, 0.1)
+    assert deviations(own, own) == []
+    machine = {"cpu": "Ours", "kernels": "znver4", "torch": "AVX512", "device": "cpu"}
+    versions = own[0].record.versions | {"torch": "9.9", "gsbench": "9.9"}
+    other = [replace(one, record=replace(one.record, machine=machine, versions=versions)) for one in own]
+    first, second = deviations(own, other)
+    assert "another kind of machine (not recorded) than the new trials (Ours (znver4, torch AVX512))" in first
+    assert "with torch 2.13.0, the new trials with 9.9" in second
+
+
+def test_questions_that_cannot_be_judged_are_refused() -> None:
+    for words, message in (
+        (("psn", None), "did you mean psnr"),
+        (("gaussians", None), "give --least"),
+        (("gaussians", "100"), "must be a part, such as 10%"),
+        (("psnr", "0"), "above 0"),
+        (("psnr", "much"), "above 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            asked(*words)
+    with pytest.raises(InputError, match="2 seeds at least"):
+        asked(seeds=1)
+    assert asked("gaussians", "10%").questions[0].sign == -1
+    assert asked(least=None).questions[0].least == 0.1
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "the following arguments are required: archive"),
+        (["nowhere.zip"], "no such file"),
+        (["exp.zip", "seed=0,1"], "seed follows from the other words"),
+        (["exp.zip", "densify=adc,volumetric"], "only scene may list values"),
+        (["exp.zip", "scene=photos", "scene.path=/"], "the archive has no trial on"),
+        (["exp.zip", "--seeds", "9"], "has 3 seeds of all scenes"),
+        (["exp.zip", "--seeds", "1"], "2 seeds at least"),
+        (["exp.zip", "--metric", "psn"], "psn"),
+        (["exp.zip", "densify=none"], "several arms on courtyard"),
+        (["exp.zip", "--where", "densify=x"], "no trial has densify=x"),
+        (["exp.zip", "launch.wait=false"], "launch.wait"),
+    ],
+)
+def test_bad_input_of_the_verb(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("GSBENCH_RUNS", raising=False)
+    write_runs(tmp_path / "made", Plan(densifiers=("adc", "volumetric")))
+    write_archive(load_experiment(tmp_path / "made", "exp"), tmp_path / "exp.zip")
+    given = any(word.startswith(("scene=", "densify=")) for word in words)
+    assert run(["gate", *words, *([] if given or not words else ["densify=adc", "init=sfm"])]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("worse", range(1, 13))
+def test_bisecting_finds_each_commit_within_its_steps(worse: int) -> None:
+    asked_for: list[int] = []
+
+    def result(commit: int) -> str:
+        asked_for.append(commit)
+        return WORSE if commit >= worse else PASSED
+
+    assert first_worse(12, result) == (worse - 1, worse)
+    assert len(asked_for) == len(set(asked_for)) <= most_steps(12) - SPARE
+
+
+def test_bisecting_passes_over_what_is_not_decided_or_does_not_train() -> None:
+    assert first_worse(12, lambda commit: PASSED) is None
+    answers = {6: NOT_DECIDED, 7: None}
+    assert first_worse(12, lambda commit: answers.get(commit, WORSE if commit >= 9 else PASSED)) == (8, 9)
+    assert first_worse(12, lambda commit: answers.get(commit, WORSE if commit >= 8 else PASSED)) == (5, 8)
+    asked_for: list[int] = []
+
+    def never(commit: int) -> str:
+        asked_for.append(commit)
+        return WORSE if commit == 12 else NOT_DECIDED
+
+    assert first_worse(12, never) == (0, 12)
+    assert len(asked_for) <= most_steps(12)
+    assert first_worse(12, lambda commit: WORSE if commit == 12 else None) == (0, 12)  # costs no step

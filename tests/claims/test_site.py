@@ -1,0 +1,200 @@
+"""The site from archives: what its pages say, that strangers' words stay words, and that its tables sort."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from gsbench.analysis.results import load_experiment
+from gsbench.claims.archive import unpack_archive, write_archive
+from gsbench.cli import run
+from gsbench.errors import InputError
+from gsbench.runs.declaration import Question, declared_now, record_text
+from tests.analysis.synthetic import Plan, write_runs
+from tests.claims.test_archive import rewrite
+from tests.view.browser import Browser
+
+HOSTILE = "<img src=x onerror=alert(1)>&\"'"
+CLAIM = {"courtyard": ("courtyard/sfm-adc/c0ffee00", "courtyard/sfm-volumetric/c0ffee00")}
+
+
+def archive(tmp_path: Path, plan: Plan, pictures: bool = False, claim: str = "") -> Path:
+    """The archive of made-up trials, with a declared claim of that name."""
+    runs, file = tmp_path / f"runs-{plan.experiment}", tmp_path / f"{plan.experiment}.zip"
+    write_runs(runs, plan)
+    if claim:
+        question = Question(metric="psnr", least=0.1, scenes=CLAIM, seeds=(0, 1, 2), name=claim)
+        (runs / plan.experiment / "declared.jsonl").write_text(record_text([declared_now(questions=(question,))]))
+    write_archive(load_experiment(runs, plan.experiment), file, pictures)
+    return file
+
+
+def site(tmp_path: Path, *archives: Path) -> str:
+    assert run(["site", *map(str, archives), "--out", str(tmp_path / "site")]) == 0
+    return (tmp_path / "site" / "index.html").read_text()
+
+
+class Elements(HTMLParser):
+    """The names of all elements with their attributes, and all text."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_the_first_page_has_arms_scenes_claims_and_links_that_lead_somewhere(tmp_path: Path) -> None:
+    files = [
+        archive(tmp_path, Plan(), claim="sharper"),
+        archive(tmp_path, Plan(experiment="other", effect={"psnr": 2})),
+    ]
+    page = site(tmp_path, *files)
+    found = Elements(page)
+    for words in ("courtyard", "garden", "sfm", "volumetric", "PSNR (dB)", "sharper", "better in", "paper-1"):
+        assert words in found.text
+    for _, attributes in found.elements:
+        target = attributes.get("href") or attributes.get("src") or ""
+        if target.startswith("#"):
+            assert f'id="{target[1:]}"' in page
+        elif target != "data:," and target:
+            assert (tmp_path / "site" / target).is_file()
+    assert found.elements.count(("table", {"class": "sorts"})) > 8
+    assert "http://" not in page
+    assert "https://" not in page
+
+
+def test_pictures_are_there_where_the_archive_has_them(tmp_path: Path) -> None:
+    file = archive(tmp_path, Plan(seeds=(0,), scenes=("courtyard",), pictures=True), pictures=True)
+    page = site(tmp_path, file)
+    shown = re.findall(r'src="(pictures/[\w-]+\.jpg)"', page)
+    assert len(shown) == 2  # arms
+    for one in shown:
+        with Image.open(tmp_path / "site" / one) as image:
+            assert image.format == "JPEG"
+    assert "data:image/png" in (tmp_path / "site" / "reports" / "exp.html").read_text()  # crops and whole views
+    without = tmp_path / "without.zip"
+    write_archive(load_experiment(tmp_path / "runs-exp", "exp"), without)
+    assert without.stat().st_size < file.stat().st_size / 2
+    back = unpack_archive(file, tmp_path / "back").trials[0]
+    there = load_experiment(tmp_path / "runs-exp", "exp").trials[0]
+    for kind in ("renders", "ground_truth"):
+        assert [one.read_bytes() for one in back.folder.pictures(kind)] == [
+            one.read_bytes() for one in there.folder.pictures(kind)
+        ]
+
+
+def test_words_of_a_stranger_stay_words(tmp_path: Path) -> None:
+    def spoil(content: dict[str, bytes]) -> None:
+        for name in ("results.jsonl", "configurations.jsonl", "declared.jsonl"):
+            lines = [json.loads(line) for line in content[name].splitlines()]
+            for line in lines:
+                if "results" in line:
+                    line["results"]["protocol"] = HOSTILE
+                    line["results"]["versions"]["gsbench"] = HOSTILE
+                    line["results"]["unavailable"] = {"lpips_alex": HOSTILE}
+                if "configuration" in line:
+                    line["configuration"]["densify"][HOSTILE] = HOSTILE
+            content[name] = "".join(json.dumps(line) + "\n" for line in lines).encode()
+        repack(content)
+
+    def repack(content: dict[str, bytes]) -> None:
+        import hashlib
+
+        manifest = json.loads(content["archive.json"])
+        manifest["sha256"] = {name: hashlib.sha256(content[name]).hexdigest() for name in manifest["sha256"]}
+        content["archive.json"] = json.dumps(manifest).encode()
+
+    file = archive(tmp_path, Plan(), claim=HOSTILE)
+    rewrite(file, spoil)
+    page = site(tmp_path, file)
+    pages = [page, (tmp_path / "site" / "reports" / "exp.html").read_text()]
+    for text in pages:
+        found = Elements(text)
+        assert not [tag for tag, attributes in found.elements if "onerror" in attributes or tag == "img"]
+    assert HOSTILE in Elements(page).text
+    assert page.count("<script>") == 1
+
+
+@pytest.mark.parametrize("name", ["index", "Con Trol%20#x", "é<>".replace("<>", "")])
+def test_names_of_experiments_lead_to_no_other_file(tmp_path: Path, name: str) -> None:
+    one, other = archive(tmp_path, Plan(experiment=name)), tmp_path / "again.zip"
+    other.write_bytes(one.read_bytes())
+    site(tmp_path, one, other)
+    reports = sorted(path.name for path in (tmp_path / "site" / "reports").iterdir())
+    assert len(reports) == 2
+    assert all(re.fullmatch(r"[a-z0-9_-]+\.html", report) for report in reports)
+
+
+def test_damaged_archives_are_left_out_and_nothing_at_all_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, bad = archive(tmp_path, Plan()), tmp_path / "bad.zip"
+    bad.write_bytes(good.read_bytes()[:100])
+    out = str(tmp_path / "site")
+    assert run(["site", str(bad), str(good), "--out", out]) == 1
+    assert "left out" in capsys.readouterr().err
+    assert "bad.zip" in (tmp_path / "site" / "index.html").read_text()
+    assert run(["site", str(bad), "--out", out]) == 2
+    assert "no archive can be shown" in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    assert run(["site", str(good), "--out", str(tmp_path / "file")]) == 2
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "pictures/courtyard/sfm-adc/c0ffee00-seed0/renders/../../x.png",
+        "pictures/../../x/renders/a.png",
+        "pictures/courtyard/sfm-adc/c0ffee00-seed9/renders/a.png",
+        "pictures/courtyard/sfm-adc/c0ffee00-seed0/other/a.png",
+        "pictures/courtyard/sfm-adc/c0ffee00-seed0/renders/",
+        "pictures/a.png",
+    ],
+)
+def test_a_picture_that_leads_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
+    import hashlib
+
+    def add(content: dict[str, bytes]) -> None:
+        manifest = json.loads(content["archive.json"])
+        content[name] = b"x"
+        manifest["sha256"][name] = hashlib.sha256(b"x").hexdigest()
+        content["archive.json"] = json.dumps(manifest).encode()
+
+    file = archive(tmp_path, Plan())
+    rewrite(file, add)
+    before = {path for path in tmp_path.rglob("*") if "inside" not in path.parts}
+    with pytest.raises(InputError, match=r"no picture of a trial|no folder of a trial|not that of an archive"):
+        unpack_archive(file, tmp_path / "inside")
+    assert {path for path in tmp_path.rglob("*") if "inside" not in path.parts} == before
+
+
+@pytest.mark.slow
+def test_a_click_on_a_heading_sorts(tmp_path: Path) -> None:
+    archives = [archive(tmp_path, Plan(experiment=name, seeds=range(k + 1))) for k, name in enumerate("cab")]
+    site(tmp_path, *archives)
+
+    def evaluated(browser: Browser, script: str) -> str:
+        return str(browser.call("Runtime.evaluate", expression=script)["result"]["value"])
+
+    names = "[...document.querySelector('table').tBodies[0].rows].map((row) => row.cells[0].textContent).join('')"
+    with Browser((tmp_path / "site" / "index.html").as_uri(), tmp_path / "profile", (400, 800)) as browser:
+        browser.wait_until(lambda picture: bool((picture < 100).any()), "text")
+        assert evaluated(browser, names) == "cab"
+        for column, shown in ((0, "abc"), (0, "cba"), (1, "cab"), (1, "bac")):
+            click = f"document.querySelectorAll('thead')[0].querySelectorAll('button')[{column}].click()"
+            browser.call("Runtime.evaluate", expression=click)
+            assert evaluated(browser, names) == shown
+        wide = "document.documentElement.scrollWidth > document.documentElement.clientWidth"
+        assert evaluated(browser, wide) == "False"

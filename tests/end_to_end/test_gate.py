@@ -1,0 +1,106 @@
+"""Versions of a densifier, trained for real: the gate's exit codes, and the commit that bisect finds."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.end_to_end.conftest import SMALL, Run
+
+pytestmark = pytest.mark.slow
+
+CLASS = """\
+from dataclasses import dataclass
+
+from gsbench.densify import ADC
+
+STEP = {step}  # each commit changes it
+
+
+@dataclass
+class Mine(ADC):
+    def prune(self, refinement):
+        super().prune(refinement)
+        if {worse}:  # only the commit that is looked for, and later ones
+            gaussians = refinement.gaussians
+            self.remove(refinement, gaussians.opacities < 0.5, gaussians.opacities < 0)
+"""
+WORDS = [
+    *(*SMALL, "train.iterations=60", "train.densify_start=10", "train.densify_interval=10", "train.densify_stop=55"),
+    *("init.count=800", "scene.width=64", "scene.height=48", "eval.lpips=[]", "eval.flip=false", "tracking=none"),
+    *("densify=adc", "densify.name=mine", "densify._target_=mine.Mine", "allow_targets=[mine]", "raster=cpu"),
+]
+
+
+def write_class(folder: Path, step: int, worse: bool) -> None:
+    (folder / "mine.py").write_text(CLASS.format(step=step, worse=worse))
+
+
+def test_a_gate_passes_what_is_equal_and_stops_what_is_worse(gsbench: Run, tmp_path: Path) -> None:
+    changes = {"GSBENCH_RUNS": str(tmp_path / "runs")}
+
+    def do(*words: str) -> subprocess.CompletedProcess[str]:
+        return gsbench(*words, timeout=900, **changes)
+
+    write_class(tmp_path, 0, worse=False)
+    assert do("-m", *WORDS, "name=good", "seed=0,1,2").returncode == 0
+    assert do("export", "--results", "good", "--out", "good.zip").returncode == 0
+    same = do("gate", "good.zip", *WORDS)
+    assert same.returncode == 0, same.stderr
+    assert "passed: equal to the last bit in all 2 pairs of trials" in same.stdout
+    write_class(tmp_path, 1, worse=True)  # in the same runs folder: what was trained before is of another version
+    worse = do("gate", "good.zip", *WORDS)
+    assert worse.returncode == 1, worse.stdout + worse.stderr
+    assert "worse in PSNR (dB): −" in worse.stdout
+    (tmp_path / "mine.py").write_text("raise RuntimeError('broken')\n")
+    broken = do("gate", "good.zip", *WORDS)
+    assert broken.returncode in (1, 2)
+    write_class(tmp_path, 0, worse=False)
+    other = do("gate", "good.zip", *WORDS, "train.iterations=61")
+    assert other.returncode == 2
+    assert "the arms differ in iterations" in other.stderr
+
+
+def test_bisect_finds_the_commit_goes_on_where_it_was_and_leaves_the_checkout_alone(
+    gsbench: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"GIT_CONFIG_GLOBAL": "/dev/null", "GIT_CONFIG_NOSYSTEM": "1"}.items():
+        monkeypatch.setenv(name, value)
+    home = tmp_path / "own" / "densifiers"  # a folder within the repository
+    home.mkdir(parents=True)
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(home.parent), "-c", "user.name=x", "-c", "user.email=x@y", *words]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    git("init", "-q", "-b", "main")
+    for step in range(13):
+        write_class(home, step, worse=step >= 7)
+        git("add", ".")
+        git("commit", "-qm", f"Commit {step}")
+    ran = tmp_path / "ran"
+    for hook in ("post-checkout", "reference-transaction"):
+        file = home.parent / ".git" / "hooks" / hook
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(f"#!/bin/sh\ntouch {ran}\n")
+        file.chmod(0o755)
+    write_class(home, 99, worse=False)  # an edit that was not committed
+    before = git("status", "--porcelain"), git("worktree", "list"), sorted(os.listdir(home.parent / ".git"))
+
+    def bisect() -> subprocess.CompletedProcess[str]:
+        words = ["HEAD~12", "HEAD", *WORDS, "--least", "0.2", "--seeds", "3"]
+        return gsbench("bisect", *words, cwd=home, timeout=1500, GSBENCH_RUNS=str(tmp_path / "runs"))
+
+    done = bisect()
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = git("log", "-1", "--format=%h", "--abbrev=10", "HEAD~5")
+    assert f"It became worse with {found}" in done.stdout
+    assert "Commit 7" in done.stdout.splitlines()[-1]
+    assert done.stdout.count("not tried") == 12 - done.stdout.count("passed") - done.stdout.count("worse in")
+    assert not ran.exists()
+    assert (git("status", "--porcelain"), git("worktree", "list"), sorted(os.listdir(home.parent / ".git"))) == before
+    again = bisect()
+    assert (again.returncode, again.stdout, again.stderr) == (0, done.stdout, "")  # nothing is trained
