@@ -137,7 +137,7 @@ def test_kernels_are_timed_and_put_back_when_a_step_fails() -> None:
         assert cpu_executor.composite_tiles is not kernel
         raise ArithmeticError
     assert cpu_executor.composite_tiles is kernel
-    assert {"project_shard", "composite_tiles", "composite_backward_tiles", "similarity_rows"} <= times.keys()
+    assert {"project_shards", "composite_tiles", "composite_backward_tiles", "similarity_rows"} <= times.keys()
     assert min(times.values()) >= 0
 
 

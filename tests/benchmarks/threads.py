@@ -66,17 +66,13 @@ class Timed:
     def step(self) -> tuple[list[tuple[str, list[float]]], float, float]:
         """The stages of a step, ms of torch's Adam, and ms of all else."""
         self.stages = []
-        run = ShardRunner.run
 
-        def timed(runner: ShardRunner, shards: int, work: Callable[[int], None]) -> None:
-            times = [0.0] * shards
-
-            def one(shard: int) -> None:
+        def timed(runner: ShardRunner, shards: int, work: Callable[[int, int], None]) -> None:
+            times = []
+            for shard in range(shards):
                 begin = time.process_time()
-                work(shard)
-                times[shard] = 1e3 * (time.process_time() - begin)
-
-            run(runner, shards, one)
+                work(shard, shard + 1)
+                times.append(1e3 * (time.process_time() - begin))
             self.stages.append((NAMES.get(work.__name__, work.__name__), times))
 
         with mock.patch.object(ShardRunner, "run", timed):

@@ -142,7 +142,7 @@ def test_an_interrupted_backward_leaves_no_trace(monkeypatch: pytest.MonkeyPatch
         rasterizer = CpuRasterizer(threads=threads)
         _, expected = render_with_gradients(rasterizer, CASE, torch.float32)
         with monkeypatch.context() as patch:
-            patch.setattr(executor, "backproject_shard", _interrupt)
+            patch.setattr(executor, "backproject_shards", _interrupt)
             with pytest.raises(KeyboardInterrupt):
                 render_with_gradients(rasterizer, CASE, torch.float32)
         _, gradients = render_with_gradients(rasterizer, CASE, torch.float32)
@@ -336,8 +336,8 @@ def test_memory_is_used_again() -> None:
 
 
 def test_an_error_in_a_shard_is_raised() -> None:
-    def fail(shard: int) -> None:
-        if shard == 3:
+    def fail(first: int, past: int) -> None:
+        if first <= 3 < past:
             raise ZeroDivisionError
 
     for threads in (1, 2):

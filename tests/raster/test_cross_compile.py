@@ -25,7 +25,7 @@ TARGETS = {  # triple, processor
     "sve": ("aarch64-unknown-linux-gnu", "neoverse-v1"),
     "apple": ("arm64-apple-macosx", "apple-m1"),
 }
-FREE_OF_VECTORS = {"sort_by_depth", "start_tiles", "fill_shard", "balance_tiles", "pair_shard"}  # counting and moving
+FREE_OF_VECTORS = {"sort_by_depth", "start_tiles", "fill_shards", "balance_tiles", "pair_shards"}  # counting and moving
 
 
 @cache

@@ -42,6 +42,20 @@ def slope_limits(camera: Camera, constants: RasterConstants = CONSTANTS) -> tupl
     )
 
 
+def projection_numbers(camera: Camera) -> list[float]:
+    """A camera as the compiled kernels take it: focal lengths and principal point, px, with integer pixel centres;
+    limits of the slopes; rotation, row by row; centre."""
+    return [
+        camera.fx,
+        camera.fy,
+        camera.cx - 0.5,
+        camera.cy - 0.5,
+        *slope_limits(camera),
+        *map(float, camera.rotation.ravel()),
+        *map(float, camera.center),
+    ]
+
+
 @dataclass(frozen=True)
 class Footprint:
     """The pixels of one view that each Gaussian is blended into: those where its alpha is not skipped and that have not

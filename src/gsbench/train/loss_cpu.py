@@ -251,8 +251,8 @@ class CompiledLoss:
         memory = arena.take("memory", (SHARDS, MAPS * (TAPS + 1) * padded + LANES), np.float32)
         common = (height, width, pixels, wanted, divisor, derivatives)
 
-        def similarity(shard: int) -> None:
-            if edges[shard] < edges[shard + 1]:
+        def similarity(first: int, past: int) -> None:
+            for shard in range(first, past):
                 similarity_rows(memory[shard], edges[shard], edges[shard + 1], *common, sums[shard])
 
         self._runner.run(SHARDS, similarity)
@@ -264,8 +264,8 @@ class CompiledLoss:
         factors = (np.float32((1 - self.ssim_weight) / numbers), np.float32(self.ssim_weight / numbers))
         flat = gradient.numpy().reshape(-1)
 
-        def differentiate_rows(shard: int) -> None:
-            if edges[shard] < edges[shard + 1]:
+        def differentiate_rows(first: int, past: int) -> None:
+            for shard in range(first, past):
                 gradient_rows(memory[shard], edges[shard], edges[shard + 1], *common, *factors, flat)
 
         self._runner.run(SHARDS, differentiate_rows)

@@ -68,11 +68,12 @@ def _take_rows(
 
 
 @kernel
-def backproject_shard(
+def backproject_shards(
     memory: Any,
-    begin: int,
-    end: int,
-    visible: int,
+    first: int,
+    past: int,
+    edges: Any,
+    visible: Any,
     gaussians: Any,
     degree: int,
     frame: Any,
@@ -82,10 +83,22 @@ def backproject_shard(
     g_absolute: Any,
     g_splitting: Any,
 ) -> None:
-    """Write all ``gradients`` of the Gaussians ``begin`` to ``end``; reads and clears their ``rows`` [shards * N * 16].
+    """Write all ``gradients`` of the shards ``first`` to ``past`` of Gaussians, which lie between ``edges``; read and
+    clear their ``rows`` [shards of tiles * N * 16].
 
-    ``g_absolute`` and ``g_splitting`` [N, 9] may be empty.
+    ``visible`` counts the records of each shard; ``g_absolute`` and ``g_splitting`` [N, 9] may be empty.
     """
+    for shard in range(first, past):
+        begin, end = edges[shard], edges[shard + 1]
+        outputs = gradients, g_screen, g_absolute, g_splitting
+        _backproject(memory, begin, end, visible[shard], gaussians, degree, frame, rows, outputs)
+
+
+@inlined
+def _backproject(
+    memory: Any, begin: int, end: int, visible: int, gaussians: Any, degree: int, frame: Any, rows: Any, outputs: Any
+) -> None:
+    gradients, g_screen, g_absolute, g_splitting = outputs
     v, record_ints, tile_shard = frame.camera, frame.record_ints, frame.tile_shard
     g_means, g_log_scales, g_quaternions = gradients.means, gradients.log_scales, gradients.quaternions
     g_logits, g_sh_dc, g_sh_rest = gradients.logits, gradients.sh_dc, gradients.sh_rest
@@ -143,7 +156,7 @@ def backproject_shard(
         scales = (exponential(log_scale[0]), exponential(log_scale[1]), exponential(log_scale[2]))
         n0, n1 = times(axis_x, matrix), times(axis_y, matrix)
         m0, m1 = scaled(n0, scales), scaled(n1, scales)
-        _, xy, yy, a = spread(m0, m1, v.blur)
+        _, xy, yy, a = spread(m0, m1)
         e, shear = ONE / yy, -xy / yy  # power = -(a t^2 + e dy^2) / 2, t = dx + shear dy
 
         # Mean on the image: d power / d mean = (a t, shear a t + e dy).

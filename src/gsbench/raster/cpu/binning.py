@@ -87,14 +87,34 @@ def _columns(records: Any, base: int, tile_y: int, first: int, past: int, reach:
 
 
 @kernel
-def pair_shard(
+def pair_shards(
+    first: int,
+    past: int,
+    edges: Any,
+    keys: Any,
+    records: Any,
+    record_ints: Any,
+    tiles_x: int,
+    cutoff: Any,
+    counts: Any,
+    pairs: Any,
+    made: Any,
+) -> None:
+    """Write the pairs of tile and record (tile in the high word) of the sorted ``keys``, of which each of the shards
+    ``first`` to ``past`` has those between two ``edges``, to the shard's ``pairs``.
+
+    Its ``counts`` [tiles] get how many each tile has, ``made`` how many there are in all; where that is more than
+    ``pairs`` has room for, the rest is not written.
+    """
+    for shard in range(first, past):
+        begin, end = edges[shard], edges[shard + 1]
+        made[shard] = _pair(begin, end, keys, records, record_ints, tiles_x, cutoff, counts[shard], pairs[shard])
+
+
+@inlined
+def _pair(
     begin: int, end: int, keys: Any, records: Any, record_ints: Any, tiles_x: int, cutoff: Any, counts: Any, pairs: Any
 ) -> int:
-    """Write the pairs of tile and record (tile in the high word) of the sorted ``keys`` ``begin`` to ``end``.
-
-    ``counts`` [tiles] gets how many each tile has. Returns how many there are in all; where that is more than ``pairs``
-    has room for, the rest is not written.
-    """
     for tile in range(len(counts)):
         counts[tile] = 0
     room = np.uint64(len(pairs))
@@ -135,12 +155,15 @@ def start_tiles(counts: Any, starts: Any) -> None:
 
 
 @kernel
-def fill_shard(count: int, pairs: Any, places: Any, entries: Any) -> None:
-    """Write the records of the first ``count`` of ``pairs`` to their tiles' lists, at ``places`` [tiles]."""
-    for k in range(np.uint64(count)):
-        tile = pairs[k] >> np.uint64(32)
-        entries[places[tile]] = np.int32(pairs[k] & LOW_WORD)
-        places[tile] += 1
+def fill_shards(first: int, past: int, made: Any, pairs: Any, places: Any, entries: Any) -> None:
+    """Write the records of the first ``made`` of each shard's ``pairs`` to their tiles' lists, at its ``places``
+    [tiles]."""
+    for shard in range(first, past):
+        own_pairs, own_places = pairs[shard], places[shard]
+        for k in range(np.uint64(made[shard])):
+            tile = own_pairs[k] >> np.uint64(32)
+            entries[own_places[tile]] = np.int32(own_pairs[k] & LOW_WORD)
+            own_places[tile] += 1
 
 
 @kernel

@@ -227,10 +227,11 @@ def composite_backward_tiles(
     frame: Any,
     g_image: Any,
     g_alpha: Any,
-    rows: Any,
+    all_rows: Any,
     want_absolute: bool,
 ) -> None:
-    """Add the gradient sums of the tiles ``first`` to ``past`` to ``rows`` [N * 16], back to front.
+    """Add the gradient sums of the tiles ``first`` to ``past``, back to front, to those of their shards among
+    ``all_rows`` [shards, N * 16].
 
     With U = (sum over the later of (c . g) alpha T, and the background's part) / T, all T counted from behind a record,
     the loss changes with its alpha by T (c . g - U), where T is the transmittance before it; then U of the record
@@ -244,6 +245,7 @@ def composite_backward_tiles(
     red, green, blue = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :], floats[2 * at.TILE_PIXELS :]
     behind, through = floats[3 * at.TILE_PIXELS :], floats[4 * at.TILE_PIXELS :]  # U, and T behind the current record
     for tile in range(first, past):
+        rows = all_rows[frame.tile_shard[tile]]
         left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
         tile_x, tile_y = np.float32(left), np.float32(top)
         state = tile * at.TILE_PIXELS
@@ -289,10 +291,6 @@ def composite_backward_tiles(
             if todo == 0:
                 continue
             base = entries[entry] * at.RECORD
-            shear = splat(records[base + at.SHEAR])
-            curve_t, curve_y = splat(records[base + at.CURVE_T]), splat(records[base + at.CURVE_Y])
-            log2_opacity = splat(records[base + at.LOG2_OPACITY])
-            r, g, b = splat(records[base + at.RED]), splat(records[base + at.GREEN]), splat(records[base + at.BLUE])
             offset_x, offset_y = tile_x - records[base + at.MEAN_X], tile_y - records[base + at.MEAN_Y]
             number = splat(np.float32(entry - begin + 1))
             sum_r, sum_g, sum_b = splat(ZERO), splat(ZERO), splat(ZERO)
@@ -305,15 +303,17 @@ def composite_backward_tiles(
                 place = block * np.uint64(LANES)
                 dx = load(PIXEL_X, place) + offset_x
                 dy = load(PIXEL_Y, place) + offset_y
-                t = fma(dy, shear, dx)
-                power = fma(curve_y * dy, dy, fma(curve_t * t, t, log2_opacity))
+                t = fma(dy, records[base + at.SHEAR], dx)
+                along_t = fma(t * records[base + at.CURVE_T], t, records[base + at.LOG2_OPACITY])
+                power = fma(dy * records[base + at.CURVE_Y], dy, along_t)  # log2(alpha)
                 blended = (power >= LOG2_ALPHA_MIN) & (number <= load(frame.last, state + place))
                 raw = select(blended, exp2(power), ZERO)
                 opacity = minimum(raw, splat(ALPHA_MAX))
                 before = load(through, place) / (ONE - opacity)
                 weight = before * opacity
                 g_red, g_green, g_blue = load(red, place), load(green, place), load(blue, place)
-                light = fma(g_red, r, fma(g_green, g, g_blue * b))
+                light = fma(g_green, records[base + at.GREEN], g_blue * records[base + at.BLUE])
+                light = fma(g_red, records[base + at.RED], light)
                 later = load(behind, place)
                 gain = light - later
                 h = before * raw * gain
@@ -332,7 +332,16 @@ def composite_backward_tiles(
                 if want_absolute is not None:
                     sum_abs_t += absolute(ht)
                     # d power / d mean_y = shear a t + e dy, with a and e from the curves: curve = -log2(e)/2 a
-                    sum_abs_y += absolute(fma(shear * curve_t, ht, curve_y * hy)) * TO_PRECISION
+                    sum_abs_y += (
+                        absolute(
+                            fma(
+                                ht,
+                                records[base + at.SHEAR] * records[base + at.CURVE_T],
+                                hy * records[base + at.CURVE_Y],
+                            )
+                        )
+                        * TO_PRECISION
+                    )
             if want_absolute is not None:
                 sums = lane_sums(
                     (sum_h, sum_ht, sum_hy, sum_htt, sum_hty, sum_hyy, sum_r, sum_g, sum_b, sum_abs_t, sum_abs_y)

@@ -13,19 +13,19 @@ from torch import Tensor
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, Footprint, view_depths
 from gsbench.raster.cpu import layout as at
-from gsbench.raster.cpu.backprojection import backproject_shard
+from gsbench.raster.cpu.backprojection import backproject_shards
 from gsbench.raster.cpu.binning import (
     BUCKETS,
     PASSES,
     balance_tiles,
-    fill_shard,
-    pair_shard,
+    fill_shards,
+    pair_shards,
     sort_by_depth,
     start_tiles,
 )
 from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_backward_tiles, composite_tiles
 from gsbench.raster.cpu.footprint import cover_tiles
-from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, project_shard
+from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, project_shards
 from gsbench.raster.cpu.shuffle import REST
 from gsbench.raster.cpu.workspace import HEADROOM, Arena, ArenaPool, ShardRunner, TensorPool
 from gsbench.raster.staged import Gradients, Lifetime, Request, StagedRasterizer
@@ -57,8 +57,9 @@ class ForwardPass:
     visible: NDArray[np.int64]  # [GAUSSIAN_SHARDS] records
 
 
-def _edges(count: int, shards: int) -> list[int]:
-    return [count * shard // shards for shard in range(shards + 1)]
+def _edges(count: int) -> NDArray[np.int64]:
+    """Where the shards of so many Gaussians or records begin, and the last one ends."""
+    return np.arange(GAUSSIAN_SHARDS + 1) * count // GAUSSIAN_SHARDS
 
 
 def forward(
@@ -73,31 +74,18 @@ def forward(
     """Project, sort, bin, composite into ``image``, ``alpha`` and ``radii``."""
     run = resources.runner.run
     count = len(gaussians)
-    view = at.make_view(request.camera, CONSTANTS)
+    view = at.make_view(request.camera)
     tiles = view.tiles_x * view.tiles_y
     arrays = _arrays(gaussians)
     records = arena.take("records", (count * at.RECORD,), np.float32)
     record_ints = records.view(np.int32)
     keys = arena.take("keys", (count,), np.uint64)
     flags = np.zeros((GAUSSIAN_SHARDS, 2), np.int64)
-    edges = _edges(count, GAUSSIAN_SHARDS)
-    radii_array = radii.numpy()
+    edges = _edges(count)
+    projected = (records, record_ints, keys, radii.numpy(), flags)
 
-    def project(shard: int) -> None:
-        begin, end = edges[shard], edges[shard + 1]
-        project_shard(
-            at.kernel_memory(),
-            begin,
-            end,
-            arrays,
-            request.degree,
-            view,
-            records,
-            record_ints,
-            keys,
-            radii_array,
-            flags[shard],
-        )
+    def project(first: int, past: int) -> None:
+        project_shards(at.kernel_memory(), first, past, edges, arrays, request.degree, view, *projected)
 
     run(GAUSSIAN_SHARDS, project)
     if flags[:, BAD_VALUE].any():
@@ -106,25 +94,15 @@ def forward(
     order = arena.take("order", (int(flags[:, VISIBLE].sum()),), np.uint64)
     digits = np.empty((PASSES, BUCKETS), np.int64)
     spare = arena.take("spare", order.shape, np.uint64)
-    sort_by_depth(np.array(edges[:-1]), flags[:, VISIBLE].copy(), keys, order, spare, digits)
+    sort_by_depth(edges[:-1], flags[:, VISIBLE].copy(), keys, order, spare, digits)
 
     counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
     starts = arena.take("starts", (tiles + 1,), np.int64)
-    cuts = _edges(len(order), GAUSSIAN_SHARDS)
     made = np.zeros(GAUSSIAN_SHARDS, np.int64)  # pairs of tile and record
+    in_order = (_edges(len(order)), order, records, record_ints)
 
-    def pair(shard: int) -> None:
-        made[shard] = pair_shard(
-            cuts[shard],
-            cuts[shard + 1],
-            order,
-            records,
-            record_ints,
-            view.tiles_x,
-            LOG2_ALPHA_MIN,
-            counts[shard],
-            pairs[shard],
-        )
+    def pair(first: int, past: int) -> None:
+        pair_shards(first, past, *in_order, view.tiles_x, LOG2_ALPHA_MIN, counts, pairs, made)
 
     room = resources.pairs_of_shard
     pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
@@ -136,7 +114,7 @@ def forward(
     start_tiles(counts, starts)
     total = int(starts[tiles])
     entries = arena.take("entries", (total,), np.int32)
-    run(GAUSSIAN_SHARDS, lambda shard: fill_shard(made[shard], pairs[shard], counts[shard], entries))
+    run(GAUSSIAN_SHARDS, lambda first, past: fill_shards(first, past, made, pairs, counts, entries))
 
     frame = at.Frame(
         view,
@@ -153,18 +131,18 @@ def forward(
         arena.take("tile_shard", (tiles,), np.uint8),
     )
     balance_tiles(starts, TILE_SHARDS, frame.bounds, frame.tile_shard)
-    image_array, alpha_array = image.numpy().reshape(-1), alpha.numpy().reshape(-1)
+    pixels = image.numpy().reshape(-1), alpha.numpy().reshape(-1)
 
-    def composite(shard: int) -> None:
-        composite_tiles(*_tiles_of(frame, shard), image_array, alpha_array)
+    def composite(first: int, past: int) -> None:
+        composite_tiles(*_tiles(frame, first, past), *pixels)
 
     run(TILE_SHARDS, composite)
     return ForwardPass(frame, request.degree, flags[:, VISIBLE])
 
 
-def _tiles_of(frame: at.Frame, shard: int) -> tuple[Any, ...]:
-    """The arguments that all kernels share which walk through the entries of tiles."""
-    return at.kernel_memory(), int(frame.bounds[shard]), int(frame.bounds[shard + 1]), frame
+def _tiles(frame: at.Frame, first: int, past: int) -> tuple[Any, ...]:
+    """The arguments that all kernels share which walk through the entries of tiles, for those of a range of shards."""
+    return at.kernel_memory(), int(frame.bounds[first]), int(frame.bounds[past]), frame
 
 
 def backward(
@@ -182,8 +160,8 @@ def backward(
     rows = arena.take("rows", (TILE_SHARDS, count * at.ROW), np.float32, zero=True)
     want_absolute = None if absolute is None else True
 
-    def composite_backward(shard: int) -> None:
-        composite_backward_tiles(*_tiles_of(frame, shard), g_image, g_alpha, rows[shard], want_absolute)
+    def composite_backward(first: int, past: int) -> None:
+        composite_backward_tiles(*_tiles(frame, first, past), g_image, g_alpha, rows, want_absolute)
 
     resources.runner.run(TILE_SHARDS, composite_backward)
 
@@ -192,6 +170,8 @@ def backward(
     g_screen = take((count, 2))
     g_splitting = take((count, 3, 3)) if want_splitting else None
     common = (
+        _edges(count),
+        passed.visible,
         _arrays(gaussians),
         passed.degree,
         frame,
@@ -201,11 +181,9 @@ def backward(
         np.empty((0, 2), np.float32) if absolute is None else absolute.numpy(),
         np.empty((0, 9), np.float32) if g_splitting is None else g_splitting.numpy().reshape(-1, 9),
     )
-    edges = _edges(count, GAUSSIAN_SHARDS)
 
-    def backproject(shard: int) -> None:
-        begin, end, visible = edges[shard], edges[shard + 1], int(passed.visible[shard])
-        backproject_shard(at.kernel_memory(), begin, end, visible, *common)
+    def backproject(first: int, past: int) -> None:
+        backproject_shards(at.kernel_memory(), first, past, *common)
 
     resources.runner.run(GAUSSIAN_SHARDS, backproject)
     return Gradients(list(gradients.tensors().values()), g_screen, g_splitting)
@@ -225,14 +203,8 @@ def footprint(
     sums, distances = np.zeros((2, TILE_SHARDS, count), np.float32)
     asked = np.empty(0, np.float32) if values is None else values.detach().float().contiguous().numpy().reshape(-1)
 
-    def cover(shard: int) -> None:
-        cover_tiles(
-            *_tiles_of(passed.frame, shard),
-            asked,
-            covered[shard],
-            sums[shard],
-            distances[shard],
-        )
+    def cover(first: int, past: int) -> None:
+        cover_tiles(*_tiles(passed.frame, first, past), asked, covered, sums, distances)
 
     resources.runner.run(TILE_SHARDS, cover)
     totals = (torch.from_numpy(shards.sum(0, dtype=shards.dtype)) for shards in (covered, sums, distances))

@@ -27,7 +27,7 @@ def cover_tiles(
     sums: Any,
     distances: Any,
 ) -> None:
-    """Add the tiles ``first`` to ``past`` to ``covered`` [N] int32, ``sums`` and ``distances`` [N], by Gaussian.
+    """Add the tiles ``first`` to ``past`` to ``covered`` [N] int32, ``sums`` and ``distances`` [N] of their shards.
 
     ``values`` [H * W] may be empty for zero. The arithmetic of the compositing kernels decides here too which pixels
     are blended.
@@ -71,8 +71,8 @@ def cover_tiles(
                 count += select(blended, one, ZERO)
                 total += select(blended, load(own, place), ZERO)
                 reach += select(blended, square_root(fma(dx, dx, dy * dy)), ZERO)
-            index = frame.record_ints[base + at.INDEX]
+            shard, index = frame.tile_shard[tile], frame.record_ints[base + at.INDEX]
             store(row, 0, lane_sums((count, total, reach)))
-            covered[index] += np.int32(row[COVERED])
-            sums[index] += row[VALUES]
-            distances[index] += row[DISTANCES]
+            covered[shard, index] += np.int32(row[COVERED])
+            sums[shard, index] += row[VALUES]
+            distances[shard, index] += row[DISTANCES]

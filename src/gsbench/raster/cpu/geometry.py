@@ -8,10 +8,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu.simd import exp2, gather, maximum, minimum, square_root
 from gsbench.system.jit import inlined
 
 LOG2_E = 1.0 / math.log(2.0)
+BLUR = CONSTANTS.blur
 MAX_LOG2 = 126.0  # beyond, exp2 is undefined; a scale of 2^126 has a variance that is not finite, and is culled
 
 
@@ -101,18 +103,18 @@ def gather_quaternions(quaternions: Any, indices: Any) -> Any:
 
 
 @inlined
-def spread(m0: Any, m1: Any, blur: Any) -> Any:
-    """Spread of the rows of M: xx, xy, yy of the covariance C = M M^T + blur I, and a = yy / det C.
+def spread(m0: Any, m1: Any) -> Any:
+    """Spread of the rows of M: xx, xy, yy of the covariance C = M M^T + BLUR I, and a = yy / det C.
 
     1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows; dividing a row by the square
     root of yy first gives 1/a without cancellation and without overflow.
     """
-    xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + blur
+    xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + BLUR
     inverse = 1 / square_root(yy)
     n1 = (m1[0] * inverse, m1[1] * inverse, m1[2] * inverse)
     cross = (m0[1] * n1[2] - m0[2] * n1[1], m0[2] * n1[0] - m0[0] * n1[2], m0[0] * n1[1] - m0[1] * n1[0])
-    given = dot(cross, cross) + blur * (xx + yy) / yy
-    return xx + blur, xy, yy, 1 / given
+    given = dot(cross, cross) + BLUR * (xx + yy) / yy
+    return xx + BLUR, xy, yy, 1 / given
 
 
 @inlined

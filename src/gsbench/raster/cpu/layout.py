@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.raster.base import RasterConstants, slope_limits
+from gsbench.raster.base import projection_numbers
 from gsbench.raster.cpu.simd import SUM_LANES
 from gsbench.raster.cpu.vector import LANES
 from gsbench.scene.camera import Camera
@@ -46,7 +45,7 @@ def kernel_memory() -> tuple[NDArray[np.float32], NDArray[np.int64]]:
 
 
 class View(NamedTuple):
-    """A camera and the constants of projection as plain numbers for the kernels."""
+    """A camera as plain numbers for the kernels."""
 
     width: int
     height: int
@@ -69,18 +68,9 @@ class View(NamedTuple):
     r20: float
     r21: float
     r22: float
-    tx: float
-    ty: float
-    tz: float
     center_x: float
     center_y: float
     center_z: float
-    near: float
-    blur: float
-    sigma_extent: float
-    eigenvalue_floor: float
-    alpha_min: float
-    log2_alpha_min: float
 
 
 class Parameters(NamedTuple):
@@ -111,22 +101,6 @@ class Frame(NamedTuple):
     tile_shard: NDArray[np.uint8]  # [tiles]
 
 
-def make_view(camera: Camera, constants: RasterConstants) -> View:
-    numbers = [
-        camera.fx,
-        camera.fy,
-        camera.cx - 0.5,
-        camera.cy - 0.5,
-        *slope_limits(camera, constants),
-        *camera.rotation.ravel(),
-        *camera.translation,
-        *camera.center,
-        constants.near,
-        constants.blur,
-        constants.sigma_extent,
-        constants.eigenvalue_floor,
-        constants.alpha_min,
-        math.log2(constants.alpha_min),
-    ]
+def make_view(camera: Camera) -> View:
     tiles = -(-camera.width // TILE), -(-camera.height // TILE)
-    return View(camera.width, camera.height, *tiles, *map(float, numbers))
+    return View(camera.width, camera.height, *tiles, *projection_numbers(camera))

@@ -1,15 +1,17 @@
 """Projection of Gaussians to records.
 
-One call handles a shard: the Gaussians ``begin`` to ``end``. Its visible ones become the records ``begin``,
-``begin + 1``, ... in the order of their index.
+Of a shard, the Gaussians ``begin`` to ``end``, the visible ones become the records ``begin``, ``begin + 1``, ... in the
+order of their index.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
+from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.geometry import (
     LOG2_E,
@@ -48,6 +50,8 @@ from gsbench.raster.cpu.vector import LANES
 from gsbench.raster.validate import MIN_QUATERNION_NORM
 from gsbench.system.jit import inlined, kernel
 
+NEAR, SIGMA_EXTENT, EIGENVALUE_FLOOR = CONSTANTS.near, CONSTANTS.sigma_extent, CONSTANTS.eigenvalue_floor
+ALPHA_MIN, LOG2_ALPHA_MIN = CONSTANTS.alpha_min, math.log2(CONSTANTS.alpha_min)
 MAX_RADIUS = 2.0**24  # px; keeps the radius of an absurdly large Gaussian inside int32
 MAX_CENTER = 1e9  # px; a centre so far outside the image cannot be told apart in float32
 MAX_VARIANCE = 1e18  # px^2; nor can a standard deviation; squares stay finite
@@ -67,7 +71,29 @@ def _tile_range(low: Any, high: Any, tiles: int) -> Any:
 
 
 @kernel
-def project_shard(
+def project_shards(
+    memory: Any,
+    first: int,
+    past: int,
+    edges: Any,
+    gaussians: Any,
+    degree: int,
+    v: Any,
+    records: Any,
+    record_ints: Any,
+    keys: Any,
+    radii: Any,
+    flags: Any,
+) -> None:
+    """Fill, for the shards ``first`` to ``past`` between ``edges``, ``records`` [N * 16], ``keys`` [N] (depth, then
+    record), ``radii`` [N], and two ``flags`` a shard."""
+    for shard in range(first, past):
+        begin, end = edges[shard], edges[shard + 1]
+        _project(memory, begin, end, gaussians, degree, v, records, record_ints, keys, radii, flags[shard])
+
+
+@inlined
+def _project(
     memory: Any,
     begin: int,
     end: int,
@@ -80,7 +106,6 @@ def project_shard(
     radii: Any,
     flags: Any,
 ) -> None:
-    """Fill ``records`` [N * 16], ``keys`` [N] (depth, then record), ``radii`` [N], and the two ``flags``."""
     floats, indices = memory
     basis, rows, scratch = floats[:MATRIX], floats[MATRIX : 2 * MATRIX], floats[2 * MATRIX :]
     out = begin
@@ -105,7 +130,7 @@ def project_shard(
         inverse_z = ONE / z
         column = x * inverse_z * v.fx + v.pixel_cx
         row = y * inverse_z * v.fy + v.pixel_cy
-        visible = (z > v.near) & (absolute(column) < MAX_CENTER) & (absolute(row) < MAX_CENTER)
+        visible = (z > NEAR) & (absolute(column) < MAX_CENTER) & (absolute(row) < MAX_CENTER)
         if mask_bits(visible) == 0:
             for i in range(start, start + count):
                 radii[i] = 0
@@ -115,11 +140,11 @@ def project_shard(
         matrix = rotation_matrix(quaternion[0], quaternion[1], quaternion[2], quaternion[3])
         m0, m1 = scaled(times(axis_x, matrix), scales), scaled(times(axis_y, matrix), scales)
         visible = visible & (dot(m0, m0) + dot(m1, m1) < MAX_VARIANCE)
-        xx, xy, yy, a = spread(m0, m1, v.blur)
+        xx, xy, yy, a = spread(m0, m1)
         half = (xx - yy) * HALF
         # middle^2 - det as a sum of squares
-        largest = (xx + yy) * HALF + square_root(maximum(half * half + xy * xy, v.eigenvalue_floor))
-        radius = minimum(ceil(square_root(largest) * v.sigma_extent), MAX_RADIUS)
+        largest = (xx + yy) * HALF + square_root(maximum(half * half + xy * xy, EIGENVALUE_FLOOR))
+        radius = minimum(ceil(square_root(largest) * SIGMA_EXTENT), MAX_RADIUS)
         first_x, past_x = _tile_range(column - radius, column + radius, v.tiles_x)
         first_y, past_y = _tile_range(row - radius, row + radius, v.tiles_y)
         visible = visible & (first_x < past_x) & (first_y < past_y)
@@ -129,8 +154,8 @@ def project_shard(
 
         # Of the tiles of the 3 sigma square, those that the contour alpha = 1/255 can touch.
         opacity = ONE / (exponential(-logit) + ONE)
-        log2_opacity = log2(maximum(opacity, v.alpha_min))
-        reach = (log2_opacity - v.log2_alpha_min) * (2 / LOG2_E)  # squared Mahalanobis distance of the contour
+        log2_opacity = log2(maximum(opacity, ALPHA_MIN))
+        reach = (log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E)  # squared Mahalanobis distance of the contour
         reach = maximum(reach, ZERO)
         half_x = square_root(reach * xx) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
         half_y = square_root(reach * yy) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
@@ -138,7 +163,7 @@ def project_shard(
         inner_y, outer_y = _tile_range(ceil(row - half_y), floor(row + half_y) + ONE, v.tiles_y)
         first_x, past_x = maximum(first_x, inner_x), minimum(past_x, outer_x)
         first_y, past_y = maximum(first_y, inner_y), minimum(past_y, outer_y)
-        seen = visible & (opacity > v.alpha_min) & (first_x < past_x) & (first_y < past_y)
+        seen = visible & (opacity > ALPHA_MIN) & (first_x < past_x) & (first_y < past_y)
         todo = mask_bits(seen) & ((np.uint64(1) << np.uint64(count)) - np.uint64(1))
         if todo == 0:
             continue

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import triton.language as tl
 
-from gsbench.raster.base import CONSTANTS, RasterConstants, slope_limits
+from gsbench.raster.base import CONSTANTS, projection_numbers
 from gsbench.scene.camera import Camera
 
 # A block is what one program of one warp composites: half a tile of 3DGS, four pixels a lane. Lane l has the row
@@ -117,21 +117,8 @@ def make_grid(camera: Camera) -> Grid:
     return Grid(width, height, -(-width // BLOCK_WIDTH.value), -(-height // BLOCK_HEIGHT.value))
 
 
-def make_view(camera: Camera, constants: RasterConstants = CONSTANTS) -> View:
+def make_view(camera: Camera) -> View:
     grid = make_grid(camera)
-    numbers = [
-        grid.width,
-        grid.height,
-        -(-grid.width // TILE.value),
-        -(-grid.height // TILE.value),
-        grid.blocks_x,
-        grid.blocks_y,
-        camera.fx,
-        camera.fy,
-        camera.cx - 0.5,
-        camera.cy - 0.5,
-        *slope_limits(camera, constants),
-        *camera.rotation.ravel(),
-        *camera.center,
-    ]
-    return View(*map(float, numbers))
+    tiles = -(-grid.width // TILE.value), -(-grid.height // TILE.value)
+    sizes = map(float, (grid.width, grid.height, *tiles, grid.blocks_x, grid.blocks_y))
+    return View(*sizes, *projection_numbers(camera))
