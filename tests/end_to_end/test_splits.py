@@ -54,7 +54,7 @@ def bits(folder: Path) -> dict[str, str]:
 
 @pytest.mark.parametrize(
     ("init", "choice"),
-    [("sfm", "train"), ("dataset", "train"), ("dataset", "retriangulated"), ("sift_kornia", "train")],
+    [("sfm", "train"), ("dataset", "train"), ("sift_kornia", "train")],
 )
 def test_not_one_bit_of_a_test_photograph_enters_a_trial(
     captures: tuple[Path, Path], tmp_path: Path, init: str, choice: str

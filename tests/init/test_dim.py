@@ -20,7 +20,7 @@ from gsbench.init.networks import extract_and_match
 from gsbench.init.networks.extract_and_match import NetworkJob, at_low_resolution, choose_pairs, open_store
 from gsbench.init.networks.extractors import SUPERPOINT_BORDER, build_extractor, extract_features
 from gsbench.init.networks.features import Features, FeatureStore
-from gsbench.init.networks.matching import MutualNearest, build_matcher, match_within_memory
+from gsbench.init.networks.matching import MutualNearest, build_matcher, match
 from gsbench.logs import no_progress
 from gsbench.scene.courtyard.render import surface_distance
 from gsbench.scene.types import Capture
@@ -278,26 +278,16 @@ class TestErrors:
         with pytest.raises(InputError, match="no keypoint in any image"):
             SiftKornia().run(capture, tmp_path / "blank")
 
-    def test_out_of_gpu_memory_halves_the_keypoints(self):
+    def test_out_of_gpu_memory_in_matching_says_so(self):
         features = Features(
             np.zeros((1000, 2), np.float32), np.zeros((1000, 8), np.float32), np.ones(1000, np.float32), (9, 9), (9, 9)
         )
-        seen = []
-
-        def small_gpu(first: Features, second: Features) -> np.ndarray:
-            seen.append(len(first.keypoints))
-            if len(first.keypoints) > 300:
-                raise torch.OutOfMemoryError("CUDA out of memory")
-            return np.zeros((5, 2), np.uint32)
-
-        matches, halved = match_within_memory(small_gpu, features, features)
-        assert (len(matches), halved, seen) == (5, True, [1000, 500, 250])
 
         def no_gpu(first: Features, second: Features) -> np.ndarray:
             raise torch.OutOfMemoryError("CUDA out of memory")
 
-        with pytest.raises(InputError, match=r"ran out of memory: lower init.max_image_size"):
-            match_within_memory(no_gpu, features, features)
+        with pytest.raises(InputError, match=r"1000 keypoints ran out of memory: lower init.max_image_size"):
+            match(no_gpu, features, features)
 
     def test_out_of_gpu_memory_in_extraction_says_so(self, courtyard: Capture):
         def no_gpu(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -310,9 +300,7 @@ class TestErrors:
         some = Features(
             np.zeros((3, 2), np.float32), np.eye(3, 8, dtype=np.float32), np.ones(3, np.float32), (9, 9), (9, 9)
         )
-        matches, halved = match_within_memory(MutualNearest(0.9, CPU), some, some.strongest(0))
-        assert matches.shape == (0, 2)
-        assert not halved
+        assert match(MutualNearest(0.9, CPU), some, some.strongest(0)).shape == (0, 2)
 
     @pytest.mark.parametrize(
         ("options", "message"),

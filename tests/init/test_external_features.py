@@ -20,14 +20,13 @@ from gsbench.init.colmap.database import (
     write_matches,
 )
 from gsbench.init.colmap.mapping import map_images
-from gsbench.init.colmap.reconstruct import MappingSettings, Verification
+from gsbench.init.colmap.reconstruct import verification_options
 from gsbench.init.colmap.sift import extract_sift, match_sift
 from gsbench.init.networks.extractors import build_extractor, extract_features
 from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 
-MAPPING = MappingSettings(seed=0, threads=1, min_model_size=3, two_view_tracks=False, fixed_intrinsics=False)
 SIFT = FeatureSettings(extractor="sift_kornia", matcher="mutual_nearest", max_image_size=1600, max_keypoints=2000)
 
 
@@ -42,7 +41,7 @@ def own_path(bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory) -> 
     names = new_database(path, bare_photos)
     pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
     extract_sift(path, bare_photos.images, names, Sfm(), 1, no_progress)
-    match_sift(path, pairs, Sfm(), Verification(0, 15), 1, no_progress)
+    match_sift(path, pairs, Sfm(), 1, no_progress)
     return path, pairs
 
 
@@ -58,13 +57,11 @@ def test_sift_through_the_external_path_gives_the_same_model(
     new_database(external, bare_photos)
     write_keypoints(external, keypoints)
     write_matches(external, matches)
-    verify_pairs(external, pairs, Verification(0, 15).options(), no_progress)
+    verify_pairs(external, pairs, verification_options(Sfm()), no_progress)
     assert database_counts(external) == database_counts(own)
 
-    verification = Verification(0, 15)
     first, second = (
-        map_images(path, bare_photos.images, tmp_path / path.stem, MAPPING, verification, "auto", no_progress).model
-        for path in (own, external)
+        map_images(path, bare_photos.images, tmp_path / path.stem, Sfm(), no_progress).model for path in (own, external)
     )
     assert first.num_points3D() == second.num_points3D() > 100
     for point_id, point in first.points3D.items():
@@ -134,7 +131,7 @@ def test_a_pair_must_keep_a_share_of_its_matches(
         new_database(path, bare_photos)
         write_keypoints(path, keypoints)
         write_matches(path, matches)
-        verify_pairs(path, own_path[1], Verification(0, 15, ratio).options(), no_progress)
+        verify_pairs(path, own_path[1], verification_options(Sfm(min_inlier_ratio=ratio)), no_progress)
         with pycolmap.Database.open(path) as database:
             geometries[ratio] = {
                 pair: database.read_two_view_geometry(ids[pair[0]], ids[pair[1]]) for pair in own_path[1]

@@ -17,7 +17,6 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Dataset, Initializer, Sfm, SiftKornia, read_cloud
 from gsbench.init.base import REPORT_FILE, PointsFrom
-from gsbench.init.colmap.training_points import track_matches
 from gsbench.pipeline.steps.inputs import options_of
 from gsbench.scene.colmap import read_model
 from gsbench.scene.types import Capture
@@ -106,41 +105,6 @@ def test_colours_come_from_training_photographs(with_points: Capture, tmp_path: 
         np.testing.assert_allclose(point.color, np.mean(samples, axis=0), atol=1.0)
 
 
-def test_retriangulated_points_are_near_the_first_ones_and_have_training_observations_alone(
-    with_points: Capture, tmp_path: Path
-) -> None:
-    report = Dataset(points_from="retriangulated").run(with_points, tmp_path)
-    model, test = read_model(tmp_path / MODEL_FOLDER), set(with_points.test_names)
-    assert report.training_points is not None
-    assert 0 < report.training_points.removed < 0.6  # type: ignore[operator]
-    assert not any(names & test for names in seen_by(model))
-    assert poses(tmp_path).keys() == set(with_points.image_names)
-    first = read_cloud_of(with_points)
-    cloud = read_cloud(tmp_path / MODEL_FOLDER).points
-    nearest = [float(np.linalg.norm(first - point, axis=1).min()) for point in cloud[::20]]
-    assert np.median(nearest) < 0.02  # m, in a yard of 10 m
-    assert model.compute_mean_reprojection_error() < 1.0
-
-
-def read_cloud_of(capture: Capture) -> np.ndarray:
-    return np.array([point.xyz for point in read_model(capture.model).points3D.values()])  # type: ignore[arg-type]
-
-
-def test_matches_of_tracks_are_all_pairs_of_a_tracks_training_views(with_points: Capture) -> None:
-    model = read_model(with_points.model)  # type: ignore[arg-type]
-    train = set(with_points.train_names)
-    expected: dict[tuple[int, int], set[tuple[int, int]]] = {}
-    for point in model.points3D.values():
-        elements = sorted((e.image_id, e.point2D_idx) for e in point.track.elements)
-        elements = [(i, k) for i, k in elements if model.images[i].name in train]
-        for place, (one, k) in enumerate(elements):
-            for other, m in elements[place + 1 :]:
-                expected.setdefault((one, other), set()).add((k, m))
-    found = track_matches(model, train)
-    assert {pair: {(int(k), int(m)) for k, m in rows} for pair, rows in found.items()} == expected
-    assert track_matches(model, []) == {}
-
-
 def with_noise(capture: Capture, folder: Path) -> Capture:
     """The capture with its test photographs replaced by noise."""
     shutil.copytree(capture.images, folder)
@@ -158,15 +122,12 @@ MAKERS: dict[str, Callable[[PointsFrom], Initializer]] = {
 }
 
 
-@pytest.mark.parametrize("choice", ["train", "retriangulated"])
 @pytest.mark.parametrize("name", ["sfm", "dataset", "sift_kornia"])  # the last: the path of dim, without weights
 @pytest.mark.slow
-def test_not_one_bit_of_a_test_photograph_is_in_the_cloud(
-    with_points: Capture, tmp_path: Path, name: str, choice: PointsFrom
-) -> None:
+def test_not_one_bit_of_a_test_photograph_is_in_the_cloud(with_points: Capture, tmp_path: Path, name: str) -> None:
     clouds = []
     for capture, place in ((with_points, "a"), (with_noise(with_points, tmp_path / "noise"), "b")):
-        MAKERS[name](choice).run(capture, tmp_path / place)
+        MAKERS[name]("train").run(capture, tmp_path / place)
         cloud = read_cloud(tmp_path / place / MODEL_FOLDER)
         assert len(cloud) > 100
         clouds.append((cloud.points.tobytes(), cloud.colors.tobytes(), poses(tmp_path / place)))
@@ -183,12 +144,9 @@ def test_noise_would_be_seen_in_points_from_all(with_points: Capture, tmp_path: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("choice", ["train", "retriangulated"])
-def test_estimated_cameras_keep_all_views_and_points_of_training_views(
-    bare_photos: Capture, tmp_path: Path, choice: PointsFrom
-) -> None:
+def test_estimated_cameras_keep_all_views_and_points_of_training_views(bare_photos: Capture, tmp_path: Path) -> None:
     capture = replace(bare_photos, test_names=bare_photos.image_names[3:5])
-    report = Sfm(points_from=choice, threads=1).run(capture, tmp_path)
+    report = Sfm(points_from="train", threads=1).run(capture, tmp_path)
     model, test = read_model(tmp_path / MODEL_FOLDER), set(capture.test_names)
     assert report.num_registered == len(capture.image_names)
     assert not any(names & test for names in seen_by(model))

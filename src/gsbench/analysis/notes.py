@@ -176,7 +176,7 @@ def points_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def _points_from(trial: TrialResult) -> str:
-    """The views that made the trial's initial points: all, train or retriangulated; "" where no observations did."""
+    """The views that made the trial's initial points: all or train; "" where no observations did."""
     if "init.points_from" in trial.config:
         return str(trial.config["init.points_from"])
     return "all" if trial.record.init_report.get("mean_track_length") is not None else ""

@@ -26,7 +26,7 @@ GAUSSIANS_FILE = "gaussians.ply"  # optional: the Gaussians to start from, where
 PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
 MIN_IMAGES = 3  # two views have no third that could contradict a wrong geometry
 Poses = Literal["shared", "own"]
-PointsFrom = Literal["all", "train", "retriangulated"]
+PointsFrom = Literal["all", "train"]
 Seed = Annotated[int, Interval(ge=0, le=2**31 - 1)]  # COLMAP takes no larger one
 
 

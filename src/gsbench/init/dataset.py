@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from gsbench.errors import InputError
-from gsbench.init.base import MIN_IMAGES, WORK_FOLDER, Initializer, InitReport, PointsFrom, Timer, TrainingPoints
+from gsbench.init.base import WORK_FOLDER, Initializer, InitReport, PointsFrom, Timer, TrainingPoints
 from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 class Dataset(Initializer):
     """Takes over the capture's model: restricted to its selected images, cameras scaled to the files.
 
-    ``points_from=train`` leaves what two training views see, where it is, in their colours; ``retriangulated`` finds
-    its place anew from their observations alone.
+    ``points_from=train`` leaves what two training views see, where it is, in their colours.
     """
 
     name: ClassVar[str] = "dataset"
@@ -59,9 +58,9 @@ def _copy_model(job: tuple[Dataset, Capture, Path], progress: Progress) -> InitR
     if model.num_points3D() == 0:
         raise InputError(f"init=dataset: the model of scene {capture.name} has no points: use init=sfm or init=random")
     points = None
-    if options.points_from != "all":
-        with timer.phase(options.points_from):
-            points = _of_training(options, capture, model, output_dir / WORK_FOLDER)
+    if options.points_from == "train":
+        with timer.phase("train"):
+            points = _of_training(capture, model, output_dir / WORK_FOLDER)
     result = report.make_report(
         options.name,
         "shared",
@@ -77,20 +76,15 @@ def _copy_model(job: tuple[Dataset, Capture, Path], progress: Progress) -> InitR
     return result
 
 
-def _of_training(options: Dataset, capture: Capture, model: pycolmap.Reconstruction, work: Path) -> TrainingPoints:
+def _of_training(capture: Capture, model: pycolmap.Reconstruction, work: Path) -> TrainingPoints:
     """Leave in ``model`` the points that training views alone vouch for."""
     from gsbench.init.colmap.database import readable_images
-    from gsbench.init.colmap.reconstruct import MappingSettings
-    from gsbench.init.colmap.training_points import database_of_tracks, keep_training_points, retriangulate
+    from gsbench.init.colmap.training_points import keep_training_points
 
-    names = capture.train_names
     work.mkdir(parents=True, exist_ok=True)
     try:
-        images = readable_images(capture.images, names, work)
-        if options.points_from == "train":
-            return keep_training_points(model, names, images)
-        database_of_tracks(work / "tracks.db", model, names)
-        settings = MappingSettings(0, 1, MIN_IMAGES, two_view_tracks=True, fixed_intrinsics=True)
-        return retriangulate(model, names, work / "tracks.db", images, work / "mapping", settings)
+        return keep_training_points(
+            model, capture.train_names, readable_images(capture.images, capture.train_names, work)
+        )
     finally:
         shutil.rmtree(work, ignore_errors=True)

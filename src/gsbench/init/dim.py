@@ -71,7 +71,7 @@ class FeatureInitializer(ColmapInitializer):
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
         from gsbench.init.colmap.database import verify_pairs, write_keypoints, write_matches
-        from gsbench.init.colmap.reconstruct import Verification
+        from gsbench.init.colmap.reconstruct import verification_options
         from gsbench.init.networks.extract_and_match import NetworkJob, choose_pairs, open_store
 
         weights = self.find_weights()
@@ -83,8 +83,7 @@ class FeatureInitializer(ColmapInitializer):
         matches = {pair: indices for pair, indices in matches.items() if len(indices) > 0}
         write_matches(task.database, matches)
         with timer.phase("verify"):
-            verification = Verification(self.seed, self.min_inliers, self.min_inlier_ratio)
-            verify_pairs(task.database, sorted(matches), verification.options(), progress)
+            verify_pairs(task.database, sorted(matches), verification_options(self), progress)
         return {}
 
     def packages(self) -> tuple[str, ...]:

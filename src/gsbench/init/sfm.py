@@ -48,7 +48,6 @@ class Sfm(ColmapInitializer):
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
         from gsbench.init.colmap.database import colmap_masks, database_counts, strongest_descriptors
         from gsbench.init.colmap.pairs import STRONGEST, proposed_pairs
-        from gsbench.init.colmap.reconstruct import Verification
         from gsbench.init.colmap.sift import extract_sift, match_sift
 
         with timer.phase("extract"):
@@ -62,8 +61,7 @@ class Sfm(ColmapInitializer):
                 pairs = proposed_pairs(task.names, lambda name: strongest_descriptors(task.database, name, STRONGEST))
             counts = {"pairs_selected": len(pairs), "pairs_left_out": len(task.pairs) - len(pairs)}
         with timer.phase("match"):
-            verification = Verification(self.seed, self.min_inliers, self.min_inlier_ratio)
-            match_sift(task.database, pairs, self, verification, self.num_threads, progress)
+            match_sift(task.database, pairs, self, self.num_threads, progress)
         return counts
 
 

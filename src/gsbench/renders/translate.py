@@ -1,15 +1,13 @@
-"""The renders of trials under the conventions of other programs, and what of the difference each convention makes."""
+"""The renders of trials measured under the conventions of other programs."""
 
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
-from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,17 +16,15 @@ from numpy.typing import NDArray
 from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, quantize, summarize
-from gsbench.eval.protocol import OTHERS, Protocol, get_protocol, protocol_of
-from gsbench.files import write_json
+from gsbench.eval.protocol import OTHERS, Protocol, get_protocol
 from gsbench.gaussians.model import MAX_SH_DEGREE
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.scene import makers_of_views
 from gsbench.pipeline.wiring import TrialSteps
-from gsbench.runs.layout import GROUND_TRUTH, MASKS, POINT_CLOUD, PROTOCOLS, RENDERS, STORE, VIEWS
+from gsbench.runs.layout import GROUND_TRUTH, MASKS, POINT_CLOUD, RENDERS, STORE, VIEWS
 from gsbench.runs.store import Store
-from gsbench.runs.translation_record import VERSION, Translation, Translations, made_of, read_translations
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.images import read_image
 from gsbench.scene.load import load_scene
@@ -37,15 +33,11 @@ from gsbench.scene.names import png_name
 from gsbench.scene.types import Scene
 from gsbench.system.resources import available_threads
 from gsbench.view.trials import find_trial
-from gsbench.words import signed
 
 log = logging.getLogger(__name__)
 
-SHARED_METRICS = ("psnr", "ssim")  # whose difference is shared; LPIPS by another network is another metric
-WITHOUT_EFFECT = {"psnr": ("SSIM padding",)}
 ROUNDING_TOLERANCE = 1  # 8-bit levels by which a render that is made again may differ from its file
 
-Run = frozenset[str]  # the conventions that are those of the other program
 Picture = NDArray[np.uint8]
 Pictures = Mapping[str, Picture]  # by view
 
@@ -66,98 +58,45 @@ class Material:
     masks: Mapping[str, Mask] = field(default_factory=dict)
 
 
+class Translation(NamedTuple):
+    """A protocol's metrics; ``unknown`` maps a convention that could not be followed to the reason in one line."""
+
+    metrics: dict[str, float]
+    unknown: dict[str, str]
+
+
 def translate_trials(place: str, protocol: str | None, runs: Path) -> None:
-    """Measure the trials of an experiment, or one trial, by ``protocol`` or all of `OTHERS`; keep and print it."""
+    """Measure the trials of an experiment, or one trial, by ``protocol`` or all of `OTHERS`, and print it."""
     torch.set_num_threads(available_threads())
     trials = [find_trial(place, runs)] if ":" in place else list(load_experiment(runs, place).trials)
     wanted = list(OTHERS.values()) if protocol in (None, "all") else [get_protocol(str(protocol))]
     for trial in trials:
-        base = protocol_of(trial.record.protocol)
-        if base is None:
-            raise InputError(f"{trial.label} was measured by {trial.record.protocol}, which is not known here")
         material = material_of(trial, runs)
-        found = {one.id: translate(material, base, one, _lpips_evaluator(trial)) for one in wanted}
-        _keep(trial, found)
-        print(
-            f"{trial.label}, measured by {base.id}: PSNR {trial.metrics['psnr']:.2f}, SSIM {trial.metrics['ssim']:.4f}"
-        )
-        for name, one in found.items():
-            print(f"  {name}: {in_words(one)}")
+        print(f"{trial.label}\n  {trial.record.protocol}: {in_words(Translation(dict(trial.metrics), {}))}")
+        for one in wanted:
+            print(f"  {one.id}: {in_words(translate(material, one, _lpips_evaluator(trial)))}")
 
 
-def translate(
-    material: Material, base: Protocol, protocol: Protocol, make: Callable[[Protocol], Evaluator]
-) -> Translation:
-    """The metrics of ``material`` by ``protocol``, and the shares of its conventions in the change from ``base``.
-
-    ``make`` gives the evaluator that also computes the LPIPS of ``protocol``.
-    """
+def translate(material: Material, protocol: Protocol, make: Callable[[Protocol], Evaluator]) -> Translation:
+    """The metrics of ``material`` by ``protocol``; ``make`` gives its evaluator."""
     unknown: dict[str, str] = {}
-    photographs, masks, exact = material.photographs, material.masks, None
+    photographs, renders = material.photographs, material.renders
     try:
         photographs = material.shrunk(protocol)
     except InputError as error:
         unknown["resampling"] = str(error)
     if not protocol.eight_bit:
         try:
-            exact = material.exact()
+            renders = material.exact()
         except InputError as error:
             unknown["rounding"] = str(error)
-    switches: dict[str, dict[str, Any]] = {
-        "resampling": {"photographs": photographs} if photographs is not material.photographs else {},
-        "rounding": {"renders": exact, "eight_bit": False} if exact is not None else {},
-        "SSIM padding": {"ssim_padding": protocol.ssim_padding} if protocol.ssim_padding != base.ssim_padding else {},
-        "crop": {"crop": protocol.crop} if protocol.crop != base.crop else {},
-    }
-    used = [name for name, changes in switches.items() if changes]
-
-    @cache
-    def values(run: Run) -> dict[str, float]:
-        state: dict[str, Any] = {"renders": material.renders, "photographs": material.photographs}
-        for name in used:
-            state |= switches[name] if name in run else {}
-        renders, truths = state.pop("renders"), state.pop("photographs")
-        evaluator = Evaluator(replace(base, **state), lpips=(), flip=False)
-        per_view = {
-            view: evaluator.evaluate_view(render, truths[view], masks.get(view)) for view, render in renders.items()
-        }
-        return summarize(per_view, evaluator.unavailable)
-
-    shares = {}
-    for metric in SHARED_METRICS:
-        matter = [name for name in used if name not in WITHOUT_EFFECT.get(metric, ())]
-        runs = [Run(chosen) for size in range(len(matter) + 1) for chosen in combinations(matter, size)]
-        if all(metric in values(run) for run in runs):
-            shares[metric] = shapley(matter, {run: values(run)[metric] for run in runs})
-    final = make(replace(protocol, eight_bit=protocol.eight_bit or exact is None))
-    renders = material.renders if exact is None else exact
+            protocol = replace(protocol, eight_bit=True)
+    evaluator = make(protocol)
     per_view = {
-        view: final.evaluate_view(render, photographs[view], masks.get(view)) for view, render in renders.items()
+        view: evaluator.evaluate_view(render, photographs[view], material.masks.get(view))
+        for view, render in renders.items()
     }
-    return Translation(
-        metrics=summarize(per_view, final.unavailable),
-        unavailable=dict(final.unavailable),
-        shares=shares,
-        unknown=unknown,
-    )
-
-
-def shapley(switches: Sequence[str], values: Mapping[Run, float]) -> dict[str, float]:
-    """The share of each switch in ``values[all] - values[none]``, from the values of all 2^n sets (Shapley 1953).
-
-    It is the mean, over all orders of turning switches on, of what one adds when its turn comes. The shares add up to
-    the whole difference, and interactions are split evenly among those that have them.
-    """
-    count, shares = len(switches), {}
-    for switch in switches:
-        others = [name for name in switches if name != switch]
-        total = 0.0
-        for size in range(count):
-            weight = 1 / (count * math.comb(count - 1, size))
-            for chosen in combinations(others, size):
-                total += weight * (values[frozenset((*chosen, switch))] - values[frozenset(chosen)])
-        shares[switch] = total
-    return shares
+    return Translation(summarize(per_view, evaluator.unavailable), unknown)
 
 
 def material_of(trial: TrialResult, runs: Path) -> Material:
@@ -253,19 +192,14 @@ def _same_views(scene: Scene, photographs: Pictures, protocol: Protocol) -> Pict
 
 
 def in_words(one: Translation) -> str:
-    """``PSNR 27.41 (+0.31: resampling +0.27, rounding +0.04), SSIM …; rounding: not known, …``"""
-    parts = []
-    for metric, digits in (("psnr", 2), ("ssim", 4)):
-        if metric not in one.metrics:
-            continue
-        shares = one.shares.get(metric, {})
-        spec = f".{digits + 1}f"
-        listed = ", ".join(f"{name} {signed(value, spec)}" for name, value in shares.items())
-        change = f" ({signed(sum(shares.values()), spec)}: {listed})" if shares else " (no other convention)"
-        parts.append(f"{metric.upper()} {one.metrics[metric]:.{digits}f}{change}")
-    parts += [f"LPIPS {value:.4f}" for key, value in one.metrics.items() if key.startswith("lpips")]
-    unknown = "".join(f"; {name} as it was, since {reason}" for name, reason in one.unknown.items())
-    return f"{', '.join(parts)}{unknown}"
+    """``PSNR 27.41, SSIM 0.8123, LPIPS 0.1034; rounding as it was, since …``"""
+    parts = [
+        f"{key.upper()} {one.metrics[key]:.{digits}f}"
+        for key, digits in (("psnr", 2), ("ssim", 4))
+        if key in one.metrics
+    ]
+    parts += [f"{key} {value:.4f}" for key, value in one.metrics.items() if key.startswith("lpips")]
+    return ", ".join(parts) + "".join(f"; {name} as it was, since {reason}" for name, reason in one.unknown.items())
 
 
 def _lpips_evaluator(trial: TrialResult) -> Callable[[Protocol], Evaluator]:
@@ -279,10 +213,3 @@ def _lpips_evaluator(trial: TrialResult) -> Callable[[Protocol], Evaluator]:
         return Evaluator(protocol, "cpu", lpips, False, folder, bool(trial.config.get("eval.download", True)))
 
     return make
-
-
-def _keep(trial: TrialResult, found: Mapping[str, Translation]) -> None:
-    """Write what was found beside what the trial's folder has of other protocols, if that is of the same renders."""
-    known = read_translations(trial.path, trial.record)
-    kept = Translations(version=VERSION, made_of=made_of(trial.record), protocols=known | dict(found))
-    write_json(trial.path / PROTOCOLS, kept.to_json())

@@ -38,7 +38,6 @@ BUILDING = "building.json"  # the stage that an unfinished trial is at, and wher
 INIT_REPORT = "init_report.json"
 PER_VIEW = "per_view.csv"
 FROM_PIXELS = "from_pixels.json"  # measures of pictures, in a trial that an archive brought without its pictures
-PROTOCOLS = "protocols.json"  # the same renders under the conventions of others, where somebody asked
 CURVES = "metrics.jsonl"  # of the training
 EVENTS = "events.jsonl"  # what every refinement did
 HISTOGRAMS = "volume_histograms.jsonl"

@@ -52,7 +52,7 @@ def _parser() -> ArgumentParser:
         prog="gsbench evaluate",
         description="Measure renders of any program against photographs, by the protocol that trials are measured by. "
         "Names are matched, never guessed; sizes must be equal. Or, without --truth, measure the trials of an "
-        "experiment under the conventions of others, for `gsbench tables --protocol NAME`.",
+        "experiment under the conventions of others.",
     )
     parser.add_argument(
         "renders",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -10,6 +11,7 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
+from gsbench.init import Sfm
 from gsbench.init.colmap.alignment import align_poses
 from gsbench.init.colmap.database import (
     assume_focal_lengths,
@@ -20,13 +22,12 @@ from gsbench.init.colmap.database import (
     write_keypoints,
     write_matches,
 )
-from gsbench.init.colmap.mapping import Mapped, Mapper, map_images
-from gsbench.init.colmap.reconstruct import MappingSettings, Verification, poses_by_name
+from gsbench.init.colmap.mapping import Mapped, map_images
+from gsbench.init.colmap.reconstruct import poses_by_name, verification_options
 from gsbench.logs import no_progress
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 520.0  # px; COLMAP's guess without EXIF is 1.2 x 640 = 768
-SETTINGS = MappingSettings(seed=0, threads=1, min_model_size=3, two_view_tracks=False, fixed_intrinsics=False)
-VERIFICATION = Verification(0, 15)
+VERIFICATION = verification_options(Sfm())
 
 
 def small_baseline(folder: Path, spread: float = 0.2, turn: float = 0.0) -> tuple[Path, dict[str, np.ndarray]]:
@@ -56,13 +57,13 @@ def small_baseline(folder: Path, spread: float = 0.2, turn: float = 0.0) -> tupl
             _, a, b = np.intersect1d(seen[first], seen[second], return_indices=True)
             matches[first, second] = np.stack([a, b], axis=1).astype(np.uint32)
     write_matches(database, matches)
-    verify_pairs(database, sorted(matches), VERIFICATION.options(), no_progress)
+    verify_pairs(database, sorted(matches), VERIFICATION, no_progress)
     return database, centers
 
 
-def mapped(database: Path, mapper: Mapper) -> Mapped:
+def mapped(database: Path, mapper: Any) -> Mapped:
     images = database.parent / "images"
-    return map_images(database, images, database.parent / "out", SETTINGS, VERIFICATION, mapper, no_progress)
+    return map_images(database, images, database.parent / "out", Sfm(mapper=mapper), no_progress)
 
 
 @pytest.mark.slow
@@ -113,13 +114,13 @@ def test_an_assumed_focal_length_is_known_and_verified_anew(tmp_path: Path) -> N
         (camera,) = opened.read_all_cameras()
         assert camera.mean_focal_length() == pytest.approx(0.8 * WIDTH)
         assert opened.num_verified_image_pairs() == 0
-    verify_pairs(database, pairs, VERIFICATION.options(), no_progress)
+    verify_pairs(database, pairs, VERIFICATION, no_progress)
     with pycolmap.Database.open(database) as opened:
         assert opened.num_verified_image_pairs() == 36
 
 
 @pytest.mark.parametrize("mapper", [pytest.param("auto", marks=pytest.mark.slow), "global"])
-def test_copies_of_one_view_are_no_scene(tmp_path: Path, mapper: Mapper) -> None:
+def test_copies_of_one_view_are_no_scene(tmp_path: Path, mapper: Any) -> None:
     """Without parallax every way must be refused, not believed."""
     database, _ = small_baseline(tmp_path, spread=0.0)
     with pytest.raises(InputError, match="structure from motion"):

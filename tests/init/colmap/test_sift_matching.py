@@ -17,7 +17,6 @@ from gsbench.init.base import Timer
 from gsbench.init.colmap.database import create_database, guessed_groups
 from gsbench.init.colmap.options import DatabaseTask
 from gsbench.init.colmap.pairs import best_pairs
-from gsbench.init.colmap.reconstruct import Verification
 from gsbench.init.colmap.sift import deal, divide, extract_sift, match_sift
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
@@ -96,7 +95,6 @@ def test_matches_are_those_of_colmap_on_one_thread(
         tmp_path / "database.db",
         pairs,
         Sfm(),
-        Verification(0, 15),
         processes,
         lambda phase, done, total: told.append(done),
     )
@@ -123,7 +121,7 @@ def test_colmaps_matcher_never_gets_a_second_thread(
         match(path, **options)
 
     monkeypatch.setattr(pycolmap, "match_image_pairs", noting)
-    match_sift(tmp_path / "database.db", pairs, Sfm(), Verification(0, 15), 1, no_progress)
+    match_sift(tmp_path / "database.db", pairs, Sfm(), 1, no_progress)
     assert set(threads) == {1}
 
 

@@ -16,7 +16,7 @@ from gsbench.init.colmap import database as colmap_database
 from gsbench.init.colmap import mapping, reconstruct
 from gsbench.init.colmap.alignment import Similarity
 from gsbench.init.colmap.options import ColmapOptions, DatabaseTask
-from gsbench.init.colmap.training_points import keep_training_points, retriangulate
+from gsbench.init.colmap.training_points import keep_training_points
 from gsbench.logs import Progress
 from gsbench.scene.types import Capture
 
@@ -50,7 +50,7 @@ def build_model(job: Job, progress: Progress) -> InitReport:
         )
     placed = colmap_database.create_database(database, cameras)
     names = [name for name in placed if name in set(seen)]
-    pairs = reconstruct.select_pairs(capture.images, names, options, reference)
+    pairs = reconstruct.select_pairs(names, options)
     task = DatabaseTask(database, images, names, pairs, capture, job.work_dir)
     counts = options.fill_database(task, progress, timer)
     counts = {**job.preparation.counts, **counts, **colmap_database.database_counts(database)}
@@ -58,30 +58,19 @@ def build_model(job: Job, progress: Progress) -> InitReport:
         raise InputError(
             f"{options.name}: no pair of images shares enough matches: the photos need more overlap or texture"
         )
-    settings = reconstruct.MappingSettings(
-        options.seed,
-        options.mapper_threads,
-        options.min_model_size,
-        options.two_view_tracks,
-        fixed_intrinsics=options.intrinsics == "reference",
-    )
     scratch = job.work_dir / "mapping"
     shutil.rmtree(scratch, ignore_errors=True)
     if options.poses == "shared" and reference is not None:
         with timer.phase("triangulate"):
-            model = reconstruct.triangulate(database, images, scratch, reference, names, settings, progress)
+            model = reconstruct.triangulate(database, images, scratch, reference, names, options, progress)
         left = TrainingPoints(options.points_from, model.num_points3D(), None, None)
         points = left if options.leaves_out(reference) else None
         return _finish(job, "shared", model, reference, None, timer, counts, points=points)
     with timer.phase("map"):
-        verification = reconstruct.Verification(options.seed, options.min_inliers, options.min_inlier_ratio)
-        mapped = mapping.map_images(database, images, scratch, settings, verification, options.mapper, progress)
+        mapped = mapping.map_images(database, images, scratch, options, progress)
     points = None
     if options.points_from == "train":
         points = keep_training_points(mapped.model, capture.train_names, images)
-    elif options.points_from == "retriangulated":
-        with timer.phase("triangulate"):
-            points = retriangulate(mapped.model, capture.train_names, database, images, scratch, settings)
     similarity = None if reference is None else reconstruct.similarity_to(mapped.model, reference)
     counts["models"] = mapped.models
     return _finish(job, "own", mapped.model, reference, similarity, timer, counts, mapped, points)

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pycolmap
@@ -20,11 +19,11 @@ import pycolmap
 from gsbench.errors import InputError
 from gsbench.init.base import MIN_IMAGES
 from gsbench.init.colmap.database import assume_focal_lengths, cameras_without_prior, verify_pairs
-from gsbench.init.colmap.reconstruct import MappingSettings, Verification, pipeline_options
+from gsbench.init.colmap.options import ColmapOptions
+from gsbench.init.colmap.reconstruct import pipeline_options, verification_options
 from gsbench.init.report import REGISTERED_SHARE
 from gsbench.logs import Progress
 
-Mapper = Literal["auto", "incremental", "global"]
 SMALL_ANGLE_DEG = 2.0  # of the initial pair; COLMAP's default is 16
 FOCAL_FACTORS = (0.75, 1.0, 1.4)  # focal length over the longest side: lenses of 27, 36 and 50 mm on 35 mm film
 MIN_ANGLE_DEG = 0.5  # median over points of the widest angle that sees one; below it depth is a guess
@@ -58,9 +57,7 @@ def map_images(
     database: Path,
     images: Path,
     output: Path,
-    settings: MappingSettings,
-    verification: Verification,
-    mapper: Mapper,
+    options: ColmapOptions,
     progress: Progress,
 ) -> Mapped:
     """Cameras and points from the matches in ``database``; of several models the one with the most images.
@@ -74,7 +71,7 @@ def map_images(
         total = opened.num_images()
     best: tuple[pycolmap.Reconstruction, int, str] | None = None
     tried: list[tuple[str, int]] = []
-    for way, run in _ways(database, images, output, settings, verification, mapper, progress, total):
+    for way, run in _ways(database, images, output, options, progress, total):
         models = [model for model in run() if _is_plausible(model)]
         largest = max(models, key=_size, default=None)
         tried.append((way, 0 if largest is None else largest.num_reg_images()))
@@ -99,39 +96,35 @@ def _ways(
     database: Path,
     images: Path,
     output: Path,
-    settings: MappingSettings,
-    verification: Verification,
-    mapper: Mapper,
+    options: ColmapOptions,
     progress: Progress,
     total: int,
 ) -> Iterator[tuple[str, Run]]:
-    """The ways that ``mapper`` allows, in the order of trying, each with what runs it."""
+    """The ways that ``init.mapper`` allows, in the order of trying, each with what runs it."""
 
     def incremental(found: Path, angle: float | None = None) -> Sequence[pycolmap.Reconstruction]:
-        return _incremental(found, images, _empty(output), settings, progress, total, angle)
+        return _incremental(found, images, _empty(output), options, progress, total, angle)
 
     def with_focal_lengths(factor: float) -> Sequence[pycolmap.Reconstruction]:
         copy = database.with_name(f"assumed-{factor:g}.db")
-        return incremental(_with_focal_lengths(database, copy, factor, verification, progress), SMALL_ANGLE_DEG)
+        return incremental(_with_focal_lengths(database, copy, factor, options, progress), SMALL_ANGLE_DEG)
 
-    if mapper in ("auto", "incremental"):
+    if options.mapper in ("auto", "incremental"):
         yield "incremental", lambda: incremental(database)
-    if mapper == "auto":
+    if options.mapper == "auto":
         yield f"incremental from {SMALL_ANGLE_DEG:g} degrees", lambda: incremental(database, SMALL_ANGLE_DEG)
-    if mapper in ("auto", "global"):
-        yield "global", lambda: _global(database, images, _empty(output), settings, progress, total)
-    if mapper == "auto" and cameras_without_prior(database):
+    if options.mapper in ("auto", "global"):
+        yield "global", lambda: _global(database, images, _empty(output), options, progress, total)
+    if options.mapper == "auto" and cameras_without_prior(database):
         for factor in FOCAL_FACTORS:
             yield f"focal length {factor:g} x the longest side", partial(with_focal_lengths, factor)
 
 
-def _with_focal_lengths(
-    database: Path, copy: Path, factor: float, verification: Verification, progress: Progress
-) -> Path:
+def _with_focal_lengths(database: Path, copy: Path, factor: float, options: ColmapOptions, progress: Progress) -> Path:
     """A copy of the database whose unknown focal lengths are ``factor`` times the longest side, verified anew."""
     shutil.copy(database, copy)
     pairs = assume_focal_lengths(copy, factor)
-    verify_pairs(copy, pairs, verification.options(), progress)
+    verify_pairs(copy, pairs, verification_options(options), progress)
     return copy
 
 
@@ -139,7 +132,7 @@ def _incremental(
     database: Path,
     images: Path,
     output: Path,
-    settings: MappingSettings,
+    settings: ColmapOptions,
     progress: Progress,
     total: int,
     initial_angle: float | None,
@@ -162,15 +155,15 @@ def _incremental(
 
 
 def _global(
-    database: Path, images: Path, output: Path, settings: MappingSettings, progress: Progress, total: int
+    database: Path, images: Path, output: Path, settings: ColmapOptions, progress: Progress, total: int
 ) -> Sequence[pycolmap.Reconstruction]:
     options = pycolmap.GlobalPipelineOptions()
-    options.num_threads = settings.threads
+    options.num_threads = settings.mapper_threads
     options.random_seed = settings.seed
     options.min_model_size = settings.min_model_size
     adjustment = options.mapper.bundle_adjustment
-    adjustment.refine_focal_length = not settings.fixed_intrinsics
-    adjustment.refine_extra_params = not settings.fixed_intrinsics
+    adjustment.refine_focal_length = settings.intrinsics == "estimate"
+    adjustment.refine_extra_params = settings.intrinsics == "estimate"
     progress("map", 0, total)
     pycolmap.set_random_seed(settings.seed)
     models = pycolmap.global_mapping(database, images, output, options=options)

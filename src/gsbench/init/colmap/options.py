@@ -50,7 +50,7 @@ class ColmapOptions(ABC):
 
     Unless ``points_from`` is ``all``, test views have no part in the points: under given cameras their photographs are
     not looked at; where cameras are estimated, all photographs make these, and of the points those of the training
-    views are kept (``train``) or triangulated anew from them (``retriangulated``).
+    views are kept.
     """
 
     name: ClassVar[str]
@@ -63,7 +63,6 @@ class ColmapOptions(ABC):
     intrinsics: Intrinsics = "estimate"
     pairs: Pairing = "exhaustive"
     overlap: Annotated[int, Interval(ge=1, le=60)] = 10
-    neighbors: PositiveInt = 20
     min_inliers: Annotated[int, Ge(7)] = 15  # a fundamental matrix takes seven
     min_inlier_ratio: Fraction = 0.0
     mapper: Literal["auto", "incremental", "global"] = "auto"

@@ -6,58 +6,28 @@ Everything here calls native code that can abort the process: run it isolated.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import pycolmap
 
 from gsbench.errors import InputError
 from gsbench.init.colmap.alignment import Array, Similarity, align_poses
-from gsbench.init.colmap.pairs import exhaustive_pairs, gps_positions, sequential_pairs, spatial_pairs
+from gsbench.init.colmap.options import ColmapOptions
+from gsbench.init.colmap.pairs import exhaustive_pairs, sequential_pairs
 from gsbench.logs import Progress
 from gsbench.scene.colmap import read_reference
 from gsbench.scene.types import Capture
 
 
-class Pairing(Protocol):
-    """The options that choose pairs."""
-
-    @property
-    def pairs(self) -> str: ...
-    @property
-    def overlap(self) -> int: ...
-    @property
-    def neighbors(self) -> int: ...
-
-
-@dataclass(frozen=True)
-class Verification:
+def verification_options(options: ColmapOptions) -> pycolmap.TwoViewGeometryOptions:
     """COLMAP's geometric verification of a pair's matches."""
-
-    seed: int  # of each pair's RANSAC
-    min_inliers: int  # matches that must fit one geometry
-    min_inlier_ratio: float = 0.0  # … and as a share of all of the pair
-
-    def options(self) -> pycolmap.TwoViewGeometryOptions:
-        """The options in COLMAP's own type."""
-        options = pycolmap.TwoViewGeometryOptions()
-        options.ransac.random_seed = self.seed
-        options.min_num_inliers = self.min_inliers
-        options.min_inlier_ratio = self.min_inlier_ratio
-        return options
-
-
-@dataclass(frozen=True)
-class MappingSettings:
-    """Settings of COLMAP's mapper and triangulator; see the fields of `gsbench.init.Sfm`."""
-
-    seed: int
-    threads: int
-    min_model_size: int
-    two_view_tracks: bool
-    fixed_intrinsics: bool
+    found = pycolmap.TwoViewGeometryOptions()
+    found.ransac.random_seed = options.seed
+    found.min_num_inliers = options.min_inliers
+    found.min_inlier_ratio = options.min_inlier_ratio
+    return found
 
 
 def load_reference(capture: Capture, reference: Path | None) -> pycolmap.Reconstruction | None:
@@ -67,28 +37,12 @@ def load_reference(capture: Capture, reference: Path | None) -> pycolmap.Reconst
     return None if capture.model is None else read_reference(capture)
 
 
-def select_pairs(
-    images: Path, names: Sequence[str], options: Pairing, reference: pycolmap.Reconstruction | None
-) -> list[tuple[str, str]]:
-    """The pairs of image names to match; ``spatial`` goes by the reference's camera centres, else by EXIF GPS.
-
-    For ``auto`` and ``lowres`` these are all, of which features will tell those that are worth it.
-
-    Raises ``InputError`` where ``spatial`` has neither.
-    """
-    if options.pairs in ("exhaustive", "auto", "lowres"):
-        pairs = exhaustive_pairs(len(names))
-    elif options.pairs == "sequential":
+def select_pairs(names: Sequence[str], options: ColmapOptions) -> list[tuple[str, str]]:
+    """The pairs of image names to match; all for ``auto`` and ``lowres``, of which features will tell the best."""
+    if options.pairs == "sequential":
         pairs = sequential_pairs(len(names), options.overlap)
     else:
-        poses = {} if reference is None else poses_by_name(reference)
-        if all(name in poses for name in names):
-            positions: Array | None = np.array([poses[name][0] for name in names], dtype=np.float64)
-        else:
-            positions = gps_positions([images / name for name in names])
-        if positions is None:
-            raise InputError("init.pairs=spatial: the photos have neither reference cameras nor GPS: use exhaustive")
-        pairs = spatial_pairs(positions, options.neighbors)
+        pairs = exhaustive_pairs(len(names))
     return [(names[first], names[second]) for first, second in pairs]
 
 
@@ -98,7 +52,7 @@ def triangulate(
     output: Path,
     reference: pycolmap.Reconstruction,
     names: Collection[str],
-    settings: MappingSettings,
+    options: ColmapOptions,
     progress: Progress,
 ) -> pycolmap.Reconstruction:
     """Points from the verified matches of the images ``names`` under the reference's cameras, which stay to the bit.
@@ -117,7 +71,11 @@ def triangulate(
                 known.add_image_with_trivial_frame(image, pose)
             else:
                 others.append((image, pose))
-    model = triangulate_known(known, database, images, output, settings)
+    pycolmap.set_random_seed(options.seed)
+    output.mkdir(parents=True, exist_ok=True)
+    model = pycolmap.triangulate_points(
+        known, database, images, output, clear_points=True, options=pipeline_options(options), refine_intrinsics=False
+    )
     progress("triangulate", 1, 1)
     if model.num_points3D() == 0:
         raise InputError(
@@ -129,17 +87,6 @@ def triangulate(
     for image, pose in others:
         model.add_image_with_trivial_frame(image, pose)
     return model
-
-
-def triangulate_known(
-    known: pycolmap.Reconstruction, database: Path, images: Path, output: Path, settings: MappingSettings
-) -> pycolmap.Reconstruction:
-    """Points from the matches in ``database`` under the cameras and poses of ``known``, whose ids are those there."""
-    pycolmap.set_random_seed(settings.seed)
-    output.mkdir(parents=True, exist_ok=True)
-    return pycolmap.triangulate_points(
-        known, database, images, output, clear_points=True, options=pipeline_options(settings), refine_intrinsics=False
-    )
 
 
 def poses_by_name(model: pycolmap.Reconstruction) -> dict[str, tuple[Array, Array]]:
@@ -184,19 +131,15 @@ def apply_similarity(model: pycolmap.Reconstruction, similarity: Similarity) -> 
     model.transform(pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation))
 
 
-def pipeline_options(settings: MappingSettings) -> pycolmap.IncrementalPipelineOptions:
-    """COLMAP's incremental pipeline as ``settings`` describe it; the triangulator reads the same options."""
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = settings.threads
-    options.random_seed = settings.seed
-    options.mapper.num_threads = settings.threads
-    options.mapper.random_seed = settings.seed
-    options.triangulation.random_seed = settings.seed
-    options.triangulation.ignore_two_view_tracks = not settings.two_view_tracks
-    options.multiple_models = True  # a stray first model of a few images must not be the last (see map_images)
-    options.min_model_size = settings.min_model_size
-    options.ba_refine_focal_length = not settings.fixed_intrinsics
-    options.ba_refine_extra_params = not settings.fixed_intrinsics
-    options.mapper.abs_pose_refine_focal_length = not settings.fixed_intrinsics
-    options.mapper.abs_pose_refine_extra_params = not settings.fixed_intrinsics
-    return options
+def pipeline_options(options: ColmapOptions) -> pycolmap.IncrementalPipelineOptions:
+    """COLMAP's incremental pipeline by our ``options``; the triangulator reads the same."""
+    found = pycolmap.IncrementalPipelineOptions()
+    found.num_threads = found.mapper.num_threads = options.mapper_threads
+    found.random_seed = found.mapper.random_seed = found.triangulation.random_seed = options.seed
+    found.triangulation.ignore_two_view_tracks = not options.two_view_tracks
+    found.multiple_models = True  # a stray first model of a few images must not be the last (see map_images)
+    found.min_model_size = options.min_model_size
+    refined = options.intrinsics == "estimate"
+    found.ba_refine_focal_length = found.ba_refine_extra_params = refined
+    found.mapper.abs_pose_refine_focal_length = found.mapper.abs_pose_refine_extra_params = refined
+    return found

@@ -17,45 +17,27 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import pycolmap
 
 from gsbench.init.colmap.database import image_ids, rename_images, write_pairs
 from gsbench.init.colmap.progress_pipe import run_with_progress
-from gsbench.init.colmap.reconstruct import Verification
+from gsbench.init.colmap.reconstruct import verification_options
 from gsbench.logs import Progress
+
+if TYPE_CHECKING:
+    from gsbench.init.sfm import Sfm
 
 IMAGES_PER_CALL = 8  # COLMAP reports no progress within a call, so it is called for a few images at a time, …
 IMAGES_PER_THREAD = 2  # … and for more where many threads want work
-
-
-class SiftSettings(Protocol):
-    """COLMAP's SIFT; see the fields of `gsbench.init.Sfm`."""
-
-    @property
-    def max_image_size(self) -> int: ...
-    @property
-    def max_num_features(self) -> int: ...
-    @property
-    def peak_threshold(self) -> float: ...
-    @property
-    def edge_threshold(self) -> float: ...
-    @property
-    def first_octave(self) -> int: ...
-    @property
-    def max_ratio(self) -> float: ...
-    @property
-    def cross_check(self) -> bool: ...
-    @property
-    def guided_matching(self) -> bool: ...
 
 
 def extract_sift(
     database: Path,
     images: Path,
     names: Sequence[str],
-    sift: SiftSettings,
+    sift: Sfm,
     threads: int,
     progress: Progress,
     masks: Path | None = None,
@@ -110,15 +92,13 @@ class MatchingJob:
     empty: Path
     result: Path
     parts: list[list[IdPair]]
-    sift: SiftSettings
-    verification: Verification
+    sift: Sfm
 
 
 def match_sift(
     database: Path,
     pairs: Sequence[tuple[str, str]],
-    sift: SiftSettings,
-    verification: Verification,
+    sift: Sfm,
     processes: int,
     progress: Progress,
 ) -> None:
@@ -134,7 +114,7 @@ def match_sift(
     parts = divide([(ids[first], ids[second]) for first, second in pairs], _block_size(len(ids), processes))
     _copy_without_features(database, folder / "empty.db")
     jobs = [
-        MatchingJob(database, folder / "empty.db", folder / f"matches-{index}.db", share, sift, verification)
+        MatchingJob(database, folder / "empty.db", folder / f"matches-{index}.db", share, sift)
         for index, share in enumerate(deal(parts, processes))
     ]
     progress("match", 0, len(pairs))
@@ -169,7 +149,7 @@ def match_parts(job: MatchingJob, progress: Progress) -> None:
             part_database,
             matching_options=options,
             pairing_options=pairing,
-            verification_options=job.verification.options(),
+            verification_options=verification_options(job.sift),
             device=pycolmap.Device.cpu,
         )
         _insert(job.result, part_database, MATCH_TABLES)

@@ -17,7 +17,7 @@ from gsbench.init.colmap.pairs import STRONGEST, proposed_pairs
 from gsbench.init.colmap.reconstruct import load_reference, select_pairs
 from gsbench.init.networks.extractors import build_extractor, extract_features
 from gsbench.init.networks.features import Features, FeatureSettings, FeatureStore
-from gsbench.init.networks.matching import build_matcher, match_within_memory
+from gsbench.init.networks.matching import build_matcher, match
 from gsbench.logs import Progress
 from gsbench.scene.masks import read_mask
 from gsbench.scene.types import Capture
@@ -63,7 +63,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     store = open_store(job)
     reference = load_reference(capture, job.reference)
     names = options.select_images(capture, reference)
-    pairs = select_pairs(capture.images, names, options, reference)
+    pairs = select_pairs(names, options)
     timer = Timer()
     with timer.phase("extract"):
         empty = _extract_all(job, store, names, device, progress)
@@ -78,14 +78,12 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
             _match_all(small, open_store(small), pairs, device, progress)
     candidates, pairs = len(pairs), choose_pairs(job, names, pairs)
     with timer.phase("match"):
-        without, halved = _match_all(job, store, pairs, device, progress)
+        without = _match_all(job, store, pairs, device, progress)
     if len(without) == len(pairs):  # where no pair was selected, too
         raise InputError(f"{options.name}: no pair of images has a match: the photos need more overlap or texture")
     warnings = []
     if empty:
         warnings.append(f"no keypoint in {_some(empty)}: no point comes from these images")
-    if halved:
-        warnings.append(f"out of GPU memory: {len(halved)} pairs were matched with fewer keypoints")
     weights = [path for path in (job.extractor_weights, job.matcher_weights) if path is not None]
     return Preparation(
         seconds=timer.seconds,
@@ -111,8 +109,7 @@ def choose_pairs(job: NetworkJob, names: Sequence[str], pairs: list[tuple[str, s
         return proposed_pairs(names, lambda name: store.require_features(name).strongest(STRONGEST).descriptors)
     if job.options.pairs == "lowres":  # type: ignore[comparison-overlap]
         small = open_store(at_low_resolution(job))
-        matches = {pair: small.read_matches(*pair) for pair in pairs}  # none where memory did not suffice for all
-        return [pair for pair, found in matches.items() if found is None or len(found) > LOWRES_MATCHES]
+        return [pair for pair in pairs if len(small.require_matches(*pair)) > LOWRES_MATCHES]
     return pairs
 
 
@@ -163,25 +160,22 @@ def _extract_all(
 
 def _match_all(
     job: NetworkJob, store: FeatureStore, pairs: Sequence[tuple[str, str]], device: torch.device, progress: Progress
-) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
-    """Matches of all pairs into the store; returns the pairs without a match, and those matched in part."""
+) -> list[tuple[str, str]]:
+    """Matches of all pairs into the store; returns the pairs without a match."""
     settings = job.settings
-    matcher, without, halved = None, [], []
+    matcher, without = None, []
     read = _cached_reader(store, pairs)
     progress("match", 0, len(pairs))
     for done, (first, second) in enumerate(pairs, start=1):
         matches = store.read_matches(first, second)
         if matches is None:
             matcher = matcher or build_matcher(settings, job.matcher_weights, device)
-            matches, in_part = match_within_memory(matcher, read(first), read(second))
-            if in_part:
-                halved.append((first, second))
-            else:
-                store.write_matches(first, second, matches)
+            matches = match(matcher, read(first), read(second))
+            store.write_matches(first, second, matches)
         if len(matches) == 0:
             without.append((first, second))
         progress("match", done, len(pairs))
-    return without, halved
+    return without
 
 
 def _cached_reader(store: FeatureStore, pairs: Sequence[tuple[str, str]]) -> Callable[[str], Features]:

@@ -15,8 +15,6 @@ from gsbench.init.networks.extractors import GPU_MEMORY_MEND, load_into
 from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.weights import load_state
 
-MIN_HALVED_KEYPOINTS = 128  # with fewer, a pair's geometry is a matter of luck
-
 
 class Matcher(Protocol):
     """Matches two images: indices [M, 2] of keypoints in the first and the second."""
@@ -83,21 +81,12 @@ class LightGlueMatcher:
         }
 
 
-def match_within_memory(matcher: Matcher, first: Features, second: Features) -> tuple[NDArray[np.uint32], bool]:
-    """Matches [M, 2] and whether keypoints had to be left out: out of GPU memory, each image keeps its stronger half.
-
-    Raises ``InputError`` where even a few keypoints are too many.
-    """
+def match(matcher: Matcher, first: Features, second: Features) -> NDArray[np.uint32]:
+    """Matches [M, 2]; raises ``InputError`` where the device runs out of memory."""
     if len(first.keypoints) == 0 or len(second.keypoints) == 0:
-        return np.empty((0, 2), dtype=np.uint32), False
-    count = max(len(first.keypoints), len(second.keypoints))
-    halved = False
-    while True:
-        try:
-            return matcher(first.strongest(count), second.strongest(count)), halved
-        except torch.OutOfMemoryError as error:
-            count //= 2
-            halved = True
-            if count < MIN_HALVED_KEYPOINTS:
-                raise InputError(f"matching of {2 * count} keypoints ran out of memory: {GPU_MEMORY_MEND}") from error
-            torch.cuda.empty_cache()
+        return np.empty((0, 2), dtype=np.uint32)
+    try:
+        return matcher(first, second)
+    except torch.OutOfMemoryError as error:
+        count = max(len(first.keypoints), len(second.keypoints))
+        raise InputError(f"matching of {count} keypoints ran out of memory: {GPU_MEMORY_MEND}") from error
