@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -80,7 +80,8 @@ def translate_trials(place: str, protocol: str | None, runs: Path) -> None:
 def translate(material: Material, protocol: Protocol, make: Callable[[Protocol], Evaluator]) -> Translation:
     """The metrics of ``material`` by ``protocol``; ``make`` gives its evaluator."""
     unknown: dict[str, str] = {}
-    photographs, renders = material.photographs, material.renders
+    photographs = material.photographs
+    renders: Mapping[str, NDArray[Any]] = material.renders
     try:
         photographs = material.shrunk(protocol)
     except InputError as error:
