@@ -95,6 +95,17 @@ def test_pictures_are_there_where_the_archive_has_them(tmp_path: Path) -> None:
         ]
 
 
+def test_an_archive_of_too_many_bytes_is_neither_written_nor_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = archive(tmp_path, Plan())
+    monkeypatch.setattr("gsbench.claims.archive.MOST_TOGETHER", 1000)
+    with pytest.raises(InputError, match="and 1 kB are the most"):
+        unpack_archive(file, tmp_path / "back")
+    with pytest.raises(InputError, match="and 1 kB are the most"):
+        write_archive(load_experiment(tmp_path / "runs-exp", "exp"), tmp_path / "again.zip")
+
+
 def test_words_of_a_stranger_stay_words(tmp_path: Path) -> None:
     def spoil(content: dict[str, bytes]) -> None:
         for name in ("results.jsonl", "configurations.jsonl", "declared.jsonl"):

@@ -25,8 +25,9 @@ def first_trials(verb: str, settings: Sequence[str], metric: str) -> dict[str, T
     keys = [word.partition("=")[0].lstrip("+") for word in settings]
     if given := [key for key in keys if key in GIVEN]:
         raise InputError(f"{verb}: {given[0]} follows from the other words: leave it out")
-    words = [*settings, "seed=0", *([] if "name" in keys else [f"name={verb}"]), *primary(metric)]
-    trials = [Trial(trial.values, trial.overrides) for trial in compose_trials(words, multirun=True)]
+    asked = [] if metric in COSTS else [f"eval.primary={metric}"]  # looks whether the settings compute it
+    words = [*settings, "seed=0", *([] if "name" in keys else [f"name={verb}"]), *asked]
+    trials = [_undeclared(trial) for trial in compose_trials(words, multirun=True)]
     by_scene = {trial.values["scene"]["name"]: trial for trial in trials}
     if len(by_scene) < len(trials):
         raise InputError(f"{verb} is about one arm: only scene may list values")
@@ -35,6 +36,7 @@ def first_trials(verb: str, settings: Sequence[str], metric: str) -> dict[str, T
     return by_scene
 
 
-def primary(metric: str) -> list[str]:
-    """The word that declares a metric, by which it is checked and computed; none for counts and times."""
-    return [] if metric in COSTS else [f"eval.primary={metric}"]
+def _undeclared(trial: Trial) -> Trial:
+    """The trial without ``eval.primary``: the verb declares its question itself, and once for all seeds."""
+    words = tuple(word for word in trial.overrides if not word.startswith("eval.primary="))
+    return Trial(trial.values | {"eval": trial.values["eval"] | {"primary": None}}, words)

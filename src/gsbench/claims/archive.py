@@ -42,7 +42,7 @@ from gsbench.parsing import read_bytes, read_yaml
 from gsbench.runs.declaration import Declaration, read_declarations
 from gsbench.runs.layout import CONFIG, DECLARED, FROM_PIXELS, GROUND_TRUTH, PER_VIEW, RENDERS, RESULTS
 from gsbench.settings import is_folder_name
-from gsbench.words import without_places
+from gsbench.words import readable_bytes, without_places
 
 FORMAT, VERSION = "gsbench results", 1
 PIXELS = "from_pixels.jsonl"
@@ -50,6 +50,7 @@ MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
 PICTURES_FOLDER, PICTURES = "pictures", (RENDERS, GROUND_TRUTH)
 MOST_BYTES = 1 << 28  # of a file when unpacked; more than any experiment has
+MOST_TOGETHER = 1 << 30  # bytes of all files
 FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # of the files within: the earliest that zip knows
 PRIVATE = ("runs", "tracking")  # settings that say where somebody's files and servers are, and nothing else
 PASSWORD = re.compile(r"(?<=://)[^/@\s]*@")  # user and password of an address
@@ -91,6 +92,7 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         for kind in PICTURES:
             for path in trial.folder.pictures(kind):
                 contents[f"{PICTURES_FOLDER}/{_folder(trial)}/{kind}/{path.name}"] = read_bytes(path)
+    _check_size(sum(map(len, contents.values())))
     manifest = {
         "format": FORMAT,
         "version": VERSION,
@@ -173,6 +175,7 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
                     f"it is of version {manifest.get('version')} of the archive (gsbench {manifest.get('gsbench')}), "
                     f"and this gsbench reads {VERSION}: use one gsbench for both"
                 )
+            _check_size(sum(info.file_size for info in archive.infolist()))
             contents = {str(name): _member(archive, str(name)) for name in manifest["sha256"]}
     except FileNotFoundError:
         raise InputError("no such file") from None
@@ -188,6 +191,11 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
         if hashlib.sha256(content).hexdigest() != manifest["sha256"][name]:
             raise InputError(f"{name} was changed after the export (its sha256 is another): export it again")
     return manifest, contents
+
+
+def _check_size(size: int) -> None:
+    if size > MOST_TOGETHER:
+        raise InputError(f"its files are {readable_bytes(size)}, and {readable_bytes(MOST_TOGETHER)} are the most")
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> bytes:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult, read_experiment
-from gsbench.app.versions import add_question, first_trials, primary
+from gsbench.app.versions import add_question, first_trials
 from gsbench.claims.bisect import first_worse, most_steps
 from gsbench.claims.gate import BASELINE, NEW, Gate, ask, describe, result_of
 from gsbench.claims.stopping import Planned, run_looks
@@ -135,7 +135,7 @@ def _begin(
     make_runs_folder(runs)
     home = runs / f"{some.values['name']}_{sha256_of([commits[0][0], commits[-1][0], *kept])[:SHOWN]}"
     declaration = declare_questions(home, declaration)
-    return Search(home, [*kept, *primary(metric)], frozenset(first), declaration, trees, commits)
+    return Search(home, kept, frozenset(first), declaration, trees, commits)
 
 
 def _trials(home: Path) -> tuple[TrialResult, ...]:
