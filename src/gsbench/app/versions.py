@@ -1,4 +1,4 @@
-"""What the verbs that hold two versions of a trainer against each other (``gate``, ``bisect``) share of their words."""
+"""Words of the verbs that hold two versions of a trainer against each other (``gate``, ``bisect``), and their trials."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Part:
-    """What the first page says of one archive."""
+    """An archive's part of the first page."""
 
     name: str
     key: str  # in names of files and anchors: letters, digits, - and _
