@@ -1,4 +1,4 @@
-"""Words of the verbs that hold two versions of a trainer against each other (``gate``, ``bisect``), and their trials."""
+"""Words and trials of the verbs that hold two versions of a trainer against each other: ``gate``, ``bisect``."""
 
 from __future__ import annotations
 

@@ -124,11 +124,12 @@ def _part(experiment: Experiment, key: str, out: Path) -> Part:
 
 
 def _claims(experiment: Experiment) -> tuple[Verdict, ...]:
-    """The verdicts on claims that were declared, as `gsbench check --from` makes them."""
+    """The verdicts on claims that were declared, as `gsbench check --from` makes them; of a gate half is elsewhere."""
     declared = [one for one in read_declarations(experiment.folder) if one.of_claims]
     if not declared:
         return ()
-    return tuple(judge(experiment.trials, resolve(standing_one(declared), experiment.trials)))
+    judged = judge(experiment.trials, resolve(standing_one(declared), experiment.trials))
+    return tuple(verdict for verdict in judged if not verdict.question.versions)
 
 
 def _by_quantity(table: Table) -> Iterator[tuple[str, str]]:
