@@ -1,4 +1,4 @@
-"""What differs between two arms, said wherever they are compared, and which arm would isolate an ingredient."""
+"""What differs between two arms, said wherever they are compared."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from typing import Any
 import pytest
 import yaml
 
-from gsbench.analysis.attribution import (
+from gsbench.analysis.cells import with_variants
+from gsbench.analysis.configurations import departures, shipped_arms
+from gsbench.analysis.differences import (
     ELSEWHERE,
     NO_RECORD,
-    _under_the_same_settings,
-    attribute,
-    attribution_sentence,
     ingredients,
+    ingredients_between,
+    ingredients_sentence,
+    is_mixed,
     representatives,
 )
-from gsbench.analysis.cells import with_variants
-from gsbench.analysis.configurations import departures, resolved, shipped_arms
 from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import TrialResult, load_experiment
@@ -38,7 +38,8 @@ SCHEDULE |= {"train.densify_interval": 100, "train.opacity_reset_interval": 3000
 
 def config(name: str, **changes: Any) -> dict[str, Any]:
     """A shipped densifier as a trial records it."""
-    return SCHEDULE | resolved(shipped_arms()[name], SCHEDULE) | {f"densify.{key}": v for key, v in changes.items()}
+    own = {f"densify.{key}": SCHEDULE.get(str(v).strip("${}"), v) for key, v in shipped_arms()[name].items()}
+    return SCHEDULE | own | {f"densify.{key}": v for key, v in changes.items()}
 
 
 def densifier(name: str, **changes: Any) -> dict[str, Any]:
@@ -54,7 +55,8 @@ def trials_of(runs: Path, arms: dict[str, dict[str, Any]], **settings: Any) -> l
 
 def sentence(trials: list[TrialResult], first: str, second: str) -> str:
     pair = Arm("sfm", first), Arm("sfm", second)
-    return attribution_sentence(attribute(trials, *pair), *pair)
+    found = ingredients_between(trials, *pair)
+    return ingredients_sentence(found, *pair) if is_mixed(found) else ""
 
 
 # --- ingredients
@@ -100,13 +102,10 @@ def test_a_class_of_ones_own_is_one_ingredient_and_its_settings_belong_to_it() -
     assert ingredients(config("longaxis"), own)[0] == "rule mine.Patient"
 
 
-# --- isolating
-
-
-def test_a_mixed_comparison_names_the_arm_that_isolates(tmp_path: Path) -> None:
+def test_a_mixed_comparison_is_said(tmp_path: Path) -> None:
     trials = trials_of(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")})
     assert sentence(trials, "adc", "longaxis") == (
-        "sfm-longaxis differs from sfm-adc by split, gradient and threshold; isolate split with densify=absgrad."
+        "sfm-longaxis differs from sfm-adc by split, gradient and threshold."
     )
     page = build_report(load_experiment(tmp_path, "exp"))
     assert "longaxis differs from sfm-adc by split, gradient and threshold" in page.split("</strong>")[0]
@@ -120,51 +119,12 @@ def test_a_comparison_of_one_ingredient_is_not_commented(tmp_path: Path) -> None
     assert not any("differs from" in note for note in build_table(load_experiment(tmp_path, "exp")).notes)
 
 
-def test_an_arm_that_was_run_comes_before_one_that_could_be(tmp_path: Path) -> None:
-    arms = {name: densifier(name) for name in ("adc", "absgrad", "longaxis")}
-    assert "isolate split with sfm-absgrad, which is here" in sentence(trials_of(tmp_path, arms), "adc", "longaxis")
-
-
 def test_what_a_command_changed_in_all_arms_is_no_difference(tmp_path: Path) -> None:
-    """A threshold, a budget and a schedule that both have hold for the isolating arm, too."""
     changes = {"gradient_threshold": 0.0016, "max_gaussians": 9, "cap": "governor", "stop": 77}
     arms = {name: densifier(name, **changes) for name in ("adc", "longaxis")}
     assert sentence(trials_of(tmp_path, arms), "adc", "longaxis") == (
-        "sfm-longaxis differs from sfm-adc by split and gradient; isolate split with densify=absgrad."
+        "sfm-longaxis differs from sfm-adc by split and gradient."
     )
-
-
-def test_a_shipped_arm_of_the_same_class_is_no_stand_in_for_another() -> None:
-    """`absgrad`, `adc` and `revised` are of one class: what `adc` is shipped with, nobody changed."""
-    adc, few = config("adc"), config("adc", max_gaussians=9, cap="hard")
-    alike = _under_the_same_settings(config("absgrad"), adc, few)
-    assert set(ingredients(alike, few)) == {"gradient", "threshold", "budget"}
-    both = (arm | {"densify.split_size": 0.5} for arm in (adc, few))
-    assert _under_the_same_settings(config("absgrad"), *both)["densify.split_size"] == 0.5
-    own = config("absgrad"), config("absgrad", max_gaussians=9)
-    assert set(ingredients(_under_the_same_settings(config("adc"), *own), own[1])) == {
-        "gradient",
-        "threshold",
-        "budget",
-    }
-
-
-def test_where_nothing_isolates_that_is_said(tmp_path: Path) -> None:
-    own = densifier("adc", interval=50) | {"_target_": "mine.Patient", "patience": 3}
-    trials = trials_of(tmp_path, {"adc": densifier("adc"), "patient": own})
-    expected = "differs from sfm-adc by rule mine.Patient and schedule; no arm at hand isolates one of them."
-    assert sentence(trials, "adc", "patient").endswith(expected)
-
-
-def test_a_variant_of_a_setting_is_an_arm_that_can_isolate(tmp_path: Path) -> None:
-    own = {"_target_": "mine.Patient", "patience": 3}
-    write_arms(tmp_path, {"adc": densifier("adc"), "patient": densifier("adc", interval=50) | own})
-    write_arms(tmp_path, {"patient": densifier("adc") | own})
-    trials = with_variants(load_experiment(tmp_path, "exp").trials)
-    (mixed,) = {trial.arm for trial in trials if trial.config["densify.interval"] == 50}
-    (baseline,) = {trial.arm for trial in trials if trial.densify == "adc"}
-    said = attribution_sentence(attribute(trials, baseline, mixed), baseline, mixed)
-    assert "isolate schedule with sfm-patient interval=100, which is here" in said
 
 
 def test_trials_without_a_record_are_said_to_have_none(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from gsbench.analysis.attribution import ingredients
+from gsbench.analysis.differences import ingredients
 from gsbench.densify import ADC, GNS, MCMC, MRNF, Densifier, DensifyContext, EdgeAware, FastGS, Refinement, SteepGS
 from gsbench.events import RefineEvent
 from gsbench.gaussians.model import Gaussians

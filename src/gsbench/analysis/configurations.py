@@ -7,12 +7,10 @@ comments of its file: lines above the settings, ``theirs: VALUE`` beside one, an
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -85,11 +83,8 @@ def canonical(value: object) -> str:
 
 
 GROUP = "densify"
-THEIRS = re.compile(r"^(?P<key>\w+):.*#.*?theirs:? (?P<value>[^;|]+?)\s*$", re.MULTILINE)  # the authors' own value
-PRESET = re.compile(r"\btrain=(\w+)")
 FACTS = ("Source", "Compared", "Tests", "Otherwise", "Departs from adc by")
 FACT = re.compile(rf"^# (?P<key>{'|'.join(FACTS)}): (?P<text>.*(?:\n#   .*)*)$", re.MULTILINE)  # may go on, indented
-REFERENCE = re.compile(r"\$\{([\w.]+)\}")  # the value of another key
 
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -99,35 +94,6 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 def shipped_arms() -> dict[str, Mapping[str, Any]]:
     """The settings of each densifier of gsbench by its name; programs of others are none."""
     return {path.stem: _read(path.stem) for path in sorted((conf_dir() / GROUP).glob("*.yaml"))}
-
-
-def shipped_name(config: Mapping[str, Any]) -> str | None:
-    """The shipped arm that a trial's configuration is made from: of its name, else of its class; None of neither."""
-    target, name = config.get(f"{GROUP}._target_"), config.get(f"{GROUP}.name")
-    same = [arm for arm, settings in shipped_arms().items() if settings["_target_"] == target]
-    return str(name) if name in same else next(iter(sorted(same, key=len)), None)
-
-
-@dataclass(frozen=True)
-class FileNotes:
-    """Notes of a shipped arm's file on its authors: its first lines, their values where they are others, and the
-    preset of `train` that goes with it ("" for none).
-    """
-
-    text: str
-    theirs: Mapping[str, str]
-    preset: str
-
-
-@cache
-def notes_of(name: str) -> FileNotes:
-    """The comments of the file of the shipped arm ``name``."""
-    content = (conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8")
-    lines = itertools.takewhile(lambda line: line.startswith("#"), content.splitlines())
-    text = " ".join(line.removeprefix("#").strip() for line in lines)
-    preset = PRESET.search(text)
-    theirs = {found["key"]: found["value"].strip() for found in THEIRS.finditer(content)}
-    return FileNotes(text, theirs, preset[1] if preset else "")
 
 
 @cache
@@ -146,18 +112,6 @@ def departures() -> dict[str, tuple[str, ...]]:
         if "_target_" in content:  # a file built on another one is of the other's class
             text = facts_of(name).get("Departs from adc by", "")
             found[content["_target_"]] = tuple(filter(None, text.split(", ")))
-    return found
-
-
-def resolved(settings: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
-    """``settings`` of a densifier with dotted keys, as they would be in a trial with the configuration ``config``.
-
-    What refers to a key that ``config`` lacks stays as it is written.
-    """
-    found = {}
-    for key, value in settings.items():
-        named = REFERENCE.fullmatch(value) if isinstance(value, str) else None
-        found[f"{GROUP}.{key}"] = value if named is None else config.get(named[1], value)
     return found
 
 

@@ -1,4 +1,8 @@
-"""Differences between trials: the conditions, the settings, and the versions of the code that made them."""
+"""Differences between trials and between arms: conditions, settings, versions of the code, and *ingredients*.
+
+Ingredients are read from the trials' recorded configurations and code: each setting is one, settings that only make
+sense together share a name, and a class of densifiers brings those in which it departs from ADC.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,12 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from gsbench.analysis.configurations import canonical
-from gsbench.analysis.results import TrialResult
+from gsbench.analysis.configurations import canonical, departures
+from gsbench.analysis.results import Arm, TrialResult, by_key
 from gsbench.runs.code import SHOWN
-from gsbench.words import counted
+from gsbench.words import counted, listed
 
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 
@@ -19,6 +24,38 @@ IGNORED_SETTINGS = (
     *("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path"),
     *("eval.primary", "eval.controls", "densify.switches"),
 )
+MOST_NAMED = 6  # ingredients that a headline names before it counts
+NO_RECORD = "what is not recorded (a trial has no readable config.yaml)"
+ELSEWHERE = "what a training elsewhere did, of which nothing is recorded"
+BY_PROGRAM = "all that the program {} does otherwise"
+TARGET, INIT = "densify._target_", "initial cloud"
+
+# Settings with one name for several keys. All others are called as their key, without the group of the densifier.
+NAMES = {
+    "densify.gradient_threshold": "threshold",
+    "densify.threshold_inclusive": "threshold",
+    **{f"densify.{key}": "schedule" for key in ("start", "stop", "interval")},
+    **{f"train.{key}": "schedule" for key in ("densify_start", "densify_stop", "densify_interval", "mcmc_stop")},
+    **{f"densify.{key}": "opacity reset" for key in ("opacity_reset_interval", "opacity_reset_value")},
+    "train.opacity_reset_interval": "opacity reset",
+    "train.resolution_schedule": "resolution schedule",
+    **{f"densify.{key}": "budget" for key in ("max_gaussians", "cap", "governor_dimension")},
+    **{f"densify.{key}": "prunings" for key in ("prune_opacity", "prune_size", "prune_screen_radius")},
+    **{f"init.{key}": "cameras" for key in ("poses", "align")},
+    **{
+        f"train.{key}": "learning rates"
+        for key in ("position_initial", "position_final", "sh_dc", "sh_rest", "opacity", "scale", "rotation")
+    },
+}
+# Settings without effect on what is trained.
+WITHOUT_EFFECT = (
+    *IGNORED_SETTINGS,
+    *("eval.", "scene.name", "init.name", "densify.name", "raster.name", "runs", "allow_targets", "init.device"),
+    *("train.name", "train.log_every", "train.checkpoint_", "train.volume_histogram"),
+    *("init.weights", "init.download", "init.threads", "densify.time_limit_minutes"),
+)
+
+
 CODE = "code of "  # how the keys of ``TrialResult.code`` start that are a user's modules
 
 
@@ -127,3 +164,94 @@ def _code(trial: TrialResult) -> dict[str, str]:
 
 def _finished(trial: TrialResult) -> float:
     return trial.finished
+
+
+def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, ...]:
+    """The ingredients in which two configurations with dotted keys differ, those of the rule first."""
+    if not one or not other:
+        return (NO_RECORD,)
+    rule = _rule(one) ^ _rule(other)
+    order = [name for config in (other, one) for name in _rule_names(config) if name in rule]
+    cloud = one.get("init._target_") != other.get("init._target_") or one.get("init.name") != other.get("init.name")
+    for key in differing_keys(one, other):
+        if key == TARGET or (one.get(TARGET) != other.get(TARGET) and _belongs_to_rule(key, one, other)):
+            continue
+        is_cloud = cloud and key.startswith("init.") and key not in NAMES
+        order.append(INIT if is_cloud else NAMES.get(key, key.removeprefix("densify.")))
+    return tuple(dict.fromkeys(order))
+
+
+def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """The settings in which two configurations differ, those left out that have no effect on what is trained."""
+    keys = [key for key in {**one, **other} if not key.startswith(WITHOUT_EFFECT)]
+    return [key for key in keys if one.get(key) != other.get(key)]
+
+
+def ingredients_between(trials: Sequence[TrialResult], first: Arm, second: Arm) -> tuple[str, ...]:
+    """The ingredients in which two arms of ``trials`` differ: of their configurations, and code of several versions.
+
+    A difference can be put down to an ingredient only where it is the one in which the arms differ.
+    """
+    one, other = representatives(trials, first, second)
+    if one.made_elsewhere or other.made_elsewhere:
+        return (ELSEWHERE,)
+    return tuple(dict.fromkeys([*ingredients(one.config, other.config), *differing_code((one, other))]))
+
+
+def ingredients_sentence(found: Sequence[str], first: Arm, second: Arm) -> str:
+    """``sfm-longaxis differs from sfm-adc by split, gradient and threshold.``"""
+    if not found:
+        return f"{second} and {first} differ in no recorded setting."
+    named = [*found[:MOST_NAMED], *([f"{len(found) - MOST_NAMED} more"] if len(found) > MOST_NAMED else [])]
+    return f"{second} differs from {first} by {listed(named)}{'' if is_mixed(found) else ' alone'}."
+
+
+def is_mixed(found: Sequence[str]) -> bool:
+    """Return whether a difference between arms may come from more than one ingredient."""
+    return len(found) > 1 or any(_is_bundle(name) for name in found)
+
+
+def representatives(trials: Iterable[TrialResult], first: Arm, second: Arm) -> tuple[TrialResult, TrialResult]:
+    """A trial of each arm, of one scene and seed where there is such a pair, else of one scene, else of one seed.
+
+    Raises ValueError for an arm without trials.
+    """
+    by_arm = by_key(trials, lambda trial: trial.arm)
+    if missing := [arm for arm in (first, second) if arm not in by_arm]:
+        raise ValueError(f"no trial of {missing[0]}")
+    likenesses: tuple[Callable[[TrialResult], object], ...] = (
+        lambda trial: (trial.scene, trial.seed),
+        lambda trial: trial.scene,
+        lambda trial: trial.seed,
+        lambda trial: None,
+    )
+    for likeness in likenesses:
+        others = by_key(by_arm[second], likeness)
+        one = next((trial for trial in by_arm[first] if likeness(trial) in others), None)
+        if one is not None:
+            break
+    assert one is not None
+    return one, others[likeness(one)][0]
+
+
+def _is_bundle(ingredient: str) -> bool:
+    """Return whether it stands for many at once, which nobody can tell apart."""
+    return ingredient in (NO_RECORD, ELSEWHERE) or ingredient.startswith(BY_PROGRAM.partition("{")[0])
+
+
+def _belongs_to_rule(key: str, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Return whether a setting of the densifier is there for one of two classes alone."""
+    return key.startswith("densify.") and ((key in one) != (key in other))
+
+
+def _rule(config: Mapping[str, Any]) -> set[str]:
+    return set(_rule_names(config))
+
+
+def _rule_names(config: Mapping[str, Any]) -> tuple[str, ...]:
+    target = config.get(TARGET)
+    if target is None:
+        return ()
+    if target == "gsbench.densify.External":
+        return (BY_PROGRAM.format(config.get("densify.name")),)
+    return departures().get(str(target), (f"rule {target}",))

@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.analysis.cells import Cell, check_averageable, make_cell, swept_settings
-from gsbench.analysis.differences import differing_settings, short_version
-from gsbench.analysis.pairing import BASELINE
-from gsbench.analysis.paper import load_paper
-from gsbench.analysis.paper_tables import agreement, layout_of, paper_init
+from gsbench.analysis.cells import check_averageable, make_cell, swept_settings
+from gsbench.analysis.differences import short_version
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import Experiment, TrialResult, load_experiment
 from gsbench.analysis.tables import format_cell
@@ -41,9 +38,7 @@ def explain_cell(address: str, runs: Path) -> str:
     ]
     if cell.reason:
         lines.append(f"  not available: {cell.reason}")
-    lines += _paper_lines(name, scene, trials[0], shown, cell)
     lines += ["", "Conditions"] + [f"  {key}: {value}" for key, value in trials[0].conditions.items()]
-    lines += _baseline_lines(experiment, trials[0])
     lines += _trials_lines(trials, shown)
     left_out = [line for line in experiment.warnings if line.startswith(f"{name}/{scene}/") and arm in line]
     if left_out:
@@ -63,39 +58,6 @@ def _find(experiment: Experiment, scene: str, arm: str) -> list[TrialResult]:
         names = ", ".join(f"{init}-{densify}" for init, densify in arms)
         raise InputError(f"{arm!r} names {len(chosen)} arms of {scene}; choose one of {names}")
     return [trial for trial in of_scene if (trial.init, trial.densify) == chosen[0]]
-
-
-def _paper_lines(name: str, scene: str, trial: TrialResult, shown: Quantity, cell: Cell) -> list[str]:
-    layout = layout_of(name)
-    if layout is None or cell.mean is None:
-        return []
-    table = load_paper().table(layout)
-    keys = {"gaussians": "gaussians_millions", "train_time": "train_minutes"}
-    in_paper_units = quantity(keys.get(shown.key, shown.key), cell.trials)
-    printed = table.get((scene, paper_init(trial.init), trial.densify, in_paper_units.key))
-    if printed is None:
-        return []
-    same_units = make_cell(cell.trials, in_paper_units, [scene], cell.expected)
-    assert same_units.mean is not None
-    words = agreement(same_units, printed).name.lower()
-    delta = f"{same_units.mean - printed.value:+.{in_paper_units.decimals + 1}f}"
-    return [f"  the paper prints {printed.text} ({in_paper_units.name}): difference {delta} ({words})"]
-
-
-def _baseline_lines(experiment: Experiment, trial: TrialResult) -> list[str]:
-    """The settings in which the arm differs from the baseline of the same scene and initialiser."""
-    others = [t for t in experiment.trials if (t.scene, t.init, t.densify) == (trial.scene, trial.init, BASELINE)]
-    if not others or trial.densify == BASELINE or trial.from_renders:
-        return []
-    base = next((other for other in others if other.seed == trial.seed), others[0])
-    settings = differing_settings([base, trial])
-    both = [key for key in settings if key in base.config and key in trial.config]
-    lines = [f"  {key}: {base.config[key]} -> {trial.config[key]}" for key in both]
-    for one, other in ((trial, base), (base, trial)):
-        own = [f"{key} {one.config[key]}" for key in settings if key in one.config and key not in other.config]
-        if own:
-            lines.append(f"  of {one.init}-{one.densify} alone: {', '.join(own)}")
-    return ["", f"Settings that differ from {base.init}-{base.densify}", *lines] if lines else []
 
 
 def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:

@@ -1,6 +1,6 @@
-"""The fairness sheet of a comparison: all in which two arms differ, what was tuned, and what is whose default.
+"""The fairness sheet of a comparison: all in which two arms differ, and what was tuned.
 
-It is made from the trials' records and from the files of the arms, never written by hand, so nothing can be left out of
+It is made from the trials' records, never written by hand, so nothing can be left out of
 it that was recorded.
 """
 
@@ -10,25 +10,25 @@ import statistics
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from gsbench.analysis.attribution import (
-    attribute,
-    attribution_sentence,
+from gsbench.analysis.configurations import canonical
+from gsbench.analysis.differences import (
+    CODE,
     differing_keys,
+    ingredients_between,
+    ingredients_sentence,
     representatives,
+    short_version,
 )
-from gsbench.analysis.configurations import REFERENCE, canonical, notes_of, resolved, shipped_arms, shipped_name
-from gsbench.analysis.differences import CODE, short_version
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.tables import Column, Entry, Row, Table
 from gsbench.analysis.tuning import tuning_lines
 from gsbench.runs.trial_record import TrialRecord
-from gsbench.words import counted, listed
+from gsbench.words import counted
 
 LONGEST = 60  # characters of a value that are shown
 UNKNOWN, NONE = "not recorded", "–"
 ALIKE, UNLIKE = "", "≠"
-NAMES = ("densify.name", "densify._target_")  # settings that say which arm it is
 DIFFERS = "differs"  # heading of the column that marks what does
 
 Reader = Callable[[TrialResult], float | None]
@@ -48,11 +48,9 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
     settings = [_setting_row(key, one, other) for key in differing_keys(one.config, other.config)]
     if settings:
         settings[0] = Row(settings[0].labels, settings[0].entries, rule_above=True)
-    found = attribute(trials, first, second)
-    notes = [attribution_sentence(found, first, second) or _alone(found.ingredients, first, second)]
+    notes = [ingredients_sentence(ingredients_between(trials, first, second), first, second)]
     notes += [f"Compared: {counted(len(pairs), 'pair')} of trials of one scene and seed."]
     notes += [f"Tuning. {line}" for line in tuning_lines(trials, (first, second))]
-    notes += [line for trial in (one, other) for line in default_lines(trial)]
     return Table(
         f"Fairness sheet: {second} against {first}",
         ("what",),
@@ -62,52 +60,6 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
         (("", str(first)), ("", str(second)), ("", DIFFERS)),
         wrapped=True,
     )
-
-
-def default_lines(trial: TrialResult) -> list[str]:
-    """Settings of an arm by their origin, as its file states it: its authors' defaults, gsbench's, the trial's own."""
-    name, config = shipped_name(trial.config), trial.config
-    if not config:
-        return [f"Defaults. {trial.arm}: {UNKNOWN}."]
-    if trial.program:
-        version = trial.trainer_version or UNKNOWN
-        what = f"the program {trial.program} (version {version}) with its own defaults, but for what its command gives"
-        return [f"Defaults. {trial.arm}: {what}: {_shown(config.get('densify.command'))}."]
-    if name is None:
-        target = config.get("densify._target_", "a class that is not recorded")
-        digest = trial.code.get(f"{CODE}{target}")
-        of_file = f" (version {short_version(digest)})" if digest else ""
-        what = f"{target}{of_file} is no arm of gsbench; its defaults stand in its class"
-        return [f"Defaults. {trial.arm}: {what}."]
-    notes = notes_of(name)
-    own = resolved(shipped_arms()[name], config)
-    changed = [
-        f"{key.removeprefix('densify.')} {_shown(config[key])} ({_shown(value)} there)"
-        for key, value in own.items()
-        if key in config and config[key] != value and not _is_open(value) and key not in NAMES
-    ]
-    line = f"Defaults. {trial.arm}: densify={name}"
-    line += f" but for {listed(changed)}" if changed else " as it is shipped"
-    if notes.theirs:
-        line += f"; its authors have {listed([f'{key} {value}' for key, value in notes.theirs.items()])}"
-    if notes.preset and config.get("train.name") not in (notes.preset, None):
-        line += f"; its file names train={notes.preset}, this is train={config['train.name']}"
-    return [f"{line}. {_source(notes.text)}".rstrip()]
-
-
-def _is_open(value: object) -> bool:
-    """Return whether a setting of a file refers to one that the trial has not recorded."""
-    return isinstance(value, str) and REFERENCE.fullmatch(value) is not None
-
-
-def _source(text: str) -> str:
-    return f"Its file says: “{text}”" if text else ""
-
-
-def _alone(found: Sequence[str], first: Arm, second: Arm) -> str:
-    if not found:
-        return f"{second} and {first} differ in no recorded setting."
-    return f"{second} differs from {first} by {found[0]} alone."
 
 
 def _row(what: str, first: str, second: str) -> Row:

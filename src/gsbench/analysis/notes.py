@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from gsbench.analysis.attribution import attribute, attribution_sentence
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import standing
+from gsbench.analysis.differences import ingredients_between, ingredients_sentence, is_mixed
 from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.results import Arm, Experiment, TrialResult, by_key
 from gsbench.analysis.tuning import tuning_sentence
@@ -99,7 +99,8 @@ def caveats(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
     """Say where two arms of ``trials`` have unlike counts, differ in more than one ingredient, and where one was tuned
     more; else "".
     """
-    mixed = attribution_sentence(attribute(trials, first, second), first, second)
+    found = ingredients_between(trials, first, second)
+    mixed = ingredients_sentence(found, first, second) if is_mixed(found) else ""
     counts = counts_sentence(trials, first, second)
     return " ".join(filter(None, [counts, mixed, tuning_sentence(trials, (first, second))]))
 

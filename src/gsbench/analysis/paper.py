@@ -1,210 +1,28 @@
-"""A paper's printed results as data, and the settings that a paper leaves open or in which gsbench differs from it.
-
-The values of gsbench are read from the recorded configurations of trials; what the paper says of a setting stands with
-its numbers, as ``setup`` of its YAML. A choice of which that says nothing is not shown, nor one in which both agree.
-"""
+"""The paper's printed Tables 1 and 2 as data, the same tables from one's own trials, and how far they lie apart."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from functools import cache
 from importlib.resources import files
-from typing import Any
 
 import yaml
 
-from gsbench.analysis.results import TrialResult
-from gsbench.eval.facts import LPIPS, find
-from gsbench.eval.protocol import PAPER, protocol_of
-from gsbench.runs.trial_record import BY_LISTS
+from gsbench.analysis.cells import Cell
+from gsbench.analysis.quantities import Quantity, quantity
+from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.analysis.tables import Column, Entry, Row, Table, build_table
+from gsbench.errors import InputError
+from gsbench.words import signed
 
-NOT_RECORDED = "not recorded"
-PLACES = {"sampled": "drawn from the parent's density", "parent_mean": "the parent's mean"}
-ORDERS = {
-    "after_adc": "after clone and split, before pruning",
-    "before_adc": "before clone and split",
-    "after_prune": "after pruning",
-}
-
-
-@dataclass(frozen=True)
-class PaperChoice:
-    """Words of a paper on one setting, to be read after "the paper"; ``value`` is set where it states all of it."""
-
-    words: str
-    value: str | None = None
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A choice: ``read`` gives a trial's as text, None where it has none; it may raise KeyError for what is unknown."""
-
-    key: str  # in ``setup`` of a paper's YAML
-    label: str
-    read: Callable[[TrialResult], str | None]
-    detail: Callable[[Sequence[TrialResult]], str] = lambda trials: ""  # of all trials, after their choices
-
-
-def read_setup(content: Mapping[str, Any]) -> dict[str, PaperChoice]:
-    """``setup`` of a paper's YAML: for each topic words, or words with a value. Raises ValueError for another topic."""
-    known = [topic.key for topic in TOPICS]
-    if unknown := content.keys() - set(known):
-        raise ValueError(f"setup: unknown {', '.join(sorted(unknown))}; known are {', '.join(known)}")
-    return {
-        key: PaperChoice(said) if isinstance(said, str) else PaperChoice(said["words"], str(said["value"]))
-        for key, said in content.items()
-    }
-
-
-def choice_lines(trials: Sequence[TrialResult], setup: Mapping[str, PaperChoice]) -> list[str]:
-    """A line for each topic of ``setup`` in which our trials and the paper do not state the same."""
-    own = [trial for trial in trials if not trial.made_elsewhere]
-    lines = []
-    for topic in TOPICS:
-        chosen: dict[str, list[TrialResult]] = {}
-        for trial in own:
-            if (text := _read(topic, trial)) is not None:
-                chosen.setdefault(text, []).append(trial)
-        said = setup.get(topic.key)
-        if said is not None and chosen and set(chosen) != {said.value}:
-            lines.append(f"{topic.label}: {_of_whom(chosen)}{topic.detail(own)}; the paper {said.words}.")
-    return lines
-
-
-def _read(topic: Topic, trial: TrialResult) -> str | None:
-    try:
-        return topic.read(trial)
-    except KeyError:
-        return NOT_RECORDED
-
-
-def _of_whom(chosen: Mapping[str, Sequence[TrialResult]]) -> str:
-    """``2,048 an image for dim, 8,192 an image for sfm``: of several choices, each with those whose it is."""
-    if len(chosen) == 1:
-        return next(iter(chosen))
-    for name in ("init", "densify", "scene"):
-        owners = {text: sorted({getattr(trial, name) for trial in trials}) for text, trials in chosen.items()}
-        if len({owner for group in owners.values() for owner in group}) == sum(map(len, owners.values())):
-            return ", ".join(f"{text} for {' '.join(group)}" for text, group in owners.items())
-    return ", ".join(f"{text} in {len(trials)} trials" for text, trials in chosen.items())
-
-
-def _poses(trial: TrialResult) -> str:
-    trial.config["init.name"]  # raises where nothing was recorded
-    if trial.config.get("init.poses") == "own":
-        return "estimated by each initialiser (init.poses=own)"
-    return "the same for all arms of a scene (init.poses=shared)" if "init.poses" in trial.config else "as they came"
-
-
-def _gauge(trial: TrialResult) -> str:
-    own = trial.config["init.name"] and trial.config.get("init.poses") == "own"
-    if not own:
-        return "that of the given cameras"
-    return (
-        "moved into that of the reference"
-        if trial.config.get("init.align")
-        else "as the mapper left it (init.align=false)"
-    )
-
-
-def _keypoints(trial: TrialResult) -> str | None:
-    trial.config["init.name"]
-    for key in ("max_keypoints", "max_num_features"):
-        if (count := trial.config.get(f"init.{key}")) is not None:
-            return f"{count:,} an image"
-    return None
-
-
-def _networks(trial: TrialResult) -> str | None:
-    trial.config["init.name"]
-    parts = [trial.config.get(f"init.{key}") for key in ("extractor", "matcher")]
-    return " and ".join(map(str, parts)) if all(parts) else None
-
-
-def _cap(trial: TrialResult) -> str:
-    count, cap = trial.config.get("densify.max_gaussians"), trial.config["densify.cap"]
-    return "none" if count is None else f"{count:,} (densify.cap={cap})"
-
-
-def _hold_out(trial: TrialResult) -> str:
-    every = f"every {trial.config['scene.test_every']}th image"
-    return {"every_nth": every, BY_LISTS: "by lists"}.get(trial.split, trial.split)
-
-
-def _selection(trial: TrialResult) -> str:
-    return f"at most {trial.config['scene.max_images']}, evenly spaced over the sorted names"
-
-
-def _volume(key: str, say: Callable[[Any], str]) -> Callable[[TrialResult], str | None]:
-    """Reads a setting of the volume rule; None for arms without the rule."""
-
-    def read(trial: TrialResult) -> str | None:
-        trial.config["densify.name"]  # raises where nothing was recorded
-        value = trial.config.get(f"densify.{key}")
-        return None if value is None else say(value)
-
-    return read
-
-
-def _window(trial: TrialResult) -> str | None:
-    config = trial.config
-    if config.get("densify.volume_order") is None:
-        config["densify.name"]  # raises where nothing was recorded
-        return None
-    start, stop = (
-        config[f"densify.{key}"] if config.get(f"densify.volume_{key}") is None else config[f"densify.volume_{key}"]
-        for key in ("start", "stop")
-    )
-    interval = config.get("densify.volume_interval") or config["densify.interval"]
-    return f"every {interval} iterations, after {start:,} and before {stop:,}"
-
-
-def _images(trial: TrialResult) -> str:
-    config = trial.config
-    text = f"the files of {config['scene.images']}" if config.get("scene.images") else "the photographs"
-    if config["scene.downscale"] != 1:
-        text += f" divided by {config['scene.downscale']}"
-    if config.get("scene.max_size") is not None:
-        text += f" at most {config['scene.max_size']} px long"
-    return f"{text} ({config['scene.resample']} where shrunk)"
-
-
-def _sizes(trials: Sequence[TrialResult]) -> str:
-    """`` at 400×300 px``, or the smallest and the largest."""
-    sizes = sorted({tuple(size) for trial in trials if (size := trial.record.resolution)}, key=math.prod)
-    shown = [f"{width}×{height}" for width, height in dict.fromkeys([*sizes[:1], *sizes[-1:]])]
-    return f", {' to '.join(shown)} px" if shown else ""
-
-
-def _lpips(trial: TrialResult) -> str:
-    protocol = protocol_of(trial.record.protocol) or PAPER
-    facts = find(f"{LPIPS}{protocol.lpips}")
-    assert facts is not None
-    return f"net {facts.options['net']}, fed [{'0' if facts.options['raw'] else '−1'}, 1]"
-
-
-TOPICS = (
-    Topic("poses", "Poses", _poses),
-    Topic("gauge", "Gauge (the unit of V_th)", _gauge),
-    Topic("keypoints", "Keypoints", _keypoints),
-    Topic("networks", "Matching networks", _networks),
-    Topic("cap", "Cap of Gaussians", _cap),
-    Topic("opacity", "Learning rate of opacity", lambda trial: str(trial.config["train.opacity"])),
-    Topic("iterations", "Iterations", lambda trial: str(trial.record.iterations)),
-    Topic("images", "Images", _images, _sizes),
-    Topic("hold_out", "Held out", _hold_out),
-    Topic("selection", "Images of a large scene", _selection),
-    Topic("children", "Children of a volume split", _volume("volume_children", str)),
-    Topic("placement", "Their places", _volume("placement", PLACES.__getitem__)),
-    Topic("order", "Order of the volume rule", _volume("volume_order", ORDERS.__getitem__)),
-    Topic("window", "Window of the volume rule", _window),
-    Topic("hardware", "Hardware", lambda trial: trial.machine or NOT_RECORDED),
-    Topic("lpips", "LPIPS weights", _lpips),
-)
-
-
+PAPER_TABLES = ("table1", "table2")
+OWN = "_own"  # ends the name of the same table with poses and gauge of each initialiser's own
+STAND_FOR = {"dim_paper": "dim"}  # initialisers that are one of the paper's arms under another name
+CONFIDENCE = 0.95
 TABLE1_QUANTITIES = ("ssim", "psnr", "lpips_vgg_raw", "gaussians_millions", "train_minutes")
 TABLE1_ARMS = (("dim", "adc"), ("dim", "volumetric"))
 TABLE2_ARMS = (("sfm", "adc"), ("dim", "adc"), ("sfm", "volumetric"), ("dim", "volumetric"))
@@ -242,7 +60,7 @@ class Paper:
     table1: Mapping[Key, Printed]
     table2: Mapping[Key, Printed]
     contradictions: tuple[str, ...]  # of the paper with itself, a sentence each
-    setup: Mapping[str, PaperChoice]
+    setup: Mapping[str, str]  # its words on settings beside the method
 
     def table(self, name: str) -> Mapping[Key, Printed]:
         return {"table1": self.table1, "table2": self.table2}[name]
@@ -258,12 +76,156 @@ def load_paper() -> Paper:
     content = yaml.safe_load(files("gsbench.analysis").joinpath("paper.yaml").read_text(encoding="utf-8"))
     table1: dict[Key, Printed] = {}
     for scene, (_, *pairs) in content["table1"]["scenes"].items():
-        for quantity, pair in zip(TABLE1_QUANTITIES, pairs, strict=True):
+        for key, pair in zip(TABLE1_QUANTITIES, pairs, strict=True):
             for (init, densify), text in zip(TABLE1_ARMS, pair, strict=True):
-                table1[scene, init, densify, quantity] = Printed(text)
+                table1[scene, init, densify, key] = Printed(text)
     table2 = {
         (scene, init, densify, "lpips_vgg_raw"): Printed(text)
         for scene, texts in content["table2"]["scenes"].items()
         for (init, densify), text in zip(TABLE2_ARMS, texts, strict=True)
     }
-    return Paper(table1, table2, tuple(content["contradictions"]), read_setup(content["setup"]))
+    return Paper(table1, table2, tuple(content["contradictions"]), content["setup"])
+
+
+def setup_lines(setup: Mapping[str, str]) -> list[str]:
+    """Say in a line each what a paper writes on settings beside its method, to be held against one's own."""
+    return [f"The paper on {topic}: it {words}." for topic, words in setup.items()]
+
+
+class Agreement(Enum):
+    """Classes of agreement between a measured cell and the printed number, from the closest to the farthest."""
+
+    ROUNDING = "="  # the mean lies within half a step of the last printed digit
+    INTERVAL = "≈"  # our t interval meets the range that the printed number stands for
+    DIFFERS = "≠"
+
+
+def paper_tables(
+    experiment: Experiment, name: str, trials: Sequence[TrialResult] | None = None, metrics: Sequence[str] | None = None
+) -> list[Table]:
+    """The measured table in the paper's layout and the table of differences from the printed numbers."""
+    trials = list(experiment.trials if trials is None else trials)
+    arms, notes = _arms(name, trials)
+    trials = [trial for trial in trials if (trial.init, trial.densify) in arms]
+    if not trials:
+        needed = ", ".join(f"init={init} densify={densify}" for init, densify in arms)
+        raise InputError(f"experiment {experiment.name!r} has no trial for {name} ({needed}); use --layout plain")
+    scenes = load_paper().scenes(name)
+    scenes += sorted({trial.scene for trial in trials} - set(scenes))
+    columns = ("densify",) if name == "table1" else ("init", "densify")
+    measured = build_table(
+        experiment,
+        trials,
+        rows=("scene",),
+        columns=columns,
+        metrics=metrics or (TABLE1_QUANTITIES if name == "table1" else ("lpips_vgg_raw",)),
+        title=f"{name.replace('table', 'Table ')}, measured (experiment {experiment.name})",
+        order=([(scene,) for scene in scenes], [arm[-len(columns) :] for arm in arms]),
+        names=ARM_NAMES | INIT_NAMES | {init: INIT_NAMES[known] for init, known in STAND_FOR.items()},
+    )
+    return [measured, _differences(name, measured, arms, trials, notes)]
+
+
+def layout_of(name: str) -> str | None:
+    """The paper's table that the experiment ``name`` repeats, by its name: ``table1`` for ``table1_own``, too."""
+    table = name.removesuffix(OWN)
+    return table if table in PAPER_TABLES else None
+
+
+def agreement(cell: Cell, printed: Printed) -> Agreement:
+    """Class a measured cell against a printed number; a single trial has no interval."""
+    assert cell.mean is not None
+    if abs(cell.mean - printed.value) <= printed.half_step:
+        return Agreement.ROUNDING
+    if cell.std is not None:
+        half = t_half_width(cell.std, cell.count)
+        low, high = printed.range
+        if cell.mean - half <= high and cell.mean + half >= low:
+            return Agreement.INTERVAL
+    return Agreement.DIFFERS
+
+
+def compare_with_printed(
+    cell: Cell | None, printed: Printed | None, shown: Quantity, tally: Counter[Agreement]
+) -> list[Entry]:
+    """The printed number, and how far the measured cell is from it; how they agree is added to ``tally``."""
+    if printed is None or cell is None or cell.mean is None:
+        return [Entry(printed.text if printed else ""), Entry("—")]
+    found = agreement(cell, printed)
+    tally[found] += 1
+    decimals = max(shown.decimals, len(printed.text.partition(".")[2]))
+    delta = signed(cell.mean - printed.value, f".{decimals}f")
+    return [Entry(printed.text), Entry(f"{delta} {found.value}", cell=cell)]
+
+
+def legend(tally: Counter[Agreement]) -> str:
+    """Explain the marks, with the number of cells that have each."""
+    return (
+        f"Δ is measured minus printed. Of {sum(tally.values())} cells {tally[Agreement.ROUNDING]} are within rounding "
+        f"(=), {tally[Agreement.INTERVAL]} within our {CONFIDENCE:.0%} t interval of the mean (≈), "
+        f"{tally[Agreement.DIFFERS]} differ (≠). The paper prints no deviation, so the spread of its own trials is not "
+        "taken into account; a single trial has no interval."
+    )
+
+
+def t_half_width(std: float, count: int) -> float:
+    """Half the width of Student's 95 % interval of a mean of ``count`` values."""
+    from scipy.special import stdtrit  # here, for a quick start of what needs no interval
+
+    return float(stdtrit(count - 1, 0.5 + CONFIDENCE / 2)) * std / math.sqrt(count)
+
+
+def _arms(name: str, trials: Sequence[TrialResult]) -> tuple[list[tuple[str, str]], list[str]]:
+    """The (init, densify) arms of a table; where DIM was not run and one other initialiser was, that one stands in."""
+    inits = {trial.init for trial in trials}
+    arms = [(_run_as(init, inits), densify) for init, densify in (TABLE1_ARMS if name == "table1" else TABLE2_ARMS)]
+    if name == "table1" and arms[0][0] not in inits and len(inits) == 1:
+        other = inits.pop()
+        note = f"Initial clouds from {other} replace the paper's DIM: the columns do not repeat its experiment."
+        return [(other, densify) for _, densify in TABLE1_ARMS], [note]
+    return arms, []
+
+
+def _run_as(init: str, inits: set[str]) -> str:
+    """The initialiser that stands for the paper's ``init``: itself, unless only another of that kind was run."""
+    others = [other for other in sorted(inits) if init not in inits and STAND_FOR.get(other) == init]
+    return others[0] if others else init
+
+
+def _differences(
+    name: str, measured: Table, arms: Sequence[tuple[str, str]], trials: Sequence[TrialResult], notes: Sequence[str]
+) -> Table:
+    paper = load_paper()
+    printed_table = paper.table(name)
+    paper_arms = dict(zip(arms, TABLE1_ARMS if name == "table1" else TABLE2_ARMS, strict=True))
+    keys = list(dict.fromkeys(key for key, _ in measured.keys))
+    compared = [key for key in keys if any(printed[3] == key for printed in printed_table)]
+    quantities = {key: quantity(key, trials) for key in compared}
+    tally: Counter[Agreement] = Counter()
+    rows = []
+    for row in measured.rows:
+        scene = row.labels[0]
+        for place, arm in enumerate(arms):
+            entries = []
+            for key in compared:
+                cell = row.entries[keys.index(key) * len(arms) + place].cell
+                printed = printed_table.get((scene, *paper_arms[arm], key))
+                entries += compare_with_printed(cell, printed, quantities[key], tally)
+            if any(entry.cell is not None for entry in entries):
+                rows.append(Row((scene, _arm_name(name, paper_arms[arm])), tuple(entries)))
+    heads = tuple(Column(quantities[key].name, heading) for key in compared for heading in ("paper", "Δ"))
+    left_out = [key for key in keys if key not in compared]
+    if left_out:
+        notes = [*notes, f"Not compared, since the paper prints no such number: {', '.join(left_out)}."]
+    return Table(
+        f"{name.replace('table', 'Table ')}, difference from the printed values",
+        ("scene", "arm"),
+        heads,
+        tuple(rows),
+        (legend(tally), *notes, *setup_lines(paper.setup)),
+        tuple((key, heading) for key in compared for heading in ("paper", "delta")),
+    )
+
+
+def _arm_name(name: str, arm: tuple[str, str]) -> str:
+    return ARM_NAMES[arm[1]] if name == "table1" else f"{INIT_NAMES[arm[0]]} + {ARM_NAMES[arm[1]]}"

@@ -12,8 +12,7 @@ from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.frame import to_frame
 from gsbench.analysis.notes import compared_pairs
-from gsbench.analysis.paper import load_paper
-from gsbench.analysis.paper_tables import PAPER_TABLES, layout_of, paper_tables
+from gsbench.analysis.paper import PAPER_TABLES, layout_of, load_paper, paper_tables
 from gsbench.analysis.published import published_names, published_table
 from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experiment
 from gsbench.analysis.table_formats import FORMATS

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 
 import yaml
 
 from gsbench.analysis.cells import check_averageable, make_cell
-from gsbench.analysis.paper import PaperChoice, Printed, choice_lines, read_setup
-from gsbench.analysis.paper_tables import Agreement, compare_with_printed, legend
+from gsbench.analysis.paper import Agreement, Printed, compare_with_printed, legend, setup_lines
 from gsbench.analysis.quantities import quantity
 from gsbench.analysis.results import TrialResult, by_key
 from gsbench.analysis.tables import Column, Entry, Row, Table
@@ -31,7 +30,7 @@ class Published:
     densify: str  # the densifier of ours that is the paper's method
     quantities: tuple[str, ...]
     printed: Mapping[tuple[str, str], Printed]
-    setup: Mapping[str, PaperChoice]
+    setup: Mapping[str, str]
 
 
 def published_names() -> list[str]:
@@ -54,8 +53,7 @@ def load_published(name: str) -> Published:
         for key, text in zip(quantities, texts, strict=True)
     }
     title, source, conventions = (" ".join(content[key].split()) for key in ("title", "source", "conventions"))
-    setup = read_setup(content["setup"])
-    return Published(name, title, source, conventions, content["densify"], quantities, printed, setup)
+    return Published(name, title, source, conventions, content["densify"], quantities, printed, content["setup"])
 
 
 def published_table(trials: Sequence[TrialResult], name: str) -> Table:
@@ -77,20 +75,11 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
         for one in shown:
             cell = make_cell(group, one, [scene], len({trial.seed for trial in own}))
             entries += compare_with_printed(cell, paper.printed.get((scene, one.key)), one, tally)
-        rows.append(
-            Row(
-                (
-                    scene,
-                    arm.init,
-                    " ".join([arm.densify, *(f"{key.rpartition('.')[2]}={value}" for key, value in arm.variant)]),
-                ),
-                tuple(entries),
-            )
-        )
+        rows.append(Row((scene, arm.init, str(replace(arm, init=""))), tuple(entries)))
     heads = tuple(Column(one.name, heading) for one in shown for heading in (name, "Δ"))
     method = f"The printed numbers are of densify={paper.densify}; other arms are shown for orientation."
     notes = [f"{paper.title}.", f"Read from {paper.source}.", f"Conventions: {paper.conventions}.", method]
-    notes += choice_lines(own, paper.setup)
+    notes += setup_lines(paper.setup)
     keys = tuple((one.key, heading) for one in shown for heading in (name, "delta"))
     return Table(
         f"Difference from {name}", ("scene", "init", "densify"), heads, tuple(rows), (legend(tally), *notes), keys

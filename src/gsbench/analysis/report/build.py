@@ -12,8 +12,7 @@ from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import standing
 from gsbench.analysis.errors_by_region import read_image
 from gsbench.analysis.pairing import BASELINE, choose_pairs, controls_of
-from gsbench.analysis.paper import load_paper
-from gsbench.analysis.paper_tables import layout_of, paper_tables
+from gsbench.analysis.paper import layout_of, load_paper, paper_tables
 from gsbench.analysis.report.pictures import data_uri
 from gsbench.analysis.report.sections import (
     compare_arms,
