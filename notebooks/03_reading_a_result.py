@@ -138,7 +138,7 @@ for difference in (0.05, 0.1, 0.2, 0.5):
 # bins by the texture of the ground truth, and the error of both arms is taken in each bin.
 
 # %%
-regions = errors_by_region(pair_trials(experiment.trials, adc, volumetric), "texture")
+regions = errors_by_region(pair_trials(experiment.trials, adc, volumetric))
 changes = [change.mean for change in regions.changes]
 bins = np.arange(1, len(changes) + 1)
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.4))
@@ -153,8 +153,6 @@ figure.tight_layout()
 
 # %% [markdown]
 # A bar below zero means that the volumetric rule has the smaller error there; a red one is decided, a blue one is not.
-# `errors_by_region` can also sort by depth, by the distance to the initial cloud, or by the volume of the Gaussians,
-# when the trials were run with `eval.maps=true`.
 #
 # ## Is the comparison fair?
 #

@@ -14,8 +14,6 @@ from gsbench.analysis.planning import (
     components,
     power,
     sizes_needed,
-    smallest_difference,
-    within_hours,
 )
 from gsbench.analysis.statistics import student
 from gsbench.errors import InputError
@@ -81,23 +79,6 @@ def test_seeds_do_not_replace_scenes() -> None:
     scattered = Components(between=5.0, within=0.1, scenes=4, trials=12)
     assert sizes_needed(0.5, scattered, like_these=True) == []
     assert sizes_needed(0.5, scattered, like_these=False)[0] == Size(1, 3)
-
-
-def test_the_smallest_difference_is_seen_with_the_wanted_power() -> None:
-    for like_these in (False, True):
-        least = smallest_difference(Size(8, 3), KNOWN, like_these)
-        assert power(Size(8, 3), least, KNOWN, like_these) == pytest.approx(0.8, abs=1e-3)
-    assert smallest_difference(Size(6, 3), Components(0.0, 0.0, 2, 4), True) == 0.0
-
-
-def test_hours_buy_scenes_first_and_then_seeds() -> None:
-    assert within_hours(1.0, 100.0, scenes=4) == Size(4, 4)  # 36 trials: 18 pairs
-    assert within_hours(1.0, 600.0, scenes=4) == Size(1, 3)  # 6 trials: two seeds come before a second scene
-    assert within_hours(1.0, 450.0, scenes=4) == Size(2, 2)
-    assert within_hours(0.1, 600.0, scenes=4) is None
-    for hours, seconds in ((0.0, 1.0), (1.0, 0.0), (float("nan"), 1.0)):
-        with pytest.raises(InputError):
-            within_hours(hours, seconds, 4)
 
 
 def test_questions_without_an_answer_are_refused() -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from gsbench.claims.file import Claim, direction_is_odd, parse_claims, read_claims
+from gsbench.claims.file import Claim, parse_claims, read_claims
 from gsbench.errors import InputError
 from tests.conftest import ROOT
 
@@ -71,7 +71,6 @@ def test_the_files_that_ship_are_sound(path: Path) -> None:
     assert file.size
     assert len(file.claims) >= 4
     assert any(claim.not_testable for claim in file.claims)
-    assert not [remark for claim in file.claims if (remark := direction_is_odd(claim))]
 
 
 def test_words_of_a_trial_are_those_of_a_command_line() -> None:
@@ -149,11 +148,6 @@ BAD: list[tuple[str, Callable[[], Any], str]] = [
     ("a list", lambda: [], "must be a mapping"),
     ("nothing", lambda: None, "must be a mapping"),
     ("a name that is a path", lambda: changed("name", to="../other"), "letters, digits"),
-    ("contradicting claims", lambda: second_claim(direction="higher"), "lpips and other contradict"),
-    ("contradicting: none", lambda: second_claim(direction="same"), "contradict"),
-    ("contradicting, arms swapped", lambda: second_claim(baseline="volumetric", arm="adc"), "contradict"),
-    ("contradicting on one scene", lambda: second_claim(direction="higher", scenes=["own"]), "contradict.*on own"),
-    ("one claim twice", lambda: second_claim(), "ask the same"),
     ("one id twice", lambda: second_claim(id="lpips", metric="psnr"), "each its own"),
 ]
 
@@ -165,30 +159,12 @@ def test_bad_input_is_one_line(content: Callable[[], Any], message: str) -> None
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "changes", [{"metric": "psnr"}, {"budget": {"densify.cap": "hard"}}, {"split": {"scene.test_every": 4}}]
-)
-def test_claims_about_other_things_do_not_contradict(changes: dict[str, Any]) -> None:
-    assert len(parse_claims(second_claim(direction="higher", **changes)).claims) == 2
-
-
-def test_claims_on_other_scenes_do_not_contradict() -> None:
-    content = second_claim(direction="higher", scenes=["own"])
-    content["claims"][0]["scenes"] = ["courtyard"]
-    assert len(parse_claims(content).claims) == 2
-
-
 def test_a_metric_of_ones_own_needs_its_class() -> None:
     content = changed("claims", 0, "metric", to="sharpness")
     with pytest.raises(InputError, match=r"eval\.extra\.sharpness"):
         parse_claims(content)
     content["settings"]["eval.extra.sharpness._target_"] = "mine.Sharpness"
     assert parse_claims(content).claims[0].metric == "sharpness"
-
-
-def test_a_claim_against_the_metrics_direction_is_remarked() -> None:
-    assert "worse" in direction_is_odd(parse_claims(changed("claims", 0, "direction", to="higher")).claims[0])
-    assert not direction_is_odd(parse_claims(GOOD).claims[0])
 
 
 def test_the_file_that_the_document_shows_is_sound() -> None:

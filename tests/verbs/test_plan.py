@@ -20,20 +20,16 @@ def runs(tmp_path: Path) -> Path:
 
 
 def test_it_names_designs_that_suffice(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["exp", "--metric", "psnr", "--difference", "0.2", "--hours", "1"], runs) == 0
+    assert main(["exp", "--metric", "psnr", "--difference", "0.2"], runs) == 0
     out = capsys.readouterr().out
     assert "sfm-volumetric against sfm-adc" in out
     assert "(from 9 pairs on 3 scenes)" in out
     assert "scenes like these (from 6 scenes on)" in out
-    assert "1 h, at" in out
-    assert "which resolve" in out
 
 
 def test_one_scene_does_not_speak_of_others(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["one"], runs) == 0
     assert "run pilot trials on a second scene" in capsys.readouterr().out
-    assert main(["one", "--hours", "0.001"], runs) == 0
-    assert "do not suffice" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -42,7 +38,6 @@ def test_one_scene_does_not_speak_of_others(runs: Path, capsys: pytest.CaptureFi
         (["exp", "--metric", "psn"], "unknown metric"),
         (["exp", "--metric", "gaussians"], "not counts"),
         (["exp", "--difference", "0"], "above 0"),
-        (["exp", "--hours", "nan"], "above 0"),
         (["alone"], "one arm"),
         (["nothing"], "no experiment"),
     ],

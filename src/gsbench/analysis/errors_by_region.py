@@ -1,13 +1,13 @@
-"""Errors of two arms' renders, binned by a property of the ground truth or of the scene: the places where an arm helps.
+"""Errors of two arms' renders, binned by the texture of the ground truth: the places where an arm helps.
 
-Every pixel gets a property, such as the texture energy of the ground truth; pixels are sorted into equally filled
-bins of it, and the mean error of each arm is taken in each bin, view and trial. Differences are then tested as those of
+Pixels are sorted into equally filled bins of the ground truth's texture energy, and the mean error of each arm is taken
+in each bin, view and trial. Differences are then tested as those of
 any metric are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from gsbench.analysis.results import TrialResult, by_key
 from gsbench.analysis.statistics import Answer, answer_family
 from gsbench.errors import InputError
 from gsbench.records import Number, Part, read_if_sound
-from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, MAPS, MASKS, RENDERS
+from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, MASKS, RENDERS
 from gsbench.scene.masks import read_mask
 
 BINS = 5
@@ -29,23 +29,16 @@ TEXTURED_SHARE = 0.2  # of a photograph's pixels, those with the most texture
 SAMPLES = 200_000  # pixels of a scene from which the bins' edges are taken
 
 Array = NDArray[np.float64]
-# Properties that need more than the ground truth, with the array of ``maps/<view>.npz`` that holds them.
-MAP_PROPERTIES = {
-    "depth": "depth, world units",
-    "distance": "distance to the nearest initial point, world units",
-    "volume": "volume of the Gaussians seen there, cubed scene units",
-}
 
 
 @dataclass(frozen=True)
 class RegionErrors:
-    """Mean absolute errors (8-bit levels) of two arms in bins of a property, from its lowest values to its highest.
+    """Mean absolute errors (8-bit levels) of two arms in bins of texture, from the lowest to the highest.
 
     ``edges`` are the inner edges of each scene's bins; ``changes`` are second arm minus first, one for each bin,
     adjusted for their number.
     """
 
-    property: str
     first: tuple[float, ...]
     second: tuple[float, ...]
     changes: tuple[Answer, ...]
@@ -103,26 +96,20 @@ def textured_error(trial: TrialResult) -> float:
     return float(np.mean(errors))
 
 
-def errors_by_region(
-    pairs: Sequence[tuple[TrialResult, TrialResult]], property_name: str = "texture", bins: int = BINS
-) -> RegionErrors:
-    """Compare two arms, by their ``pairs`` of trials, in bins of ``texture`` or of a map (``MAP_PROPERTIES``).
+def errors_by_region(pairs: Sequence[tuple[TrialResult, TrialResult]], bins: int = BINS) -> RegionErrors:
+    """Compare two arms, by their ``pairs`` of trials, in bins of the photographs' texture.
 
-    The maps are those of the first arm's trials, so that both arms are sorted alike. Raises ``InputError``, saying what
-    is missing, where renders or maps are absent.
+    Raises ``InputError``, saying what is missing, where renders are absent.
     """
     if not pairs:
         raise InputError("no trials of the two arms share a scene, a seed and their conditions")
-    read_property = _property_reader(property_name)
     scenes: list[str] = []
     errors: list[Array] = []
     edges: dict[str, tuple[float, ...]] = {}
     for scene, group in by_key([one for one, _ in pairs], lambda trial: trial.scene).items():
         own = [(one, other) for one, other in pairs if one in group]
-        scene_edges = _edges(group[0], read_property, bins)
-        errors.append(
-            np.array([list(_pair_means(*pair, read_property, scene_edges)) for pair in own])
-        )  # [K, V, 2, bins]
+        scene_edges = _edges(group[0], bins)
+        errors.append(np.array([list(_pair_means(*pair, scene_edges)) for pair in own]))  # [K, V, 2, bins]
         scenes.append(scene)
         edges[scene] = tuple(float(edge) for edge in scene_edges)
     means, differing = [], []
@@ -130,12 +117,12 @@ def errors_by_region(
         inside = [array[:, np.isfinite(array[:, :, 0, index]).all(axis=0), :, index] for array in errors]  # [K, V', 2]
         kept = [(scene, array) for scene, array in zip(scenes, inside, strict=True) if array.size]
         if not kept:
-            raise InputError(f"{property_name}: bin {index + 1} of {bins} is empty in every scene; ask for fewer bins")
+            raise InputError(f"texture: bin {index + 1} of {bins} is empty in every scene; ask for fewer bins")
         means.append(np.mean([array.mean(axis=(0, 1)) for _, array in kept], axis=0))  # [2]
         seeds = min(len(array) for _, array in kept)
         differing.append(np.array([(array[:seeds, :, 1] - array[:seeds, :, 0]).mean(axis=1) for _, array in kept]))
     first_means, second_means = (tuple(float(mean[place]) for mean in means) for place in (0, 1))
-    return RegionErrors(property_name, first_means, second_means, tuple(answer_family(differing)), edges)
+    return RegionErrors(first_means, second_means, tuple(answer_family(differing)), edges)
 
 
 def view_names(trial: TrialResult) -> list[str]:
@@ -156,54 +143,30 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         raise InputError(f"{path} cannot be read as an image ({error})") from None
 
 
-Reader = Callable[[TrialResult, str, NDArray[np.uint8]], Array]
+def _texture(trial: TrialResult, view: str, truth: NDArray[np.uint8]) -> Array:
+    """The texture energy [H, W] of a photograph; pixels that a mask ignores are not a number, and in no bin."""
+    ignored = read_ignored(trial, view)
+    return texture_energy(truth) if ignored is None else np.where(ignored, np.nan, texture_energy(truth))
 
 
-def _property_reader(name: str) -> Reader:
-    def read(trial: TrialResult, view: str, truth: NDArray[np.uint8]) -> Array:
-        values = texture_energy(truth) if name == "texture" else _read_map(trial, view, name, truth.shape[:2])
-        ignored = read_ignored(trial, view)
-        return values if ignored is None else np.where(ignored, np.nan, values)  # in no bin
-
-    if name == "texture" or name in MAP_PROPERTIES:
-        return read
-    raise InputError(f"unknown property {name!r}; choose texture, {', '.join(MAP_PROPERTIES)}")
-
-
-def _read_map(trial: TrialResult, view: str, name: str, shape: tuple[int, int]) -> Array:
-    path = trial.path / MAPS / f"{view}.npz"
-    if not path.is_file():
-        raise InputError("the trials kept no maps; eval.maps=true keeps them")
-    try:
-        with np.load(path) as maps:
-            values = np.asarray(maps[name], dtype=np.float64)
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path} has no map {name!r} ({type(error).__name__})") from None
-    if values.shape != shape:
-        raise InputError(f"{path}: the map {name!r} is {values.shape}, its view {shape}")
-    return values
-
-
-def _edges(trial: TrialResult, read_property: Reader, bins: int) -> Array:
+def _edges(trial: TrialResult, bins: int) -> Array:
     """The inner edges [bins - 1] that cut the finite values over a scene's test views into equal parts."""
     names = view_names(trial)
     samples = []
     for name in names:
-        values = read_property(trial, name, read_image(trial.path / GROUND_TRUTH / f"{name}.png")).ravel()
+        values = _texture(trial, name, read_image(trial.path / GROUND_TRUTH / f"{name}.png")).ravel()
         values = values[np.isfinite(values)]
         samples.append(values[:: max(1, len(values) * len(names) // SAMPLES)])
     return np.quantile(np.concatenate(samples), np.linspace(0, 1, bins + 1)[1:-1])
 
 
-def _pair_means(
-    one: TrialResult, other: TrialResult, read_property: Reader, edges: Array
-) -> Iterator[tuple[Array, Array]]:
+def _pair_means(one: TrialResult, other: TrialResult, edges: Array) -> Iterator[tuple[Array, Array]]:
     """For each view: the mean error of both trials in every bin, [bins] each; a bin without pixels is not a number."""
     if view_names(one) != view_names(other):
         raise InputError(f"{one.label} and {other.label} have different renders")
     for name in view_names(one):
         truth = read_image(one.path / GROUND_TRUTH / f"{name}.png")
-        values = read_property(one, name, truth)
+        values = _texture(one, name, truth)
         index = np.where(np.isfinite(values), np.searchsorted(edges, values), len(edges) + 1).ravel()
         counts = np.bincount(index, minlength=len(edges) + 2)[:-1]
         means = []

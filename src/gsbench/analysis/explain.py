@@ -61,18 +61,14 @@ def _find(experiment: Experiment, scene: str, arm: str) -> list[TrialResult]:
 
 
 def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:
-    """Say what each trial came from; what all of them share is said once, at the end."""
-    origins = [_origin(trial) for trial in trials]
-    labels = list(dict.fromkeys(label for origin in origins for label in origin))
-    shared = [label for label in labels if len({origin.get(label) for origin in origins}) == 1]
+    """Say what each trial came from; what all of them share is said with the first."""
     lines = ["", "Trials"]
-    for trial, origin in zip(trials, origins, strict=True):
-        value = shown.read(trial)
-        own = {label: text for label, text in origin.items() if label not in shared or len(trials) == 1}
+    said: dict[str, str] = {}
+    for trial in trials:
+        value, origin = shown.read(trial), _origin(trial)
         lines.append(f"  seed {trial.seed}: {'n/a' if value is None else f'{value:.6g}'}")
-        lines += [f"    {label:<9} {text}" for label, text in own.items()]
-    if shared and len(trials) > 1:
-        lines += ["", "The same in all of them", *(f"  {label:<9} {origins[0][label]}" for label in shared)]
+        lines += [f"    {label:<9} {text}" for label, text in origin.items() if said.get(label) != text]
+        said = said | origin
     return lines
 
 

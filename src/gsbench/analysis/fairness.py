@@ -102,11 +102,6 @@ def _rounds(trial: TrialResult) -> float | None:
     return float(len(trial.folder.events())) or None
 
 
-def _last_round(trial: TrialResult) -> float | None:
-    steps = [row["step"] for row in trial.folder.events()]
-    return float(max(steps)) if steps else None
-
-
 def _recorded(read: Callable[[TrialRecord], float | None]) -> Reader:
     """Reads a number of ``results.json``."""
     return lambda trial: read(trial.record)
@@ -145,7 +140,6 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "initial cloud (hash)": _each(lambda trial: trial.cloud[:12]),
     "iterations": _span(_recorded(lambda record: record.iterations)),
     "rounds of the densifier": _span(_rounds),
-    "last round (iteration)": _span(_last_round),
     "budget": _each(budget_words),
     "Gaussians in the end": _span(_recorded(lambda record: record.num_gaussians)),
     "seconds of training": _span(_recorded(lambda record: record.seconds.get("train"))),

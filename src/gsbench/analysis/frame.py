@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from gsbench.analysis.cells import swept_settings
@@ -37,28 +37,16 @@ def to_frame(trials: Experiment | Sequence[TrialResult]) -> pd.DataFrame:
     import pandas as pd  # here, since it is slow to import
 
     chosen = list(trials.trials if isinstance(trials, Experiment) else trials)
-    swept = swept_settings(chosen)
-    metrics = metric_keys(chosen)
-    return pd.DataFrame([_row(trial, swept, metrics) for trial in chosen]).convert_dtypes(
-        convert_string=False, convert_floating=False
-    )
-
-
-def _row(trial: TrialResult, swept: Sequence[str], metrics: Sequence[str]) -> dict[str, Any]:
-    record = trial.record
-    size = record.resolution or (None, None)
-    groups: dict[str, Mapping[str, float | str]] = {
-        "seconds": record.seconds,
-        "event": record.events,
-        "hash": record.hashes,
-    }
-    return (
-        {name: getattr(record, name) for name in NAMES}
-        | {key: trial.config.get(key) for key in swept}
-        | {name: getattr(record, name) for name in CONDITIONS}
-        | {"width": size[0], "height": size[1]}
-        | {key: trial.metrics.get(key) for key in metrics}
-        | {name: getattr(record, name) for name in COUNTS}
-        | {f"{prefix}_{key}": value for prefix, group in groups.items() for key, value in group.items()}
-        | {"folder": str(trial.path)}
-    )
+    swept, metrics = swept_settings(chosen), metric_keys(chosen)
+    rows = []
+    for trial in chosen:
+        record = trial.record
+        row: dict[str, Any] = {name: getattr(record, name) for name in NAMES}
+        row |= {key: trial.config.get(key) for key in swept}
+        row |= {name: getattr(record, name) for name in CONDITIONS}
+        row |= dict(zip(("width", "height"), record.resolution or (None, None), strict=True))
+        row |= {key: trial.metrics.get(key) for key in metrics} | {name: getattr(record, name) for name in COUNTS}
+        for prefix, group in (("seconds", record.seconds), ("event", record.events), ("hash", record.hashes)):
+            row |= {f"{prefix}_{key}": value for key, value in group.items()}
+        rows.append(row | {"folder": str(trial.path)})
+    return pd.DataFrame(rows).convert_dtypes(convert_string=False, convert_floating=False)

@@ -16,29 +16,24 @@ from gsbench.runs.layout import TUNING
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 from gsbench.words import counted
 
-_BY_PROGRAM = (
-    ("Trained here by another program, its model rendered by gsbench", FROM_MODEL),
-    ("Trained here by another program, its own renders measured as they are", FROM_RENDERS),
+ORIGINS = (  # who trained (here or elsewhere), what was measured, and how that is said
+    (True, FROM_MODEL, "Trained here by another program, its model rendered by gsbench"),
+    (True, FROM_RENDERS, "Trained here by another program, its own renders measured as they are"),
+    (False, FROM_MODEL, "A model that another program trained, rendered here"),
+    (False, FROM_RENDERS, "Renders of another program, measured as they are"),
 )
 
 
 def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
     """Lines that say which arms gsbench did not train, and what of them it saw."""
     notes = []
-    for what, origin in _BY_PROGRAM:
-        own = [trial for trial in trials if trial.program and trial.record.evaluated_from == origin]
-        if own:
-            versions = {(f"{trial.init}-{trial.densify}", trial.trainer_version) for trial in own}
-            arms = ", ".join(f"{arm} (version {version})" for arm, version in sorted(versions))
-            notes.append(f"{what} (its time is that of the whole program, its budget its own): {arms}.")
-    for what, origin in (
-        ("A model that another program trained, rendered here", FROM_MODEL),
-        ("Renders of another program, measured as they are", FROM_RENDERS),
-    ):
-        own = [trial for trial in trials if trial.made_elsewhere and trial.record.evaluated_from == origin]
-        if own:
-            arms = ", ".join(sorted({f"{trial.init}-{trial.densify}" for trial in own}))
-            notes.append(f"{what} (its conditions are not known): {arms}.")
+    others = [trial for trial in trials if trial.program or trial.made_elsewhere]
+    for here, measured, what in ORIGINS:
+        own = [t for t in others if bool(t.program) == here and t.record.evaluated_from == measured]
+        versions = sorted({(f"{trial.init}-{trial.densify}", trial.trainer_version) for trial in own})
+        arms = ", ".join(f"{arm} (version {version})" if here else arm for arm, version in versions)
+        limits = "its time is that of the whole program, its budget its own" if here else "its conditions are not known"
+        notes += [f"{what} ({limits}): {arms}."] if own else []
     return notes
 
 

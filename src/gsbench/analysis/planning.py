@@ -1,4 +1,4 @@
-"""Planning from pilot trials: the scenes and seeds that resolve a difference, and what the hours at hand can resolve.
+"""Planning from pilot trials: the scenes and seeds that resolve a difference.
 
 A paired difference of scene s and seed k is ``mean + scene effect + noise``: the effect differs between scenes by a
 deviation, and trainings of one scene differ by another. From pilot trials both are estimated by the analysis of
@@ -23,8 +23,6 @@ from gsbench.errors import InputError
 POWER = 0.8
 MAX_SCENES, MAX_SEEDS = 30, 40  # the largest designs that are looked at
 DRAWS = 2000  # of a design's variances: they give its power to about 0.005
-PRECISION = 1e-6  # of a smallest difference, relative
-HOUR = 3600.0
 
 
 @dataclass(frozen=True)
@@ -133,30 +131,3 @@ def sizes_needed(difference: float, found: Components, like_these: bool) -> list
                 chosen.append(one)
                 break
     return chosen
-
-
-def smallest_difference(size: Size, found: Components, like_these: bool) -> float:
-    """The smallest difference that the design sees with a power of `POWER`, found by halving."""
-    low, high = 0.0, max(found.within, found.between or 0.0)
-    if high == 0:
-        return 0.0
-    while power(size, high, found, like_these) < POWER:
-        low, high = high, 2 * high
-    while high - low > PRECISION * high:
-        middle = (low + high) / 2
-        low, high = (low, middle) if power(size, middle, found, like_these) >= POWER else (middle, high)
-    return high
-
-
-def within_hours(hours: float, seconds_per_trial: float, scenes: int) -> Size | None:
-    """The design of at most ``scenes`` scenes that fits into ``hours`` of one trial at a time; None if none does.
-
-    Two seeds come before a further scene, since one seed says nothing of how trainings differ.
-    """
-    if not hours > 0 or not seconds_per_trial > 0:
-        raise InputError(f"hours and seconds of a trial must be above 0, got {hours} and {seconds_per_trial}")
-    pairs = int(hours * HOUR / (2 * seconds_per_trial))
-    if pairs < 2:
-        return None
-    scenes = min(scenes, pairs // 2)
-    return Size(scenes, min(MAX_SEEDS, pairs // scenes))

@@ -6,6 +6,7 @@ import html
 import itertools
 import re
 from collections.abc import Callable
+from importlib.resources import files
 
 from gsbench.analysis.tables import Column, Entry, Table
 
@@ -37,41 +38,29 @@ def to_csv(table: Table) -> str:
 
 def to_latex(table: Table) -> str:
     """A ``table`` environment in booktabs style; the document needs ``\\usepackage{booktabs}``."""
-    width = len(table.row_headings)
+    import pandas as pd  # here, since it is slow to import
+
     columns = "r" * len(table.columns)
     if table.wrapped:
         share = f"{WRAPPED_SHARE / len(table.columns):.2f}"
         columns = f">{{\\raggedright\\arraybackslash}}p{{{share}\\linewidth}}" * len(table.columns)
-    spec = "l" * width + columns
-    lines = [
-        f"% needs \\usepackage{{booktabs{',array' if table.wrapped else ''}}}",
-        "\\begin{table}",
-        "\\centering",
-        f"\\caption{{{escape_latex(table.title)}}}",
-        f"\\begin{{tabular}}{{{spec}}}",
-        "\\toprule",
-    ]
-    groups = _column_groups(table)
-    if any(name for name, _ in groups):
-        cells, rules, start = [""] * width, [], width + 1
-        for name, size in groups:
-            cells.append(f"\\multicolumn{{{size}}}{{c}}{{{escape_latex(name)}}}")
-            rules.append(f"\\cmidrule(lr){{{start}-{start + size - 1}}}")
-            start += size
-        lines += [" & ".join(cells) + " \\\\", " ".join(rules)]
-    heads = [*table.row_headings, *(column.heading for column in table.columns)]
-    lines += [" & ".join(map(escape_latex, heads)) + " \\\\", "\\midrule"]
-    for row in table.rows:
-        if row.rule_above:
-            lines.append("\\midrule")
-        cells = [f"\\textbf{{{escape_latex(e.text)}}}" if e.bold else escape_latex(e.text) for e in row.entries]
-        lines.append(" & ".join([*map(escape_latex, row.labels), *cells]) + " \\\\")
-    lines += ["\\bottomrule", "\\end{tabular}"]
+    heads = [("", name) for name in table.row_headings] + [(one.group, one.heading) for one in table.columns]
+    heads = [(escape_latex(group), escape_latex(name)) for group, name in heads]
+    grouped = any(group for group, _ in heads)
+    rows = [[*map(escape_latex, row.labels), *(_latex_text(entry) for entry in row.entries)] for row in table.rows]
+    frame = pd.DataFrame(rows, columns=pd.MultiIndex.from_tuples(heads) if grouped else [name for _, name in heads])
+    text = frame.to_latex(
+        index=False,
+        escape=False,
+        multicolumn_format="c",
+        column_format="l" * len(table.row_headings) + columns,
+        caption=escape_latex(table.title),
+    ).replace("\\begin{table}\n", "\\begin{table}\n\\centering\n")
     if table.notes:
         notes = "\\\\\n".join(escape_latex(note) for note in table.notes)
-        lines.append(f"\\par\\smallskip\\begin{{minipage}}{{\\linewidth}}\\footnotesize\n{notes}\n\\end{{minipage}}")
-    lines.append("\\end{table}")
-    return "\n".join(lines) + "\n"
+        below = f"\\par\\smallskip\\begin{{minipage}}{{\\linewidth}}\\footnotesize\n{notes}\n\\end{{minipage}}\n"
+        text = text.replace("\\end{table}", f"{below}\\end{{table}}")
+    return f"% needs \\usepackage{{booktabs{',array' if table.wrapped else ''}}}\n{text}"
 
 
 def to_html(table: Table) -> str:
@@ -100,11 +89,12 @@ def to_html(table: Table) -> str:
 
 
 def to_html_page(table: Table) -> str:
-    """The table as a page of its own."""
+    """The table as a page of its own, in the style of reports."""
+    style = files("gsbench.analysis.report").joinpath("style.css").read_text(encoding="utf-8")
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(table.title)}</title>\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<style>{PAGE_STYLE}</style></head>\n<body>\n{to_html(table)}</body></html>\n"
+        f"<style>{style}</style></head>\n<body><main>\n{to_html(table)}</main></body></html>\n"
     )
 
 
@@ -114,17 +104,6 @@ FORMATS: dict[str, tuple[str, Callable[[Table], str]]] = {  # name -> file suffi
     "latex": ("tex", to_latex),
     "html": ("html", to_html_page),
 }
-
-PAGE_STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; margin: 1rem; color: #1c1e21; background: #fff }
-figure.table { margin: 0; overflow-x: auto }
-table { border-collapse: collapse } caption { text-align: left; font-weight: 600; padding-bottom: .5rem }
-th, td { padding: .3rem .7rem; text-align: right; white-space: nowrap }
-th[scope=row], th.name { text-align: left } th[scope=row] { font-weight: normal }
-thead tr:last-child th { border-bottom: 1px solid #888 } tr.rule > * { border-top: 1px solid #888 }
-.wrapped td, .wrapped thead th { white-space: normal; text-align: left; min-width: 8rem; overflow-wrap: anywhere }
-th[scope=colgroup] { text-align: center } figcaption { font-size: .85rem; color: #555 }
-"""
 
 WRAPPED_SHARE = 0.7  # of a line of LaTeX, for the columns of a table whose cells wrap
 
@@ -161,6 +140,11 @@ def _markdown_row(cells: list[str]) -> str:
 
 def _pipe(text: str) -> str:
     return text.replace("|", "\\|")
+
+
+def _latex_text(entry: Entry) -> str:
+    text = escape_latex(entry.text)
+    return f"\\textbf{{{text}}}" if entry.bold else text
 
 
 def _html_text(entry: Entry) -> str:

@@ -6,9 +6,8 @@ A table is plain data; ``gsbench.analysis.table_formats`` writes it as Markdown,
 from __future__ import annotations
 
 import itertools
-import statistics
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from gsbench.analysis.cells import (
@@ -19,7 +18,6 @@ from gsbench.analysis.cells import (
     field_value,
     make_cell,
     swept_settings,
-    with_variants,
 )
 from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.notes import (
@@ -32,13 +30,11 @@ from gsbench.analysis.notes import (
     origin_notes,
     points_notes,
 )
-from gsbench.analysis.pairing import BASELINE, choose_pairs
-from gsbench.analysis.quantities import COSTS, Quantity, choose_quantities
+from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Experiment, TrialResult, by_key
-from gsbench.words import counted, signed
+from gsbench.words import counted
 
 DEFAULT_ROWS = ("scene", "init", "densify")
-COSTS_COMPARED = ("gaussians", "train_time")
 SIDE_BY_SIDE = ("scene.split", "scene.sector")
 
 
@@ -144,7 +140,6 @@ def build_table(
         declared_notes(experiment)
         + equal_notes(experiment)
         + caveat_notes(experiment)
-        + _cost_notes(trials)
         + held_out_notes(trials)
         + points_notes(trials)
         + machine_notes(trials)
@@ -267,58 +262,6 @@ def _reading_notes(
         }
         notes += [f"{quantity.name}: n/a, {reason}." for reason in sorted(reasons)]
     return notes
-
-
-def _cost_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """For every arm against the baseline's, the change of the costs by both averaging rules, over common scenes.
-
-    Settings that were swept make arms of their own, and arms under unlike conditions have no change to tell of.
-    """
-    arms = by_key(with_variants(trials), lambda trial: trial.arm)
-    notes = []
-    for first, second in choose_pairs(sorted(arms)):
-        baseline, name = first.densify, second.densify
-        one, other = (str(replace(arm, init="", densify="")).strip() for arm in (first, second))
-        together = by_key([*arms[first], *arms[second]], lambda trial: trial.scene).values()
-        if baseline != BASELINE or name == BASELINE or any(map(differing_conditions, together)):
-            continue
-        shared = f", {other}" if other and one == other else ""
-        names = (name, baseline) if one == other else (str(replace(second, init="")), str(replace(first, init="")))
-        for key in COSTS_COMPARED:
-            what, read = COSTS[key]
-            change = cost_change(arms[first], arms[second], read)
-            if change is not None:
-                names_said = f"{what[0].upper()}{what[1:]}, {' against '.join(names)} (init {second.init}{shared})"
-                notes.append(f"{names_said}: {change_words(*change)}.")
-    return notes
-
-
-def cost_change(
-    baseline: Sequence[TrialResult], other: Sequence[TrialResult], read: Callable[[TrialResult], float | None]
-) -> tuple[float, float, int] | None:
-    """Relative change of a cost over the scenes that both have: (ratio of totals, mean of ratios, scenes)."""
-    means = []
-    for group in (baseline, other):
-        values: dict[str, list[float]] = {}
-        for trial in group:
-            value = read(trial)
-            if value:
-                values.setdefault(trial.scene, []).append(value)
-        means.append({scene: statistics.fmean(found) for scene, found in values.items()})
-    scenes = sorted(means[0].keys() & means[1].keys())
-    if not scenes:
-        return None
-    totals = [sum(group[scene] for scene in scenes) for group in means]
-    ratios = [means[1][scene] / means[0][scene] for scene in scenes]
-    return totals[1] / totals[0] - 1, statistics.fmean(ratios) - 1, len(scenes)
-
-
-def change_words(of_totals: float, of_scenes: float, scenes: int) -> str:
-    """A relative change with its averaging rules named; over one scene there is nothing to average."""
-    totals, ratios = (signed(value, ".1%") for value in (of_totals, of_scenes))
-    if scenes == 1:
-        return totals
-    return f"{totals} as a ratio of totals, {ratios} as the mean of {scenes} scenes"
 
 
 def _left_out(experiment: Experiment) -> list[str]:

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -35,7 +35,6 @@ from gsbench.analysis.quantities import askable_names, asked_quantity
 from gsbench.analysis.statistics import ALPHA, FIRST_LOOK, plan_looks
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
-from gsbench.eval.facts import find
 from gsbench.parsing import read_yaml, resolved
 from gsbench.runs.declaration import Arm, Question
 from gsbench.settings import checked
@@ -175,7 +174,9 @@ def parse_claims(content: object) -> ClaimsFile:
     file = ClaimsFile(**(values | {"scenes": scenes, "arms": arms, "claims": claims}))
     for claim in claims:
         _check_claim(claim, file)
-    _check_together(claims, file)
+    ids = [claim.id for claim in claims]
+    if twice := [name for name in ids if ids.count(name) > 1]:
+        raise InputError(f"two claims have the id {twice[0]}: give each its own")
     return file
 
 
@@ -278,31 +279,6 @@ def _check_metric(claim: Claim, file: ClaimsFile) -> None:
         raise InputError(f"{where}: least of {claim.metric} must be a part, such as 10%, got {effect}")
     if claim.metric in ("ssim", "flip") and not effect.relative and effect.size >= 1:
         raise InputError(f"{where}: least {effect} is more than {claim.metric} can differ by")
-
-
-def _check_together(claims: Sequence[Claim], file: ClaimsFile) -> None:
-    """Raise InputError for ids that stand twice, and for two claims that contradict or repeat each other."""
-    for place, one in enumerate(claims):
-        for other in claims[place + 1 :]:
-            if one.id == other.id:
-                raise InputError(f"two claims have the id {one.id}: give each its own")
-            shared = [scene for scene in file.scenes_of(one) if scene in file.scenes_of(other)]
-            alike = (one.metric, one.budget, one.split) == (other.metric, other.budget, other.split)
-            if not shared or not alike or {one.arm, one.baseline} != {other.arm, other.baseline}:
-                continue
-            turned = other.sign if one.arm == other.arm else -other.sign
-            arms = f"{one.arm} against {one.baseline} in {one.metric} on {', '.join(shared)}"
-            if turned != one.sign:
-                raise InputError(f"claims {one.id} and {other.id} contradict each other about {arms}: take one out")
-            raise InputError(f"claims {one.id} and {other.id} ask the same about {arms}: take one out")
-
-
-def direction_is_odd(claim: Claim) -> str:
-    """A remark where a claim praises what the metric counts as worse; "" elsewhere."""
-    facts = find(claim.metric)
-    if facts is None or facts.direction == 0 or claim.sign in (0, facts.direction):
-        return ""
-    return f"{claim.id} claims {claim.direction} {facts.name}, which is worse"
 
 
 def _text(value: object) -> str:

@@ -13,7 +13,6 @@ from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.notes import caveats, cloud_notes, machine_notes
 from gsbench.analysis.report.charts import ForestRow, forest_plot
-from gsbench.analysis.report.pictures import Crop, choose_pictures
 from gsbench.analysis.results import TrialResult, by_key
 from gsbench.analysis.statistics import Outcome, plan_looks
 from gsbench.analysis.table_formats import to_html as table_to_html
@@ -26,7 +25,6 @@ from gsbench.runs.layout import SEED
 from gsbench.words import counted
 
 LARGE = 1000.0  # numbers from here on are counts or seconds, and shown whole
-CROPS = 2  # pictures each for and against an arm
 OUTCOMES: dict[Outcome, str] = {word: word for word in get_args(Outcome)}
 SYMBOLS = {"supported": "✔", "refuted": "✘", "too small to matter": "≈", "undecided": "?", NOT_TESTABLE: "–"}
 
@@ -75,13 +73,9 @@ def make_page(
             "these stands beside it, with an error rate of its own.",
         )
     judged = list({trial.path: trial for one in verdicts for trial in one.verdict.pairs.trials}.values())
-    lines += [*_size_line(file, judged), *_origin_lines(judged)]
+    lines += [f"The paper: {file.size}."] if file.size else []
+    lines += [*machine_notes(judged), *cloud_notes(judged)]
     return Page(f"{file.name}: claims and verdicts", tuple(lines), tuple(map(_section, verdicts)))
-
-
-def _origin_lines(trials: Sequence[TrialResult]) -> list[str]:
-    """Lines on what may differ between pairs of trials: machines, and the clouds of one scene."""
-    return [*machine_notes(trials), *cloud_notes(trials)]
 
 
 def to_text(page: Page) -> str:
@@ -99,8 +93,7 @@ def to_html(page: Page) -> str:
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(_resource("gsbench.claims", "page.html.j2"))
     shown = [
-        (section, tuple(map(table_to_html, section.fairness)), _chart(section.verdict), *_crops(section.verdict))
-        for section in page.sections
+        (section, tuple(map(table_to_html, section.fairness)), _chart(section.verdict)) for section in page.sections
     ]
     style = _resource("gsbench.analysis.report", "style.css")
     return template.render(page=page, sections=shown, symbols=SYMBOLS, style=style)
@@ -120,8 +113,6 @@ def _section(one: ClaimVerdict) -> Section:
             _judged_on(one),
             _like_these(one),
         ]
-    if verdict.final and one.word == "undecided" and not verdict.quantity.cost:
-        evidence.append(f"how many seeds and scenes would decide, where the trials are: {_plan_words(one)}")
     evidence += [outlying_words(verdict), _late_words(one), *one.missing, *verdict.notes]
     fairness, mixed = _fairness(one)
     if mixed:
@@ -163,13 +154,6 @@ def _late_words(one: ClaimVerdict) -> str:
     )
 
 
-def _plan_words(one: ClaimVerdict) -> str:
-    """``gsbench plan NAME --metric psnr --difference 0.1``"""
-    least, trials = one.claim.effect.size, one.verdict.pairs.trials
-    difference = least * abs(one.verdict.pairs.baseline) if one.claim.effect.relative else least
-    return f"gsbench plan {trials[0].record.experiment} --metric {one.claim.metric} --difference {difference:.3g}"
-
-
 def _fairness(one: ClaimVerdict) -> tuple[tuple[Table, ...], str]:
     """The fairness sheets of a claim's arms, and what else than the idea may have made a difference (`caveats`)."""
     trials = with_variants(one.verdict.pairs.trials)
@@ -187,21 +171,6 @@ def _declared_line(declared: Declaration, every: Sequence[Declaration]) -> str:
     return line
 
 
-def _size_line(file: ClaimsFile, trials: Sequence[TrialResult]) -> list[str]:
-    """Sentence on what was smaller than in the paper, where the file says how large that was."""
-    if not file.size or not trials:
-        return []
-    scenes = sorted({trial.scene for trial in trials})
-    steps = sorted({trial.record.iterations for trial in trials})
-    sizes = sorted({f"{size[0]}×{size[1]}" for trial in trials if (size := trial.record.resolution)})
-    seeds = len({trial.seed for trial in trials})
-    here = (
-        f"{counted(len(scenes), 'scene')} ({', '.join(scenes)}), up to {seeds} seeds, "
-        f"{' or '.join(f'{step:,}' for step in steps)} iterations, {', '.join(sizes)} px"
-    )
-    return [f"Here: {here}. The paper: {file.size}."]
-
-
 def _chart(one: ClaimVerdict) -> str:
     verdict, answer = one.verdict, one.verdict.answer
     if answer is None or answer.interval is None:
@@ -211,15 +180,6 @@ def _chart(one: ClaimVerdict) -> str:
     unit = "log ratio" if one.claim.effect.relative else "difference"
     title = f"{one.claim.arm} against {one.claim.baseline}"
     return forest_plot(title, rows, f"{verdict.quantity.name}, {unit}", one.claim.sign)
-
-
-def _crops(one: ClaimVerdict) -> tuple[list[Crop], list[Crop]]:
-    """Places where the arm is closer to the photographs, and where the baseline is."""
-    pairs = _pairs(one.verdict.pairs.trials)
-    if not pairs or one.verdict.quantity.cost:
-        return [], []
-    found = choose_pictures(pairs, CROPS)
-    return list(found.gained), list(found.lost)
 
 
 def _pairs(trials: Sequence[TrialResult]) -> list[tuple[TrialResult, TrialResult]]:

@@ -19,7 +19,7 @@ from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.pairing import choose_pairs
 from gsbench.analysis.results import Arm, TrialResult, by_key, read_experiment
 from gsbench.analysis.statistics import FIRST_LOOK, plan_looks
-from gsbench.analysis.verdicts import WORDS
+from gsbench.analysis.verdicts import in_words
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find
@@ -133,20 +133,14 @@ def plan_sweep(trials: Sequence[T]) -> Stopping[T]:
 
 
 def headline(verdict: Verdict) -> str:
-    """A pair's verdict in a sentence: ``better in LPIPS Squeeze: −0.0120 (97.5 % interval …), after 2 seeds``."""
-    question, answer = verdict.question, verdict.answer
+    """A pair's verdict in a sentence: ``better in PSNR on this scene: +0.120 (…), with 2 of at most 6 seeds``"""
+    question = verdict.question
     against = f"{question.arm} against {question.baseline}"
-    if answer is None or answer.interval is None:
+    if verdict.interval is None:
         return f"{against}: no verdict yet, {verdict.untestable or 'trials are missing'}"
-    most, seeds = len(question.seeds), verdict.pairs.seeds
-    word = WORDS[verdict.outcome]
-    if verdict.outcome == "undecided":
-        word = f"undecided after all {seeds} seeds" if verdict.final else "not decided yet"
-    return (
-        f"{against}: {word} in {verdict.quantity.name}, {verdict.shown(answer.mean)} ({100 * (1 - answer.level):.3g} % "
-        f"interval over all looks {verdict.shown_interval(answer.interval)}) with {seeds} of at most {most} seeds"
-        + "".join(f"; {note}" for note in verdict.notes)
-    )
+    waits = "" if verdict.final else "not decided yet, "
+    seeds = f"with {verdict.pairs.seeds} of at most {len(question.seeds)} seeds"
+    return "; ".join([f"{against}: {waits}{in_words(verdict)}, {seeds}", *verdict.notes])
 
 
 def _expected(trial: Trial) -> TrialResult:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gsbench.claims.check import Check, prepare, recheck
-from gsbench.claims.file import ClaimsFile, direction_is_odd, read_claims
+from gsbench.claims.file import ClaimsFile, read_claims
 from gsbench.claims.stopping import Planned, run_looks
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
@@ -106,7 +106,6 @@ def describe(check: Check) -> list[str]:
         scenes, looks = ", ".join(asked[claim.id].scenes), ", ".join(map(str, declaration.looks))
         lines.append(f"to be tested       {claim.id}: {what}; on {scenes}; looks at {looks} seeds")
         lines += [f"                   without {reason}" for reason in missing]
-        lines += [f"                   {remark}" for remark in [direction_is_odd(claim)] if remark]
     if not asked:
         return lines
     first, most = check.trials(declaration.looks[0]), check.trials(declaration.looks[-1])

@@ -4,27 +4,19 @@ from __future__ import annotations
 
 import argparse
 import math
-import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.pairing import BASELINE, choose_pairs, pair
-from gsbench.analysis.planning import (
-    Components,
-    Size,
-    components,
-    sizes_needed,
-    smallest_difference,
-    within_hours,
-)
+from gsbench.analysis.planning import Components, components, sizes_needed
 from gsbench.analysis.quantities import Quantity, quantity
-from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import MIN_SCENES
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Question
 from gsbench.verbs.arguments import ArgumentParser
-from gsbench.words import counted, readable_time
+from gsbench.words import counted
 
 MOST_SHOWN = 5  # designs
 
@@ -38,7 +30,6 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("experiment")
     parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_squeeze")
     parser.add_argument("--difference", type=_above_zero, help="to be resolved; default: what papers count as one")
-    parser.add_argument("--hours", type=_above_zero, help="at hand, one trial at a time")
     parser.add_argument("--baseline", default=BASELINE, help=f"the densifier to compare with ({BASELINE})")
     options = parser.parse_args(argv)
     trials = with_variants(load_experiment(runs, options.experiment).trials)
@@ -58,8 +49,6 @@ def main(argv: Sequence[str], runs: Path) -> int:
             raise InputError(f"no trials of {one} and {other} can be paired in {shown.name}: {paired.left_out[0]}")
         found = components([row.after - row.before for row in paired.rows])
         print("\n".join([f"{other} against {one}", *_lines(found, shown, difference)]))
-        if options.hours is not None:
-            print("\n".join(_hours_lines(found, shown, options.hours, own)))
     return 0
 
 
@@ -79,21 +68,6 @@ def _lines(found: Components, shown: Quantity, difference: float) -> list[str]:
         texts = [f"{size.scenes} × {size.seeds} ({size.trials} trials)" for size in sizes[:MOST_SHOWN]]
         lines.append(f"  {difference:g} of {of_whom}, scenes × seeds: {', '.join(texts) or 'beyond reach'}")
     return lines
-
-
-def _hours_lines(found: Components, shown: Quantity, hours: float, trials: Sequence[TrialResult]) -> list[str]:
-    timed = [sum(trial.record.seconds.values()) for trial in trials if not trial.made_elsewhere]
-    if not timed:
-        return ["  hours: no trial tells how long one takes"]
-    seconds = statistics.fmean(timed)
-    size: Size | None = within_hours(hours, seconds, found.scenes)
-    if size is None:
-        return [f"  {hours:g} h do not suffice for two seeds of both arms, at {readable_time(seconds)} a trial"]
-    least = smallest_difference(size, found, like_these=False)
-    return [
-        f"  {hours:g} h, at {readable_time(seconds)} a trial: {size.scenes} × {size.seeds}, which resolve "
-        f"{least:.{shown.decimals + 1}f} of these scenes"
-    ]
 
 
 def _above_zero(text: str) -> float:

@@ -16,7 +16,7 @@ VERBS = {
     "check": ("gsbench.verbs.check", "test the claims of a paper, written in a file: supported, refuted or undecided"),
     "gate": ("gsbench.verbs.gate", "for continuous integration: is this version worse than an archive of another?"),
     "bisect": ("gsbench.verbs.bisect", "which commit of a trainer made its results worse?"),
-    "plan": ("gsbench.verbs.plan", "how many scenes and seeds resolve a difference, and what the hours at hand do"),
+    "plan": ("gsbench.verbs.plan", "how many scenes and seeds resolve a difference"),
     "ablate": ("gsbench.verbs.ablate", "which part of a densifier carries its gain: its switches in all combinations"),
     "pool": (
         "gsbench.verbs.pool",

@@ -27,15 +27,6 @@ class Series:
 
 
 @dataclass(frozen=True)
-class Bar:
-    """An interval at ``x``, drawn upright."""
-
-    x: float
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
 class ForestRow:
     """A difference with its interval; ``low`` and ``high`` are None where no interval is known."""
 
@@ -53,16 +44,8 @@ def line_chart(
     log_x: bool = False,
     log_y: bool = False,
     marker: tuple[float, str] | None = None,
-    x_names: Sequence[str] = (),
-    dots: bool = False,
-    bars: Sequence[Bar] = (),
-    x_ticks: Sequence[float] = (),
 ) -> str:
-    """Lines over common axes; ``marker`` is a labelled vertical line. What a log axis cannot show is dropped.
-
-    With ``x_names``, x is the place in that list: values side by side at equal distances; ``x_ticks`` are marked in
-    place of round values. With ``dots``, points are marked however many there are. ``bars`` belong to the first line.
-    """
+    """Lines over common axes; ``marker`` is a labelled vertical line. What a log axis cannot show is dropped."""
     shown = [
         Series(s.name, [p for p in s.points if (p[0] > 0 or not log_x) and (p[1] > 0 or not log_y)]) for s in series
     ]
@@ -70,8 +53,8 @@ def line_chart(
     if not shown:
         return ""
     xs = [x for s in shown for x, _ in s.points] + ([marker[0]] if marker else [])
-    ys = [y for s in shown for _, y in s.points] + [end for bar in bars for end in (bar.low, bar.high)]
-    x_axis = _Axis(xs, log_x, LEFT, WIDTH - RIGHT, names=x_names, at=x_ticks)
+    ys = [y for s in shown for _, y in s.points]
+    x_axis = _Axis(xs, log_x, LEFT, WIDTH - RIGHT)
     y_axis = _Axis(ys, log_y, HEIGHT - BOTTOM, TOP)
     parts = [_frame(x_axis, y_axis, x_label, y_label)]
     if marker:
@@ -84,17 +67,12 @@ def line_chart(
         parts.append(
             f'<polyline fill="none" stroke="{color}" stroke-width="2" stroke-dasharray="{dash}" points="{path}"/>'
         )
-        if len(one.points) <= TICKS or x_names or dots:
+        if len(one.points) <= TICKS:
             parts += [
                 f'<circle cx="{x_axis.place(x):.1f}" cy="{y_axis.place(y):.1f}" r="3.5" fill="{color}"/>'
                 for x, y in one.points
             ]
-    parts += [
-        f'<line stroke="{COLORS[0]}" stroke-width="1.5" x1="{x_axis.place(bar.x):.1f}" x2="{x_axis.place(bar.x):.1f}" '
-        f'y1="{y_axis.place(bar.low):.1f}" y2="{y_axis.place(bar.high):.1f}"/>'
-        for bar in bars
-    ]
-    ends = "; ".join(f"{s.name} {_ends(s.points, x_axis)}" for s in shown)
+    ends = "; ".join(f"{s.name} {_ends(s.points)}" for s in shown)
     return _figure(title, f"{y_label} against {x_label}: {ends}.", parts, HEIGHT, [s.name for s in shown])
 
 
@@ -173,19 +151,10 @@ ROUND = (1, 2, 2.5, 5, 10)  # steps between ticks, of a power of ten
 
 
 class _Axis:
-    """Maps values to pixels, with ticks ``at`` some, else at round ones; with ``names``, one for each at 0, 1, 2, …"""
+    """Maps values to pixels, with ticks at round values."""
 
-    def __init__(
-        self,
-        values: Sequence[float],
-        log: bool,
-        start: float,
-        end: float,
-        ticks: int = TICKS,
-        names: Sequence[str] = (),
-        at: Sequence[float] = (),
-    ) -> None:
-        self._log, self._start, self._end, self.names = log, start, end, names
+    def __init__(self, values: Sequence[float], log: bool, start: float, end: float, ticks: int = TICKS) -> None:
+        self._log, self._start, self._end = log, start, end
         scaled = [self._scale(value) for value in values]
         low, high = min(scaled), max(scaled)
         if high - low < 1e-12:
@@ -194,17 +163,10 @@ class _Axis:
         margin = 0.04 * (high - low)
         zero_based = not log and min(values) == 0.0
         self._low, self._high = (low if zero_based else low - margin), high + margin
-        if names:
-            self.ticks = [float(place) for place in range(len(names))]
-        elif at:
-            self.ticks = list(at)
-        else:
-            self.ticks = self._log_ticks() if log else _round_ticks(self._low, self._high, ticks)
+        self.ticks = self._log_ticks() if log else _round_ticks(self._low, self._high, ticks)
 
     def label(self, tick: float) -> str:
-        """The tick's name, or its value with as many digits as tell it from its neighbours."""
-        if self.names:
-            return self.names[int(tick)]
+        """The tick's value with as many digits as tell it from its neighbours."""
         step = min((b - a for a, b in itertools.pairwise(self.ticks)), default=0.0)
         if self._log or step == 0 or abs(tick) >= THOUSANDS:
             return short_number(tick)
@@ -282,10 +244,8 @@ def _text(x: float, y: float, text: str, anchor: str) -> str:
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{_escape(text)}</text>'
 
 
-def _ends(points: Sequence[tuple[float, float]], x_axis: _Axis) -> str:
-    """The first and the last point in words; on an axis of names, every point."""
-    if x_axis.names:
-        return ", ".join(f"{short_number(y)} at {x_axis.label(x)}" for x, y in points)
+def _ends(points: Sequence[tuple[float, float]]) -> str:
+    """The first and the last point in words."""
     (x0, y0), (x1, y1) = points[0], points[-1]
     return f"from {short_number(y0)} at {short_number(x0)} to {short_number(y1)} at {short_number(x1)}"
 

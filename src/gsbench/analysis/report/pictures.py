@@ -1,4 +1,4 @@
-"""Renders of two arms beside the photograph: whole views, and the places where they differ most."""
+"""Renders of two arms beside the photograph: the views with the least, the median and the largest gain."""
 
 from __future__ import annotations
 
@@ -16,29 +16,11 @@ from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
 from gsbench.runs.layout import GROUND_TRUTH, RENDERS
 
-CROP = 128  # px a side, but at most a third of the image
 STRIPE, STRIPES = 4, (110, 150)  # px, grey levels: how ignored pixels are shown
-SHOWN = 288  # px: crops are enlarged to it without smoothing, so that pixels stay pixels
 WIDEST = 1200  # px: whole views are shown at most as wide
 FULL_COLOUR = 32.0  # 8-bit levels: differences of error from here on have the strongest colour
 
 Pair = tuple[TrialResult, TrialResult]
-
-
-@dataclass(frozen=True)
-class Crop:
-    """One place: data URIs of both renders and the truth, and the mean errors in it (8-bit levels)."""
-
-    scene: str
-    view: str
-    seed: int
-    box: tuple[int, int, int, int]  # left, top, right, bottom, px
-    first: str
-    second: str
-    truth: str
-    first_error: float
-    second_error: float
-    striped: bool = False  # some of its pixels, which a mask ignores
 
 
 @dataclass(frozen=True)
@@ -60,23 +42,11 @@ class WholeView:
     second_error: float
 
 
-@dataclass(frozen=True)
-class Pictures:
-    """Pictures of two arms: whole views, the places of the largest gains and losses, and what could not be read."""
+def choose_views(pairs: Sequence[Pair]) -> tuple[list[WholeView], list[str]]:
+    """Choose the worst, the median and the best view of all, by gain; the second list says what could not be read.
 
-    views: tuple[WholeView, ...]
-    gained: tuple[Crop, ...]
-    lost: tuple[Crop, ...]
-    faults: tuple[str, ...]
-
-
-def choose_pictures(pairs: Sequence[Pair], count: int) -> Pictures:
-    """Choose the worst, the median and the best view of all, and up to ``count`` places of gains and losses each.
-
-    A view's gain is the mean error of the first arm minus that of the second. One seed of each scene is looked at, and
-    at most one place in a view is taken for each list.
+    A view's gain is the mean error of the first arm minus that of the second. One seed of each scene is looked at.
     """
-    places: list[tuple[float, Pair, str, tuple[int, int, int, int]]] = []
     views: list[tuple[float, Pair, str]] = []
     faults: dict[str, str] = {}  # by scene
     seen: set[str] = set()
@@ -84,23 +54,14 @@ def choose_pictures(pairs: Sequence[Pair], count: int) -> Pictures:
         if one.scene in seen:
             continue
         try:
-            names = view_names(one)
-            for view in names:
-                images, _ = _read(one, other, view)
-                gain = absolute_error(images[0], images[2]) - absolute_error(images[1], images[2])  # [H, W]
-                places += [(most, (one, other), view, box) for most, box in _extremes(gain)]
-                views.append((float(gain.mean()), (one, other), view))
+            for view in view_names(one):
+                first, second, truth = _read(one, other, view)
+                gain = absolute_error(first, truth).mean() - absolute_error(second, truth).mean()
+                views.append((float(gain), (one, other), view))
             seen.add(one.scene)
         except InputError as error:
             faults.setdefault(one.scene, str(error))
-    best = sorted((place for place in places if place[0] > 0), key=lambda place: -place[0])[:count]
-    worst = sorted((place for place in places if place[0] < 0), key=lambda place: place[0])[:count]
-    return Pictures(
-        tuple(_whole(which, *place) for which, place in _worst_median_best(views)),
-        tuple(_cut(*place[1:]) for place in best),
-        tuple(_cut(*place[1:]) for place in worst),
-        tuple(faults.values()),
-    )
+    return [_whole(which, *place) for which, place in _worst_median_best(views)], list(faults.values())
 
 
 def _worst_median_best(views: Sequence[tuple[float, Pair, str]]) -> list[tuple[str, tuple[Pair, str]]]:
@@ -115,7 +76,7 @@ def _worst_median_best(views: Sequence[tuple[float, Pair, str]]) -> list[tuple[s
 
 
 def _whole(which: str, pair: Pair, view: str) -> WholeView:
-    (first, second, truth), _ = _read(*pair, view)
+    first, second, truth = _read(*pair, view)
     errors = [absolute_error(image, truth) for image in (first, second)]  # [H, W] each
     part = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)[..., None]  # [H, W, 1], 1 where the second is nearer
     white, blue, red = (np.array(colour) for colour in ((255, 255, 255), (33, 102, 172), (178, 24, 43)))
@@ -150,8 +111,8 @@ def data_uri(image: NDArray[np.uint8]) -> str:
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _read(one: TrialResult, other: TrialResult, view: str) -> tuple[list[NDArray[np.uint8]], NDArray[np.bool_] | None]:
-    """Both renders and the photograph, ignored pixels striped, and which these are (None: all count)."""
+def _read(one: TrialResult, other: TrialResult, view: str) -> list[NDArray[np.uint8]]:
+    """Both renders and the photograph, ignored pixels striped."""
     first = read_image(one.path / RENDERS / f"{view}.png")
     second = read_image(other.path / RENDERS / f"{view}.png")
     truth = read_image(one.path / GROUND_TRUTH / f"{view}.png")
@@ -159,7 +120,7 @@ def _read(one: TrialResult, other: TrialResult, view: str) -> tuple[list[NDArray
         raise InputError(f"{one.label} and {other.label}: {view} has different sizes")
     ignored = read_ignored(one, view)
     images = [first, second, truth]
-    return (images if ignored is None else [_hatched(image, ignored) for image in images]), ignored
+    return images if ignored is None else [_hatched(image, ignored) for image in images]
 
 
 def _hatched(image: NDArray[np.uint8], ignored: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -167,32 +128,3 @@ def _hatched(image: NDArray[np.uint8], ignored: NDArray[np.bool_]) -> NDArray[np
     rows, columns = np.indices(ignored.shape)
     stripes = np.where((rows + columns) % (2 * STRIPE) < STRIPE, *STRIPES).astype(np.uint8)  # [H, W]
     return np.where(ignored[..., None], stripes[..., None], image)
-
-
-def _extremes(gain: NDArray[np.float64]) -> list[tuple[float, tuple[int, int, int, int]]]:
-    """The boxes of largest and smallest mean in the ``gain`` [H, W] of a view."""
-    from skimage.transform import integral_image  # here, since it is slow to import
-
-    height = width = max(1, min(CROP, min(gain.shape) // 3))
-    sums = np.pad(integral_image(gain), ((1, 0), (1, 0)))  # [H + 1, W + 1]
-    boxes = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
-    found = []
-    for place in (int(boxes.argmax()), int(boxes.argmin())):
-        top, left = divmod(place, boxes.shape[1])
-        found.append((float(boxes[top, left]) / (height * width), (left, top, left + width, top + height)))
-    return found
-
-
-def _cut(pair: Pair, view: str, box: tuple[int, int, int, int]) -> Crop:
-    left, top, right, bottom = box
-    whole, ignored = _read(*pair, view)
-    images = [image[top:bottom, left:right] for image in whole]
-    errors = [float(absolute_error(image, images[2]).mean()) for image in images[:2]]
-    uris = [data_uri(_enlarge(image)) for image in images]
-    striped = ignored is not None and bool(ignored[top:bottom, left:right].any())
-    return Crop(pair[0].scene, view, pair[0].seed, box, uris[0], uris[1], uris[2], errors[0], errors[1], striped)
-
-
-def _enlarge(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    factor = max(1, SHOWN // max(image.shape[:2]))
-    return image.repeat(factor, axis=0).repeat(factor, axis=1)

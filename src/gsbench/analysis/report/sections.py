@@ -4,34 +4,34 @@ from __future__ import annotations
 
 import logging
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from gsbench.analysis.differences import short_version
-from gsbench.analysis.errors_by_region import MAP_PROPERTIES, RegionErrors, errors_by_region
+from gsbench.analysis.errors_by_region import RegionErrors, errors_by_region
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.notes import caveats
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS
 from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
-from gsbench.analysis.report.pictures import Pictures, choose_pictures
+from gsbench.analysis.report.pictures import WholeView, choose_views
 from gsbench.analysis.report.volumes import share_above, volume_histogram
 from gsbench.analysis.results import Arm, TrialResult, by_key
-from gsbench.analysis.tables import COSTS_COMPARED, Table, change_words, cost_change
+from gsbench.analysis.tables import Table
 from gsbench.analysis.verdicts import PairVerdicts
 from gsbench.errors import InputError
 from gsbench.eval.facts import find
-from gsbench.events import Cause, RefineEvent
+from gsbench.events import RefineEvent
 from gsbench.parsing import DamagedError
 from gsbench.runs import layout
 from gsbench.runs.tuning_record import read_tuning
-from gsbench.words import counted
+from gsbench.words import counted, signed
 
 log = logging.getLogger(__name__)
 
-CROPS = 4  # places of each kind
+COSTS_COMPARED = ("gaussians", "train_time")
 EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)
 CURVES = (  # key of metrics.jsonl, title, y axis
     ("num_gaussians", "Gaussians during training", "Gaussians"),
@@ -49,8 +49,9 @@ class Versus:
     fairness: Table
     costs: tuple[str, ...]
     forests: tuple[str, ...]
-    regions: tuple[tuple[RegionErrors, str], ...]
-    pictures: Pictures
+    errors: RegionErrors | None
+    region_chart: str
+    views: tuple[WholeView, ...]
     notes: tuple[str, ...]
 
     @property
@@ -64,29 +65,28 @@ class Versus:
 
 
 def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> Versus:
-    """Costs, forest plots, regions and crops of two arms; what cannot be had is said in the notes."""
+    """Costs, forest plots, errors by texture and whole views of two arms; what cannot be had is said in the notes."""
     first, second = judged.first, judged.second
     own = [trial for trial in trials if trial.arm in (first, second)]
     pairs = pair_trials(own, first, second)
-    pictures = choose_pictures(pairs, CROPS)
-    regions = []
-    without: dict[str, list[str]] = {}  # properties by the reason for which they are not shown
-    for name in ("texture", *MAP_PROPERTIES):
-        try:
-            found = errors_by_region(pairs, name)
-            regions.append((found, _region_chart(found, first, second)))
-        except InputError as error:
-            without.setdefault(str(error), []).append(name)
-    faults = [f"Errors by {', '.join(names)}: not shown, {reason}" for reason, names in without.items()]
+    views, faults = choose_views(pairs)
+    notes, region = [*judged.notes, *faults], ""
+    try:
+        found = errors_by_region(pairs)
+        region = _region_chart(found, first, second)
+    except InputError as error:
+        found = None
+        notes.append(f"Errors by texture: not shown, {error}")
     return Versus(
         judged,
         caveats(trials, first, second),
         fairness_table(trials, first, second),
         tuple(_costs(own, first, second)),
         tuple(_forest(verdict) for verdict in judged.verdicts),
-        tuple(regions),
-        pictures,
-        tuple(dict.fromkeys([*judged.notes, *faults, *pictures.faults])),
+        found,
+        region,
+        tuple(views),
+        tuple(dict.fromkeys(notes)),
     )
 
 
@@ -114,15 +114,11 @@ def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str
         return []
     labels = [cause.replace("_", " ") for cause in causes]
     bars = [(name, [counts[cause] for cause in causes]) for name, counts in totals]
-    charts = [bar_chart("Refinement by cause, mean of a trial", labels, bars, "Gaussians"), _origin_chart(trials, arms)]
-    strictness = []  # how a governor moved the thresholds; no chart where none did
+    charts = [bar_chart("Refinement by cause, mean of a trial", labels, bars, "Gaussians")]
     for arm, own in _by_arm(trials, arms).items():
-        means = _mean_curves(own, layout.EVENTS, [*causes, "strictness"])
+        means = _mean_curves(own, layout.EVENTS, causes)
         series = [Series(label, means[cause]) for cause, label in zip(causes, labels, strict=True)]
         charts.append(line_chart(f"Refinement over time: {arm}", series, "iteration", "Gaussians"))
-        strictness.append(Series(str(arm), means["strictness"]))
-    title = "Thresholds of growth under the governor, as multiples of their settings"
-    charts.append(line_chart(title, strictness, "iteration", "factor", log_y=True))
     return [chart for chart in charts if chart]
 
 
@@ -139,23 +135,6 @@ def _mean_curves(trials: Sequence[TrialResult], name: str, keys: Sequence[str]) 
         for key, curves in found.items():
             curves.append([(float(row["step"]), float(row[key])) for row in rows if key in row])
     return {key: mean_by_step(curves) for key, curves in found.items()}
-
-
-def _origin_chart(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> str:
-    """Chart of the causes of the Gaussians that are left at the end, as the mean of a trial."""
-    origins = {arm: [trial.record.causes for trial in trials if trial.arm == arm] for arm in arms}
-    causes = list(dict.fromkeys(cause for logged in origins.values() for counts in logged for cause in counts))
-    means = {
-        arm: [statistics.fmean(float(counts.get(cause, 0)) for counts in logged) for cause in causes]
-        for arm, logged in origins.items()
-    }
-    shown = [index for index in range(len(causes)) if any(row[index] for row in means.values())]
-    if not shown:
-        return ""
-    bars = [(str(arm), [row[index] for index in shown]) for arm, row in means.items()]
-    words = {cause.key: cause.words for cause in Cause}
-    labels = [words.get(causes[index], causes[index]) for index in shown]
-    return bar_chart("What made the final Gaussians, mean of a trial", labels, bars, "Gaussians")
 
 
 def volume_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> tuple[list[str], list[str]]:
@@ -223,6 +202,34 @@ def _costs(trials: Sequence[TrialResult], first: Arm, second: Arm) -> list[str]:
     return lines
 
 
+def cost_change(
+    baseline: Sequence[TrialResult], other: Sequence[TrialResult], read: Callable[[TrialResult], float | None]
+) -> tuple[float, float, int] | None:
+    """Relative change of a cost over the scenes that both have: (ratio of totals, mean of ratios, scenes)."""
+    means = []
+    for group in (baseline, other):
+        values: dict[str, list[float]] = {}
+        for trial in group:
+            value = read(trial)
+            if value:
+                values.setdefault(trial.scene, []).append(value)
+        means.append({scene: statistics.fmean(found) for scene, found in values.items()})
+    scenes = sorted(means[0].keys() & means[1].keys())
+    if not scenes:
+        return None
+    totals = [sum(group[scene] for scene in scenes) for group in means]
+    ratios = [means[1][scene] / means[0][scene] for scene in scenes]
+    return totals[1] / totals[0] - 1, statistics.fmean(ratios) - 1, len(scenes)
+
+
+def change_words(of_totals: float, of_scenes: float, scenes: int) -> str:
+    """A relative change with its averaging rules named; over one scene there is nothing to average."""
+    totals, ratios = (signed(value, ".1%") for value in (of_totals, of_scenes))
+    if scenes == 1:
+        return totals
+    return f"{totals} as a ratio of totals, {ratios} as the mean of {scenes} scenes"
+
+
 def _unsteady_times(arms: Sequence[Sequence[TrialResult]]) -> str:
     """Say how far the training times of equal trials differ, without which a change of them says little."""
     cells = by_key([trial for arm in arms for trial in arm], lambda trial: (trial.arm, trial.scene)).values()
@@ -247,8 +254,7 @@ def _forest(verdict: Verdict) -> str:
 def _region_chart(errors: RegionErrors, first: Arm, second: Arm) -> str:
     labels = ["lowest", *[""] * (len(errors.first) - 2), "highest"]
     series = [(str(first), errors.first), (str(second), errors.second)]
-    what = MAP_PROPERTIES.get(errors.property, "texture energy of the ground truth")
-    return bar_chart(f"Error by {what}", labels, series, "error (8-bit levels)")
+    return bar_chart("Error by texture energy of the ground truth", labels, series, "error (8-bit levels)")
 
 
 def _is_number(value: object) -> bool:
