@@ -59,7 +59,6 @@ def test_settings_schedules_and_what_was_measured_stand_side_by_side(tmp_path: P
     assert rows["initial cloud (hash)"][1:] == ("abcdef", UNLIKE)
     assert rows["Gaussians in the end"] == ("20,000 to 20,020, mean 20,010", "31,000", UNLIKE)
     assert rows["rounds of the densifier"] == ("15", "23", UNLIKE)
-    assert rows["last round (iteration)"] == ("2,000", "2,300", UNLIKE)
     assert rows["seconds of training"][1] == "80"
     assert rows["code"] == ("gsbench 0.1.0", "gsbench 0.2.0", UNLIKE)
     assert rows["budget"] == ("50,000 Gaussians (soft)", "50,000 Gaussians (soft)", "")
