@@ -275,6 +275,9 @@ def test_html_is_well_formed_and_escaped(make_experiment: Make) -> None:
     assert parser.open == []
     assert len(set(parser.rows)) == 1
     assert "&lt;b&gt;" in to_html(build_table(experiment, title="<b>"))
+    page = to_html(build_table(experiment, rows=["scene", "init"], columns=["densify"]))
+    heads = page[page.index("<thead>") : page.index("</thead>")]
+    assert all(f">{name}</th>" in heads for name in ("adc", "volumetric"))
 
 
 def test_latex_escapes_what_is_special() -> None:

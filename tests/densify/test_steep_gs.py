@@ -86,6 +86,16 @@ def test_steep_gs_round(seed: int, step: int) -> None:
     assert densifier.statistics["splitting_sum"].shape == (len(trainable), 3, 3)
 
 
+def test_the_eigenvalue_is_one_of_the_mean_matrix_in_units_of_the_squared_extent() -> None:
+    densifier = SteepGS()
+    prepared(densifier, 0)
+    densifier.statistics["visible_count"][:] = 2
+    densifier.statistics["splitting_sum"][:] = torch.diag(torch.tensor([4e-8, -6e-8, 2e-8]))
+    values, directions = densifier.steepest(torch.tensor([0, 1]))
+    assert values.tolist() == pytest.approx([-3e-8 * EXTENT**2] * 2)
+    assert directions.tolist() == [[0.0, 1.0, 0.0]] * 2
+
+
 def test_each_ingredient_can_be_taken_out() -> None:
     densifier = SteepGS(eigenvalue_threshold=None, opacity_factor=1.0)
     trainable, _ = prepared(densifier, 1)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from gsbench.errors import InputError
+from gsbench.pipeline.steps.scene import masked_step
 from gsbench.scene.load import load_scene
 from gsbench.scene.masks import fill, find_masks, prepare, prepared_mask, read_mask, resize_mask
 from gsbench.scene.options import SceneConfig
@@ -49,6 +50,14 @@ def test_masks_are_found_by_the_names_of_colmap(make_scene: MakeScene, read) -> 
     root = capture.images.parent
     assert capture.masks == {name: root / "masks" / f"{name}.png" for name in names}
     assert capture.image_names == names
+
+
+def test_pixels_are_prepared_anew_for_another_colour_behind_them(make_scene: MakeScene) -> None:
+    capture = read_photos("toy", with_masks(make_scene()), masks="masks")
+    steps = {behind: masked_step(capture, behind) for behind in ("black", "white")}
+    assert all(steps.values())
+    assert steps["black"].key != steps["white"].key
+    assert steps["white"].inputs["behind"] == "white"
 
 
 def test_a_mask_of_another_name_is_none(tmp_path: Path) -> None:
