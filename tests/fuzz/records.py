@@ -116,12 +116,10 @@ def write_original(runs: Path) -> dict[str, Path]:
     (failed / "building.json").write_text(json.dumps({"stage": "train", "folder": str(done)}))
     (failed / ".submitted.json").write_text(json.dumps({"job": "5", "log": "l", "user": "u"}))
     (variant / "mlflow.json").write_text(
-        json.dumps(
-            {"uri": "u", "token": "t", "started": 1, "run_id": "r", "logged": {"metrics.jsonl": 5}, "complete": "c"}
-        )
+        json.dumps({"uri": "u", "token": "t", "started": 1, "logged": {"metrics.jsonl": 5}, "complete": "c"})
     )
     (done / ".lock.holder").write_text(json.dumps({"host": "h", "pid": 1, "since": 1.0, "slurm": None, "what": "w"}))
-    entry = {"overrides": ["seed=0"], "cwd": str(runs), "time": 1.0, "sweep": {"id": "s", "count": 2}}
+    entry = {"overrides": ["seed=0"], "cwd": str(runs), "time": 1.0}
     places = {path.relative_to(home).as_posix(): entry for path in (done, failed)}
     (home / "plan.json").write_text(json.dumps({"version": 1, "trials": places}))
     declared = [

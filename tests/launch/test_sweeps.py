@@ -435,7 +435,7 @@ def fake_trial(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
     behaviour: dict[int, Exception] = {}
     order: list[int] = []
 
-    def run_one(trial: Any, wait: bool) -> Outcome:
+    def run_one(trial: Any, mirror: Any, wait: bool) -> Outcome:
         seed = trial.values["seed"]
         error = behaviour.get(seed)
         if isinstance(error, BusyError) and not wait:

@@ -5,10 +5,15 @@ from __future__ import annotations
 import json
 import os
 import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.system.locks import hold
+from gsbench.tracking import Mirror
+from gsbench.tracking.run import TrackerRun
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = 150
@@ -29,6 +34,26 @@ def begin_trial(values: dict[str, Any], uri: str | None = None, patience: float 
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.yaml").write_text(json.dumps(values | {"tracking": options(uri, patience) | more}))
     return folder
+
+
+@contextmanager
+def following(settings: dict[str, Any], folder: Path) -> Iterator[None]:
+    """Mirror the trial in ``folder``, which runs while the block does."""
+    with Mirror() as mirror, hold(folder / ".lock", "a trial"):
+        mirror.follow(folder, settings)
+        yield
+
+
+def mirror_trial(settings: dict[str, Any], folder: Path, values: dict[str, Any], anew: bool = False) -> bool:
+    """Mirror what is missing of an ended trial; False if nothing was missing. Raises what the tracker raises."""
+    run = TrackerRun(settings, TrialFolder(folder), values, anew=anew)
+    try:
+        if run.is_complete:
+            return False
+        run.end()
+        return True
+    finally:
+        run.close()
 
 
 def write_trial(folder: Path, values: dict[str, Any], records: int = RECORDS, psnr: float = 20.0) -> None:

@@ -9,10 +9,10 @@ import pytest
 
 from gsbench.cli import run
 from gsbench.errors import InputError
-from gsbench.tracking import connect, mirror_trial
+from gsbench.tracking import connect
 from gsbench.tracking.client import VARIABLE, untyped_address
 from gsbench.tracking.mlflow_sink import STATE
-from tests.tracking.helpers import begin_trial, found_runs, free_port, options, trial_values, write_trial
+from tests.tracking.helpers import begin_trial, found_runs, free_port, mirror_trial, options, trial_values, write_trial
 
 
 def test_an_address_counts_where_it_is_typed_or_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

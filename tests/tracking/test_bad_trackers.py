@@ -18,7 +18,7 @@ import psutil
 import pytest
 
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking import connect, ensure_experiment, mirror_trial
+from gsbench.tracking import connect, ensure_experiment
 from gsbench.tracking.client import SETTINGS
 from tests.end_to_end.conftest import SMALL
 from tests.processes import heed_interrupts
@@ -29,6 +29,7 @@ from tests.tracking.helpers import (
     found_runs,
     free_port,
     history,
+    mirror_trial,
     options,
     trial_values,
     write_trial,
@@ -43,12 +44,11 @@ TINY = [*SMALL, "train.iterations=20", "scene.views=8", "init.count=500", "eval.
 MIRROR = """
 import sys
 from pathlib import Path
-from gsbench.tracking import Mirror
-from tests.tracking.helpers import begin_trial, options, trial_values, write_trial
+from tests.tracking.helpers import begin_trial, following, options, trial_values, write_trial
 runs, uri, seed, patience = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), float(sys.argv[4])
 values = trial_values(runs, seed)
 folder = begin_trial(values, uri, patience)
-with Mirror(options(uri, patience), folder):
+with following(options(uri, patience), folder):
     write_trial(folder, values)
 """
 

@@ -10,21 +10,20 @@ from typing import Any
 import pytest
 
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking import connect, mirror_trial
-from tests.tracking.helpers import RECORDS, child_environment, found_runs, history, options, trial_values
+from gsbench.tracking import connect
+from tests.tracking.helpers import RECORDS, child_environment, found_runs, history, mirror_trial, options, trial_values
 
 pytestmark = pytest.mark.slow
 
 JOBS = 8
 CHILD = """
 import json, sys
-from tests.tracking.helpers import begin_trial, options, trial_values, write_trial
-from gsbench.tracking import Mirror
+from tests.tracking.helpers import begin_trial, following, options, trial_values, write_trial
 from pathlib import Path
 runs, uri, seed = Path(sys.argv[1]), sys.argv[2] or None, int(sys.argv[3])
 values = trial_values(runs, seed)
 folder = begin_trial(values, uri)
-with Mirror(options(uri), folder):
+with following(options(uri), folder):
     write_trial(folder, values)
 """
 

@@ -14,17 +14,19 @@ import psutil
 import pytest
 
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking import Mirror, connect, ensure_experiment, mirror_trial
-from gsbench.tracking.mirror import SECONDS_IN_VAIN
+from gsbench.system.locks import hold
+from gsbench.tracking import Mirror, connect, ensure_experiment
 from gsbench.tracking.mlflow_sink import STATE
 from tests.processes import bytes_written
 from tests.tracking.helpers import (
     RECORDS,
     begin_trial,
     child_environment,
+    following,
     found_runs,
     free_port,
     history,
+    mirror_trial,
     options,
     trial_values,
     write_trial,
@@ -42,17 +44,11 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(autouse=True)
-def _fresh_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is remembered of the trackers of other tests."""
-    monkeypatch.setattr(Mirror, "in_vain", False)
-
-
 @pytest.mark.slow
 def test_all_that_the_files_say_is_mirrored_once(runs: Path) -> None:
     values = trial_values(runs, seed=1)
     folder = begin_trial(values)
-    with Mirror(options(), folder):
+    with following(options(), folder):
         write_trial(folder, values)
     assert not mirror_trial(options(), folder, values)
     client = connect(None, runs)
@@ -60,10 +56,6 @@ def test_all_that_the_files_say_is_mirrored_once(runs: Path) -> None:
     assert run.info.status == "FINISHED"
     assert run.data.metrics["psnr"] == 20.0
     assert run.data.metrics["total/cloned"] == 150
-    assert {key: run.data.metrics[key] for key in run.data.metrics if key.startswith("init/")} == {
-        "init/num_points": 5.0,
-        "init/scene_extent": 4.5,
-    }
     assert run.data.params["densify.name"] == "a_densify"
     assert history(client, run.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
     assert history(client, run.info.run_id, "events/cloned") == [(50, 50.0), (100, 100.0)]
@@ -99,7 +91,7 @@ def test_results_that_changed_replace_the_run(runs: Path) -> None:
 def wait_for_run(folder: Path) -> None:
     """Wait until the trial's run is there and noted."""
     deadline = time.monotonic() + SECONDS
-    while "run_id" not in (json.loads((folder / STATE).read_text()) if (folder / STATE).exists() else {}):
+    while "logged" not in (json.loads((folder / STATE).read_text()) if (folder / STATE).exists() else {}):
         assert time.monotonic() < deadline
         time.sleep(0.1)
 
@@ -110,7 +102,7 @@ def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs: Path) ->
     folder = begin_trial(values)
     client = connect(None, runs)
     for error, status in ((KeyboardInterrupt(), "KILLED"), (RuntimeError("x"), "FAILED")):
-        with pytest.raises(type(error)), Mirror(options(), folder):  # noqa: PT012
+        with pytest.raises(type(error)), following(options(), folder):  # noqa: PT012
             wait_for_run(folder)
             if status == "FAILED":  # as a trial does before anyone beside it is told
                 (folder / "failed.json").write_text(json.dumps({"message": "x"}))
@@ -118,7 +110,7 @@ def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs: Path) ->
         (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "4"]
         assert run.info.status == status
     (folder / "failed.json").unlink()
-    with Mirror(options(), folder):
+    with following(options(), folder):
         write_trial(folder, values)
     (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "4"]
     assert run.info.status == "FINISHED"
@@ -129,14 +121,15 @@ def test_curves_of_a_training_in_progress_are_followed(runs: Path, tmp_path: Pat
     folder = begin_trial(values)
     client = connect(None, runs)
     seen = 0
-    with Mirror(options(), folder):
+    with following(options(), folder):
         (folder / "building.json").write_text(json.dumps({"stage": "train", "folder": str(tmp_path)}))
         (tmp_path / "metrics.jsonl").write_text('{"step": 10, "loss": 0.5}\n{"step": 20, "lo')
         wait_for_run(folder)
         deadline = time.monotonic() + SECONDS
         while not seen and time.monotonic() < deadline:
             time.sleep(0.1)
-            seen = len(history(client, json.loads((folder / STATE).read_text())["run_id"], "train/loss"))
+            (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "5"]
+            seen = len(history(client, run.info.run_id, "train/loss"))
     assert seen == 1
 
 
@@ -152,7 +145,7 @@ def test_a_broken_tracker_harms_no_trial(uri: str, tmp_path: Path, caplog: pytes
     }[uri]
     values = trial_values(tmp_path)
     folder = begin_trial(values, address)
-    with Mirror(options(address), folder):
+    with following(options(address), folder):
         write_trial(folder, values)
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert any(text.startswith("tracking: ") and "gsbench sync" in text for text in warnings)
@@ -166,7 +159,7 @@ def test_a_slow_tracker_is_not_waited_for(tmp_path: Path, caplog: pytest.LogCapt
     with Listener() as tracker:
         slow = options(f"http://127.0.0.1:{tracker.port}", patience=0.2)
         folder = begin_trial(values, slow["uri"], patience=0.2)
-        with Mirror(slow, folder):
+        with following(slow, folder):
             write_trial(folder, values)
             mine = threading.active_count() - threads - tracker.threads
     assert [record.getMessage().split(";")[0] for record in caplog.records] == ["tracking: MLflow is slow"]
@@ -174,33 +167,20 @@ def test_a_slow_tracker_is_not_waited_for(tmp_path: Path, caplog: pytest.LogCapt
     assert set(psutil.Process().children()) <= set(others)
 
 
-def test_patience_is_short_after_it_was_in_vain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    waited: list[float | None] = []
-
-    class Fake:
-        is_slow = True
-
-        def __init__(self, *words: str) -> None:
-            pass
-
-        def finish(self, seconds: float | None) -> None:
-            waited.append(seconds)
-            if self.is_slow:
-                raise TimeoutError
-
-    monkeypatch.setattr("gsbench.tracking.mirror.MirrorProcess", Fake)
-
-    def trial(patience: float) -> None:
-        with Mirror(options(patience=patience), tmp_path):
-            pass
-
-    trial(30)
-    trial(30)
-    trial(1)
-    Fake.is_slow = False
-    trial(30)
-    trial(30)
-    assert waited == [30, SECONDS_IN_VAIN, 1, SECONDS_IN_VAIN, 30]
+def test_one_process_mirrors_all_trials_of_a_sweep(runs: Path) -> None:
+    """MLflow is loaded once, and nobody waits for it between trials."""
+    others = set(psutil.Process().children())
+    with Mirror() as mirror:
+        for seed in (9, 10, 11):
+            values = trial_values(runs, seed)
+            folder = begin_trial(values)
+            mirror.follow(folder, options())
+            if seed < 11:  # the last never runs
+                with hold(folder / ".lock", "a trial"):
+                    write_trial(folder, values)
+            assert len(set(psutil.Process().children()) - others) == 1
+    shown = {run.data.tags["seed"]: run.info.status for run in found_runs(connect(None, runs), "tracked")}
+    assert (shown["9"], shown["10"], shown["11"]) == ("FINISHED", "FINISHED", "KILLED")
 
 
 def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(
@@ -209,7 +189,7 @@ def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(
     for seed in (6, 7):
         values = trial_values(runs, seed)
         folder = begin_trial(values)
-        with Mirror(options(), folder):
+        with following(options(), folder):
             write_trial(folder, values)
             if seed == 6:
                 for child in psutil.Process().children():
@@ -228,7 +208,7 @@ def test_the_trials_process_loads_no_mlflow(runs: Path) -> None:
     code = (
         "import json, sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror\n"
         "options, folder = json.loads(sys.argv[1])\n"
-        "with Mirror(options, Path(folder)): pass\nsys.exit('mlflow' in sys.modules)"
+        "with Mirror() as mirror: mirror.follow(Path(folder), options)\nsys.exit('mlflow' in sys.modules)"
     )
     words = json.dumps([options(), str(folder)])
     done = subprocess.run(
@@ -257,7 +237,7 @@ def test_switched_off_means_no_mlflow(tmp_path: Path) -> None:
     code = (
         "import sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror\n"
         "o = {'enabled': False, 'uri': None, 'flush_seconds': 1, 'images': 0}\n"
-        "with Mirror(o, Path('.')): pass\nsys.exit('mlflow' in sys.modules)"
+        "with Mirror() as mirror: mirror.follow(Path('.'), o)\nsys.exit('mlflow' in sys.modules)"
     )
     assert (
         subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=child_environment(), check=False).returncode == 0

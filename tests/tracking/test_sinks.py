@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,18 @@ from PIL import Image
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.preflight import check_trackers
-from gsbench.runs.plan_file import Entry, Sweep, write_entries
-from gsbench.tracking import connect, ensure_experiment, mirror_trial
+from gsbench.tracking import connect, ensure_experiment
 from gsbench.tracking.mlflow_sink import STATE
-from tests.tracking.helpers import RECORDS, begin_trial, found_runs, history, options, trial_values, write_trial
+from tests.tracking.helpers import (
+    RECORDS,
+    begin_trial,
+    found_runs,
+    history,
+    mirror_trial,
+    options,
+    trial_values,
+    write_trial,
+)
 
 AT = {"50": {"metrics": {"psnr": 15.0}, "num_gaussians": 7}}
 
@@ -83,23 +90,6 @@ def test_experiments_open_as_machine_learning(runs: Path) -> None:
     assert client.get_experiment(plain).tags[tag] == "custom_model_development"
     ensure_experiment(client, "chosen", runs)
     assert client.get_experiment(chosen).tags[tag] == "regression"  # what somebody chose stays
-
-
-def test_the_trials_of_a_sweep_have_one_parent(runs: Path) -> None:
-    trials = [finished_trial(runs, seed) for seed in (10, 11, 12)]
-    home = trials[0][0].parents[2]
-    alone = Entry(overrides=(), cwd=str(runs), time=1.0)
-    swept = replace(alone, sweep=Sweep(id="0123abcd", count=2))
-    places = [folder.relative_to(home).as_posix() for folder, _ in trials]
-    write_entries(home, dict(zip(places, (swept, swept, alone), strict=True)))
-    for folder, values in trials:
-        mirror_trial(options(), folder, values)
-    client = connect(None, runs)
-    (parent,) = [run for run in found_runs(client, "tracked") if run.data.tags["kind"] == "sweep"]
-    assert parent.info.run_name == "sweep of 2 trials"
-    assert parent.info.status == "FINISHED"
-    parents = [run_of(client, seed).data.tags.get("mlflow.parentRunId") for seed in (10, 11, 12)]
-    assert parents == [parent.info.run_id, parent.info.run_id, None]
 
 
 def test_a_tracker_whose_package_is_missing_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,10 +69,9 @@ class TrackingConfig:
     sink: Literal["mlflow", "tensorboard", "wandb"] = "mlflow"
     uri: Address | None = None  # null: $MLFLOW_TRACKING_URI, else sqlite in the runs folder; W&B: $WANDB_BASE_URL
     flush_seconds: PositiveFloat = 10.0
-    patience_seconds: NonNegativeFloat = 30.0  # with a slow tracker, at the end of a trial; `gsbench sync` mends it
+    patience_seconds: NonNegativeFloat = 30.0  # with a slow tracker, at the end of a sweep; `gsbench sync` mends it
     images: NonNegativeInt = 4  # test renders mirrored per trial
     model: bool = False  # keep the PLY as an artifact (MLflow, W&B)
-    system_metrics: bool = False  # MLflow's own: processors, memory, disk, network, GPUs
 
     def __post_init__(self) -> None:
         check_settings(self, "tracking")

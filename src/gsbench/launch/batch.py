@@ -21,6 +21,7 @@ from gsbench.runs.layout import STORE
 from gsbench.runs.stages import STAGES
 from gsbench.runs.store import Store
 from gsbench.system.stopping import stop_on_signals
+from gsbench.tracking import Mirror
 
 log = logging.getLogger(__name__)
 
@@ -33,18 +34,20 @@ def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
             raise InputError("; ".join(missing))
         outcomes, unfinished = _skip_finished(trials)
         _begin(trials, unfinished)
-        if unfinished:
-            if launcher == "serial":
-                outcomes += run_serial(unfinished)
-            elif launcher == "local":
-                from gsbench.launch.jobs import run_local
+        return outcomes + (_run(unfinished, launcher) if unfinished else [])
 
-                outcomes += run_local(unfinished)
-            else:
-                from gsbench.launch.slurm import run_slurm
 
-                outcomes += run_slurm(unfinished)
-    return outcomes
+def _run(trials: Sequence[Trial], launcher: str) -> list[Outcome]:
+    if launcher == "slurm":
+        from gsbench.launch.slurm import run_slurm
+
+        return run_slurm(trials)
+    with Mirror() as mirror:
+        if launcher == "serial":
+            return run_serial(trials, mirror)
+        from gsbench.launch.jobs import run_local
+
+        return run_local(trials, mirror)
 
 
 def begin_for_another_launcher(trials: Sequence[Trial]) -> None:

@@ -29,6 +29,7 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.own_modules import allowed_modules, take_over
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
 from gsbench.system.stopping import Stopped, stop_on_signals
+from gsbench.tracking import Mirror
 
 if TYPE_CHECKING:
     from submitit import Executor, Job
@@ -66,7 +67,9 @@ class TrialJob:
                 assign_threads(self.values["threads"], launch["parallel"])
                 from gsbench.launch.serial import run_one
 
-                outcome = run_one(Trial(self.values, (), self.job), wait=True)
+                # Where the sweep's process runs here, it mirrors all of its trials.
+                mirror = stack.enter_context(Mirror(idle=launch["name"] == "local"))
+                outcome = run_one(Trial(self.values, (), self.job), mirror, wait=True)
                 if launch["name"] == "slurm":
                     with suppress(OSError):
                         forget_submission(outcome.folder)
@@ -82,14 +85,14 @@ class TrialJob:
         return DelayedSubmission(self)
 
 
-def run_local(trials: Sequence[Trial]) -> list[Outcome]:
+def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
     """Run the trials in processes of this machine, ``launch.parallel`` at once; returns when all have ended."""
     values = trials[0].values
     import submitit
 
     executor = submitit.LocalExecutor(job_folder(values))
     executor.update_parameters(timeout_min=values["launch"]["timeout_min"] or 365 * DAYS)
-    return _run(trials, executor, values["launch"]["parallel"])
+    return _run(trials, executor, values["launch"]["parallel"], mirror)
 
 
 def job_folder(values: dict[str, Any]) -> Path:
@@ -106,7 +109,7 @@ def job_folder(values: dict[str, Any]) -> Path:
     return folder
 
 
-def _run(trials: Sequence[Trial], executor: Executor, parallel: int) -> list[Outcome]:
+def _run(trials: Sequence[Trial], executor: Executor, parallel: int, mirror: Mirror) -> list[Outcome]:
     """At most ``parallel`` processes at once; a stopped parent stops them, a killed one leaves them to finish."""
     waiting, running, outcomes = clouds_first(trials), dict[Path, "Job[Outcome]"](), list[Outcome]()
     try:
@@ -114,6 +117,7 @@ def _run(trials: Sequence[Trial], executor: Executor, parallel: int) -> list[Out
             while waiting and len(running) < parallel and not any(outcome.fatal for outcome in outcomes):
                 trial = waiting.pop(0)
                 running[trial.folder] = executor.submit(job_of(trial))
+                mirror.follow(trial.folder, trial.values["tracking"])
             ended = [folder for folder, job in running.items() if job.done()]
             for folder in ended:
                 outcomes.append(collect(running.pop(folder), folder, trials))

@@ -10,7 +10,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from gsbench.config.compose import Trial
@@ -19,9 +19,8 @@ from gsbench.files import require_own
 from gsbench.launch.experience import Experience
 from gsbench.launch.queue import ask_queue, state_in_queue
 from gsbench.runs.experiments import make_home
-from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import PLAN, RESULTS, STORE
-from gsbench.runs.plan_file import Entry, Sweep, read_entries, write_entries
+from gsbench.runs.plan_file import Entry, read_entries, write_entries
 from gsbench.system.locks import hold
 from gsbench.words import counted, readable_time
 
@@ -51,9 +50,6 @@ def add_to_plan(trials: Sequence[Trial]) -> None:
         entry = Entry(overrides=tuple(trial.overrides), cwd=os.getcwd(), time=time.time())
         by_plan.setdefault(folder.home, {})[folder.path.relative_to(folder.home).as_posix()] = entry
     for home, entries in by_plan.items():
-        if len(entries) > 1:  # the same command is the same sweep, whenever it is given
-            sweep = Sweep(id=sha256_of(sorted(entries))[:8], count=len(entries))
-            entries = {name: replace(entry, sweep=sweep) for name, entry in entries.items()}
         make_home(home)
         with hold(home / f".{PLAN}.lock", "the plan"):
             try:

@@ -12,35 +12,36 @@ from gsbench.runs.layout import LOCK
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.locks import BusyError, describe_holder, is_held
+from gsbench.tracking import Mirror
 
 log = logging.getLogger(__name__)
 
 
-def run_serial(trials: Sequence[Trial]) -> list[Outcome]:
+def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
     """Run the trials; one that another process is at comes last, so that two sweeps share the work."""
     outcomes: list[Outcome] = []
     busy: list[Trial] = []
     for trial in trials:
         try:
-            outcomes.append(run_one(trial, wait=len(trials) == 1))
+            outcomes.append(run_one(trial, mirror, wait=len(trials) == 1))
         except BusyError as error:
             log.info("%s; later", error)
             busy.append(trial)
             continue
         if outcomes[-1].fatal:
             return outcomes
-    return outcomes + [run_one(trial, wait=True) for trial in busy]
+    return outcomes + [run_one(trial, mirror, wait=True) for trial in busy]
 
 
-def run_one(trial: Trial, wait: bool) -> Outcome:
+def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
     """Run one trial; only BusyError, and what ends the program, is raised."""
     folder = trial.folder
     try:
         if trial.job is None:
-            return outcome_of_results(folder, _run(trial, wait))
+            return outcome_of_results(folder, _run(trial, mirror, wait))
         if not wait and is_held(folder / LOCK):  # before Hydra's callbacks hear of a start
             raise BusyError(f"{TrialFolder(folder).label}: {describe_holder(folder / LOCK)} is at it")
-        results = trial.job.run(partial(_run, trial, wait), lambda results: objective(results.metrics))
+        results = trial.job.run(partial(_run, trial, mirror, wait), lambda results: objective(results.metrics))
         return outcome_of_results(folder, results)
     except BusyError:
         raise
@@ -48,7 +49,7 @@ def run_one(trial: Trial, wait: bool) -> Outcome:
         return outcome_of_error(folder, error)
 
 
-def _run(trial: Trial, wait: bool) -> TrialRecord:
+def _run(trial: Trial, mirror: Mirror, wait: bool) -> TrialRecord:
     from gsbench.pipeline.trial import run_trial  # here, because a sweep that is done needs no torch
 
-    return run_trial(trial, wait)
+    return run_trial(trial, mirror, wait)

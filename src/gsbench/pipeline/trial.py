@@ -41,8 +41,8 @@ PUBLISHED_TRAINING = (
 )  # fmt: skip
 
 
-def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
-    """Run the trial, or find it done; returns what ``results.json`` holds.
+def run_trial(trial: Trial, mirror: Mirror, wait: bool = True) -> TrialRecord:
+    """Run the trial, or find it done; returns what ``results.json`` holds. The ``mirror`` is told of its begin.
 
     On failure ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again. Where
     another process runs this trial, waits for it, or raises BusyError if ``wait`` is False.
@@ -58,7 +58,7 @@ def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
                 log.info("%s: was done", folder.label)
                 return folder.record()
             remove_temporaries(folder.path)
-            return _run(trial, folder)
+            return _run(trial, folder, mirror)
 
 
 @contextmanager
@@ -104,14 +104,13 @@ def _record_failure(error: Exception, values: dict[str, Any], folder: TrialFolde
         write_json(folder.path / FAILED, record | {"time": time.time(), "seed": values["seed"]})
 
 
-def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
+def _run(trial: Trial, folder: TrialFolder, mirror: Mirror) -> TrialRecord:
     """Build every step, show its files in the trial's folder, write the results."""
     values = trial.values
     with _recorded_failures(values, folder):
         parts = Parts(values)
         parts.complete()
         torch.set_num_threads(parts.threads)
-        mirror = Mirror(values["tracking"], folder.path)
 
         def announce(stage: Stage, place: Path) -> None:
             write_json(folder.path / BUILDING, {"stage": stage.name, "folder": str(place)})
@@ -122,7 +121,8 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         pipeline = TrialSteps(parts, store)
     entries: dict[str, Entry] = {}
     code: dict[str, str] = {}
-    with mirror, _recorded_failures(values, folder):
+    mirror.follow(folder.path, values["tracking"])
+    with _recorded_failures(values, folder):
         for step in pipeline.steps():
             entries[step.stage.name] = entry = store.get(step)
             code |= step.code

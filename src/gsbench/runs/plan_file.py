@@ -11,7 +11,7 @@ from pydantic import AfterValidator
 from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.parsing import DamagedError
-from gsbench.records import Amount, Count, Part, Text, read_typed
+from gsbench.records import Amount, Part, read_typed
 from gsbench.runs.layout import PLAN
 from gsbench.settings import is_folder_name
 
@@ -20,21 +20,12 @@ LEVELS = 3  # scene, arm, trial
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sweep(Part):
-    """The sweep that asked for a trial, and of how many trials it was."""
-
-    id: Text
-    count: Count
-
-
-@dataclass(frozen=True, kw_only=True)
 class Entry(Part):
-    """A trial of the plan: its overrides, where the command was given, when (Unix time), and by which sweep."""
+    """A trial of the plan: its overrides, where the command was given, and when (Unix time)."""
 
     overrides: tuple[str, ...]
     cwd: str
     time: Amount
-    sweep: Sweep | None = None
 
 
 def _is_below(name: str) -> str:

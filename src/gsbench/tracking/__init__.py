@@ -1,11 +1,10 @@
 """The mirror: what the files of a trial say, shown in MLflow, TensorBoard or Weights & Biases.
 
-Files come first. A process beside the trial follows them and writes to the tracker in batches, so a tracker that is
+Files come first. A process beside the trials follows them and writes to the tracker in batches, so a tracker that is
 slow, down or read-only never harms a trial; what it missed, ``gsbench sync`` adds later from the same files.
 """
 
 from gsbench.tracking.client import connect, default_uri, ensure_experiment, tracker_uri
 from gsbench.tracking.mirror import Mirror, sync
-from gsbench.tracking.run import mirror_trial
 
-__all__ = ["Mirror", "connect", "default_uri", "ensure_experiment", "mirror_trial", "sync", "tracker_uri"]
+__all__ = ["Mirror", "connect", "default_uri", "ensure_experiment", "sync", "tracker_uri"]

@@ -5,9 +5,8 @@ from __future__ import annotations
 import getpass
 import logging
 import os
-import sqlite3
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
 VARIABLE = "MLFLOW_TRACKING_URI"
 ADVISORY_LOCK = 0x67736265_6E6368  # "gsbench": the number of our lock in a PostgreSQL database
 KIND = {"mlflow.experimentKind": "custom_model_development"}  # else its page opens as that of a chat program
-SWEEP_TAG = "gsbench.sweep"
-SECONDS_FOR_SQLITE = 20.0  # patience with a writer
 # Settings against printing, phoning home and hanging for minutes.
 SETTINGS = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
@@ -72,8 +69,6 @@ def connect(uri: str | None, runs: Path) -> MlflowClient:
         require_own(runs, runs / name)
     with _set_up_lock(address, runs):
         _create_sqlite(address)
-        if address == default_uri(runs):
-            _follow_moved_artifacts(runs)
         client = mlflow.MlflowClient(tracking_uri=address)  # with the first client come the tables
         client.search_experiments(max_results=1)
     return client
@@ -101,22 +96,6 @@ def ensure_experiment(client: MlflowClient, name: str, runs: Path) -> str:
         return str(found.experiment_id)
 
 
-def ensure_parent(client: MlflowClient, experiment_id: str, sweep: dict[str, Any], runs: Path) -> str:
-    """The id of the run under which the trials of a ``sweep`` (its ``id``, its ``count``) stand, created once.
-
-    It only groups: it is finished when it begins.
-    """
-    with _set_up_lock(str(client.tracking_uri), runs):
-        found = client.search_runs([experiment_id], f"tags.`{SWEEP_TAG}` = '{sweep['id']}'", max_results=1)
-        if found:
-            return str(found[0].info.run_id)
-        name = f"sweep of {sweep['count']} trials"
-        tags = {"kind": "sweep", SWEEP_TAG: sweep["id"], **user_tags()}
-        run_id = client.create_run(experiment_id, tags=tags, run_name=name).info.run_id
-        client.set_terminated(run_id, "FINISHED")
-        return str(run_id)
-
-
 def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> None:
     """Raise InputError where a run of the runs folder's own database has its artifacts outside of that folder.
 
@@ -129,7 +108,10 @@ def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> Non
     # The database of a stranger's runs folder may name a server, which would get the files and our password.
     place = Path(local_file_uri_to_path(address))
     if not place.is_relative_to(runs / ARTIFACTS) or ".." in place.parts:
-        raise InputError(f"{runs / DATABASE} would send artifacts to {address}: remove it and `gsbench sync --rebuild`")
+        raise InputError(
+            f"{runs / DATABASE} would send artifacts to {address}; if this runs folder was moved, remove {DATABASE} "
+            f"and {ARTIFACTS} there: `gsbench sync` makes them again"
+        )
     require_own(runs, place, below=True)
 
 
@@ -185,21 +167,3 @@ def _create_sqlite(uri: str) -> None:
     with atomic(Path(name)) as temporary:
         store = SqlAlchemyStore(f"sqlite:///{temporary}", str(Path(name).parent / ARTIFACTS))
         store.engine.dispose()
-
-
-def _follow_moved_artifacts(runs: Path) -> None:
-    """Point the own database of a runs folder that was moved to where the artifacts are now.
-
-    MLflow keeps absolute addresses, of each experiment and of each run, and has no word for changing them.
-    """
-    with closing(sqlite3.connect(runs / DATABASE, timeout=SECONDS_FOR_SQLITE)) as connection, connection:
-        for number, name, old in connection.execute("SELECT experiment_id, name, artifact_location FROM experiments"):
-            new = (runs / ARTIFACTS / name).as_uri()
-            if old == new or not str(old).endswith(new.removeprefix(runs.as_uri())):  # not one of ours
-                continue
-            connection.execute("UPDATE experiments SET artifact_location = ? WHERE experiment_id = ?", (new, number))
-            connection.execute(
-                "UPDATE runs SET artifact_uri = ? || substr(artifact_uri, ?)"
-                " WHERE experiment_id = ? AND substr(artifact_uri, 1, ?) = ?",
-                (new, len(old) + 1, number, len(old) + 1, f"{old}/"),
-            )

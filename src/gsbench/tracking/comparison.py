@@ -20,7 +20,6 @@ SECTION = "Final metrics"
 BARS = ("psnr", "ssim", "lpips_vgg_raw", "lpips_vgg", "flip", "num_gaussians", "seconds_train")
 COLUMNS = ("arm", "scene.name", "seed")  # parameters, beside the runs
 MAX_RUNS = 100
-ONLY_TRIALS = "tags.kind = 'trial'"  # the runs of sweeps have no numbers
 
 
 def comparison_url(base: str, client: MlflowClient, experiment_id: str) -> str:
@@ -28,9 +27,8 @@ def comparison_url(base: str, client: MlflowClient, experiment_id: str) -> str:
     wanted = json.dumps(_view(), separators=(",", ":"))
     if client.get_experiment(experiment_id).tags.get(TAG) != wanted:
         client.set_experiment_tag(experiment_id, TAG, wanted)
-    # In an order of ours MLflow lists trials flat; in its own it hides them, charts included, under their sweep's run.
-    flat = f"orderByKey={quote('params.`arm`')}&orderByAsc=true&searchFilter={quote(ONLY_TRIALS)}"
-    words = f"viewStateShareKey={NAME}&compareRunsMode=CHART&workflowType=machine_learning&{flat}"
+    ordered = f"orderByKey={quote('params.`arm`')}&orderByAsc=true"
+    words = f"viewStateShareKey={NAME}&compareRunsMode=CHART&workflowType=machine_learning&{ordered}"
     return f"{base}/#/experiments/{experiment_id}/runs?{words}"
 
 

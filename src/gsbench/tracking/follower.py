@@ -1,7 +1,6 @@
-"""The mirror's own process: it follows the files of a trial until that has ended, or mirrors all that have.
+"""The mirror's own process: it follows the files of trials until they have ended.
 
-The files are the truth: what a trial is, how far it has come and how it ended is read there. The end of the input
-says that it has ended.
+The files are the truth: what a trial is, how far it has come and how it ended is read there.
 """
 
 from __future__ import annotations
@@ -12,23 +11,21 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from queue import Empty, Queue
+from typing import NoReturn, TextIO
 
-from gsbench.errors import InputError
-from gsbench.runs.experiments import places_of_trials
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.system.locks import BusyError, hold
-from gsbench.tracking.client import untyped_address
+from gsbench.system.locks import BusyError
 from gsbench.tracking.mirror import TRACKER_FAILED
-from gsbench.tracking.run import LOCK, TrackerRun, mirror_trial
+from gsbench.tracking.run import TrackerRun
 from gsbench.tracking.sink import name_of
-from gsbench.tracking.trial import TrackedTrial
-from gsbench.words import counted
 
-SECONDS_AFTER_PARENT = 10.0  # to tell the tracker that the trial's process is gone
+SECONDS_AFTER_PARENT = 10.0  # to tell the tracker that the trials' process is gone
+
+Input = Queue[str | None]  # lines, and None for the end
 
 
 class MissedError(Exception):
@@ -36,98 +33,81 @@ class MissedError(Exception):
 
 
 def follow() -> NoReturn:
-    """Mirror the trial that the words of the command name (its folder, the program that runs it) until it has ended."""
-    folder, program = TrialFolder(Path(sys.argv[2])), sys.argv[3]
-    values = folder.configuration()
-    trial, options = TrackedTrial(folder, values), values["tracking"]
-    _serve(lambda ended, out: _follow(trial, options, program, ended), float(options["patience_seconds"]))
+    """Mirror the trials whose folders come as lines of the input, until they have ended; says what it mirrored.
 
-
-def sync() -> NoReturn:
-    """Mirror what a tracker missed of all ended trials (address, "anew" or "", experiments' folders)."""
-    uri, anew, homes = sys.argv[2] or None, bool(sys.argv[3]), sys.argv[4:]
-
-    def work(ended: threading.Event, out: TextIO) -> None:
-        for line in _sync(uri, anew, homes):
-            print(line, file=out, flush=True)
-
-    _serve(work, patience=0)
-
-
-def _follow(trial: TrackedTrial, options: dict[str, Any], program: str, ended: threading.Event) -> None:
-    """Send now and then what the files have gained, and at the end that the trial has ended.
-
-    A tracker that fails is tried again at the next occasion.
+    The words of the command: the program that runs the trials, "" where they have ended long ago; the time between two
+    looks and the patience of the process that waits for this one, in s; the tracker's address if one was typed; and
+    "anew" where what the tracker shows is to be deleted first.
     """
-    run: TrackerRun | None = None
-    with ExitStack() as held:
+    program, pause, patience, uri, anew = sys.argv[2:7]
 
-        def caught_up() -> TrackerRun:
-            nonlocal run
-            if run is None:
-                with ExitStack() as lock:
-                    lock.enter_context(hold(trial.folder.path / LOCK, "mirroring", wait=False))
-                    run = TrackerRun(options, trial, program)
-                    held.push(lock.pop_all())
-            run.add_curves()
-            return run
+    def work(told: Input, out: TextIO) -> None:
+        trials: list[_Followed] = []
+        last = False
+        while not last:
+            with suppress(Empty):
+                place = told.get(timeout=float(pause))
+                while place is not None:
+                    trials.append(_Followed(TrialFolder(Path(place)), program or None))
+                    place = told.get_nowait()
+                last = True
+            for trial in trials:
+                try:
+                    trial.catch_up(last, uri or None, bool(anew))
+                except BusyError:
+                    trial.said = f"{trial.folder.label} is being mirrored by another process"
+                except Exception as error:  # whatever the tracker raises: it is tried again, and at last said
+                    if last:
+                        reason = kind_and_words(error)
+                        raise MissedError(f"{trial.tracker} does not take {trial.folder.label} ({reason})") from error
+                if last and not program:  # else nobody reads it
+                    print(trial.said, file=out, flush=True)
+            trials = [trial for trial in trials if not trial.has_ended]
 
-        pause = 0.0  # the dashboard shows a trial when it begins
-        while not ended.wait(pause):
-            pause = float(options["flush_seconds"])
-            with suppress(Exception):  # what lasts until the end is said then
-                caught_up()
-        with suppress(BusyError):  # another process mirrors it
-            caught_up().end()
-
-
-def _sync(uri: str | None, anew: bool, homes: Sequence[str]) -> Iterator[str]:
-    """Mirror the ended trials of the experiments in ``homes``; yields lines for people."""
-    new = known = 0
-    for folder in [TrialFolder(Path(place)) for home in homes for place in sorted(places_of_trials(Path(home)))]:
-        state = folder.state()
-        if state == "damaged":
-            yield f"left out: {folder.label}: damaged, see gsbench status"
-        if state not in ("done", "failed"):
-            continue
-        try:
-            values = folder.configuration()
-        except InputError as error:
-            yield f"left out: {error}"
-            continue
-        options = values["tracking"] | ({"uri": uri} if uri else {})
-        if strange := untyped_address(options, uri):
-            yield (
-                f"left out: {folder.label}: its configuration names the tracker {strange}, and --uri {strange} was "
-                "not typed"
-            )
-            continue
-        try:
-            is_new = mirror_trial(options, folder.path, values, anew)
-        except BusyError:
-            yield f"{folder.label} is being mirrored by another process"
-            continue
-        except Exception as error:  # whatever the tracker raises
-            raise MissedError(f"{name_of(options)} does not take {folder.label} ({kind_and_words(error)})") from error
-        if is_new:
-            yield f"mirrored {folder.label}"
-        new, known = new + is_new, known + (not is_new)
-    yield f"{counted(new, 'trial')} mirrored, {known} were"
+    _serve(work, float(patience))
 
 
-def _serve(work: Callable[[threading.Event, TextIO], object], patience: float) -> NoReturn:
-    """Do ``work``, which is given the event that the input has ended, and a stream to print to; then end the process.
+class _Followed:
+    """A trial that is to be mirrored; its run is opened when the trial is seen running, or at the end of all."""
+
+    def __init__(self, folder: TrialFolder, program: str | None) -> None:
+        self.folder, self.said, self.has_ended, self.tracker = folder, "", False, ""
+        self._program = program
+        self._run: TrackerRun | None = None
+
+    def catch_up(self, last: bool, uri: str | None, anew: bool) -> None:
+        """Send what the files have gained, and that the trial has ended; ``last`` says that all trials have."""
+        if self._program is None and not last:
+            return
+        state = self.folder.state()  # before the curves are read, so that an ended trial's are whole
+        if state == "missing" or (state != "running" and self._run is None and not last):  # it waits for its turn
+            return
+        if self._run is None:
+            values = self.folder.configuration()
+            options = values["tracking"] | ({"uri": uri} if uri else {})
+            self.tracker = name_of(options)
+            self._run = TrackerRun(options, self.folder, values, self._program, anew)
+            self.said = "" if self._run.is_complete else f"mirrored {self.folder.label}"
+        self._run.add_curves()
+        if state != "running":
+            self._run.end()
+            self._run.close()
+            self.has_ended = True
+
+
+def _serve(work: Callable[[Input, TextIO], object], patience: float) -> NoReturn:
+    """Do ``work``, which is given the lines of the input and a stream to print to; then end the process.
 
     ``patience`` is the time in s for which the process that waits for this one does so; soon after it, we are gone too.
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     out = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what MLflow prints is no line of ours
-    ended = threading.Event()
-    threading.Thread(target=_watch_input, args=(ended, patience), daemon=True).start()
+    told: Input = Queue()
+    threading.Thread(target=_read_input, args=(told, patience), daemon=True).start()
     code = 0
     try:
-        work(ended, out)
+        work(told, out)
         out.flush()
     except Exception as error:  # noqa: BLE001 - whatever the tracker raises
         code = TRACKER_FAILED
@@ -136,10 +116,10 @@ def _serve(work: Callable[[threading.Event, TextIO], object], patience: float) -
     os._exit(code)  # no library is torn down: one might hang or crash in it
 
 
-def _watch_input(ended: threading.Event, patience: float) -> None:
-    while os.read(sys.stdin.fileno(), 1):
-        pass
-    ended.set()
+def _read_input(told: Input, patience: float) -> None:
+    for line in sys.stdin:
+        told.put(line.rstrip("\n"))
+    told.put(None)
     time.sleep(patience + SECONDS_AFTER_PARENT)
     os._exit(1)  # whatever hangs
 

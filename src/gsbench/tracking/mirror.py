@@ -1,11 +1,11 @@
-"""A trial's side of the mirror: a process beside it follows its files; at the end it is waited for, a bounded time.
+"""The side of the trials: a process beside them follows their files; at the end it is waited for, a bounded time.
 
 Why a process: a tracker's client may hang in a socket, a lock or a C library for as long as the other side likes. A
 thread that does so cannot be ended, and one that is inside a C library when the interpreter exits takes the whole
 process down, after a trial that was complete. A process can be killed.
 
-Nothing is said to it but the end: it is given its input for life, and finds all else in files. How it ended is its exit
-code, and why is the last line of what it wrote to stderr.
+It is told which folders to follow, and finds all else in files. How it ended is its exit code, and why is the last line
+of what it wrote to stderr.
 """
 
 from __future__ import annotations
@@ -14,78 +14,108 @@ import logging
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
+from gsbench.errors import InputError
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.isolate import describe_exit, python_command, telling_lines
+from gsbench.tracking.client import untyped_address
 from gsbench.tracking.sink import name_of
+from gsbench.words import counted
 
 log = logging.getLogger(__name__)
 
 TRACKER_FAILED = 3  # exit code where the tracker, or a file, is at fault: the last line on stderr says why
 SECONDS_TO_STOP = 3.0  # patience where a signal asks to end
-SECONDS_IN_VAIN = 10.0  # patience with a tracker that the last trial waited for in vain
 
 
 class Mirror:
-    """Mirrors the trial in ``folder``, which has its ``config.yaml``, while the ``with`` block runs.
+    """Mirrors the trials that begin while the ``with`` block runs, all by one process; none if it is ``idle``.
 
-    On leaving it, the tracker is waited for a bounded time: a sweep does not lose all of it at each trial where it was
-    in vain before. Whatever the tracker does, nothing is raised: one line in the log says what is missing.
+    On leaving it, the tracker is waited for a bounded time. Whatever the tracker does, nothing is raised: one line in
+    the log says what is missing.
     """
 
-    in_vain: ClassVar[bool] = False  # whether the last trial of this process waited for nothing
-
-    def __init__(self, options: dict[str, Any], folder: Path) -> None:
-        self._options, self._folder = options, folder
-        self._process: MirrorProcess | None = None
+    def __init__(self, idle: bool = False) -> None:
+        self._idle = idle
+        self._process: FollowerProcess | None = None
+        self._options: dict[str, Any] = {}
 
     def __enter__(self) -> Mirror:
-        if self._options["enabled"]:
-            program = Path(sys.argv[0]).name or "python"
-            try:
-                self._process = MirrorProcess("follow", str(self._folder), program)
-            except OSError as error:
-                self._warn(error)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
-        if self._process is None:
+    def follow(self, folder: Path, options: dict[str, Any]) -> None:
+        """Mirror the trial in ``folder``, with the settings ``tracking``, from when it runs until it has ended."""
+        if self._idle or not options["enabled"]:
             return
-        stopped = kind is not None and not issubclass(kind, Exception)
+        program = Path(sys.argv[0]).name or "python"
+        self._options = options
         try:
-            self._process.finish(SECONDS_TO_STOP if stopped else self._patience())
+            if self._process is not None and self._process.has_ended():
+                self._finish(0)
+            if self._process is None:
+                self._process = FollowerProcess(program, options["flush_seconds"], options["patience_seconds"])
+            self._process.tell(str(folder))
+        except OSError as error:
+            self._warn(error)
+
+    def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
+        stopped = kind is not None and not issubclass(kind, Exception)
+        if self._process is not None:
+            self._finish(SECONDS_TO_STOP if stopped else float(self._options["patience_seconds"]))
+
+    def _finish(self, seconds: float) -> None:
+        process, self._process = self._process, None
+        try:
+            if process is not None:
+                process.finish(seconds)
         except TimeoutError:
-            Mirror.in_vain = True
-            log.warning("tracking: %s is slow; `gsbench sync` mirrors the rest of %s later", self._name, self._folder)
+            log.warning("tracking: %s is slow; `gsbench sync` mirrors the rest later", name_of(self._options))
         except MirrorError as broken:
             self._warn(broken)
-        else:
-            Mirror.in_vain = False
-
-    def _patience(self) -> float:
-        seconds = float(self._options["patience_seconds"])
-        return min(seconds, SECONDS_IN_VAIN) if Mirror.in_vain else seconds
-
-    @property
-    def _name(self) -> str:
-        return name_of(self._options)
 
     def _warn(self, error: object) -> None:
         log.warning("tracking: %s; the files are complete, `gsbench sync` mirrors them later", error)
 
 
-def sync(homes: Sequence[Path], uri: str | None, anew: bool) -> Iterator[str]:
-    """Mirror what the tracker missed of the experiments in ``homes``; yields a line for each trial and one for all.
+def sync(folders: Iterable[TrialFolder], uri: str | None, anew: bool) -> Iterator[str]:
+    """Mirror what the tracker missed of ended trials; yields a line for each that is new there or left out, and one
+    for all.
 
     With ``anew``, what the tracker shows is deleted first. Raises MirrorError where the tracker does not take it.
     """
-    process = MirrorProcess("sync", uri or "", "anew" if anew else "", *map(str, homes))
+    places = []
+    for folder in folders:
+        state = folder.state()
+        if state == "damaged":
+            yield f"left out: {folder.label}: damaged, see gsbench status"
+        if state not in ("done", "failed"):
+            continue
+        try:
+            options = folder.configuration()["tracking"]
+        except InputError as error:
+            yield f"left out: {error}"
+            continue
+        # A runs folder of somebody else's must not send what is here, or our passwords, to an address of theirs.
+        if strange := untyped_address(options | ({"uri": uri} if uri else {}), uri):
+            yield (
+                f"left out: {folder.label}: its configuration names the tracker {strange}, and --uri {strange} was "
+                "not typed"
+            )
+            continue
+        places.append(str(folder.path))
+    process = FollowerProcess("", 1.0, 0.0, uri, anew)
     try:
-        yield from process.lines()
+        new = 0
+        for line in process.lines(places):
+            new += line.startswith("mirrored")
+            if line:
+                yield line
         process.finish(None)
+        yield f"{counted(new, 'trial')} mirrored, {len(places) - new} were"
     finally:
         process.kill()  # Ctrl-C ends it, whatever the tracker does
 
@@ -94,24 +124,41 @@ class MirrorError(Exception):
     """Error of a mirror that could not be written; the text is the reason, in one line."""
 
 
-class MirrorProcess:
-    """A fresh interpreter that runs a function of `gsbench.tracking.follower`. Raises OSError where it cannot start."""
+class FollowerProcess:
+    """A fresh interpreter that runs `gsbench.tracking.follower.follow`. Raises OSError where it cannot start."""
 
-    def __init__(self, function: str, *arguments: str) -> None:
+    def __init__(self, program: str, pause: float, patience: float, uri: str | None = None, anew: bool = False) -> None:
+        words = (program, str(pause), str(patience), uri or "", "anew" if anew else "")
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - the process's for all its life
         self._process = subprocess.Popen(
-            python_command("gsbench.tracking.follower", function, *arguments),
+            python_command("gsbench.tracking.follower", "follow", *words),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
             start_new_session=True,  # Ctrl-C is for the trial, which then ends us
         )
 
-    def lines(self) -> Iterator[str]:
-        """The lines that it prints, until it ends."""
+    def tell(self, line: str) -> None:
+        """Write a line to the process's input."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{line}\n".encode())
+        self._process.stdin.flush()
+
+    def has_ended(self) -> bool:
+        """Return whether the process is gone."""
+        return self._process.poll() is not None
+
+    def lines(self, told: Iterable[str]) -> Iterator[str]:
+        """The lines that it prints, until it ends, when it is ``told`` these and no more."""
+        assert self._process.stdin is not None
         assert self._process.stdout is not None
-        for line in self._process.stdout:
-            yield line.decode("utf-8", "replace").rstrip("\n")
+        with suppress(BrokenPipeError):  # how it ended is said in `finish`
+            for line in told:
+                self.tell(line)
+            self._process.stdin.close()
+        self._process.stdin = None
+        for said in self._process.stdout:
+            yield said.decode("utf-8", "replace").rstrip("\n")
 
     def finish(self, seconds: float | None) -> None:
         """Tell the process that its input has ended, and wait for its own end.
@@ -138,7 +185,7 @@ class MirrorProcess:
 
     def kill(self) -> None:
         """End the process, whatever it is doing."""
-        if self._process.poll() is None:
+        if not self.has_ended():
             self._process.kill()
         self._process.wait()
         for stream in (self._process.stdin, self._process.stdout):

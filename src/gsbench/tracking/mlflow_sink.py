@@ -18,18 +18,17 @@ from gsbench.tracking.client import (
     connect,
     default_uri,
     ensure_experiment,
-    ensure_parent,
     require_own_artifacts,
     source_tags,
     user_tags,
 )
 from gsbench.tracking.sink import Point, Summary
-from gsbench.tracking.trial import TrackedTrial, read_state
+from gsbench.tracking.trial import TrackedTrial
 
 STATE = "mlflow.json"  # in the trial's folder: the run that mirrors it and how far
 OWN_DATABASE = "runs/mlflow.db"
 TOKEN_TAG = "gsbench.token"
-PARENT_TAG = "mlflow.parentRunId"
+PARAMS_TAG = "gsbench"  # set when all settings are there
 ERROR_TAG = "error"
 MAX_TAG = 5000  # characters of a tag (MLflow's limit)
 MAX_VALUE = 6000  # characters of a parameter (MLflow's limit)
@@ -44,22 +43,33 @@ class MlflowSink:
     state_file = STATE
 
     def __init__(self, options: dict[str, Any], trial: TrackedTrial, program: str | None) -> None:
-        self._options, self._trial, self._program = options, trial, program
+        self._trial, self._program = trial, program
         self.client = connect(options["uri"], trial.folder.runs)
         self.run_id = ""
         self._started = 0  # ms since 1970
-        self._monitor: Any = None
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
         """Open the run (see `gsbench.tracking.sink.Sink`); a deleted one, and one in another tracker, count as none."""
-        state = self._known(state, results) or self._create_run()
-        self.run_id, self._started = state["run_id"], state["started"]
-        address = str(self.client.get_run(self.run_id).info.artifact_uri)
-        require_own_artifacts(self.client, address, self._trial.folder.runs)
+        uri = self._uri()
+        experiment_id = ensure_experiment(self.client, self._trial.values["name"], self._trial.folder.runs)
+        run = None
+        if state.get("uri") in (uri, self.client.tracking_uri) and state.get("token"):
+            run = self._find_run(experiment_id, state["token"])
+        if run is not None and state["complete"] not in (None, results):
+            self.client.delete_run(run.info.run_id)  # it shows results that are no longer the trial's
+            run = None
+        if run is None:
+            token = uuid.uuid4().hex
+            state = {"uri": uri, "token": token, "started": int(time.time() * 1000), "complete": None, "logged": {}}
+            # Before the run is there, so that it is found again if nobody hears of its creation.
+            write_json(self._trial.folder.path / STATE, state)
+            run = self._create_run(experiment_id, token)
+        self.run_id, self._started = run.info.run_id, state["started"]
+        if PARAMS_TAG not in run.data.tags:
+            self._log_params()
+        require_own_artifacts(self.client, str(run.info.artifact_uri), self._trial.folder.runs)
         if state["complete"] is None:
             self.client.update_run(self.run_id, status="RUNNING")
-            if self._program is not None and self._options.get("system_metrics"):
-                self._monitor = start_system_metrics(self.run_id, str(self.client.tracking_uri))
         return state
 
     def log(self, points: Sequence[Point]) -> None:
@@ -75,7 +85,6 @@ class MlflowSink:
         from mlflow.entities import RunTag
         from PIL import Image
 
-        self._end_monitor()
         if ERROR_TAG in self.client.get_run(self.run_id).data.tags:  # an earlier attempt failed
             self.client.delete_tag(self.run_id, ERROR_TAG)
         self.log(summary.points)
@@ -91,7 +100,6 @@ class MlflowSink:
 
     def stop(self, status: str, reason: str | None) -> None:
         """Close the run; the ``reason`` of a failure becomes a tag, and its files are shown."""
-        self._end_monitor()
         if reason is not None:
             self.client.set_tag(self.run_id, ERROR_TAG, reason[:MAX_TAG])
             for name in (layout.CONFIG, layout.FAILED, layout.LOG):
@@ -103,58 +111,25 @@ class MlflowSink:
         """Delete the run."""
         self.client.delete_run(self.run_id)
 
-    def _known(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """Say how far the trial is mirrored here; empty where it never was, was elsewhere, or computed anew since."""
-        from mlflow.exceptions import MlflowException
+    def _find_run(self, experiment_id: str, token: str) -> Any:
+        """The run that has the token; None where there is none, or it was deleted."""
+        found = self.client.search_runs([experiment_id], f"tags.`{TOKEN_TAG}` = '{token}'", max_results=1)
+        return found[0] if found else None
 
-        if state.get("uri") not in (self._uri(), self.client.tracking_uri) or "run_id" not in state:
-            return {}
-        try:
-            run = self.client.get_run(state["run_id"])
-        except MlflowException as error:
-            if error.error_code != "RESOURCE_DOES_NOT_EXIST":
-                raise
-            return {}
-        if run.info.lifecycle_stage != "active":
-            return {}
-        if state["complete"] not in (None, results):
-            self.client.delete_run(state["run_id"])  # it shows results that are no longer the trial's
-            return {}
-        return state
-
-    def _create_run(self) -> dict[str, Any]:
-        from mlflow.entities import Param, RunTag
-
+    def _create_run(self, experiment_id: str, token: str) -> Any:
         trial, client = self._trial, self.client
-        begun = self._begin()
-        experiment_id = ensure_experiment(client, trial.values["name"], trial.folder.runs)
-        tags = trial.tags() | {TOKEN_TAG: begun["token"]} | user_tags()
+        tags = trial.tags() | {TOKEN_TAG: token} | user_tags()
         if self._program is not None:
             tags |= source_tags(self._program)
-        if sweep := trial.sweep():
-            tags[PARENT_TAG] = ensure_parent(client, experiment_id, sweep, trial.folder.runs)
-        found = client.search_runs([experiment_id], f"tags.`{TOKEN_TAG}` = '{begun['token']}'", max_results=1)
-        run = found[0] if found else client.create_run(experiment_id, tags=tags, run_name=trial.label)
-        run_id = run.info.run_id
-        params = [Param(key, value[:MAX_VALUE]) for key, value in trial.params().items()]
+        return client.create_run(experiment_id, tags=tags, run_name=trial.label)
+
+    def _log_params(self) -> None:
+        from mlflow.entities import Param
+
+        params = [Param(key, value[:MAX_VALUE]) for key, value in self._trial.params().items()]
         for start in range(0, len(params), MAX_PARAMS):
-            client.log_batch(run_id, params=params[start : start + MAX_PARAMS], tags=[RunTag("gsbench", "1")])
-        return begun | {"run_id": run_id, "logged": {}, "complete": None}
-
-    def _begin(self) -> dict[str, Any]:
-        """Note, before a run is created, by what it is found again if nobody hears of its creation."""
-        file = self._trial.folder.path / STATE
-        state = read_state(file)
-        if state.get("uri") == self._uri() and "token" in state and "run_id" not in state:
-            return state
-        begun = {"uri": self._uri(), "token": uuid.uuid4().hex, "started": int(time.time() * 1000)}
-        write_json(file, begun)
-        return begun
-
-    def _end_monitor(self) -> None:
-        if self._monitor is not None:
-            self._monitor.finish()
-            self._monitor = None
+            self.client.log_batch(self.run_id, params=params[start : start + MAX_PARAMS])
+        self.client.set_tag(self.run_id, PARAMS_TAG, "1")
 
     def _time_of(self, seconds: float) -> int:
         """The time in ms of what happened after ``seconds`` of training."""
@@ -164,12 +139,3 @@ class MlflowSink:
         """Address of the run: the tracker's address, or a word for the runs folder's own, which may move with it."""
         uri = str(self.client.tracking_uri)
         return OWN_DATABASE if uri == default_uri(self._trial.folder.runs) else uri
-
-
-def start_system_metrics(run_id: str, uri: str) -> Any:
-    """MLflow's own monitor of processors, memory, disk, network and GPUs, which logs to a run until ``finish``."""
-    from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
-
-    monitor = SystemMetricsMonitor(run_id, resume_logging=True, tracking_uri=uri)
-    monitor.start()
-    return monitor

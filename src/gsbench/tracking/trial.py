@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsbench.errors import InputError
 from gsbench.records import Count, Part, read_if_sound
 from gsbench.runs import layout
 from gsbench.runs.hashing import flatten, sha256_of
-from gsbench.runs.plan_file import read_entries
 from gsbench.runs.rows import read_rows
 from gsbench.runs.stages import TRAIN
 from gsbench.runs.trial_folder import TrialFolder
@@ -19,8 +17,6 @@ from gsbench.runs.trial_record import TrialRecord
 from gsbench.tracking.sink import Point, Summary
 
 FILES = (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS)
-# Of the init's report: is the cloud to be trusted, and what does a volume threshold mean there?
-INIT_FIELDS = ("num_registered", "num_points", "mean_reprojection_error", "mean_track_length", "pose_errors", "gauge")
 CURVES = {layout.CURVES: "train", layout.EVENTS: "events"}
 
 
@@ -55,15 +51,6 @@ class TrackedTrial:
         """The settings that have a value, by their dotted keys; the arm is first in charts."""
         return {"arm": self.arm} | {key: str(value) for key, value in flatten(self.values).items() if str(value)}
 
-    def sweep(self) -> dict[str, Any]:
-        """The sweep that asked for the trial: its ``id`` and ``count`` of trials; empty for one trial alone."""
-        home = self.folder.home
-        try:
-            entry = read_entries(home).get(self.folder.path.relative_to(home).as_posix())
-        except InputError:  # a damaged plan: who reads it says so
-            entry = None
-        return {} if entry is None or entry.sweep is None else entry.sweep.to_json()
-
     def results_hash(self) -> str | None:
         """The hash of the results, by which a mirror knows whether it shows them; None where there are none."""
         results = self.folder.sound_record()
@@ -95,7 +82,6 @@ class TrackedTrial:
         }
         numbers |= {f"seconds_{key}": value for key, value in results.seconds.items()}
         numbers |= {f"total/{key}": value for key, value in results.events.items()}
-        numbers |= {f"init/{key}": value for key, value in _numbers(results.init_report, INIT_FIELDS)}
         points = [
             Point(key, float(value), int(at), seconds * int(at) / max(1, step))
             for at, measured in results.metrics_at.items()
@@ -123,16 +109,6 @@ def _seconds(record: Mapping[str, float]) -> float:
     return float(record.get("seconds", record["step"] / 1000))
 
 
-def _numbers(report: dict[str, Any], names: Sequence[str]) -> Iterator[tuple[str, float]]:
-    """The numbers among the fields ``names`` of a report, nested ones included; what is unknown is left out."""
-    for name in names:
-        value = report.get(name)
-        if isinstance(value, dict):
-            yield from _numbers(value, tuple(value))
-        elif isinstance(value, (int, float)) and not isinstance(value, bool):
-            yield name, float(value)
-
-
 @dataclass(frozen=True, kw_only=True)
 class MirrorState(Part):
     """State that any sink keeps: ``complete`` is the hash of the results that it shows, ``logged`` the newest iteration
@@ -144,11 +120,10 @@ class MirrorState(Part):
     uri: str | None = None
     token: str | None = None
     started: Count | None = None  # ms since 1970
-    run_id: str | None = None
     id: str | None = None
 
     def __post_init__(self) -> None:
-        if self.run_id is not None and self.started is None:
+        if self.token is not None and self.started is None:
             raise ValueError("it has a run and no start")
 
 

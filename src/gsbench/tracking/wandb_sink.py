@@ -16,7 +16,7 @@ STEP = "iteration"  # the axis of our curves: their own counter only goes up, an
 
 
 class WandbSink:
-    """The W&B run of one trial; the project is the experiment, the group is the sweep."""
+    """The W&B run of one trial; the project is the experiment, the group is scene and arm."""
 
     state_file = "wandb.json"
 
@@ -44,7 +44,7 @@ class WandbSink:
             name=trial.label,
             id=state["id"],
             resume="allow",
-            group=trial.sweep().get("id"),
+            group=f"{trial.values['scene']['name']} {trial.arm}",
             config=trial.params(),
             tags=[trial.values["scene"]["name"], trial.arm],
             dir=str(folder),

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.errors import GsbenchError
-from gsbench.runs.experiments import experiment_home, list_experiments
+from gsbench.runs.experiments import experiment_home, list_experiments, places_of_trials
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import sync
 from gsbench.tracking.mirror import MirrorError
 from gsbench.verbs.arguments import ArgumentParser
@@ -28,7 +29,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
         else [runs / n for n in list_experiments(runs)]
     )
     try:
-        for line in sync(homes, options.uri, options.rebuild):
+        folders = [TrialFolder(Path(place)) for home in homes for place in sorted(places_of_trials(home))]
+        for line in sync(folders, options.uri, options.rebuild):
             print(line, flush=True)
     except (MirrorError, OSError) as error:
         raise GsbenchError(f"{error}; the files are complete: try again") from error
