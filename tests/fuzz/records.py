@@ -30,7 +30,7 @@ from gsbench.analysis.tables import build_table
 from gsbench.analysis.tuning import tuning_lines
 from gsbench.errors import InputError
 from gsbench.launch import queue
-from gsbench.launch.experience import Experience
+from gsbench.launch.finished import FinishedTrials
 from gsbench.launch.plan import read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.runs.declaration import read_declarations
@@ -234,7 +234,7 @@ def look(runs: Path, places: dict[str, Path]) -> int:
     attempt(lambda: explain_cell(f"{EXPERIMENT}:courtyard:psnr:adc", runs))
     attempt(lambda: "\n".join(lines_of(states_of_experiment(home), everything=True)).encode())
     attempt(lambda: read_plan(home))
-    attempt(lambda: Experience(runs).estimate(values_of(runs, "adc", 0, 0.03)))
+    attempt(lambda: FinishedTrials(runs).estimate(values_of(runs, "adc", 0, 0.03)))
     attempt(lambda: read_declarations(home))
     attempt(lambda: search_part(home))
     for folder in {path.parent for path in places.values()} - {home}:

@@ -25,7 +25,7 @@ from gsbench.errors import InputError
 from gsbench.files import DiskFullError, explain_storage
 from gsbench.launch import serial
 from gsbench.launch.batch import run_batch
-from gsbench.launch.experience import Experience
+from gsbench.launch.finished import FinishedTrials
 from gsbench.launch.outcome import Outcome
 from gsbench.launch.plan import add_to_plan, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
@@ -66,6 +66,7 @@ def finish(
     seconds: float = 100.0,
     unavailable: dict[str, str] | None = None,
     awaited: Sequence[str] = (),
+    resolution: tuple[int, int] = (400, 300),
 ) -> TrialRecord:
     """Make the files of a finished trial, with one stage result in the store and one source file."""
     folder = TrialFolder.of(values)
@@ -84,6 +85,7 @@ def finish(
         unavailable=unavailable or {},
         seconds={"init": 1.0, "train": seconds, "evaluate": 0.0},
         hashes={"config": config_hash(values)},
+        resolution=resolution,
         awaited=list(awaited),
     )
     folder.write_finished(values, results, [source], {"train": entry.path}, [folder.path / "table.csv"])
@@ -370,8 +372,8 @@ def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs: Path) -> 
     add_to_plan(trials[:2])
     add_to_plan(trials)
     folders = [TrialFolder.of(trial.values).path for trial in trials]
-    assert [trial.folder for trial in read_plan(runs / "x")] == folders
-    assert compose_one(read_plan(runs / "x")[1].overrides).values == trials[1].values
+    assert list(read_plan(runs / "x")) == folders
+    assert compose_one(read_plan(runs / "x")[folders[1]].overrides).values == trials[1].values
     finish(trials[0].values)
     folders[1].mkdir(parents=True)
     (folders[1] / "config.yaml").touch()
@@ -393,7 +395,7 @@ def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs: Path) -> 
 def test_damaged_plan_is_named_and_the_next_command_mends_it(runs: Path, caplog: pytest.LogCaptureFixture) -> None:
     (runs / "x").mkdir(parents=True)
     (runs / "x" / "plan.json").write_text("{")
-    assert read_plan(runs / "x") == []
+    assert read_plan(runs / "x") == {}
     assert states_of_experiment(runs / "x") == []
     assert "left out: " in caplog.text
     add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
@@ -403,7 +405,7 @@ def test_damaged_plan_is_named_and_the_next_command_mends_it(runs: Path, caplog:
 
 def test_dry_run_tells_states_and_time(runs: Path) -> None:
     trials = compose_trials(["name=x", "densify=adc,volumetric", "seed=0,1"], multirun=True)
-    assert describe_plan(trials)[-1].startswith("time: not known")
+    assert describe_plan(trials)[-1].startswith("time: no estimate")
     finish(trials[0].values, seconds=600)
     finish(trial_values("name=other", "densify=adc", "seed=1"), seconds=1200)
     lines = describe_plan(trials, parallel=2)
@@ -411,7 +413,7 @@ def test_dry_run_tells_states_and_time(runs: Path) -> None:
     assert "as in other: nothing to compute" in lines[1]
     assert lines[4] == "4 trials: 1 done, 3 missing"
     assert lines[5] == "time: about 15 min, 2 at once, judged by 2 finished trials"  # 2 x (600 + 1200) / 2, two at once
-    assert Experience(runs).elsewhere(TrialFolder.of(trials[1].values)) == "other"
+    assert FinishedTrials(runs).elsewhere(TrialFolder.of(trials[1].values)) == "other"
     assert describe_plan(trials[1:2])[1:] == [
         "1 trial: 1 missing",
         "time: seconds, since other experiments have the results",
@@ -421,9 +423,26 @@ def test_dry_run_tells_states_and_time(runs: Path) -> None:
 def test_estimate_prefers_the_same_scene_and_densifier_and_scales_with_iterations(runs: Path) -> None:
     finish(trial_values("densify=adc", "train.iterations=100"), seconds=10)
     finish(trial_values("densify=mcmc", "train.iterations=100"), seconds=30)
-    experience = Experience(runs)
-    assert experience.estimate(trial_values("densify=adc", "train.iterations=1000")).seconds == pytest.approx(100)
-    assert experience.estimate(trial_values("densify=none", "train.iterations=1000")).seconds == pytest.approx(200)
+    finished = FinishedTrials(runs)
+    assert finished.estimate(trial_values("densify=adc", "train.iterations=1000")).seconds == pytest.approx(100)
+    assert finished.estimate(trial_values("densify=none", "train.iterations=1000")).seconds == pytest.approx(200)
+
+
+def test_estimate_scales_with_pixels_and_knows_its_rasterizer_and_pictures_or_is_none(runs: Path) -> None:
+    finish(trial_values("train.iterations=100"), seconds=10)
+    photos = ("scene=colmap", "scene.path=/x", "train.iterations=100")
+    finish(trial_values(*photos, "scene.max_size=200"), seconds=10, resolution=(200, 100))
+    finished = FinishedTrials(runs)
+
+    def seconds(*words: str) -> float | None:
+        estimate = finished.estimate(trial_values("train.iterations=100", *words))
+        return estimate.seconds if estimate.learned_from else None
+
+    assert seconds("scene.width=800", "scene.height=600") == pytest.approx(40)
+    assert seconds("scene.max_size=200") == pytest.approx(2.5)
+    assert seconds(*photos, "scene.max_size=200", "densify=adc") == pytest.approx(10)
+    assert seconds(*photos) is None  # nobody has read these pictures at their full size
+    assert seconds("raster=reference") is None
 
 
 # ---- running a sweep
@@ -523,7 +542,7 @@ def test_verbs_that_write_say_storage_errors_in_one_line(
         raise OSError(number, os.strerror(number), str(runs / "x" / "plan.json"))
 
     add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
-    monkeypatch.setattr("gsbench.runs.plan_file.write_json", refuse)
+    monkeypatch.setattr("gsbench.launch.plan.write_json", refuse)
     assert cli.run(["status", "x", "--forget"]) == 2
     said = capsys.readouterr().err
     assert len(said.splitlines()) == 1

@@ -9,32 +9,56 @@ import logging
 import os
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import AfterValidator
 
 from gsbench.config.compose import Trial
-from gsbench.errors import GsbenchError, InputError
-from gsbench.files import require_own
-from gsbench.launch.experience import Experience
+from gsbench.errors import GsbenchError
+from gsbench.files import require_own, write_json
+from gsbench.launch.finished import FinishedTrials
 from gsbench.launch.queue import ask_queue, state_in_queue
+from gsbench.parsing import DamagedError
+from gsbench.records import Amount, Part, read_typed
 from gsbench.runs.experiments import make_home
 from gsbench.runs.layout import PLAN, RESULTS, STORE
-from gsbench.runs.plan_file import Entry, read_entries, write_entries
+from gsbench.settings import is_folder_name
 from gsbench.system.locks import hold
 from gsbench.words import counted, readable_time
 
 log = logging.getLogger(__name__)
 
+PLAN_VERSION = 1
+LEVELS = 3  # scene, arm, trial
+STATES = ("done", "partial", "missing", "running", "queued", "failed", "damaged")  # in the order of a summary
 
-@dataclass(frozen=True)
-class Planned:
-    """A trial of the plan: its folder, its overrides, where the command was given, and when (Unix time)."""
 
-    folder: Path
+@dataclass(frozen=True, kw_only=True)
+class PlannedTrial(Part):
+    """A trial of the plan: its overrides, where the command was given, and when (Unix time)."""
+
     overrides: tuple[str, ...]
     cwd: str
-    time: float
+    time: Amount
+
+
+def _is_below(name: str) -> str:
+    parts = name.split("/")
+    if len(parts) != LEVELS or not all(map(is_folder_name, parts)):
+        raise ValueError("it is no folder of a trial")
+    return name
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanFile(Part):
+    """The whole file; ``trials`` are by their folders as seen from the experiment's."""
+
+    version: int
+    trials: dict[Annotated[str, AfterValidator(_is_below)], PlannedTrial]
 
 
 def add_to_plan(trials: Sequence[Trial]) -> None:
@@ -42,29 +66,22 @@ def add_to_plan(trials: Sequence[Trial]) -> None:
 
     A trial that was read from its own record stays out: its plan would hold no words, which describe the defaults.
     """
-    by_plan: dict[Path, dict[str, Entry]] = {}
+    by_home: dict[Path, dict[Path, PlannedTrial]] = {}
     for trial in trials:
-        if trial.recorded:
-            continue
-        folder = trial.files
-        entry = Entry(overrides=tuple(trial.overrides), cwd=os.getcwd(), time=time.time())
-        by_plan.setdefault(folder.home, {})[folder.path.relative_to(folder.home).as_posix()] = entry
-    for home, entries in by_plan.items():
+        if not trial.recorded:
+            planned = PlannedTrial(overrides=tuple(trial.overrides), cwd=os.getcwd(), time=time.time())
+            by_home.setdefault(trial.files.home, {})[trial.folder] = planned
+    for home, added in by_home.items():
         make_home(home)
         with hold(home / f".{PLAN}.lock", "the plan"):
-            try:
-                known = read_entries(home)
-            except InputError as error:  # trials of other commands are found by their folders, if they have begun
-                log.warning("%s", error)
-                known = {}
-            write_entries(home, known | entries)
+            _write(home, read_plan(home) | added)
 
 
 def forget(home: Path, folders: Iterable[Path]) -> None:
     """Drop trials from the plan of the experiment in ``home``."""
-    doomed = {folder.relative_to(home).as_posix() for folder in folders}
+    doomed = set(folders)
     with hold(home / f".{PLAN}.lock", "the plan"):
-        write_entries(home, {name: entry for name, entry in read_entries(home).items() if name not in doomed})
+        _write(home, {folder: trial for folder, trial in read_plan(home).items() if folder not in doomed})
 
 
 def remove(home: Path, folders: Iterable[Path]) -> None:
@@ -80,20 +97,34 @@ def remove(home: Path, folders: Iterable[Path]) -> None:
     forget(home, folders)
 
 
-def read_plan(home: Path) -> list[Planned]:
-    """The planned trials of the experiment in ``home``; none if it has no plan, or a damaged one, which is named."""
+def read_plan(home: Path) -> dict[Path, PlannedTrial]:
+    """The planned trials of the experiment in ``home`` by their folders; none if it has no plan.
+
+    None either where it is damaged, which is said: trials of other commands are found by their folders, if they have
+    begun.
+    """
     try:
-        entries = read_entries(home)
-    except InputError as error:
-        log.warning("left out: %s", error)
-        entries = {}
-    return [Planned(home / name, entry.overrides, entry.cwd, entry.time) for name, entry in sorted(entries.items())]
+        trials = read_typed(home / PLAN, PlanFile).trials
+    except FileNotFoundError:
+        return {}
+    except DamagedError as error:
+        log.warning("left out: %s: each command of a sweep writes it anew, with its own trials", error)
+        return {}
+    return {home / name: trial for name, trial in sorted(trials.items())}
+
+
+def _write(home: Path, trials: dict[Path, PlannedTrial]) -> None:
+    names = {folder.relative_to(home).as_posix(): trial for folder, trial in trials.items()}
+    write_json(home / PLAN, PlanFile(version=PLAN_VERSION, trials=names).to_json())
+
+
+# ---- what a dry run says
 
 
 def _stage_finder(trials: Sequence[Trial]) -> Callable[[Trial], list[str]]:
     """A function that tells which stages of a trial are in the store; loads torch only where there is such a store."""
-    store = trials[0].files.runs / STORE if trials else None
-    if store is None or not store.is_dir():
+    store = trials[0].files.runs / STORE
+    if not store.is_dir():
         return lambda trial: []
     from gsbench.pipeline.parts import Parts
     from gsbench.pipeline.wiring import StepFinder
@@ -112,14 +143,10 @@ def _stage_finder(trials: Sequence[Trial]) -> Callable[[Trial], list[str]]:
 
 def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
     """Lines for ``--dry-run``: each trial with its state, and the time that the unfinished ones will take."""
-    lines, remaining, unknown, counts = (
-        [],
-        0.0,
-        0,
-        dict.fromkeys(("done", "partial", "missing", "running", "queued", "failed", "damaged"), 0),
-    )
-    experience = Experience(trials[0].files.runs) if trials else None
-    learned = 0
+    lines: list[str] = []
+    remaining, unknown, learned = 0.0, 0, 0
+    counts: Counter[str] = Counter()
+    finished = FinishedTrials(trials[0].files.runs)
     built_stages = _stage_finder(trials)
     queue = ask_queue(trial.folder for trial in trials)
     for trial in trials:
@@ -131,30 +158,28 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
         if state == "done":
             if reason := folder.why_not_done(trial.values):
                 note = f"  will be checked: {reason}"
+        elif shared := finished.elsewhere(folder):
+            note = f"  as in {shared}: nothing to compute"
         else:
-            assert experience is not None
-            shared = experience.elsewhere(folder)
-            if shared is not None:
-                note = f"  as in {shared}: nothing to compute"
-            else:
-                estimate = experience.estimate(trial.values)
-                done = folder.stage_and_step()[1] / max(1, trial.values["train"]["iterations"])
-                remaining += estimate.seconds * (1 - min(1.0, done))
-                learned = max(learned, estimate.learned_from)
-                if built := built_stages(trial):
-                    note = f"  the store has its {', '.join(built)}"
-                unknown += estimate.learned_from == 0
+            estimate = finished.estimate(trial.values)
+            done = folder.stage_and_step()[1] / max(1, trial.values["train"]["iterations"])
+            remaining += estimate.seconds * (1 - min(1.0, done))
+            learned = max(learned, estimate.learned_from)
+            unknown += estimate.learned_from == 0
+            if built := built_stages(trial):
+                note = f"  the store has its {', '.join(built)}"
         counts[state] += 1
         lines.append(f"{state:<8} {folder.label}{note}")
-    summary = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
+    summary = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])
     lines.append(f"{counted(len(trials), 'trial')}: {summary}")
-    if counts["done"] < len(trials):
-        if unknown:
-            lines.append("time: not known, since no finished trial tells how long one takes here")
-        elif learned == 0:
-            lines.append("time: seconds, since other experiments have the results")
-        else:
-            at_once = f", {parallel} at once" if parallel > 1 else ""
-            took = readable_time(remaining / parallel)
-            lines.append(f"time: about {took}{at_once}, judged by {counted(learned, 'finished trial')}")
-    return lines
+    if counts["done"] == len(trials):
+        return lines
+    if unknown:
+        time = "no estimate, since no finished trial tells how long one takes here with its rasterizer and pictures"
+    elif learned == 0:
+        time = "seconds, since other experiments have the results"
+    else:
+        at_once = f", {parallel} at once" if parallel > 1 else ""
+        took = readable_time(remaining / parallel)
+        time = f"about {took}{at_once}, judged by {counted(learned, 'finished trial')}"
+    return [*lines, f"time: {time}"]

@@ -21,22 +21,12 @@ WAITING = ("PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED", 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Note(Part):
+class Submission(Part):
     """``.submitted.json``: the job that a trial was given to, its log, whose job it is."""
 
     job: Annotated[str, Field(pattern=r"^[\w.\[\]%-]+$")]
     log: str = "unknown"
     user: Annotated[str, Field(pattern=r"^[\w.@\\+-]*$")] = ""
-
-
-@dataclass(frozen=True)
-class Submission:
-    """The Slurm job that was given a trial, its log, whose job it is, and the file that says so."""
-
-    job: str
-    log: str
-    user: str
-    note: Path
 
 
 @dataclass(frozen=True)
@@ -63,15 +53,12 @@ Queue = Mapping[str, QueuedJob]
 def record_submission(folder: Path, job: str, log: Path) -> None:
     """Note in the trial's ``folder`` that Slurm was given it as ``job``."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / SUBMITTED, Note(job=job, log=str(log), user=current_user()).to_json())
+    write_json(folder / SUBMITTED, Submission(job=job, log=str(log), user=current_user()).to_json())
 
 
 def read_submission(folder: Path) -> Submission | None:
     """The job that was last given the trial in ``folder``; None if there is none, or it has ended by itself."""
-    note = read_if_sound(folder / SUBMITTED, Note)
-    if note is None:
-        return None
-    return Submission(note.job, note.log, note.user or current_user(), folder / SUBMITTED)
+    return read_if_sound(folder / SUBMITTED, Submission)
 
 
 def forget_submission(folder: Path) -> None:
@@ -82,7 +69,7 @@ def forget_submission(folder: Path) -> None:
 def ask_queue(folders: Iterable[Path]) -> Queue | None:
     """The queue, of those users whose jobs were given trials in ``folders``; None where Slurm does not answer."""
     submissions = [found for folder in folders if (found := read_submission(folder))]
-    return read_queue({submission.user for submission in submissions}) if submissions else {}
+    return read_queue({submission.user or current_user() for submission in submissions}) if submissions else {}
 
 
 def state_in_queue(folder: Path, queue: Queue | None) -> Literal["queued", "running"] | None:

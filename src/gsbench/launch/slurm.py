@@ -112,7 +112,7 @@ def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[
 
 def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Trial]) -> list[Outcome]:
     outcomes: list[Outcome] = []
-    users = {known.user for folder in jobs if (known := read_submission(folder))} | {current_user()}
+    users = {known.user or current_user() for folder in jobs if (known := read_submission(folder))} | {current_user()}
     unseen = dict.fromkeys(jobs, 0)
     checked = time.monotonic()
     while jobs:

@@ -16,7 +16,7 @@ from gsbench.launch.queue import Queue, ask_queue, read_submission, state_in_que
 from gsbench.parsing import DamagedError
 from gsbench.runs.experiments import places_of_trials
 from gsbench.runs.hashing import determining
-from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED
+from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED
 from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
 
@@ -42,7 +42,7 @@ class TrialState:
 
 def states_of_experiment(home: Path) -> list[TrialState]:
     """The state of every trial of the experiment in ``home``, planned or found there."""
-    planned = {trial.folder: trial.time for trial in read_plan(home)}
+    planned = {folder: trial.time for folder, trial in read_plan(home).items()}
     found = {path for path in map(Path, places_of_trials(home)) if SEED in path.name and (path / CONFIG).exists()}
     folders = sorted({*planned, *found})
     queue = ask_queue(folders)
@@ -106,7 +106,7 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
             job = queue.get(submission.job) if queue is not None else None
             words = job.words if job else "Slurm does not answer"
             note = f"{_reached(folder)} Slurm job {submission.job}, {words}".strip()
-            return TrialState(folder, found, _changed(submission.note), note)
+            return TrialState(folder, found, _changed(folder / SUBMITTED), note)
         lost = f"; Slurm job {submission.job} has ended, log: {submission.log}"
     if state == "failed":
         return TrialState(folder, state, _changed(folder / FAILED), TrialFolder(folder).failure())

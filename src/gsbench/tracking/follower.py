@@ -118,7 +118,7 @@ def _serve(work: Callable[[Input, TextIO], object], patience: float) -> NoReturn
 
 def _read_input(told: Input, patience: float) -> None:
     for line in sys.stdin:
-        told.put(line.rstrip("\n"))
+        told.put(line.rstrip("\n") or None)  # an empty line: no more will come, and we have all the time that it takes
     told.put(None)
     time.sleep(patience + SECONDS_AFTER_PARENT)
     os._exit(1)  # whatever hangs

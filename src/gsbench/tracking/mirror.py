@@ -153,10 +153,8 @@ class FollowerProcess:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with suppress(BrokenPipeError):  # how it ended is said in `finish`
-            for line in told:
+            for line in (*told, ""):
                 self.tell(line)
-            self._process.stdin.close()
-        self._process.stdin = None
         for said in self._process.stdout:
             yield said.decode("utf-8", "replace").rstrip("\n")
 

@@ -11,7 +11,7 @@ from gsbench.config.command_words import key_of, typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
-from gsbench.launch.plan import Planned, describe_plan, forget, read_plan
+from gsbench.launch.plan import PlannedTrial, describe_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.runs.experiments import experiment_home
 from gsbench.runs.layout import CONFIG
@@ -52,7 +52,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     if not unfinished:
         print(f"nothing to retry: all trials of {options.experiment} are done, running or queued")
         return 0
-    planned = {trial.folder: trial for trial in read_plan(home)}
+    planned = read_plan(home)
     here = os.getcwd()
     trials = [recompose(folder, planned.get(folder), runs, options.changes, here) for folder in unfinished]
     _check_trackers(trials, options.changes)
@@ -78,7 +78,7 @@ def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
             )
 
 
-def recompose(folder: Path, planned: Planned | None, runs: Path, changes: list[str], here: str) -> Trial:
+def recompose(folder: Path, planned: PlannedTrial | None, runs: Path, changes: list[str], here: str) -> Trial:
     """The trial in ``folder``: from its planned overrides, else from the configuration that it wrote.
 
     Neither allows anything to run: that ``changes``, which were typed ``here``, must do again.

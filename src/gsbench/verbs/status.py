@@ -61,7 +61,7 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
 
     A user's class is looked up where the trial was asked for: another folder may have another file of that name.
     """
-    places = {trial.folder: trial.cwd for trial in read_plan(home)}
+    places = {folder: trial.cwd for folder, trial in read_plan(home).items()}
 
     def present(module: str, trial: TrialResult) -> str | None:
         return module_digest(module, places[trial.path]) if trial.path in places else None
