@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import pickle
+
 import pytest
 
 from gsbench.app.command import compose_trials
 from gsbench.config.compose import compose_one
 from gsbench.config.jobs import HydraJob, _plain_values
 from gsbench.errors import InputError
+from gsbench.launch.jobs import job_of
 
 ARMS = "densify=adc,volumetric"
 SWEEPS = {  # words, and how often Hydra composes for them
@@ -70,3 +73,19 @@ def test_a_bad_value_is_refused_where_it_shares_a_composition(words: list[str]) 
 )
 def test_values_that_may_be_set_after_the_rest(words: list[str], values: dict[str, object]) -> None:
     assert _plain_values(words) == values
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ([], False),
+        (["hydra.verbose=true"], True),
+        (["+hydra.job.env_set.OMP_NUM_THREADS='1'"], True),
+        (["hydra.sweep.dir=elsewhere"], True),
+        (["+hydra.callbacks.log._target_=hydra.experimental.callbacks.LogJobReturnCallback"], True),
+    ],
+)
+def test_trials_carry_hydras_sweep_along_only_where_hydra_does_something(words: list[str], expected: bool) -> None:
+    trials = compose_trials(["densify=adc,volumetric", "seed=0,1", *words], multirun=True)
+    carried = [len(pickle.dumps(job_of(trial))) > 20_000 for trial in trials]
+    assert carried == [expected] * 4

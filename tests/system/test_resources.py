@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from gsbench.system.resources import assign_gpu, available_threads, take_slot
+from gsbench.system.resources import assign_gpu, available_threads, take_slot, trials_at_once
 
 
 def test_slots_gpus_and_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -26,3 +27,23 @@ def test_slots_gpus_and_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert available_threads(10**6) == 1
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "7")
     assert available_threads(2) == 7
+
+
+@pytest.mark.parametrize(
+    ("cores", "gigabytes", "most", "gpus", "expected"),
+    [
+        (2, 16, None, 0, 2),
+        (1, 16, None, 0, 1),
+        (6, 16, None, 0, 2),
+        (64, 256, 100_000, 0, 16),
+        (64, 16, 3_000_000, 0, 2),
+        (64, 256, None, 1, 1),
+    ],
+)
+def test_trials_at_once_suit_cores_memory_and_gpus(
+    cores: int, gigabytes: int, most: int | None, gpus: int, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsbench.system.resources.available_cores", lambda: cores)
+    monkeypatch.setattr("gsbench.system.resources.installed_gpus", lambda: ["0"] * gpus)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(total=gigabytes * 10**9))
+    assert trials_at_once.__wrapped__(most, "auto") == expected

@@ -32,7 +32,7 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.batch import run_batch
 from gsbench.launch.outcome import Outcome, objective
 from gsbench.launch.plan import describe_plan
-from gsbench.launch.preflight import check_parts, missing_folders, need_no_check
+from gsbench.launch.preflight import check_parts, disk_line, missing_folders, need_no_check
 from gsbench.logs import set_up_logging, show_details
 from gsbench.system.own_modules import allow_modules
 
@@ -175,7 +175,8 @@ def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
     """Print the trials with their states, and what they will miss; run none."""
     if not need_no_check(trials):
         check_parts(trials, here=False)
-    print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"]) + missing_folders(trials)))
+    lines = describe_plan(trials, trials[0].values["launch"]["parallel"])
+    print("\n".join([*lines, *filter(None, [disk_line(trials)]), *missing_folders(trials)]))
     return []
 
 

@@ -73,12 +73,16 @@ def _context_of(_: None, loader: Any, callbacks: Any) -> JobContext:
 
 @dataclass(frozen=True)
 class HydraJob:
-    """A trial as job ``number`` of a ``sweep``, by its ``words``: in this process or, pickled, in another."""
+    """A trial as job ``number`` of a ``sweep``, by its ``words``: in this process or, pickled, in another.
+
+    ``has_effect`` tells whether anybody notices that Hydra runs it: else a trial need not carry the whole sweep along.
+    """
 
     context: HydraContext
     sweep: DictConfig
     words: tuple[str, ...]
     number: int
+    has_effect: bool = True
 
     def composed(self) -> DictConfig:
         """The job's configuration with the node ``hydra``; raises InputError for what was not allowed."""
@@ -129,6 +133,7 @@ class _Base:
 
     config: DictConfig
     for_any_seed: bool  # whether the other settings are the same for all
+    has_effect: bool  # of `HydraJob`
 
 
 def compose_jobs(
@@ -145,7 +150,10 @@ def compose_jobs(
         seeds = [int(match.group(1)) for word in words if (match := SEED.fullmatch(word))]
         others = tuple(word for word in words if not SEED.fullmatch(word))
         if seeds and others in by_settings:
-            trials.append(replace(with_seed(by_settings[others], seeds[-1]), overrides=given, job=job))
+            like = by_settings[others]
+            assert like.job is not None
+            job = replace(job, has_effect=like.job.has_effect)
+            trials.append(replace(with_seed(like, seeds[-1]), overrides=given, job=job))
             continue
         values = _plain_values(words)
         files = (*(word for word in words if word.partition("=")[0] not in values), *values)
@@ -153,13 +161,15 @@ def compose_jobs(
         if base is None:
             with explained(given):
                 config = job.composed()
+            job = replace(job, has_effect=_has_effect(config))
             trial = settle(config, given)
             trials.append(resolved(trial, given, job))
             if asks_hydra(trial):
                 continue
-            base = _Base(without_hydra(config), not MAY_ASK_FOR_SEED.search(raw_text(trial)))
+            base = _Base(without_hydra(config), not MAY_ASK_FOR_SEED.search(raw_text(trial)), job.has_effect)
             by_files[files] = base
         else:
+            job = replace(job, has_effect=base.has_effect)
             trial = copy.deepcopy(base.config)
             with explained(given):
                 for key, value in values.items():
@@ -169,6 +179,14 @@ def compose_jobs(
         if base.for_any_seed:
             by_settings[others] = trials[-1]
     return trials
+
+
+def _has_effect(config: DictConfig) -> bool:
+    """Return whether Hydra's own settings of a job do more than to run it."""
+    raw: Any = OmegaConf.to_container(config.hydra, resolve=False)
+    folders = [raw["sweep"]["dir"], raw["sweep"]["subdir"], raw["output_subdir"]]
+    said = raw["callbacks"] or raw["job"]["env_set"] or raw["verbose"]
+    return bool(said) or folders != [OWN_FOLDER, ".", None]
 
 
 def typed(overrides: DictConfig) -> tuple[list[str], list[str]]:

@@ -36,6 +36,7 @@ from gsbench.settings import (
     is_folder_name,
     unknown_setting,
 )
+from gsbench.system.resources import trials_at_once
 from gsbench.train.options import TrainConfig
 
 NO_DENSIFIER = "gsbench.densify.NoDensifier"
@@ -80,7 +81,7 @@ class TrackingConfig:
 @dataclass
 class LaunchConfig:
     name: Literal["serial", "local", "slurm"] = MISSING
-    parallel: PositiveInt = 1  # trials at once
+    parallel: PositiveInt | Literal["auto"] = 1  # trials at once; auto: as this machine's cores, memory and GPUs allow
     timeout_min: PositiveInt | None = None  # minutes until a trial is stopped with a checkpoint and queued again
     stop_when_decided: bool = False  # look at eval.primary seed by seed; what is decided gets no further seeds
     least_difference: PositiveFloat | None = None  # of eval.primary, that matters; null: what papers count as one
@@ -188,6 +189,8 @@ def check(config: DictConfig) -> None:
         raise InputError("train.iterations=0 trains nothing, so nothing grows: add densify=none")
     if is_external(config.densify):
         check_external(config)
+    if config.launch.parallel == "auto":
+        config.launch.parallel = trials_at_once(config.densify.get("max_gaussians"), config.device)
 
 
 def _check_groups(config: DictConfig, check_group: Check) -> None:

@@ -15,7 +15,14 @@ from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, stor
 from gsbench.launch.declare import declare, declared_metrics, planned_trials
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
-from gsbench.launch.preflight import borrowed_names, check_parts, check_trackers, missing_folders, missing_weights
+from gsbench.launch.preflight import (
+    borrowed_names,
+    check_parts,
+    check_trackers,
+    disk_line,
+    missing_folders,
+    missing_weights,
+)
 from gsbench.launch.serial import run_serial
 from gsbench.runs.layout import STORE
 from gsbench.runs.stages import STAGES
@@ -67,8 +74,9 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
     check_parts(unfinished, here=launcher != "slurm")
     if launcher != "slurm":
         check_trackers(unfinished)
-    for line in borrowed_names(unfinished):
-        log.warning("%s", line)
+    for line in [*borrowed_names(unfinished), disk_line(unfinished)]:
+        if line:
+            log.warning("%s", line)
     try:
         make_runs_folder(runs)
     except OSError as error:

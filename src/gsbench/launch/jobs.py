@@ -186,4 +186,5 @@ class _Outcomes(pickle.Unpickler):
 def job_of(trial: Trial) -> TrialJob:
     """The trial as a job of the environment that this process has."""
     path = [entry for entry in sys.path if entry]
-    return TrialJob(trial.values, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"), trial.job)
+    job = trial.job if trial.job is not None and trial.job.has_effect else None
+    return TrialJob(trial.values, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"), job)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +14,10 @@ from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.runs.code import OWN
 from gsbench.system.install import install_command
+from gsbench.words import counted, readable_bytes
+
+BYTES_OF_GAUSSIAN = 248  # in a PLY
+LARGE_SHARE = 0.1  # of the free disk
 
 
 def missing_folders(trials: Sequence[Trial]) -> list[str]:
@@ -45,6 +50,17 @@ def missing_weights(trials: Sequence[Trial]) -> list[str]:
         for group, folder in sorted(named)
         if not Path(folder).expanduser().is_dir()
     ]
+
+
+def disk_line(trials: Sequence[Trial]) -> str:
+    """Say how much disk the models of trials may take, where that is a good part of what is free; else ""."""
+    most = sum(BYTES_OF_GAUSSIAN * (trial.values["densify"].get("max_gaussians") or 0) for trial in trials)
+    if not most:
+        return ""
+    runs = trials[0].files.runs
+    free = shutil.disk_usage(next(place for place in (runs, *runs.parents) if place.exists())).free
+    said = f"disk: up to {readable_bytes(most)} for the models of {counted(len(trials), 'trial')}"
+    return f"{said}, {readable_bytes(free)} are free in {runs}" if most > free * LARGE_SHARE else ""
 
 
 def check_parts(trials: Sequence[Trial], here: bool) -> None:

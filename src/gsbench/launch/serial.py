@@ -21,7 +21,9 @@ def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
     """Run the trials; one that another process is at comes last, so that two sweeps share the work."""
     outcomes: list[Outcome] = []
     busy: list[Trial] = []
-    for trial in trials:
+    for number, trial in enumerate(trials, 1):
+        if len(trials) > 1:
+            log.info("%d of %d: %s", number, len(trials), trial.files.label)
         try:
             outcomes.append(run_one(trial, mirror, wait=len(trials) == 1))
         except BusyError as error:
@@ -37,7 +39,7 @@ def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
     """Run one trial; only BusyError, and what ends the program, is raised."""
     folder = trial.folder
     try:
-        if trial.job is None:
+        if trial.job is None or not trial.job.has_effect:
             return outcome_of_results(folder, _run(trial, mirror, wait))
         if not wait and is_held(folder / LOCK):  # before Hydra's callbacks hear of a start
             raise BusyError(f"{TrialFolder(folder).label}: {describe_holder(folder / LOCK)} is at it")

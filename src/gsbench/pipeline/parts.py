@@ -25,7 +25,7 @@ from gsbench.pipeline.components import (
 from gsbench.pipeline.steps.inputs import UserCode
 from gsbench.raster import Rasterizer, create_rasterizer
 from gsbench.raster.executors import AUTO, resolve
-from gsbench.runs.code import user_modules
+from gsbench.runs.code import OWN, user_modules
 from gsbench.scene.options import SceneConfig
 from gsbench.system.resources import available_threads
 from gsbench.train.device import select_device
@@ -58,7 +58,10 @@ class Parts:
 
     @cached_property
     def initializer(self) -> Initializer:
-        made: Initializer = build("init", self.values["init"], self._allowed)
+        values = self.values["init"]
+        if values.get("threads") == "auto" and values["_target_"].startswith(OWN):  # else COLMAP takes all cores
+            values = values | {"threads": self.threads}
+        made: Initializer = build("init", values, self._allowed)
         return made
 
     @cached_property

@@ -124,13 +124,14 @@ def _run(trial: Trial, folder: TrialFolder, mirror: Mirror) -> TrialRecord:
     mirror.follow(folder.path, values["tracking"])
     with _recorded_failures(values, folder):
         for step in pipeline.steps():
+            if step.stage.name == TRAIN.name:
+                scene = pipeline.views.scene
+                log.info("%s: %d training and %d test views", folder.label, len(scene.train), len(scene.test))
             entries[step.stage.name] = entry = store.get(step)
             code |= step.code
             if step.stage is INIT:
                 link_or_copy(entry.path / REPORT_FILE, folder.path / layout.INIT_REPORT)
-        scene = pipeline.views.scene
-        log.info("%s: %d training and %d test views", folder.label, len(scene.train), len(scene.test))
-        results = results_of(values, pipeline.capture, scene, parts.rasterizer.name, entries, code)
+        results = results_of(values, pipeline.capture, pipeline.views.scene, parts.rasterizer.name, entries, code)
         published = _publish(folder.path, entries)
         made_of = {stage.name: entries[stage.name].path for stage in (INIT, TRAIN, GROUND_TRUTH, EVALUATE)}
         again = folder.write_finished(values, results, source_files(pipeline.taken, store), made_of, published)

@@ -55,7 +55,7 @@ class TrialSteps:
             self.capture = masked(self.taken, store.path(replaced))
         reference = None
         if parts.initializer.needs_reference(self.capture):
-            reference = init_step(store, self.capture, Sfm())
+            reference = init_step(store, self.capture, Sfm(threads=parts.threads))
             yield reference
         init = init_step(store, self.capture, parts.initializer, reference, parts.user_code)
         yield init

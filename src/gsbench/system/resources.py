@@ -8,11 +8,17 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import cache
 from pathlib import Path
+
+import psutil
 
 from gsbench.system.locks import BusyError, hold
 
 SECONDS_BETWEEN_TRIES = 0.5
+CORES_OF_TRIAL = 4  # beyond, more trials at once gain more than more threads of one
+MEMORY_OF_TRIAL, MEMORY_OF_GAUSSIAN = 545 * 2**20, 1592  # bytes, of a training on the CPU
+USUAL_GAUSSIANS = 1_000_000  # where nothing limits them
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
@@ -22,6 +28,17 @@ def available_threads(parallel: int = 1) -> int:
     if slurm.isdigit() and int(slurm) > 0:
         return int(slurm)
     return max(1, available_cores() // parallel)
+
+
+@cache
+def trials_at_once(max_gaussians: int | None, device: str) -> int:
+    """The number of trials that use this machine well: by its GPUs where they train, else by its cores and memory."""
+    if device != "cpu" and (gpus := installed_gpus()):
+        return len(gpus)
+    cores = available_cores()
+    needed = MEMORY_OF_TRIAL + MEMORY_OF_GAUSSIAN * (max_gaussians or USUAL_GAUSSIANS)
+    in_memory = psutil.virtual_memory().total // needed
+    return max(1, min(max(min(2, cores), cores // CORES_OF_TRIAL), in_memory))
 
 
 @contextmanager

@@ -7,9 +7,11 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
+from omegaconf import OmegaConf
+
 from gsbench.config.command_words import check_search_path, check_single, parse_word, search_path, typed_permissions
 from gsbench.config.compose import compose_values
-from gsbench.config.questions import answer, has_part
+from gsbench.config.hydra_entry import run_main
 from gsbench.errors import InputError
 from gsbench.verbs.arguments import ArgumentParser
 
@@ -29,14 +31,18 @@ def ask_hydra(argv: list[str]) -> int:
         _check_typed(os.environ.get("COMP_LINE", ""))
     else:
         _check(options.overrides, options.config_dir, options.package)
-    answer(argv)
+
+    def task(config: object) -> None:
+        raise AssertionError("Hydra was asked a question, and ran the task instead")
+
+    run_main(task, argv)
     return 0
 
 
 def _check(overrides: list[str], config_dir: Path | None, package: str | None) -> None:
     check_single(overrides, "choose one whose configuration is shown")
     config = compose_values([*search_path([config_dir] if config_dir else [], overrides), *overrides])
-    if package is not None and not has_part(config, package):
+    if package is not None and OmegaConf.select(config, package) is None:
         raise InputError(f"--package {package}: there is no such part of the configuration")
 
 
