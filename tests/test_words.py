@@ -94,7 +94,6 @@ REFUSED = {  # command line: a part of the line that refuses it
     "-m densify.volume_threshold=interval(0,inf)": "from a number to a larger one",
     "-m densify=adc densify.volume_threshold=interval(0,1)": "it belongs to densify=volumetric",
     "-m hydra.sweeper.tune.seed=-1 densify.volume_threshold=interval(0,1)": "seed must be a whole number in [0,",
-    "-m hydra.sweeper.tune.points=0 densify.volume_threshold=interval(0,1)": "searches nothing",
     "-m hydra.sweeper.tune.at_onec=2 seed=0,1": "did you mean at_once?",
     "-m hydra/sweeper=optuna seed=0,1": "a search is an interval and hydra.sweeper.tune.points",
     "-m hydra.sweeper.params=x seed=0,1": "must map settings to their values",

@@ -36,7 +36,7 @@ class GsbenchLauncher(Launcher):
 class GsbenchSweeper(Sweeper):
     """The grid of all listed values, or several joined, handed to the launcher as a whole.
 
-    ``tune`` says what of each arm is tuned before that. What ``grids`` say is read before Hydra resolves it.
+    ``tune`` says how intervals are searched before that. What ``grids`` say is read before Hydra resolves it.
     """
 
     def __init__(self, params: dict[str, Any] | None, tune: dict[str, Any] | None = None, grids: Any = None) -> None:
@@ -54,7 +54,7 @@ class GsbenchSweeper(Sweeper):
 LAUNCHER = {"_target_": "hydra_plugins.gsbench.GsbenchLauncher"}
 SWEEPER = {"_target_": "hydra_plugins.gsbench.GsbenchSweeper", "params": {}, "grids": []}
 # as gsbench.app.tuning.TuneSettings
-TUNE = {"points": None, "at_once": 1, "metric": None, "direction": None, "seed": 100, "ranges": {}}
+TUNE = {"points": 20, "at_once": 1, "metric": None, "direction": None, "seed": 100}
 # Hydra imports this file more than once; from 1.4 on it says so unless it is told that the same may come again.
 AGAIN: dict[str, Any] = {"replace": True} if "replace" in signature(ConfigStore.store).parameters else {}
 for group, node in (("launcher", LAUNCHER), ("sweeper", {**SWEEPER, "tune": TUNE})):

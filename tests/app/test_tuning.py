@@ -41,12 +41,14 @@ eval: {primary: psnr}
 hydra:
   mode: MULTIRUN
   sweeper:
-    params: {densify: "adc,volumetric", seed: "0,1"}
-    tune:
-      points: 4
-      ranges:
-        adc: {densify.gradient_threshold: "tag(log, interval(1e-4, 4e-4))"}
-        volumetric: {densify.volume_threshold: "tag(log, interval(1e-3, 1e-1))", densify.stop: "range(100, 500, 100)"}
+    params: {seed: "0,1"}
+    grids:
+      - densify: adc
+        densify.gradient_threshold: tag(log, interval(1e-4, 4e-4))
+      - densify: volumetric
+        densify.volume_threshold: tag(log, interval(1e-3, 1e-1))
+        densify.stop: tag(int, interval(100, 500))
+    tune: {points: 4}
 """
 WORDS = [*(word for word in TINY if not word.startswith(("densify=", "seed=", "name="))), "+experiment=fair"]
 KEYS = {"adc": "gradient_threshold", "volumetric": "volume_threshold"}
@@ -144,7 +146,7 @@ def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_th
         assert not any(one["scene"]["validation"] for one in own)
     assert fake.tuning("adc")[0].values["densify"]["gradient_threshold"] == 0.0002  # the arm as it is comes first
     assert tuning(runs, "adc").as_it_is
-    assert not tuning(runs, "volumetric").as_it_is  # its stop is no multiple of 100
+    assert not tuning(runs, "volumetric").as_it_is  # its stop is beyond
 
 
 @pytest.mark.parametrize("stops", [3, 9])  # in the search, and in the sweep
@@ -226,6 +228,13 @@ def test_points_that_fail_are_part_of_the_budget_and_an_arm_without_any_ends_the
     assert "no point of random-adc has a psnr (gsbench status none-tune-random-adc says why)" in capsys.readouterr().err
 
 
+def test_a_typed_value_takes_the_place_of_an_interval(sweep: Sweep, runs: Path) -> None:
+    fake = Fake()
+    assert sweep(fake, "densify.stop=300", "hydra.sweeper.tune.points=1") == 0
+    assert {one.values["densify"]["stop"] for one in fake.tuning("volumetric")} == {300}
+    assert chosen(runs, "volumetric").keys() == {"densify.volume_threshold"}
+
+
 def test_zero_points_tune_nothing(sweep: Sweep, runs: Path) -> None:
     fake = Fake()
     assert sweep(fake, "hydra.sweeper.tune.points=0") == 0
@@ -291,7 +300,7 @@ def test_the_sheet_says_budget_views_points_and_what_was_chosen(sweep: Sweep, ru
         "the best of 4 points by psnr of validation views (courtyard; seed 100), before any of these trials. "
         in volumetric
     )
-    assert "densify.stop=range(100, 500, 100)" in volumetric
+    assert "densify.stop=tag(int, interval(100, 500))" in volumetric
     assert "the arm as it is was no point" in volumetric
     assert "the first point was the arm as it is" in adc
     assert "Tried: 0.0002 (27.59)" in adc
@@ -300,7 +309,7 @@ def test_the_sheet_says_budget_views_points_and_what_was_chosen(sweep: Sweep, ru
     assert "is the best of 4 points" in page
 
 
-UNEVEN = FILE.replace('{densify.gradient_threshold: "tag(log, interval(1e-4, 4e-4))"}', "{}")
+UNEVEN = FILE.replace("        densify.gradient_threshold: tag(log, interval(1e-4, 4e-4))\n", "")
 SENTENCE = "Their tuning was unequal: random-adc none and random-volumetric 4 points of 1 seed on validation views."
 
 
@@ -335,6 +344,7 @@ def test_trials_from_before_the_tuning_and_with_other_values_are_named(sweep: Sw
 
 # --- bad input
 
+INTERVAL = "tag(log, interval(1e-3, 1e-1))"
 MISTAKES = [
     (FILE, "hydra.sweeper.tune.point=3", "did you mean points?"),
     (FILE, "hydra.sweeper.tune.metric=psnrr", "did you mean psnr?"),
@@ -343,21 +353,19 @@ MISTAKES = [
     (FILE, "hydra.sweeper.tune.metric=mine", "for a metric of your own give hydra.sweeper.tune.direction, too"),
     (FILE, "hydra.sweeper.tune.seed='1,2'", "tune.seed: 1 is a seed of the sweep, too"),
     (FILE, "hydra.sweeper.tune.seed=one", "must list whole numbers"),
-    (FILE, "densify.stop=300", "is tuned and given as well"),
-    (FILE, "densify=adc", "ranges.volumetric is no arm of the sweep"),
-    (FILE, "densify=adc,volumetric,longaxis", "say nothing of longaxis"),
     (FILE, "scene.validation=true", "leave scene.validation out"),
     (FILE, "launch.wait=false", "launch.wait must be true"),
-    (FILE, "hydra/sweeper=basic", "hydra.sweeper.tune: gsbench's own sweeper alone tunes arms"),
-    (FILE.replace("points: 4", "points: null"), "", "say how many points"),
-    (FILE[: FILE.index("      ranges")], "", "no ranges to search"),
+    (FILE, "hydra/sweeper=basic", "gsbench's own sweeper alone"),
+    (
+        f"{FILE[: FILE.index('    tune')]}      - {{densify: adc, densify.gradient_threshold: 0.1}}\n",
+        "",
+        "leave one of",
+    ),
     (FILE.replace("densify.stop", "densify.stpo"), "", "did you mean"),
     (FILE.replace("densify.stop", "scene.max_size"), "", "of what all arms are measured by"),
     (FILE.replace("densify.stop", "seed"), "", "of what all arms are measured by"),
-    (FILE.replace('"range(100, 500, 100)"', "300"), "", "is one value"),
-    (FILE.replace("interval(1e-3, 1e-1)", "interval(0, 1e-1)"), "", "densify.volume_threshold"),
-    (FILE.replace("interval(1e-3, 1e-1)", "interval(1e-3"), "", "tune.ranges"),
-    (FILE.replace("        adc: {", "        adc: 3 #"), "", "hydra.sweeper.tune.ranges"),
+    (FILE.replace(INTERVAL, "tag(log, interval(0, 1e-1))"), "", "densify.volume_threshold"),
+    (FILE.replace(INTERVAL, "interval(1e-3"), "", "densify.volume_threshold"),
 ]
 
 
@@ -378,4 +386,4 @@ def test_hydra_shows_the_defaults_of_the_class() -> None:
         field.name: field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
         for field in dataclasses.fields(TuneSettings)
     }
-    assert defaults == {**TUNE, "intervals": False}
+    assert defaults == TUNE

@@ -16,7 +16,7 @@ from gsbench.config.compose import compose_one
 from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
 from gsbench.launch.plan import add_to_plan
-from gsbench.pipeline.components import build
+from gsbench.pipeline.parts import build
 from gsbench.runs.trial_folder import TrialFolder
 from tests.strange import no_trial
 from tests.strange import place as place

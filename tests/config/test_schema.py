@@ -17,7 +17,7 @@ from gsbench.config.compose import compose_one
 from gsbench.config.schema import check, plain, register_schemas
 from gsbench.config.trust import check_target
 from gsbench.errors import InputError
-from gsbench.pipeline.components import build, build_metrics
+from gsbench.pipeline.parts import build, build_metrics
 from gsbench.runs.hashing import config_hash
 from gsbench.system.install import conf_dir
 from gsbench.train.options import TrainConfig

@@ -138,7 +138,7 @@ def test_one_killed_trial_harms_no_other_and_the_next_command_mends_it(
 
 
 TUNED = [
-    *("+experiment=tuned", "densify=adc,volumetric", "seed=0", *SMALL, "train.iterations=120", "eval.lpips=[]"),
+    *("+experiment=tuned", "seed=0", *SMALL, "train.iterations=120", "eval.lpips=[]"),
     *("tracking=none", "hydra.sweeper.tune.points=2", "name=small"),
 ]
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from gsbench.errors import InputError
-from gsbench.pipeline.components import locate
+from gsbench.pipeline.parts import locate
 from gsbench.raster import create_rasterizer, executors, resolve_name
 from gsbench.raster.contract import CASES, departures
 from gsbench.raster.executors import EXECUTORS, Executor, find, resolve

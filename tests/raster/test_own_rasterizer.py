@@ -15,7 +15,7 @@ import torch
 from gsbench.config.compose import compose_one
 from gsbench.densify import ADC, PixelGS
 from gsbench.errors import InputError
-from gsbench.pipeline.components import build_rasterizer, check_offers
+from gsbench.pipeline.parts import build_rasterizer, check_offers
 from gsbench.pipeline.steps.inputs import rasterizer_inputs
 from gsbench.raster import create_rasterizer
 from gsbench.runs.hashing import config_hash

@@ -8,7 +8,7 @@ from gsbench.analysis.differences import differing_keys
 from gsbench.analysis.results import Arm, TrialResult, by_key, read_experiment
 from gsbench.records import read_if_sound
 from gsbench.runs.layout import TUNING
-from gsbench.runs.tuning_record import Point, TuningRecord, is_value
+from gsbench.runs.tuning_record import Point, TuningRecord
 from gsbench.words import counted, listed
 
 MOST_VALUES = 8  # points of a search that are named
@@ -138,4 +138,4 @@ def _has_values(trial: TrialResult, point: Point | None) -> bool:
     if point is None or not point.settings:
         return False
     settings = {key.lstrip("+~"): value for key, value in point.settings.items()}
-    return all(key in trial.config and is_value(trial.config[key], value) for key, value in settings.items())
+    return all(trial.config.get(key) == value for key, value in settings.items())

@@ -54,9 +54,9 @@ def is_interval(override: Override) -> bool:
     return override.is_sweep_override() and not override.is_discrete_sweep()
 
 
-def intervals_of(overrides: Sequence[Override]) -> dict[str, str]:
-    """The intervals among words: the text of each by its setting."""
-    return {one.get_key_element(): str(one.input_line).partition("=")[2] for one in overrides if is_interval(one)}
+def text_of(override: Override) -> str:
+    """The value of a word as it was typed."""
+    return str(override.input_line).partition("=")[2]
 
 
 def checked_grids(grids: Any) -> list[dict[str, str]]:
@@ -73,18 +73,19 @@ def words_of_grids(
 
     Of two for one setting the later counts; trials are in the order of the grids, the shared settings varying fastest.
     """
-    listed = {_bare(key) for grid in grids for key in grid}
+    listed = {bare(key) for grid in grids for key in grid}
     return [
         [
             *(f"{key}={value}" for key, value in grid.items()),
-            *(f"{key}={value}" for key, value in params.items() if _bare(key) not in map(_bare, grid)),
-            *(word for word in given if key_of(word) not in listed - set(map(_bare, grid))),
+            *(f"{key}={value}" for key, value in params.items() if bare(key) not in map(bare, grid)),
+            *(word for word in given if key_of(word) not in listed - set(map(bare, grid))),
         ]
         for grid in grids or [{}]
     ]
 
 
-def _bare(key: str) -> str:
+def bare(key: str) -> str:
+    """A key without the signs by which it is added or taken away."""
     return key.lstrip("+~")
 
 

@@ -20,7 +20,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
 from gsbench.app.command import OWN, Task
-from gsbench.app.grids import checked_grids, grid, intervals_of, is_interval, words_of_grids
+from gsbench.app.grids import bare, checked_grids, grid, is_interval, words_of_grids
 from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import Planned, headline, plan_sweep, run_looks
 from gsbench.config.compose import Trial
@@ -56,16 +56,17 @@ class Sweep:
 
     def run(self, params: Mapping[str, Any], tune: Mapping[str, Any], words: Sequence[str]) -> Sequence[JobReturn]:
         """Run all points that the words of the sweep span; ``params`` are the settings and values of
-        ``hydra.sweeper.params``, ``tune`` says what of the arms is tuned before (`gsbench.app.tuning`).
+        ``hydra.sweeper.params``, ``tune`` says how the intervals among them are searched before (`gsbench.app.tuning`).
         """
         grids = checked_grids(self.task.grids or [])
         jobs: list[list[str]] = []
-        intervals: list[dict[str, str]] = []  # among the words of each job: what is searched for its arm
+        intervals: list[dict[str, Override]] = []  # among the words of each job: what is searched for its arm
         for of_grid in words_of_grids(params, grids, words):
-            given = self.parse(of_grid)
-            points = grid([override for override in given if not is_interval(override)])
+            given = {bare(one.get_key_element()): one for one in self.parse(of_grid)}  # the later counts
+            points = grid([one for one in given.values() if not is_interval(one)])
             jobs += points
-            intervals += [intervals_of(given)] * len(points)
+            searched = {one.get_key_element(): one for one in given.values() if is_interval(one)}
+            intervals += [searched] * len(points)
         trials = self.trials(tuned_jobs(self, tune, jobs, intervals))
         until_decided = any(trial.values["launch"]["stop_when_decided"] for trial in trials)
         return self._run_until_decided(trials) if until_decided else self.launch(trials)

@@ -1,8 +1,8 @@
 """Tuning parity: before a sweep's trials, each arm gets the same number of points of a search, on validation views.
 
-What is tuned is given as intervals among the words of the sweep, or below ``hydra.sweeper.tune``: the number of points
-and, for each arm, the ranges of its settings. A search is the tuning of one arm. Each arm's points are trained in an
-experiment of its own, so that no table holds them; the first is the arm as it is, where that lies in the ranges. The
+What is tuned is given as intervals among the words of the sweep or in its grids, each for the arms that it is meant
+for; an arm without any stays as it is. A search is the tuning of one arm. Each arm's points are trained in an
+experiment of its own, so that no table holds them; the first is the arm as it is, where that lies in the intervals. The
 best point's values become words of the sweep's jobs.
 
 Each arm has a study of Optuna's in memory, whose proposals depend on the results before them alone. A sweep that was
@@ -20,11 +20,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
+from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 from pydantic import NonNegativeInt, PositiveInt
 
-from gsbench.app.grids import grid
+from gsbench.app.grids import bare, grid, text_of
 from gsbench.config.command_words import check_makes_trials, key_of, parse_word
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
@@ -33,7 +33,7 @@ from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.runs.declaration import metric_and_question
 from gsbench.runs.experiments import make_home
 from gsbench.runs.layout import TUNING
-from gsbench.runs.tuning_record import Point, TuningRecord, is_value
+from gsbench.runs.tuning_record import Point, TuningRecord
 from gsbench.settings import check_settings
 from gsbench.system.install import install_command
 from gsbench.words import closest, counted, listed
@@ -49,7 +49,7 @@ log = logging.getLogger(__name__)
 
 PLACE = "hydra.sweeper.tune"
 DEFAULT_METRIC = "psnr"
-DEFAULT_POINTS = 20  # of intervals on the command line
+DEFAULT_POINTS = 20
 SEED = "seed"
 MEASURED_ON = ("scene", "eval", "launch", "tracking", "hydra")  # groups that no arm may tune: they say how it is judged
 REPLACED = (SEED, "name", "scene.validation", "eval.primary")  # words of a job that a point's trials have otherwise
@@ -59,32 +59,19 @@ DIRECTIONS: dict[int, Literal["maximize", "minimize"]] = {1: "maximize", -1: "mi
 
 @dataclass(frozen=True)
 class TuneSettings:
-    """Settings of a tuning. ``points`` are those of each arm; 0 and None: nothing is tuned.
+    """Settings of a tuning. ``points`` are those of each arm; 0: nothing is tuned, and intervals are left out.
 
-    ``ranges`` maps an arm (``adc`` or ``sfm-adc``) to its settings, each with its values as on the command line;
-    ``seed`` are the seeds of a point's trials, none of which the sweep may have. ``intervals``: the sweep's words have
-    ranges as well.
+    ``seed`` are the seeds of a point's trials, none of which the sweep may have.
     """
 
-    points: NonNegativeInt | None = None
+    points: NonNegativeInt = DEFAULT_POINTS
     at_once: PositiveInt = 1  # points of an arm that are chosen before the next result is known
     metric: str | None = None  # None: eval.primary, else PSNR
     direction: Literal["maximize", "minimize"] | None = None
     seed: int | str = 100
-    ranges: dict[str, dict[str, Any]] = field(default_factory=dict)
-    intervals: bool = False
 
     def __post_init__(self) -> None:
         check_settings(self, PLACE)
-        if self.ranges and self.points is None:
-            raise InputError(f"{PLACE}.ranges are given: say how many points each arm gets ({PLACE}.points=6; 0: none)")
-        if self.points and not self.ranges and not self.intervals:
-            raise InputError(
-                f"{PLACE}.points={self.points}, and no ranges to search: give them by arm, as "
-                f"{PLACE}.ranges.adc={{densify.gradient_threshold: 'tag(log, interval(1e-4, 4e-4))'}}, best in a file"
-            )
-        if self.points == 0 and self.intervals:
-            raise InputError(f"{PLACE}.points=0 searches nothing: give a value in place of each interval")
 
 
 @dataclass(frozen=True)
@@ -176,24 +163,21 @@ class Search:
 
 
 def tuned_jobs(
-    begun: Sweep, settings: Any, jobs: Sequence[Sequence[str]], intervals: Sequence[Mapping[str, str]]
+    begun: Sweep, settings: Any, jobs: Sequence[Sequence[str]], intervals: Sequence[Mapping[str, Override]]
 ) -> list[list[str]]:
-    """The jobs of a sweep with the values to which each arm is tuned first.
+    """The jobs of a sweep with the values to which each arm is tuned first, in the ``intervals`` that each job has.
 
-    What is tuned are the ``intervals`` among the words of each job, and what ``settings`` (``hydra.sweeper.tune``) say.
-    Raises InputError for settings that fit no arm, and GsbenchError where no point of an arm could be judged.
+    Raises InputError for ``settings`` (``hydra.sweeper.tune``) and intervals that cannot be, and GsbenchError where no
+    point of an arm could be judged.
     """
-    given: Any = OmegaConf.to_container(settings) if OmegaConf.is_config(settings) else dict(settings)
-    if any(intervals) and given.get("points") is None:
-        given["points"] = DEFAULT_POINTS
-    wanted = TuneSettings(**given, intervals=any(intervals))
+    wanted = TuneSettings(**OmegaConf.to_container(OmegaConf.create(settings)))  # type: ignore[arg-type]
     untuned = [list(job) for job in jobs]
-    if not wanted.points:
+    if not wanted.points or not any(intervals):
         return untuned
     if not begun.config.launch.wait:
         raise InputError(f"{PLACE} learns from results, so launch.wait must be true")
     trials = begun.trials(jobs)
-    searches = _plan(begun, wanted, jobs, intervals, trials)
+    searches = _plan(wanted, jobs, intervals, trials)
     tuned = {search.arm: search for search in searches if search.ranges}
     if begun.task.look_only:
         print(_describe(searches))
@@ -276,15 +260,14 @@ def _describe(searches: Sequence[Search]) -> str:
 
 
 def _plan(
-    begun: Sweep,
     wanted: TuneSettings,
     jobs: Sequence[Sequence[str]],
-    intervals: Sequence[Mapping[str, str]],
+    intervals: Sequence[Mapping[str, Override]],
     trials: Sequence[Trial],
 ) -> list[Search]:
     """The search of each arm of a sweep, without ranges where the arm stays as it is.
 
-    Raises InputError for settings that fit no arm.
+    Raises InputError for what cannot be searched.
     """
     _check_installed()
     homes = {trial.files.home for trial in trials}
@@ -293,42 +276,28 @@ def _plan(
     if any(trial.values["scene"]["validation"] for trial in trials):
         raise InputError(f"{PLACE} searches on validation views by itself: leave scene.validation out")
     goal = _goal(wanted, trials)
-    names = [(str(trial.values["init"]["name"]), str(trial.values["densify"]["name"])) for trial in trials]
-    known = {name for init, densify in names for name in (densify, f"{init}-{densify}")}
-    if unknown := next((name for name in wanted.ranges if name not in known), None):
-        raise InputError(
-            f"{PLACE}.ranges.{unknown} is no arm of the sweep{closest(unknown, known)} (there are: "
-            f"{', '.join(sorted({densify for _, densify in names}))})"
-        )
+    (home,) = homes
+    names = [trial.folder.parent.name for trial in trials]
     searches = []
-    for pair in dict.fromkeys(names):
-        name = "-".join(pair)
-        places = [place for place, own in enumerate(names) if own == pair]
-        typed = {key: text for place in places for key, text in intervals[place].items()}
-        given = wanted.ranges.get(name, wanted.ranges.get(pair[1], typed or None))
-        if given is None:
-            raise InputError(
-                f"{PLACE}.ranges say nothing of {pair[1]}: give what is tuned of it, or {pair[1]}: {{}} to leave it "
-                "as it is, which each verdict will say"
-            )
-        texts = {str(key): str(value) for key, value in given.items()} | typed
-        ranges = _ranges(begun, name, texts, [word for place in places for word in jobs[place]])
+    for name in dict.fromkeys(names):
+        places = [place for place, own in enumerate(names) if own == name]
+        given = dict(sorted((key, one) for place in places for key, one in intervals[place].items()))
         own = [tuple(word for word in jobs[place] if key_of(word) not in REPLACED) for place in places]
-        first, home = trials[places[0]], trials[places[0]].files.home
+        if both := next((key for key in given if any(key_of(word) == bare(key) for job in own for word in job)), None):
+            raise InputError(f"{both} of {name} is searched in one grid and given in another: leave one of them out")
+        ranges = {key: distribution(one) for key, one in given.items()}
         searches.append(
             Search(
                 arm=name,
                 home=home.with_name(f"{home.name}-tune-{name}"),
                 goal=goal,
-                texts=texts,
+                texts={key: text_of(one) for key, one in given.items()},
                 ranges=ranges,
                 jobs=list(dict.fromkeys(own)),
                 scenes=list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
-                first=_as_it_is(first.values, ranges),
+                first=_as_it_is(trials[places[0]].values, ranges),
             )
         )
-    if not any(search.ranges for search in searches):
-        raise InputError(f"{PLACE}.ranges name no setting of any arm: nothing is tuned")
     return searches
 
 
@@ -373,51 +342,25 @@ def _sign_of(metric: str, direction: str | None) -> Literal[-1, 1]:
 # ---- ranges
 
 
-def _ranges(begun: Sweep, arm: str, texts: Mapping[str, str], words: Sequence[str]) -> dict[str, BaseDistribution]:
-    given = {key_of(word) for word in words}
-    found = {}
-    for key, text in texts.items():
-        bare = key.lstrip("+~")
-        if bare.partition(".")[0] in (*MEASURED_ON, *REPLACED):
-            raise InputError(f"{PLACE}.ranges: {key} is no setting of an arm, but of what all arms are measured by")
-        if bare in given:
-            raise InputError(f"{PLACE}.ranges: {key} of {arm} is tuned and given as well: leave one of them out")
-        try:
-            parse_word(f"{key}={text}")
-        except InputError as error:
-            raise InputError(f"{PLACE}.ranges of {arm}: {error}") from None
-        (override,) = begun.parse([f"{key}={text}"])
-        if not override.is_sweep_override():
-            raise InputError(f"{PLACE}.ranges: {key}={text} is one value: give an interval or a list of values")
-        found[key] = distribution(override)
-    return dict(sorted(found.items()))
-
-
 def distribution(override: Override) -> BaseDistribution:
-    """Return the range of a swept word's values; raises InputError for what makes no other trial."""
-    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+    """Return the range of an interval's values; raises InputError for what makes no other trial of an arm."""
+    from optuna.distributions import FloatDistribution, IntDistribution
 
     check_makes_trials(override)
+    key = override.get_key_element()
+    if bare(key).partition(".")[0] in (*MEASURED_ON, *REPLACED):
+        raise InputError(f"{key} is no setting of an arm, but of what all arms are measured by: give it a value")
     sweep: Any = override.value()
+    low, high, log_scale = sweep.start, sweep.end, "log" in sweep.tags
     try:
-        if isinstance(sweep, IntervalSweep):
-            low, high = sweep.start, sweep.end
-            assert low is not None
-            assert high is not None
-            log_scale = "log" in sweep.tags
-            if not -math.inf < low < high < math.inf:
-                raise ValueError("an interval goes from a number to a larger one")
-            if log_scale and low <= 0:
-                raise ValueError("on a logarithmic scale an interval begins above 0")
-            if isinstance(low, int) and isinstance(high, int) and "int" in sweep.tags:
-                return IntDistribution(low, high, log=log_scale)
-            return FloatDistribution(float(low), float(high), log=log_scale)
-        if isinstance(sweep, RangeSweep) and not isinstance(sweep.step, float):
-            values = [int(str(value)) for value in override.sweep_iterator()]
-            return IntDistribution(values[0], values[-1], step=max(1, int(sweep.step)))
-        choices = list(dict.fromkeys(word.partition("=")[2] for (word,) in grid([override])))
-        return CategoricalDistribution(choices)
-    except (ValueError, IndexError) as error:
+        if not -math.inf < low < high < math.inf:
+            raise ValueError("an interval goes from a number to a larger one")
+        if log_scale and low <= 0:
+            raise ValueError("on a logarithmic scale an interval begins above 0")
+        if isinstance(low, int) and isinstance(high, int) and "int" in sweep.tags:
+            return IntDistribution(low, high, log=log_scale)
+        return FloatDistribution(float(low), float(high), log=log_scale)
+    except ValueError as error:
         raise InputError(f"{override.input_line}: {error}") from error
 
 
@@ -426,7 +369,7 @@ def _as_it_is(values: Mapping[str, Any], ranges: Mapping[str, BaseDistribution])
     found: dict[str, Any] = {}
     for key, one in ranges.items():
         value: Any = values
-        for part in key.lstrip("+~").split("."):
+        for part in bare(key).split("."):
             value = value.get(part) if isinstance(value, Mapping) else None
         if (own := _in_range(value, one)) is None:
             return None
@@ -436,12 +379,10 @@ def _as_it_is(values: Mapping[str, Any], ranges: Mapping[str, BaseDistribution])
 
 def _in_range(value: Any, one: Any) -> Any:
     """The value as the range ``one`` has it; None where that lacks it."""
-    if hasattr(one, "choices"):
-        return next((choice for choice in one.choices if is_value(value, choice)), None)
     if isinstance(value, bool) or not isinstance(value, int | float) or not one.low <= value <= one.high:
         return None
     if isinstance(one.low, int):
-        return value if isinstance(value, int) and (value - one.low) % one.step == 0 else None
+        return value if isinstance(value, int) else None
     return float(value) if _rounded(float(value)) == value else None
 
 

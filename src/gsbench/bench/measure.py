@@ -16,7 +16,7 @@ from gsbench.bench.scenes import SEED, make_scene
 from gsbench.densify import ADC
 from gsbench.errors import InputError
 from gsbench.logs import Progress, progress
-from gsbench.pipeline.components import build_rasterizer
+from gsbench.pipeline.parts import build_rasterizer
 from gsbench.raster.base import Rasterizer
 from gsbench.raster.executors import find
 from gsbench.system.isolate import run_isolated

@@ -174,7 +174,7 @@ def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
     known = find(metric)
     if known is not None:
         return known
-    from gsbench.pipeline.components import build_metrics  # a user's own, whose class must be made
+    from gsbench.pipeline.parts import build_metrics  # a user's own, whose class must be made
 
     return facts_of(metric, build_metrics(values["eval"], values["allow_targets"])[metric])
 

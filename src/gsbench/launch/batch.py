@@ -118,6 +118,6 @@ def _unavailable_metrics(options: dict[str, Any]) -> frozenset[str]:
 def _unavailable(options: str) -> frozenset[str]:
     """The metrics that cannot be computed here and now; weights are looked for, and fetched, once for a sweep."""
     from gsbench.eval.options import EvalConfig
-    from gsbench.pipeline.components import make_evaluator
+    from gsbench.pipeline.parts import make_evaluator
 
     return frozenset(make_evaluator(EvalConfig(**json.loads(options))).awaited)

@@ -21,7 +21,7 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.pictures import Matching, Pair, match_by_order, match_pictures, measure
 from gsbench.files import storage_errors
 from gsbench.logs import progress
-from gsbench.pipeline.components import build_metrics, make_evaluator
+from gsbench.pipeline.parts import build_metrics, make_evaluator
 from gsbench.renders.import_renders import check_place, enter, find_place
 from gsbench.renders.reference_images import Truth, find_truth, truth_of_trial
 from gsbench.scene.readers import list_images

@@ -14,7 +14,7 @@ from gsbench.runs.layout import TUNING
 class Point(Part):
     """A choice of values; ``value`` is the mean of the metric over its trials, None where one of them has none."""
 
-    settings: dict[str, bool | Whole | Number | str]
+    settings: dict[str, Whole | Number]
     value: Number | None
 
 
@@ -43,7 +43,7 @@ class TuningRecord(Part):
         if len({frozenset(point.settings) for point in self.points if point.value is not None}) > 1:
             raise ValueError("the points have different settings")
         on_scale = (point.settings.get(key) for point in self.points for key in self.log)
-        if any(isinstance(value, int | float) and value <= 0 for value in on_scale):
+        if any(value is not None and value <= 0 for value in on_scale):
             raise ValueError("a setting of a log scale is not above 0")
 
     @property
@@ -56,20 +56,3 @@ class TuningRecord(Part):
 def read_tuning(home: Path) -> TuningRecord:
     """The search of the experiment in ``home``; raises FileNotFoundError and DamagedError."""
     return read_typed(home / TUNING, TuningRecord)
-
-
-def is_value(setting: object, of_point: object) -> bool:
-    """Return whether a setting has the value of a point, where a choice among words stands as it was typed.
-
-    Examples:
-        >>> is_value(True, "true"), is_value(0.3, "0.30"), is_value("soft", "soft"), is_value(True, 1)
-        (True, True, True, False)
-    """
-    if setting is None or isinstance(setting, bool):
-        return of_point == ("null" if setting is None else str(setting).lower())
-    if isinstance(setting, int | float) and isinstance(of_point, str):
-        try:
-            return float(of_point) == setting
-        except ValueError:
-            return False
-    return setting == of_point
