@@ -168,7 +168,6 @@ REFUSED = {  # command line: a part of the line that refuses it
     "bench --size 999999999x999999999": "a size is WIDTHxHEIGHT",
     "bench --raster auto": "name those to time",
     "--cfg job nosuch=1": "nosuch is not a setting",
-    "--cfg job train.iterations=abc": "train.iterations must be",
     "--cfg job -m seed=1": "unrecognized arguments: -m",
     "tables x --fromat csv": "unrecognized arguments: --fromat csv; did you mean --format?",
     "tables x --fromat=csv": "did you mean --format?",

@@ -47,7 +47,7 @@ hydra:
         densify.gradient_threshold: tag(log, interval(1e-4, 4e-4))
       - densify: volumetric
         densify.volume_threshold: tag(log, interval(1e-3, 1e-1))
-        densify.stop: tag(int, interval(100, 500))
+        densify.stop: tag(int, interval(300, 500))
     tune: {points: 4}
 """
 WORDS = [*(word for word in TINY if not word.startswith(("densify=", "seed=", "name="))), "+experiment=fair"]
@@ -144,6 +144,7 @@ def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_th
         assert [one["seed"] for one in own] == [0, 1]
         assert {one["densify"][KEYS[arm]] for one in own} == {closest}
         assert not any(one["scene"]["validation"] for one in own)
+    assert all(isinstance(one.values["densify"]["stop"], int) for one in fake.tuning("volumetric"))
     assert fake.tuning("adc")[0].values["densify"]["gradient_threshold"] == 0.0002  # the arm as it is comes first
     assert tuning(runs, "adc").as_it_is
     assert not tuning(runs, "volumetric").as_it_is  # its stop is beyond
@@ -230,8 +231,8 @@ def test_points_that_fail_are_part_of_the_budget_and_an_arm_without_any_ends_the
 
 def test_a_typed_value_takes_the_place_of_an_interval(sweep: Sweep, runs: Path) -> None:
     fake = Fake()
-    assert sweep(fake, "densify.stop=300", "hydra.sweeper.tune.points=1") == 0
-    assert {one.values["densify"]["stop"] for one in fake.tuning("volumetric")} == {300}
+    assert sweep(fake, "densify.stop=200", "hydra.sweeper.tune.points=1") == 0
+    assert {one.values["densify"]["stop"] for one in fake.tuning("volumetric")} == {200}
     assert chosen(runs, "volumetric").keys() == {"densify.volume_threshold"}
 
 
@@ -300,7 +301,7 @@ def test_the_sheet_says_budget_views_points_and_what_was_chosen(sweep: Sweep, ru
         "the best of 4 points by psnr of validation views (courtyard; seed 100), before any of these trials. "
         in volumetric
     )
-    assert "densify.stop=tag(int, interval(100, 500))" in volumetric
+    assert "densify.stop=tag(int, interval(300, 500))" in volumetric
     assert "the arm as it is was no point" in volumetric
     assert "the first point was the arm as it is" in adc
     assert "Tried: 0.0002 (27.59)" in adc

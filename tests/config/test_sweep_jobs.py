@@ -87,5 +87,6 @@ def test_values_that_may_be_set_after_the_rest(words: list[str], values: dict[st
 )
 def test_trials_carry_hydras_sweep_along_only_where_hydra_does_something(words: list[str], expected: bool) -> None:
     trials = compose_trials(["densify=adc,volumetric", "seed=0,1", *words], multirun=True)
-    carried = [len(pickle.dumps(job_of(trial))) > 20_000 for trial in trials]
-    assert carried == [expected] * 4
+    jobs = [job_of(trial) for trial in trials]
+    assert [job.job is not None for job in jobs] == [expected] * 4
+    assert expected or all(len(pickle.dumps(job)) < 20_000 for job in jobs)

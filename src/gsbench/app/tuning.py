@@ -357,8 +357,10 @@ def distribution(override: Override) -> BaseDistribution:
             raise ValueError("an interval goes from a number to a larger one")
         if log_scale and low <= 0:
             raise ValueError("on a logarithmic scale an interval begins above 0")
-        if isinstance(low, int) and isinstance(high, int) and "int" in sweep.tags:
-            return IntDistribution(low, high, log=log_scale)
+        if "int" in sweep.tags:
+            if not float(low).is_integer() or not float(high).is_integer():
+                raise ValueError("whole numbers lie between whole numbers")
+            return IntDistribution(int(low), int(high), log=log_scale)
         return FloatDistribution(float(low), float(high), log=log_scale)
     except ValueError as error:
         raise InputError(f"{override.input_line}: {error}") from error

@@ -29,7 +29,7 @@ from gsbench.config.command_words import (
 )
 from gsbench.config.hydra_entry import CONFIG_NAME, hydra_ready
 from gsbench.config.messages import explained
-from gsbench.config.schema import check, check_values, plain
+from gsbench.config.schema import check, plain
 from gsbench.config.trust import PERMISSIONS, check_composed, check_permissions
 from gsbench.errors import InputError
 from gsbench.parsing import LOADER, MOST_VALUES
@@ -142,16 +142,6 @@ def compose_one(overrides: Sequence[str], modules: str | None = None) -> Trial:
     check_single(overrides, "choose one")
     with hydra_ready():
         return ready_trial(compose_whole(overrides, modules), overrides)
-
-
-def compose_values(overrides: Sequence[str]) -> DictConfig:
-    """The configuration to look at: every value is allowed, and what a trial needs may still be missing."""
-    with hydra_ready():
-        config = compose_whole(overrides)
-        with explained(overrides):
-            values = without_hydra(config)
-            check_values(values)
-    return values
 
 
 def ready_trial(config: DictConfig, overrides: Sequence[str], job: HydraJob | None = None) -> Trial:

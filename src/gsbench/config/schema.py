@@ -166,18 +166,16 @@ def _names_and_defaults(schema: type) -> type:
     return dataclasses.make_dataclass(schema.__name__, fields)
 
 
-def check_values(config: DictConfig) -> None:
-    """Hold the values of a composed configuration against their schemas, and convert them (``1e3`` to 1000).
+def check(config: DictConfig) -> None:
+    """Hold the values of a composed configuration against their schemas and each other, and convert them (``1e3``).
 
     The classes that ``init`` and ``densify`` name check their own options when they are made. Raises InputError naming
     the key.
     """
-    _check_groups(config, checked)
-
-
-def check(config: DictConfig) -> None:
-    """Do as `check_values`, and apply the rules between values: a trial can then be made of the configuration."""
-    _check_groups(config, _made)
+    for group, schema in GROUP_SCHEMAS.items():
+        _convert(config[group], schema, _settings_of(config, group), group, _made)
+    groups = (*GROUP_SCHEMAS, *COMPONENTS)
+    _convert(config, Config, {str(key): _unwrapped(config[key]) for key in config if key not in groups}, "", checked)
     for group in COMPONENTS:
         values = _group(config, group)
         checked(ComponentConfig, {key: values.get(key) for key in ("name", "_target_")}, group)
@@ -191,13 +189,6 @@ def check(config: DictConfig) -> None:
         check_external(config)
     if config.launch.parallel == "auto":
         config.launch.parallel = trials_at_once(config.densify.get("max_gaussians"), config.device)
-
-
-def _check_groups(config: DictConfig, check_group: Check) -> None:
-    for group, schema in GROUP_SCHEMAS.items():
-        _convert(config[group], schema, _settings_of(config, group), group, check_group)
-    groups = (*GROUP_SCHEMAS, *COMPONENTS)
-    _convert(config, Config, {str(key): _unwrapped(config[key]) for key in config if key not in groups}, "", checked)
 
 
 def _made(schema: type, given: Mapping[str, Any], group: str) -> dict[str, Any]:

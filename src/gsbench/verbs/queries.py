@@ -10,8 +10,8 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from gsbench.config.command_words import check_search_path, check_single, parse_word, search_path, typed_permissions
-from gsbench.config.compose import compose_values
-from gsbench.config.hydra_entry import run_main
+from gsbench.config.compose import compose_whole
+from gsbench.config.hydra_entry import hydra_ready, run_main
 from gsbench.errors import InputError
 from gsbench.verbs.arguments import ArgumentParser
 
@@ -41,7 +41,8 @@ def ask_hydra(argv: list[str]) -> int:
 
 def _check(overrides: list[str], config_dir: Path | None, package: str | None) -> None:
     check_single(overrides, "choose one whose configuration is shown")
-    config = compose_values([*search_path([config_dir] if config_dir else [], overrides), *overrides])
+    with hydra_ready():
+        config = compose_whole([*search_path([config_dir] if config_dir else [], overrides), *overrides])
     if package is not None and OmegaConf.select(config, package) is None:
         raise InputError(f"--package {package}: there is no such part of the configuration")
 
