@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -10,7 +11,8 @@ import torch
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.protocol import PAPER
 from gsbench.pipeline.steps import inputs as inputs_module
-from gsbench.pipeline.steps.evaluate import evaluate_step, measure_step
+from gsbench.pipeline.steps.evaluate import evaluate_step
+from gsbench.pipeline.steps.inputs import UserCode
 from gsbench.raster import create_rasterizer
 from gsbench.runs.stages import TRAIN, Step
 
@@ -21,10 +23,20 @@ FOUR_LPIPS = ["lpips_alex", "lpips_squeeze", "lpips_vgg", "lpips_vgg_raw"]
 def inputs(of_model: dict[str, bool] | None = None, **options: Any) -> dict[str, Any]:
     """The inputs of an evaluation without LPIPS, whose views are not needed for a key."""
     evaluator = Evaluator(PAPER, lpips=[], **options)
-    cpu, asked = torch.device("cpu"), of_model or {}
-    rasterizer = create_rasterizer("reference", cpu, 1)
-    step = evaluate_step(None, TRAINED, rasterizer, evaluator, (0, 0, 0), False, cpu, of_model=asked)  # type: ignore[arg-type]
-    measured = measure_step(None, TRAINED, evaluator, of_model=asked)  # type: ignore[arg-type]
+    cpu = torch.device("cpu")
+    parts: Any = SimpleNamespace(
+        evaluator=evaluator,
+        rasterizer=create_rasterizer("reference", cpu, 1),
+        device=cpu,
+        train=SimpleNamespace(background=(0, 0, 0)),
+        eval=SimpleNamespace(maps=False, of_model=of_model or {}),
+        measured_earlier=[],
+        user_code=UserCode(),
+        program=None,
+    )
+    step = evaluate_step(None, TRAINED, parts)  # type: ignore[arg-type]
+    parts.program = SimpleNamespace(leaves_model=False)
+    measured = evaluate_step(None, TRAINED, parts)  # type: ignore[arg-type]
     new = {"more", "geometry", "flicker"}
     assert {key: measured.inputs[key] for key in new & measured.inputs.keys()} == {
         key: step.inputs[key] for key in new & step.inputs.keys()

@@ -9,10 +9,9 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 
-from gsbench.errors import InputError
 from gsbench.init import Sfm
 from gsbench.pipeline.parts import Parts
-from gsbench.pipeline.steps.evaluate import evaluate_step, measure_step
+from gsbench.pipeline.steps.evaluate import evaluate_step
 from gsbench.pipeline.steps.external import external_step
 from gsbench.pipeline.steps.init import init_step
 from gsbench.pipeline.steps.scene import CaptureSource, Views, ground_truth_step, masked, masked_step
@@ -60,50 +59,11 @@ class TrialSteps:
         init = init_step(store, self.capture, parts.initializer, reference, parts.user_code)
         yield init
         self.views = Views(store, self.capture, init, parts.scene)
-        trained = self._train_step()
+        program = parts.program
+        trained = train_step(self.views, parts) if program is None else external_step(self.views, program, parts)
         yield trained
         yield ground_truth_step(self.views)
-        yield self._evaluate_step(trained)
-
-    def _train_step(self) -> Step:
-        parts = self.parts
-        if parts.program is not None:
-            if self.capture.masks:
-                raise InputError(
-                    f"densify={parts.values['densify']['name']}: another program is not told of masks, and would learn "
-                    "what stands in for ignored pixels: leave scene.masks out, or train with gsbench"
-                )
-            return external_step(
-                self.views, parts.program, parts.train.iterations, parts.seed, parts.device, parts.threads
-            )
-        return train_step(
-            self.views,
-            parts.densifier,
-            parts.rasterizer,
-            parts.train,
-            parts.seed,
-            parts.device,
-            parts.measured_earlier,
-            parts.user_code,
-        )
-
-    def _evaluate_step(self, trained: Step) -> Step:
-        parts = self.parts
-        if parts.program is not None and not parts.program.leaves_model:
-            return measure_step(self.views, trained, parts.evaluator, parts.eval.of_model, parts.user_code)
-        return evaluate_step(
-            self.views,
-            trained,
-            parts.rasterizer,
-            parts.evaluator,
-            parts.train.background,
-            parts.eval.maps,
-            parts.device,
-            parts.measured_earlier,
-            made_by_program=parts.program is not None,
-            of_model=parts.eval.of_model,
-            user=parts.user_code,
-        )
+        yield evaluate_step(self.views, trained, parts)
 
 
 class StepFinder:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from gsbench.gaussians.ply import read_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.logs import progress
-from gsbench.pipeline.steps.inputs import GSBENCH_ALONE, UserCode, options_of, rasterizer_inputs, step_of
+from gsbench.pipeline.steps.inputs import UserCode, options_of, rasterizer_inputs, step_of
 from gsbench.pipeline.steps.model_metrics import ModelMetrics, measure_model, nothing_known
 from gsbench.pipeline.steps.pictures import draw_ellipsoids, view_maps
 from gsbench.pipeline.steps.scene import Views
@@ -38,28 +38,24 @@ from gsbench.scene.nearness import COUNTED, nearness
 from gsbench.scene.types import Scene
 from gsbench.train.trainer import snapshot_file
 
+if TYPE_CHECKING:
+    from gsbench.pipeline.parts import Parts
+
 EXTRA = "eval.extra"  # where a configuration has the user's own metrics
 
 
-def evaluate_step(
-    views: Views,
-    trained: Step,
-    rasterizer: Rasterizer,
-    evaluator: Evaluator,
-    background: tuple[float, float, float],
-    maps: bool,
-    device: torch.device,
-    earlier: Sequence[int] = (),
-    made_by_program: bool = False,
-    of_model: Mapping[str, Any] = MappingProxyType({}),
-    user: UserCode = GSBENCH_ALONE,
-) -> Step:
-    """Render and measure the model of ``trained``, and its snapshots of the iterations ``earlier``.
+def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
+    """Render and measure the model of ``trained``, and its snapshots of earlier iterations; or renders as they are.
 
-    ``maps`` also keeps what the report needs to say where an arm helps; ``of_model`` says what is measured of the model
-    itself (`gsbench.eval.options.EvalConfig.of_model`). The key of a training by another program
-    (``made_by_program``) knows nothing of the rendering, so it is in this step's.
+    ``eval.maps`` also keeps what the report needs to say where an arm helps; ``of_model`` says what is measured of the
+    model itself (`gsbench.eval.options.EvalConfig.of_model`). The key of a training by another program knows nothing of
+    the rendering, so it is in this step's.
     """
+    if parts.program is not None and not parts.program.leaves_model:
+        return _measure_step(views, trained, parts)
+    rasterizer, evaluator, device = parts.rasterizer, parts.evaluator, parts.device
+    background, maps, of_model = parts.train.background, parts.eval.maps, parts.eval.of_model
+    earlier, user = parts.measured_earlier, parts.user_code
     inputs: dict[str, Any] = {
         "train": trained.key,
         "protocol": evaluator.protocol.id,
@@ -68,7 +64,7 @@ def evaluate_step(
     }
     if earlier:
         inputs["earlier"] = list(earlier)
-    if made_by_program:
+    if parts.program is not None:
         inputs |= {"raster": rasterizer_inputs(rasterizer, user), "background": list(background)}
     inputs |= _further_metrics(evaluator, user) | dict(of_model)
 
@@ -107,14 +103,9 @@ def evaluate_step(
     return step_of(EVALUATE, inputs, build, user)
 
 
-def measure_step(
-    views: Views,
-    trained: Step,
-    evaluator: Evaluator,
-    of_model: Mapping[str, Any] = MappingProxyType({}),
-    user: UserCode = GSBENCH_ALONE,
-) -> Step:
+def _measure_step(views: Views, trained: Step, parts: Parts) -> Step:
     """Measure the renders that another program left in ``trained``, as they are."""
+    evaluator, of_model, user = parts.evaluator, parts.eval.of_model, parts.user_code
     inputs: dict[str, Any] = {
         "renders": trained.key,
         "protocol": evaluator.protocol.id,

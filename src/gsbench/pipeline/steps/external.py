@@ -11,10 +11,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from gsbench.densify import Lineage
 from gsbench.errors import InputError, TrainingError
@@ -34,6 +33,9 @@ from gsbench.system.machine import describe_machine
 from gsbench.system.own_modules import SAFE_PATH
 from gsbench.words import readable_time
 
+if TYPE_CHECKING:
+    from gsbench.pipeline.parts import Parts
+
 CONTRACT = 1  # raise when programs are given, or asked for, something else
 WORK = "work"  # in the folder of the build: what the program is given, and where it writes
 SECONDS_TO_TELL_VERSION = 120.0
@@ -43,10 +45,17 @@ OWN_VARIABLES = "GSBENCH_"  # gsbench's settings, such as where photographs lie,
 log = logging.getLogger(__name__)
 
 
-def external_step(
-    views: Views, trainer: External, iterations: int, seed: int, device: torch.device, threads: int
-) -> Step:
-    """Let ``trainer`` train on the training views, from the cloud of the initialiser."""
+def external_step(views: Views, trainer: External, parts: Parts) -> Step:
+    """Let ``trainer`` train on the training views, from the cloud of the initialiser.
+
+    Raises InputError for a capture with masks.
+    """
+    if views.capture.masks:
+        raise InputError(
+            f"densify={parts.values['densify']['name']}: another program is not told of masks, and would learn what "
+            "stands in for ignored pixels: leave scene.masks out, or train with gsbench"
+        )
+    iterations, seed, device, threads = parts.train.iterations, parts.seed, parts.device, parts.threads
     inputs: dict[str, Any] = {
         "contract": CONTRACT,
         "scene": views.inputs,

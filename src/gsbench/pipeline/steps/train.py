@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from gsbench.densify import Densifier
 from gsbench.files import write_json
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
@@ -18,29 +16,24 @@ from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.logs import progress
-from gsbench.pipeline.steps.inputs import GSBENCH_ALONE, UserCode, options_of, rasterizer_inputs, step_of
+from gsbench.pipeline.steps.inputs import options_of, rasterizer_inputs, step_of
 from gsbench.pipeline.steps.scene import Views
-from gsbench.raster import Rasterizer
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
 from gsbench.runs.stages import TRAIN, Step
 from gsbench.system.checkout import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.memory import peak_memory_mb, reset_peak_memory
-from gsbench.train.options import WITHOUT_EFFECT_ON_MODEL, TrainConfig
+from gsbench.train.options import WITHOUT_EFFECT_ON_MODEL
 from gsbench.train.trainer import Status, Trainer
 
+if TYPE_CHECKING:
+    from gsbench.pipeline.parts import Parts
 
-def train_step(
-    views: Views,
-    densifier: Densifier,
-    rasterizer: Rasterizer,
-    options: TrainConfig,
-    seed: int,
-    device: torch.device,
-    snapshot_at: Sequence[int] = (),
-    user: UserCode = GSBENCH_ALONE,
-) -> Step:
-    """Train on the training views, from the cloud of the initialiser; keep the model at ``snapshot_at`` too."""
+
+def train_step(views: Views, parts: Parts) -> Step:
+    """Train on the training views, from the cloud of the initialiser; keep the model where it is measured, too."""
+    densifier, rasterizer, options, seed = parts.densifier, parts.rasterizer, parts.train, parts.seed
+    device, snapshot_at, user = parts.device, parts.measured_earlier, parts.user_code
     values = dataclasses.asdict(options)
     of_model = {key: value for key, value in values.items() if key not in WITHOUT_EFFECT_ON_MODEL}
     inputs: dict[str, Any] = {
