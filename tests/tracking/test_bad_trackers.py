@@ -195,11 +195,11 @@ def test_a_tracker_may_go_at_any_moment(
 
     A transaction that was cut off, of which the database never hears again, keeps nobody from its rows for long.
     """
+    gate, uri = tracker
+    ensure_experiment(connect(uri, tmp_path), "tracked", tmp_path)  # may take longer than what follows
     seconds = SETTINGS["PGOPTIONS"].replace("60s", "3s")
     assert seconds != SETTINGS["PGOPTIONS"]
     monkeypatch.setenv("PGOPTIONS", seconds)
-    gate, uri = tracker
-    ensure_experiment(connect(uri, tmp_path), "tracked", tmp_path)
     gate.passed = 0
     assert "tracking" not in mirror_a_trial(tmp_path, uri, seed=0, patience=SECONDS)
     whole = gate.passed
