@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gsbench.pipeline.parts import build
 
 from gsbench.analysis.results import load_experiment
 from gsbench.claims.ablation import (
@@ -27,6 +26,7 @@ from gsbench.config.command_words import options
 from gsbench.config.compose import compose_one
 from gsbench.densify.volumetric import Volumetric
 from gsbench.errors import InputError
+from gsbench.pipeline.parts import build
 from gsbench.runs.hashing import config_hash
 from gsbench.settings import Switch
 from tests.analysis.synthetic import Plan, trial_data, write_trial
