@@ -35,7 +35,7 @@ STRICT = ConfigDict(strict=True, allow_inf_nan=False, extra="ignore")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Part:
+class Record:
     """Base of the records: strict types, finite numbers; further keys may stand beside the known ones."""
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -47,7 +47,7 @@ class Part:
         return {entry.name: whole[entry.name] for entry in fields(self) if not _says_nothing(self, entry)}
 
 
-def _says_nothing(record: Part, entry: Any) -> bool:
+def _says_nothing(record: Record, entry: Any) -> bool:
     default = entry.default if entry.default_factory is MISSING else entry.default_factory()
     return default is not MISSING and getattr(record, entry.name) == default
 

@@ -18,7 +18,7 @@ from PIL import Image, UnidentifiedImageError
 from gsbench.analysis.results import TrialResult, by_key
 from gsbench.analysis.statistics import Answer, answer_family
 from gsbench.errors import InputError
-from gsbench.records import Number, Part, read_if_sound
+from gsbench.records import Number, Record, read_if_sound
 from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, MASKS, RENDERS
 from gsbench.scene.masks import read_mask
 
@@ -71,7 +71,7 @@ def absolute_error(render: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Array
 
 
 @dataclass(frozen=True, kw_only=True)
-class FromPixels(Part):
+class FromPixels(Record):
     """Measures of a trial's pictures, as an archive keeps them, which has no pictures."""
 
     error_textured: Number

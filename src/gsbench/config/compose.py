@@ -146,10 +146,10 @@ def compose_one(overrides: Sequence[str], modules: str | None = None) -> Trial:
 
 def ready_trial(config: DictConfig, overrides: Sequence[str], job: HydraJob | None = None) -> Trial:
     """The trial of a composed configuration, checked; ``config`` stays as it is."""
-    return resolved(settle(config, overrides), overrides, job)
+    return resolved(checked_config(config, overrides), overrides, job)
 
 
-def settle(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
+def checked_config(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Check ``config`` and return the trial's part of it: a copy without Hydra's own node ``hydra``."""
     with explained(overrides):  # such as an interpolation that leads nowhere
         trial = without_hydra(config)
@@ -159,7 +159,7 @@ def settle(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
 
 
 def resolved(config: DictConfig, overrides: Sequence[str], job: HydraJob | None) -> Trial:
-    """The trial of a settled configuration."""
+    """The trial of a checked configuration."""
     with explained(overrides):
         return Trial(plain(config), tuple(overrides), job)
 

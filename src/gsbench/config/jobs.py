@@ -26,10 +26,10 @@ from gsbench.config.command_words import check_search_path, parse_word
 from gsbench.config.compose import (
     Trial,
     asks_hydra,
+    checked_config,
     look_at,
     raw_text,
     resolved,
-    settle,
     without_hydra,
 )
 from gsbench.config.hydra_entry import hydra_ready
@@ -162,7 +162,7 @@ def compose_jobs(
             with explained(given):
                 config = job.composed()
             job = replace(job, has_effect=_has_effect(config))
-            trial = settle(config, given)
+            trial = checked_config(config, given)
             trials.append(resolved(trial, given, job))
             if asks_hydra(trial):
                 continue

@@ -65,16 +65,16 @@ def declare(metrics: Mapping[Path, str | None], planned: Mapping[Path, Planned])
         with hold(home / f".{DECLARED}.lock", "the declarations"):
             every = read_declarations(home)
             known = [one for one in every if not one.of_claims]
-            standing = known[-1] if known else None
-            metric = standing.primary if given is None and standing is not None else given
+            latest = known[-1] if known else None
+            metric = latest.primary if given is None and latest is not None else given
             if metric is None:
                 continue
-            if given is None and standing is not None:
-                log.info("%s: %s stays declared, since %s", home.name, standing.primary, standing.when)
-            before = {} if standing is None else standing.planned
+            if given is None and latest is not None:
+                log.info("%s: %s stays declared, since %s", home.name, latest.primary, latest.when)
+            before = {} if latest is None else latest.planned
             together = united(before, planned[home])
-            same = standing is not None and standing.primary == metric
-            known_trials = standing is not None and standing.names_trials
+            same = latest is not None and latest.primary == metric
+            known_trials = latest is not None and latest.names_trials
             if same and (together == before or not known_trials):
                 continue
             added = declared_now(questions=(open_question(metric),), trials=dict(together))
@@ -85,12 +85,12 @@ def declare(metrics: Mapping[Path, str | None], planned: Mapping[Path, Planned])
                 home.name,
                 metric,
             )
-        elif standing is not None:
+        elif latest is not None:
             log.warning(
                 "%s: the verdict is from now on about %s, and the report will say that %s was declared before",
                 home.name,
                 metric,
-                standing.primary,
+                latest.primary,
             )
 
 

@@ -23,7 +23,7 @@ from gsbench.files import require_own, write_json
 from gsbench.launch.finished import FinishedTrials
 from gsbench.launch.queue import ask_queue, state_in_queue
 from gsbench.parsing import DamagedError
-from gsbench.records import Amount, Part, read_typed
+from gsbench.records import Amount, Record, read_typed
 from gsbench.runs.experiments import make_home
 from gsbench.runs.layout import PLAN, RESULTS, STORE
 from gsbench.settings import is_folder_name
@@ -38,7 +38,7 @@ STATES = ("done", "partial", "missing", "running", "queued", "failed", "damaged"
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlannedTrial(Part):
+class PlannedTrial(Record):
     """A trial of the plan: its overrides, where the command was given, and when (Unix time)."""
 
     overrides: tuple[str, ...]
@@ -54,7 +54,7 @@ def _is_below(name: str) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanFile(Part):
+class PlanFile(Record):
     """The whole file; ``trials`` are by their folders as seen from the experiment's."""
 
     version: int

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from gsbench.files import write_json
-from gsbench.records import Part, read_if_sound
+from gsbench.records import Record, read_if_sound
 from gsbench.runs.layout import SUBMITTED
 
 SECONDS_TO_ANSWER = 60.0
@@ -21,7 +21,7 @@ WAITING = ("PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED", 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Submission(Part):
+class Submission(Record):
     """``.submitted.json``: the job that a trial was given to, its log, whose job it is."""
 
     job: Annotated[str, Field(pattern=r"^[\w.\[\]%-]+$")]

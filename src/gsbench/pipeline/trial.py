@@ -134,7 +134,7 @@ def _run(trial: Trial, folder: TrialFolder, mirror: Mirror) -> TrialRecord:
         results = results_of(values, pipeline.capture, pipeline.views.scene, parts.rasterizer.name, entries, code)
         published = _publish(folder.path, entries)
         made_of = {stage.name: entries[stage.name].path for stage in (INIT, TRAIN, GROUND_TRUTH, EVALUATE)}
-        again = folder.write_finished(values, results, source_files(pipeline.taken, store), made_of, published)
+        again = folder.write_finished(values, results, source_files(pipeline.photographs, store), made_of, published)
         (folder.path / BUILDING).unlink(missing_ok=True)
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
     size = "" if results.num_gaussians is None else f"  {results.num_gaussians} Gaussians"

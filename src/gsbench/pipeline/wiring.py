@@ -25,7 +25,7 @@ from gsbench.scene.types import Capture
 class TrialSteps:
     """A trial before, while and after its steps are built; each step's result is found in ``store`` under its key."""
 
-    taken: Capture  # the user's photographs; known, as the next, once `steps` is past the making of photographs
+    photographs: Capture  # the user's photographs; known, as the next, once `steps` is past the making of photographs
     capture: Capture  # what the steps look at: without what masks ignore
     views: Views
 
@@ -47,11 +47,11 @@ class TrialSteps:
             yield made
             if store.find(made) is None:
                 return
-        self.capture = self.taken = source.read(None if made is None else store.path(made))
-        replaced = masked_step(self.taken, parts.scene.transparent)
+        self.capture = self.photographs = source.read(None if made is None else store.path(made))
+        replaced = masked_step(self.photographs, parts.scene.transparent)
         if replaced is not None:
             yield replaced
-            self.capture = masked(self.taken, store.path(replaced))
+            self.capture = masked(self.photographs, store.path(replaced))
         reference = None
         if parts.initializer.needs_reference(self.capture):
             reference = init_step(store, self.capture, Sfm(threads=parts.threads))

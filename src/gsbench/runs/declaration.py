@@ -20,7 +20,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from gsbench.parsing import DamagedError, fault_of, read_bytes
-from gsbench.records import STRICT, Amount, Count, Part, iterate_rows
+from gsbench.records import STRICT, Amount, Count, Record, iterate_rows
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import DECLARED
 from gsbench.runs.trial_record import Declared
@@ -62,7 +62,7 @@ class Arm:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Question(Part):
+class Question(Record):
     """A question: does ``arm`` differ from ``baseline`` in ``metric``, the way ``sign`` says, by ``least`` at least?
 
     ``sign`` is that of the claimed difference, arm minus baseline; 0 where it is claimed that there is none. ``least``
@@ -95,7 +95,7 @@ class Question(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Declaration(Part):
+class Declaration(Record):
     """Questions that were asked at ``time`` (UTC), which share ``error_rate``, the chance that any answer is false.
 
     ``looks`` are numbers of seeds, rising: after each of them a question may be decided; none: all is judged once.

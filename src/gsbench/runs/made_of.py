@@ -17,7 +17,7 @@ from pydantic_core import from_json
 
 from gsbench.files import file_sha256
 from gsbench.parsing import DamagedError, fault_of, read_bytes
-from gsbench.records import Part
+from gsbench.records import Record
 from gsbench.runs.code import changed_rooms
 from gsbench.runs.hashing import config_hash, sha256_of
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS, PER_VIEW
@@ -36,7 +36,7 @@ _digests: dict[Stamp, str] = {}  # by a file's device, number and state: what th
 
 
 @dataclass(frozen=True, kw_only=True)
-class MadeOf(Part):
+class MadeOf(Record):
     """The configuration with its hash, versions, and files with their stamps.
 
     ``results`` is the hash of the rest of ``results.json``, ``sources`` are files of the user's and ``folders`` where
@@ -61,7 +61,7 @@ class MadeOf(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnDisk(Part):
+class OnDisk(Record):
     """The part of ``results.json`` that this module reads."""
 
     made_of: MadeOf | None = field(default=None, repr=False)

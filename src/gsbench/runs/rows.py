@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from gsbench.parsing import DamagedError, read_bytes
-from gsbench.records import Amount, Count, Number, Part, Whole, iterate_rows
+from gsbench.records import Amount, Count, Number, Record, Whole, iterate_rows
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ Row = Annotated[dict[str, Value], AfterValidator(_with_step)]  # of ``metrics.js
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stepped(Part):
+class Stepped(Record):
     """A row of any of these files, of which the iteration is asked for."""
 
     step: Count

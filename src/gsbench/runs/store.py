@@ -30,7 +30,7 @@ from gsbench.files import (
     write_json,
 )
 from gsbench.parsing import DamagedError, fault_of
-from gsbench.records import Amount, Count, Part, read_typed
+from gsbench.records import Amount, Count, Record, read_typed
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import MANIFEST, VIEWS
 from gsbench.runs.stages import Stage, Step
@@ -42,7 +42,7 @@ LEFTOVER_AGE = 24 * 3600.0  # seconds: temporary files outside the locks are swe
 
 
 @dataclass(frozen=True, kw_only=True)
-class Output(Part):
+class Output(Record):
     """A file of a result as it was written; the time of change is in ns."""
 
     size: Count
@@ -51,7 +51,7 @@ class Output(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Manifest(Part):
+class Manifest(Record):
     """``manifest.json`` of a finished result: what made it, and a checksum of every file."""
 
     stage: str

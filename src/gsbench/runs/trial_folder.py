@@ -21,7 +21,7 @@ from pydantic_core import to_json
 from gsbench.errors import InputError
 from gsbench.files import atomic, require_own
 from gsbench.parsing import DamagedError, one_line, read_bytes, read_tail, read_yaml
-from gsbench.records import MOST, Amount, Count, Part, read_if_sound, read_typed, typed
+from gsbench.records import MOST, Amount, Count, Record, read_if_sound, read_typed, typed
 from gsbench.runs.hashing import config_hash
 from gsbench.runs.layout import (
     BUILDING,
@@ -48,14 +48,14 @@ TAIL_BYTES = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
-class NamedGroup(Part):
+class NamedGroup(Record):
     """A group of the configuration, of which only the name must be there."""
 
     name: FolderName
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackingSettings(Part):
+class TrackingSettings(Record):
     """Settings of the group ``tracking`` that mirroring a trial later needs."""
 
     uri: str | None
@@ -65,7 +65,7 @@ class TrackingSettings(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Configuration(Part):
+class Configuration(Record):
     """Keys that a trial's ``config.yaml`` must have to be used at all; `gsbench.config.schema` has the rest."""
 
     name: FolderName
@@ -78,7 +78,7 @@ class Configuration(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Failure(Part):
+class Failure(Record):
     """``failed.json``: the kind of the error, its text, where it came from, and when (Unix time)."""
 
     error: str = ""
@@ -95,7 +95,7 @@ class Failure(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Building(Part):
+class Building(Record):
     """``building.json``: the stage that an unfinished trial is at, and the folder where it is built."""
 
     stage: str = ""

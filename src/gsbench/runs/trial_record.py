@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import Field, ValidationError
 
 from gsbench.parsing import DamagedError, fault_of
-from gsbench.records import MOST, Amount, Count, Number, Part, Text, adapter, misfit, read_typed
+from gsbench.records import MOST, Amount, Count, Number, Record, Text, adapter, misfit, read_typed
 from gsbench.runs.layout import METRICS, TRAINING
 
 # ``evaluated_from`` of what gsbench did not train itself: the model was rendered here, or only renders are known.
@@ -28,7 +28,7 @@ Iteration = Annotated[str, Field(pattern=r"^\d{1,18}$")]  # as the key of an obj
 
 
 @dataclass(frozen=True, kw_only=True)
-class Budget(Part):
+class Budget(Record):
     """Limits on the growth of a trial: a cap on Gaussians, the rule that keeps it, a limit of time in s."""
 
     max_gaussians: Count | None = None
@@ -37,7 +37,7 @@ class Budget(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Code(Part):
+class Code(Record):
     """The versions of the code: sha256 of the a user's modules, versions of gsbench's stages.
 
     ``rooms`` are those of gsbench that had a part, with their states (`gsbench.runs.code`); ``commit`` is that of the
@@ -52,7 +52,7 @@ class Code(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MetricRecord(Part):
+class MetricRecord(Record):
     """Facts of a user's own metric; see `gsbench.eval.facts`."""
 
     label: str
@@ -63,7 +63,7 @@ class MetricRecord(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Earlier(Part):
+class Earlier(Record):
     """Metrics at an earlier iteration."""
 
     metrics: dict[str, Number]
@@ -71,7 +71,7 @@ class Earlier(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Declared(Part):
+class Declared(Record):
     """The metric that the verdict was declared to be about, and when (`gsbench.runs.declaration`)."""
 
     metric: str
@@ -79,7 +79,7 @@ class Declared(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trainer(Part):
+class Trainer(Record):
     """The program that trained in gsbench's place: as it is called, its version, what it says of it, the command."""
 
     program: str
@@ -89,7 +89,7 @@ class Trainer(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialRecord(Part):
+class TrialRecord(Record):
     """A finished trial. What nobody can know of it is None, or absent from the file where that is the default.
 
     ``metrics`` are means over the test views, ``unavailable`` says why others are missing and ``awaited`` names those
@@ -158,7 +158,7 @@ def record_from(content: bytes, path: Path) -> TrialRecord:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Training(Part):
+class Training(Record):
     """Record of what a training took and gave; of another program's, ``trained_by`` and ``evaluated_from`` are set."""
 
     iterations: Count
@@ -175,7 +175,7 @@ class Training(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluation(Part):
+class Evaluation(Record):
     """The means of the metrics, why others are missing, and which of those may still come."""
 
     metrics: dict[str, Number]

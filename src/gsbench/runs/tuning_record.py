@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from gsbench.records import Count, Number, Part, Text, Whole, read_typed
+from gsbench.records import Count, Number, Record, Text, Whole, read_typed
 from gsbench.runs.layout import TUNING
 
 
 @dataclass(frozen=True, kw_only=True)
-class Point(Part):
+class Point(Record):
     """A choice of values; ``value`` is the mean of the metric over its trials, None where one of them has none."""
 
     settings: dict[str, Whole | Number]
@@ -19,7 +19,7 @@ class Point(Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TuningRecord(Part):
+class TuningRecord(Record):
     """The search for the values of ``arm`` (INIT-DENSIFY) that the experiment ``sweep`` then trained.
 
     ``ranges`` are what was searched, as it was given, those in ``log`` on a logarithmic scale; ``wanted`` is the number

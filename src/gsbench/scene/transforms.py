@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.parsing import resolved
-from gsbench.records import Number, Part, Text, read_typed
+from gsbench.records import Number, Record, Text, read_typed
 from gsbench.scene.images import IMAGE_SUFFIXES, image_size
 from gsbench.scene.prepare import CameraModel
 from gsbench.words import some_of
@@ -40,7 +40,7 @@ PERSPECTIVE, FISHEYE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Intrinsics(Part):
+class Intrinsics(Record):
     """Intrinsics that a file gives all its cameras, or a frame its own."""
 
     camera_model: str | None = None

@@ -17,7 +17,7 @@ from filelock import FileLock, Timeout
 
 from gsbench.errors import InputError
 from gsbench.files import open_plain
-from gsbench.records import Amount, Part, read_if_sound
+from gsbench.records import Amount, Record, read_if_sound
 
 try:
     import fcntl
@@ -87,7 +87,7 @@ def is_held(path: Path) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LockHolder(Part):
+class LockHolder(Record):
     """Record that a lock's holder writes of itself: host, process, Slurm job, time of start (Unix), its work."""
 
     host: str

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsbench.records import Count, Part, read_if_sound
+from gsbench.records import Count, Record, read_if_sound
 from gsbench.runs import layout
 from gsbench.runs.hashing import flatten, sha256_of
 from gsbench.runs.rows import read_rows
@@ -110,7 +110,7 @@ def _seconds(record: Mapping[str, float]) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MirrorState(Part):
+class MirrorState(Record):
     """State that any sink keeps: ``complete`` is the hash of the results that it shows, ``logged`` the newest iteration
     by file; the rest says which run it is, in the sink's own words.
     """
