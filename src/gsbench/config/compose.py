@@ -175,6 +175,11 @@ def without_hydra(config: DictConfig) -> DictConfig:
     return trial
 
 
+def has_part(config: DictConfig, key: str) -> bool:
+    """Return whether a configuration has the part ``key``, with dots."""
+    return OmegaConf.select(config, key) is not None
+
+
 def asks_hydra(trial: DictConfig) -> bool:
     """Return whether a value asks Hydra (``${hydra:…}``): such a value differs from trial to trial, or may."""
     return "${hydra" in raw_text(trial)
