@@ -143,6 +143,7 @@ def check_permissions(values: Mapping[str, Any]) -> None:
     This is the last check, of plain values, whatever file or command line they came from. Raises InputError.
     """
     allowed = values.get(PERMISSIONS) or []
+    # A class that nobody allowed may stand anywhere, also within the options of one that is: its owner may build it.
     for place, target in targets_in(values):
         group = ".".join(place)
         check_target(target, group, allowed, homes_of(place))
@@ -183,7 +184,7 @@ def check_composed(config: DictConfig, allowed: Sequence[str]) -> None:
     for place, key, value in _entries(raw):
         if isinstance(value, str) and "${" in value:
             _check_interpolation(place, key, value)
-        # `_partial_` makes a function of anything, and 1.4's `_execution_whitelist_` allows it
+        # `_partial_` makes a function of anything, which is called later; 1.4's `_execution_whitelist_` allows any class
         if key in SPECIAL_KEYS and (key not in OF_CALLBACKS or place[:2] != ("hydra", "callbacks")):
             raise InputError(f"{'.'.join((*place, key))}: gsbench makes no objects so: leave it out")
     known = known_plugins()
@@ -251,6 +252,7 @@ def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str], pl
         if target not in plugins:
             raise InputError(f"{group}.{TARGET}={target} is no {place[-1]} that is installed")
         return
+    # Of gsbench's own classes each is for its group: `densify._target_=gsbench.init.…` would run another's constructor.
     own = HYDRAS_CALLBACKS if place[:2] == ("hydra", "callbacks") and len(place) == 3 else homes_of(place)
     check_target(target, group, allowed, own)
     if is_allowed(target, (PACKAGE,)) and not PUBLIC_CLASS.fullmatch(target):
@@ -308,7 +310,10 @@ def _check_launcher(launcher: dict[str, Any], allowed: Sequence[str], plugins: M
 
 
 def _check_copies(config: DictConfig, hydra: dict[str, Any]) -> None:
-    """Refuse ``${…}`` that stands for a whole mapping where Hydra makes objects: its classes are for other places."""
+    """Refuse ``${…}`` that stands for a whole mapping where Hydra makes objects: its classes are for other places.
+
+    ``callbacks.x=${densify}`` would make a callback of a class that was allowed as a densifier only.
+    """
     for node in MADE_BY_HYDRA:
         for place, key, value in _entries(hydra.get(node), ("hydra", node)):
             if isinstance(value, str) and value.startswith("${") and place[2:3] not in (("params",), ("grids",)):
@@ -344,6 +349,7 @@ def is_external(densify: Mapping[str, Any]) -> bool:
 
 def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
     """Refuse another trainer whose programs or variables the user did not allow."""
+    # A YAML of somebody's may call any program of this machine a trainer, or load code into one by a variable.
     options = settings.get("options") or {}
     programs = [program_of(settings.get("command") or "", options)]
     if settings.get("version_command") is not None:
