@@ -184,7 +184,7 @@ def check_composed(config: DictConfig, allowed: Sequence[str]) -> None:
     for place, key, value in _entries(raw):
         if isinstance(value, str) and "${" in value:
             _check_interpolation(place, key, value)
-        # `_partial_` makes a function of anything, which is called later; 1.4's `_execution_whitelist_` allows any class
+        # `_partial_` makes a function of anything, to be called later; 1.4's `_execution_whitelist_` allows any class
         if key in SPECIAL_KEYS and (key not in OF_CALLBACKS or place[:2] != ("hydra", "callbacks")):
             raise InputError(f"{'.'.join((*place, key))}: gsbench makes no objects so: leave it out")
     known = known_plugins()
