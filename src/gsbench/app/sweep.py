@@ -23,6 +23,7 @@ from gsbench.app.command import OWN, Task
 from gsbench.app.grids import bare, checked_grids, grid, is_interval, words_of_grids
 from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import Planned, headline, plan_sweep, run_looks
+from gsbench.config.command_words import parse_word
 from gsbench.config.compose import Trial
 from gsbench.config.jobs import JobContext, begin_sweep, compose_jobs
 from gsbench.config.messages import explained
@@ -73,6 +74,8 @@ class Sweep:
 
     def parse(self, words: Sequence[str]) -> list[Override]:
         """The words as Hydra reads them, with the choices of ``glob(*)``."""
+        for word in words:
+            parse_word(word)  # which says what is wrong with one that a file has
         with explained(words):
             return OverridesParser.create(self.context.config_loader).parse_overrides(list(words))
 
