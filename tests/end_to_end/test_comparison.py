@@ -40,10 +40,7 @@ def test_arms_of_any_origin_are_told_apart_and_those_that_come_late_cost_the_dec
     notes = tables()
     assert "SSIM was declared beforehand" in notes
     assert "before any of the 4 trials was measured" in notes
-    mixed = (
-        "random-longaxis differs from random-adc by split, gradient and threshold; isolate split with densify=absgrad"
-    )
-    assert mixed in notes
+    assert "random-longaxis differs from random-adc by split, gradient and threshold." in notes
 
     assert run(["-m", *TINY, *OWN, "densify.interval=40", "allow_targets=[patient_arm]"]) == 0
     notes = tables()
@@ -52,5 +49,4 @@ def test_arms_of_any_origin_are_told_apart_and_those_that_come_late_cost_the_dec
     sheet = tables("--layout", "fairness", "--format", "latex")
     assert "densify.patience & -- & 4" in sheet
     assert "patient\\_arm.Patient" in sheet
-    assert "is no arm of gsbench" in sheet
     assert sheet.count("\\caption{Fairness sheet") == 2

@@ -34,14 +34,14 @@ MIN_STUDIES = 2
 class Study:
     """One archive's difference of two arms in one metric, with its ``interval`` (None of a single pair).
 
-    ``conditions`` are what studies must share before a mean of them means anything: protocol, metric, and whatever else
-    the caller holds for such. ``budget`` says what limited the growth of its arms; "" where nobody knows.
+    Studies must share a ``protocol`` before a mean of them means anything. ``budget`` says what limited the growth of
+    its arms; "" where nobody knows.
     """
 
     name: str
     effect: float
     interval: Interval | None = None
-    conditions: Mapping[str, str] = field(default_factory=dict)
+    protocol: str = ""
     budget: str = ""
 
 
@@ -62,9 +62,9 @@ class Pooled:
 
 
 def pool(studies: Sequence[Study]) -> Pooled:
-    """The mean of studies; without one, and with the reason, where they are of unlike conditions.
+    """The mean of studies; without one, and with the reason, where they follow several protocols.
 
-    Raises InputError for an effect that is no finite number, or a study that stands twice.
+    Raises InputError for a study that stands twice.
     """
     _check(studies)
     refusal = _refusal(studies)
@@ -99,9 +99,6 @@ def describe(pooled: Pooled) -> list[str]:
 
 
 def _check(studies: Sequence[Study]) -> None:
-    for study in studies:
-        if not math.isfinite(study.effect):
-            raise InputError(f"{study.name}: its effect must be a number, got {study.effect}")
     names = [study.name for study in studies]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -111,12 +108,9 @@ def _check(studies: Sequence[Study]) -> None:
 def _refusal(studies: Sequence[Study]) -> str:
     if len(studies) < MIN_STUDIES:
         return f"{len(studies)} of {MIN_STUDIES} studies that a mean needs"
-    keys = sorted({key for study in studies for key in study.conditions})
-    for key in keys:
-        values = {study.name: study.conditions.get(key, "unknown") for study in studies}
-        if len(set(values.values())) > 1:
-            shown = "; ".join(f"{name}: {value}" for name, value in values.items())
-            return f"the studies differ in {key} ({shown})"
+    if len({study.protocol for study in studies}) > 1:
+        shown = "; ".join(f"{study.name}: {study.protocol or 'unknown'}" for study in studies)
+        return f"the studies differ in protocol ({shown})"
     return ""
 
 
@@ -167,7 +161,7 @@ def read_studies(path: Path, wanted: Wanted, name: str) -> Found:
                     raise InputError(f"{path}: no trials can be paired in {wanted.metric}{reason}")
                 test = student(together.differences)
                 mean, interval = float(together.differences.mean()), None if test is None else test.interval()
-                studies.append(Study(label, mean, interval, _conditions(protocol, wanted.metric), _budgets(own, pairs)))
+                studies.append(Study(label, mean, interval, protocol, _budgets(own, pairs)))
                 for (first, second), paired in zip(pairs, found, strict=True):
                     count = sum(len(row.seeds) for row in paired.rows)
                     notes.append(
@@ -210,10 +204,6 @@ def _pairs(trials: Sequence[TrialResult], wanted: Wanted, path: Path) -> list[tu
             f"{', '.join(map(str, arms))})"
         )
     return found
-
-
-def _conditions(protocol: str, metric: str) -> dict[str, str]:
-    return {"protocol": protocol, "metric": metric}
 
 
 def _budgets(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> str:

@@ -64,8 +64,8 @@ def pool_sources(
         seen |= dict.fromkeys(found.trials, source)
         notes += found.notes
         for study in found.studies:
-            if protocol is not None and study.conditions["protocol"] != protocol:
-                notes.append(f"{study.name}: not asked for, it is by {study.conditions['protocol']}")
+            if protocol is not None and study.protocol != protocol:
+                notes.append(f"{study.name}: not asked for, it is by {study.protocol}")
             elif study.interval is None:
                 faults.append(f"left out: {study.name} has one pair of trials: nothing tells how sure it is")
             else:
@@ -79,5 +79,5 @@ def _rows(pooled: Pooled) -> list[str]:
     lines = ["| study | difference | 95 % interval | protocol |", "|---|---|---|---|"]
     for study in pooled.studies:
         interval = "unknown" if study.interval is None else f"{study.interval.low:+.4g} to {study.interval.high:+.4g}"
-        lines.append(f"| {study.name} | {study.effect:+.4g} | {interval} | {study.conditions['protocol']} |")
+        lines.append(f"| {study.name} | {study.effect:+.4g} | {interval} | {study.protocol} |")
     return lines
