@@ -35,14 +35,12 @@ Array = NDArray[np.float64]
 class RegionErrors:
     """Mean absolute errors (8-bit levels) of two arms in bins of texture, from the lowest to the highest.
 
-    ``edges`` are the inner edges of each scene's bins; ``changes`` are second arm minus first, one for each bin,
-    adjusted for their number.
+    ``changes`` are second arm minus first, one for each bin, adjusted for their number.
     """
 
     first: tuple[float, ...]
     second: tuple[float, ...]
     changes: tuple[Answer, ...]
-    edges: dict[str, tuple[float, ...]]
 
     def words(self) -> tuple[str, ...]:
         """Say of each bin whether the second arm is better, worse or undecided there."""
@@ -103,26 +101,21 @@ def errors_by_region(pairs: Sequence[tuple[TrialResult, TrialResult]], bins: int
     """
     if not pairs:
         raise InputError("no trials of the two arms share a scene, a seed and their conditions")
-    scenes: list[str] = []
-    errors: list[Array] = []
-    edges: dict[str, tuple[float, ...]] = {}
-    for scene, group in by_key([one for one, _ in pairs], lambda trial: trial.scene).items():
-        own = [(one, other) for one, other in pairs if one in group]
-        scene_edges = _edges(group[0], bins)
-        errors.append(np.array([list(_pair_means(*pair, scene_edges)) for pair in own]))  # [K, V, 2, bins]
-        scenes.append(scene)
-        edges[scene] = tuple(float(edge) for edge in scene_edges)
+    errors: list[Array] = []  # by scene, [K, V, 2, bins]
+    for own in by_key(pairs, lambda pair: pair[0].scene).values():
+        edges = _edges(own[0][0], bins)
+        errors.append(np.array([list(_pair_means(*pair, edges)) for pair in own]))
     means, differing = [], []
     for index in range(bins):
         inside = [array[:, np.isfinite(array[:, :, 0, index]).all(axis=0), :, index] for array in errors]  # [K, V', 2]
-        kept = [(scene, array) for scene, array in zip(scenes, inside, strict=True) if array.size]
+        kept = [array for array in inside if array.size]
         if not kept:
             raise InputError(f"texture: bin {index + 1} of {bins} is empty in every scene; ask for fewer bins")
-        means.append(np.mean([array.mean(axis=(0, 1)) for _, array in kept], axis=0))  # [2]
-        seeds = min(len(array) for _, array in kept)
-        differing.append(np.array([(array[:seeds, :, 1] - array[:seeds, :, 0]).mean(axis=1) for _, array in kept]))
+        means.append(np.mean([array.mean(axis=(0, 1)) for array in kept], axis=0))  # [2]
+        seeds = min(map(len, kept))
+        differing.append(np.array([(array[:seeds, :, 1] - array[:seeds, :, 0]).mean(axis=1) for array in kept]))
     first_means, second_means = (tuple(float(mean[place]) for mean in means) for place in (0, 1))
-    return RegionErrors(first_means, second_means, tuple(answer_family(differing)), edges)
+    return RegionErrors(first_means, second_means, tuple(answer_family(differing)))
 
 
 def view_names(trial: TrialResult) -> list[str]:

@@ -23,7 +23,6 @@ from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.tables import Column, Entry, Row, Table
 from gsbench.analysis.tuning import tuning_lines
-from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted
 
 LONGEST = 60  # characters of a value that are shown
@@ -102,11 +101,6 @@ def _rounds(trial: TrialResult) -> float | None:
     return float(len(trial.folder.events())) or None
 
 
-def _recorded(read: Callable[[TrialRecord], float | None]) -> Reader:
-    """Reads a number of ``results.json``."""
-    return lambda trial: read(trial.record)
-
-
 def _resolution(trial: TrialResult) -> str | None:
     size = trial.record.resolution
     return None if size is None else f"{size[0]}×{size[1]} px"
@@ -132,18 +126,18 @@ def _code(trial: TrialResult) -> str | None:
 # Settings that are shown of both arms, whether they differ in them or not.
 MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "trials": lambda trials: str(len(trials)),
-    "views for training": _span(_recorded(lambda record: record.train_views)),
-    "held-out views": _span(_recorded(lambda record: record.test_views)),
+    "views for training": _span(lambda trial: trial.record.train_views),
+    "held-out views": _span(lambda trial: trial.record.test_views),
     "pictures": _each(_resolution),
     "photographs (hash)": _each(lambda trial: trial.record.hashes.get("data", "")[:12]),
-    "initial points": _span(_recorded(lambda record: record.num_init_points)),
+    "initial points": _span(lambda trial: trial.record.num_init_points),
     "initial cloud (hash)": _each(lambda trial: trial.cloud[:12]),
-    "iterations": _span(_recorded(lambda record: record.iterations)),
+    "iterations": _span(lambda trial: trial.record.iterations),
     "rounds of the densifier": _span(_rounds),
     "budget": _each(budget_words),
-    "Gaussians in the end": _span(_recorded(lambda record: record.num_gaussians)),
-    "seconds of training": _span(_recorded(lambda record: record.seconds.get("train"))),
-    "memory (MB)": _span(_recorded(lambda record: record.peak_memory_mb)),
+    "Gaussians in the end": _span(lambda trial: trial.record.num_gaussians),
+    "seconds of training": _span(lambda trial: trial.record.seconds.get("train")),
+    "memory (MB)": _span(lambda trial: trial.record.peak_memory_mb),
     "rasterizer": _each(lambda trial: trial.record.raster),
     "protocol": _each(lambda trial: trial.record.protocol),
     "machine": _each(lambda trial: trial.machine),

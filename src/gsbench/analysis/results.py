@@ -28,6 +28,7 @@ from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError
 from gsbench.system.machine import kind_of_machine
 
 K = TypeVar("K", bound=Hashable)
+T = TypeVar("T")
 
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
 TRIAL_FOLDER = re.compile(rf"(?P<hash>[0-9a-f]{{8}}){SEED}(?P<seed>\d+)")
@@ -244,9 +245,9 @@ class Experiment:
         return {trial.path.relative_to(self.folder).as_posix(): trial for trial in self.trials}
 
 
-def by_key(trials: Iterable[TrialResult], key: Callable[[TrialResult], K]) -> dict[K, list[TrialResult]]:
-    """Trials grouped by ``key(trial)``, in order of appearance."""
-    groups: dict[K, list[TrialResult]] = {}
+def by_key(trials: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
+    """Trials (or pairs of them) grouped by ``key(trial)``, in order of appearance."""
+    groups: dict[K, list[T]] = {}
     for trial in trials:
         groups.setdefault(key(trial), []).append(trial)
     return groups

@@ -6,7 +6,6 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gsbench import __version__
 from gsbench.analysis.results import TrialResult
 
 SPECIFICATION = "https://w3id.org/ro/crate/1.1"
@@ -29,17 +28,15 @@ def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str,
     scenes = sorted({trial.scene for trial in trials})
     arms = sorted({f"{trial.init}-{trial.densify}" for trial in trials})
     protocols = sorted({trial.record.protocol for trial in trials})
-    when = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime(max(trial.measured for trial in trials)))
+    day = time.strftime("%Y-%m-%d", time.gmtime(max(trial.measured for trial in trials)))
     root = {
         "@id": "./",
         "@type": "Dataset",
         "name": f"{name}: results of gsbench",
         "description": f"{len(trials)} trainings of 3D Gaussian Splatting: {', '.join(arms)} on {', '.join(scenes)}, "
         f"measured by {', '.join(protocols)}. No models.",
-        "datePublished": when[:10],
-        "keywords": ["3D Gaussian Splatting", *arms, *scenes],
+        "datePublished": day,
         "hasPart": [{"@id": file} for file in sizes],
-        "mentions": [{"@id": "#trials"}],
     }
     files = [
         {
@@ -52,19 +49,10 @@ def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str,
         }
         for file, size in sizes.items()
     ]
-    action = {
-        "@id": "#trials",
-        "@type": "CreateAction",
-        "name": "Training and measuring",
-        "instrument": {"@id": "#gsbench"},
-        "result": [{"@id": "results.jsonl"}, {"@id": "per_view.csv"}],
-        "endTime": when,
-    }
-    program = {"@id": "#gsbench", "@type": "SoftwareApplication", "name": "gsbench", "version": __version__}
     descriptor = {
         "@id": "ro-crate-metadata.json",
         "@type": "CreativeWork",
         "conformsTo": {"@id": SPECIFICATION},
         "about": {"@id": "./"},
     }
-    return {"@context": f"{SPECIFICATION}/context", "@graph": [descriptor, root, *files, action, program]}
+    return {"@context": f"{SPECIFICATION}/context", "@graph": [descriptor, root, *files]}
