@@ -49,6 +49,7 @@ TargetName = Annotated[
 ]
 MISSING: Any = "???"  # a value that must be given, as Hydra writes it in YAML
 Fraction = Annotated[float, Interval(ge=0, le=1)]
+Threads = Annotated[int, Interval(ge=1, le=4096)]  # more is a slip, and no system starts them
 OpenFraction = Annotated[float, Interval(gt=0, lt=1)]
 
 

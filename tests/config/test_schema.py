@@ -274,3 +274,9 @@ def test_no_training_needs_no_densifier() -> None:
     assert composed("train=none", "densify=none")["train"]["iterations"] == 0
     with pytest.raises(InputError, match=r"train\.iterations must be a whole number of at least 0"):
         composed("train.iterations=-1")
+
+
+@pytest.mark.parametrize("threads", ["4097", "1000000000000", "0"])
+def test_no_more_threads_than_a_system_starts(threads: str) -> None:
+    with pytest.raises(InputError, match=r"threads must be a whole number in \[1, 4096\] or 'auto'"):
+        composed(f"threads={threads}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -48,3 +49,35 @@ def test_what_is_no_number_is_named(value: Any) -> None:
 def test_a_metric_that_ends_the_process_is_an_error() -> None:
     with pytest.raises(InputError, match=r"eval\.extra\.own ended the process \(exit code 0\)"):
         measured(SystemExit)
+
+
+class Falls:
+    def __init__(self, fall: Callable[[], Any]) -> None:
+        self.fall = fall
+
+    def measure(self, image: torch.Tensor, truth: torch.Tensor) -> Any:
+        return self.fall()
+
+
+def endless() -> Any:
+    return endless()
+
+
+def failing() -> Any:
+    raise RuntimeError("two\nlines")
+
+
+@pytest.mark.parametrize(
+    ("fall", "said"),
+    [
+        (failing, r"eval\.extra\.own raised RuntimeError two lines \(.*test_own_metric\.py, line \d+\)"),
+        (endless, r"eval\.extra\.own raised RecursionError .*test_own_metric\.py"),
+        (lambda: 10**400, r"eval\.extra\.own must return a number for each view, got one beyond all bounds"),
+        (lambda: 10**5000, r"eval\.extra\.own must return a number for each view, got one beyond all bounds"),
+    ],
+)
+def test_a_metric_that_falls_is_named_in_one_line(fall: Callable[[], Any], said: str) -> None:
+    evaluator = Evaluator(get_protocol("paper"), lpips=(), flip=False, extra={"own": Falls(fall)})
+    with pytest.raises(InputError, match=said) as caught:
+        evaluator.evaluate_view(IMAGE, IMAGE)
+    assert "\n" not in str(caught.value)

@@ -110,7 +110,7 @@ def _pipe(path: Path, outside: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [_link, _folder_link, _pipe])
-@pytest.mark.parametrize("name", ["per_view.csv", "renders", "ground_truth/v.png", "log.txt"])
+@pytest.mark.parametrize("name", ["per_view.csv", "renders", "ground_truth/v.png", "log.txt", ".lock.holder"])
 def test_a_trial_that_holds_something_strange_is_left_out(
     name: str, make: Callable[[Path, Path], None], trial: Path, outside: Path
 ) -> None:
@@ -159,3 +159,9 @@ def test_what_a_killed_build_linked_is_removed_and_what_it_led_to_stays(tmp_path
     assert sorted(path.name for path in partial.iterdir()) == ["kept", "work"]
     assert not list((partial / "work").iterdir())
     assert (outside / "private").read_text() == SECRET
+
+
+def test_a_pipe_in_the_place_of_a_lock_s_note_holds_nobody_up(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "x.lock.holder")
+    with hold(tmp_path / "x.lock", "this"):
+        assert (tmp_path / "x.lock.holder").is_file()

@@ -157,3 +157,8 @@ def test_a_scene_is_called_after_its_folder_and_a_missing_model_is_named(tmp_pat
     assert SceneConfig(name=None, kind="photos", path=str(tmp_path / "my fern")).name == "my fern"
     assert SceneConfig(name=None, kind="photos", path="/").name == "scene"
     assert missing_model("fern", tmp_path, None).startswith(f"scene fern: {tmp_path}: no COLMAP model in")
+
+
+def test_a_list_that_is_not_there_is_said_in_few_words(make_scene):
+    with pytest.raises(InputError, match=r"scene\.test_list: .*cannot be read \(No such file or directory\): name a"):
+        read_colmap("toy", make_scene(), split=SplitRule(test_list="\\n"))

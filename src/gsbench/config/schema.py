@@ -31,6 +31,7 @@ from gsbench.settings import (
     FolderName,
     PathName,
     TargetName,
+    Threads,
     check_settings,
     checked,
     is_folder_name,
@@ -117,7 +118,7 @@ class Config:
     name: ExperimentName = "default"
     seed: Annotated[int, Interval(ge=0, le=MAX_SEED)] = 0
     device: DeviceName = "auto"
-    threads: PositiveInt | Literal["auto"] = "auto"
+    threads: Threads | Literal["auto"] = "auto"
     runs: PathName = MISSING
     allow_targets: list[str] = field(default_factory=list)  # what the command line allows to run; no file can say it
     scene: SceneConfig = field(default_factory=SceneConfig)

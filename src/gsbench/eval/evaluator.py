@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import traceback
 from collections.abc import Mapping, Sequence
 from numbers import Real
 from pathlib import Path
@@ -134,13 +135,28 @@ class Evaluator:
                 value = metric.measure_masked(image, target, counts)
             else:
                 value = metric.measure(image, target)
+        except UnavailableError:
+            raise
         except SystemExit as error:
             raise InputError(f"eval.extra.{key} ended the process (exit code {error.code}): it must return") from error
+        except Exception as error:
+            if key not in self.own:
+                raise
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            said = " ".join(f"{type(error).__name__} {str(error)[:200]}".split())
+            raise InputError(
+                f"eval.extra.{key} raised {said} ({place.filename}, line {place.lineno}): mend it"
+            ) from error
         if isinstance(value, Tensor | np.ndarray | np.generic) and math.prod(value.shape) == 1:
             value = value.item()
         if isinstance(value, bool) or not isinstance(value, Real):
             raise InputError(f"eval.extra.{key} must return a number for each view, got {value!r:.80}")
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise InputError(
+                f"eval.extra.{key} must return a number for each view, got one beyond all bounds"
+            ) from None
 
     def _leave_out(self, key: str, error: UnavailableError) -> None:
         self.unavailable[key] = " ".join(str(error).split())

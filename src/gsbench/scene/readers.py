@@ -292,7 +292,8 @@ def _read_list(root: Path, file: str | None, key: str) -> list[str] | None:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{key}: {path} cannot be read as text ({error})") from error
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{key}: {path} cannot be read ({reason}): name a text file of image names") from error
     return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
 
 

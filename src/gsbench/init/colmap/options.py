@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from annotated_types import Ge, Interval
-from pydantic import PositiveFloat, PositiveInt
+from pydantic import PositiveFloat
 
 from gsbench.init.base import PointsFrom, Poses, Seed, Timer
 from gsbench.init.colmap.pairs import Pairing
 from gsbench.logs import Progress
 from gsbench.scene.types import Capture
-from gsbench.settings import Fraction, check_settings
+from gsbench.settings import Fraction, Threads, check_settings
 from gsbench.system.resources import available_cores
 
 if TYPE_CHECKING:
@@ -70,8 +70,8 @@ class ColmapOptions(ABC):
     two_view_tracks: bool = False
     points_from: PointsFrom = "all"
     seed: Seed = 0
-    threads: PositiveInt | Literal["auto"] = "auto"
-    mapper_threads: PositiveInt = 1
+    threads: Threads | Literal["auto"] = "auto"
+    mapper_threads: Threads = 1
 
     def __post_init__(self) -> None:
         check_settings(self, "init")
