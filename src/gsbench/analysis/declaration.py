@@ -9,7 +9,7 @@ from pathlib import Path
 
 from gsbench.analysis.results import TrialResult
 from gsbench.runs.declaration import Declaration, Planned, Question, read_declarations
-from gsbench.words import counted, listed
+from gsbench.words import counted
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ class ActiveDeclaration:
             ]
         elif self.added:
             lines = [
-                f"{name} was declared beforehand (eval.primary, {when}), but {len(self.added)} of the {every} "
-                f"were added when results were there ({self._what_was_added()}), so it is adjusted with all other "
-                "metrics: who adds trials until something is found will find something. Trials with other seeds under "
-                "another name, all asked for by one command, would test it."
+                f"{name} was declared beforehand (eval.primary, {when}), but {len(self.added)} of the {every} were "
+                "added when results were there, so it is adjusted with all other metrics: who adds trials until "
+                "something is found will find something. Trials with other seeds under another name, all asked for by "
+                "one command, would test it."
             ]
         else:
             lines = [f"{name} was declared beforehand (eval.primary, {when}), before any of the {every} was measured."]
@@ -79,20 +79,6 @@ class ActiveDeclaration:
                 "part, and who ends at a look that pleases finds more than there is."
             )
         return lines + [f"Before it, {one.primary} was declared ({one.when})." for one in self.earlier]
-
-    def _what_was_added(self) -> str:
-        """``seeds 3 and 4; arm sfm-absgrad``: what none of the declared trials has."""
-        planned = self.declaration.planned
-        scenes = {key.split("/")[0] for key in planned}
-        arms = {key.split("/", 1)[1] for key in planned}
-        seeds = {seed for own in planned.values() for seed in own}
-        news = {
-            "scene": {trial.scene for trial in self.added} - scenes,
-            "arm": {str(trial.arm) for trial in self.added if trial.key.split("/", 1)[1] not in arms},
-            "seed": {str(trial.seed) for trial in self.added if trial.seed not in seeds},
-        }
-        parts = [f"{what if len(new) == 1 else what + 's'} {listed(sorted(new))}" for what, new in news.items() if new]
-        return "; ".join(parts) or "further combinations of scene, arm and seed"
 
 
 def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration | None:

@@ -56,6 +56,7 @@ WITHOUT_EFFECT = (
 )
 
 
+UNSET = canonical(None)
 CODE = "code of "  # how the keys of ``TrialResult.code`` start that are a user's modules
 
 
@@ -84,7 +85,7 @@ def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
         return {}
     known = {trial.key: trial.config_texts for trial in trials}.values()
     keys = {key for texts in known for key in texts if not key.startswith(IGNORED_SETTINGS)}
-    values = {key: {texts.get(key, canonical(None)) for texts in known} for key in keys}
+    values = {key: {texts.get(key, UNSET) for texts in known} for key in keys}
     return {key: sorted(found) for key, found in sorted(values.items()) if len(found) > 1}
 
 

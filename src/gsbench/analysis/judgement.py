@@ -136,7 +136,7 @@ def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdi
     by_arm, by_folder = by_key(trials, lambda trial: trial.arm), by_key(trials, lambda trial: trial.key)
 
     def own(question: Question) -> list[TrialResult]:
-        """The trials that the question can be about: a look at all for each of many would take long."""
+        """The trials of the question's arms: to search all trials for each of many questions takes long."""
         if question.scenes:
             keys = dict.fromkeys(key for both in question.scenes.values() for key in both)
             return [trial for key in keys for trial in by_folder.get(key, [])]

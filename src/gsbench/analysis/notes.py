@@ -37,49 +37,39 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
     return notes
 
 
-def declared_notes(experiment: Experiment) -> list[str]:
-    """The verdict on the declared metric, of the whole experiment; nothing where none was declared.
+def comparison_notes(experiment: Experiment) -> list[str]:
+    """Lines on the arms that are compared: the declared verdict, which are equal to the last bit, and caveats.
 
-    Which trials a table shows has no say in it, so that nobody can choose a verdict by choosing trials.
+    They are of the whole experiment: nobody can choose a verdict by choosing the trials that a table shows.
     """
+    trials, pairs = compared_pairs(experiment)
     declared = standing(experiment.folder, experiment.trials)
-    if declared is None:
-        return []
-    from gsbench.analysis.verdicts import declared_lines, judge_pairs  # here, for a quick start of what needs no test
-
-    trials, pairs = compared_pairs(experiment)
-    return declared_lines(declared, judge_pairs(trials, pairs, declared))
-
-
-def caveat_notes(experiment: Experiment) -> list[str]:
-    """A line for each pair of arms that differ in more than one ingredient, or of which one was tuned more."""
-    trials, pairs = compared_pairs(experiment)
-    return [sentence for pair in pairs if (sentence := caveats(trials, *pair))]
-
-
-def equal_notes(experiment: Experiment) -> list[str]:
-    """A line for each pair of arms that are equal to the last bit: what they differ in never acted."""
-    trials, pairs = compared_pairs(experiment)
     notes = []
+    if declared is not None:
+        from gsbench.analysis.verdicts import declared_lines, judge_pairs  # here, for a quick start without a test
+
+        notes = declared_lines(declared, judge_pairs(trials, pairs, declared))
+    by_arm = by_key(trials, lambda trial: trial.arm)
     for first, second in pairs:
-        one, other = (
-            {(trial.scene, trial.seed): outcome(trial) for trial in trials if trial.arm == arm}
-            for arm in (first, second)
-        )
-        shared = one.keys() & other.keys()
-        if shared and all(one[key] == other[key] and one[key][0] for key in shared):
+        if _are_equal(by_arm[first], by_arm[second]):
             names = f"{second} and {first}"
             notes.append(f"{names} are equal to the last bit in all their trials: what they differ in never acted.")
-    return notes
+    said = (caveats([*by_arm[first], *by_arm[second]], first, second) for first, second in pairs)
+    return notes + list(filter(None, said))
 
 
-def outcome(trial: TrialResult) -> tuple[dict[str, float], int | None]:
-    """All metrics and the number of Gaussians: two trainings that share them are one and the same."""
-    return dict(trial.metrics), trial.record.num_gaussians
+def _are_equal(first: Sequence[TrialResult], second: Sequence[TrialResult]) -> bool:
+    """Return whether all trials of one scene and seed have the same metrics and number of Gaussians."""
+    one, other = (
+        {(trial.scene, trial.seed): (dict(trial.metrics), trial.record.num_gaussians) for trial in own}
+        for own in (first, second)
+    )
+    shared = one.keys() & other.keys()
+    return bool(shared) and all(one[key] == other[key] and one[key][0] for key in shared)
 
 
 def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
-    """The experiment's trials as arms, and the pairs of arms that are compared: none among the points of a search."""
+    """The experiment's trials as arms, and the pairs of arms that are compared. Points of a search are not."""
     trials = with_variants(experiment.trials)
     if (experiment.folder / TUNING).exists():
         return trials, []

@@ -21,10 +21,8 @@ from gsbench.analysis.cells import (
 )
 from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.notes import (
-    caveat_notes,
     cloud_notes,
-    declared_notes,
-    equal_notes,
+    comparison_notes,
     held_out_notes,
     machine_notes,
     origin_notes,
@@ -137,9 +135,7 @@ def build_table(
     heads = tuple(Column(q.heading, arm) if columns else Column("", q.heading) for q in quantities for arm in arms)
     notes += _reading_notes(grid, quantities, expected, "scene" in fields) + origin_notes(trials)
     notes += (
-        declared_notes(experiment)
-        + equal_notes(experiment)
-        + caveat_notes(experiment)
+        comparison_notes(experiment)
         + held_out_notes(trials)
         + points_notes(trials)
         + machine_notes(trials)
