@@ -268,3 +268,26 @@ def test_a_snapshot_is_the_model_of_a_training_that_ends_there(
     Trainer(tiny_scene, cloud(truth), small(), rasterizer, options(), 0, snapshot_at=[60]).run(tmp_path / "long")
     short = train(tiny_scene, truth, rasterizer, tmp_path / "short", small(), iterations=60)
     assert same(read_ply(tmp_path / "long" / snapshot_file(60)), short)
+
+
+def test_defaults_are_those_of_3dgs() -> None:
+    """As ``arguments/__init__.py`` of the 2023 code of 3DGS has them."""
+    published = {
+        "iterations": 30_000,
+        "position_initial": 0.00016,
+        "position_final": 0.0000016,
+        "position_steps": 30_000,
+        "sh_dc": 0.0025,
+        "sh_rest": 0.0025 / 20,
+        "opacity": 0.05,
+        "scale": 0.005,
+        "rotation": 0.001,
+        "ssim_weight": 0.2,
+        "densify_interval": 100,
+        "opacity_reset_interval": 3000,
+        "densify_start": 500,
+        "densify_stop": 15_000,
+        "sh_interval": 1000,
+    }
+    defaults = TrainConfig(name="paper")
+    assert {name: getattr(defaults, name) for name in published} == published

@@ -42,6 +42,13 @@ def test_reflected_points_give_a_rotation():
     assert np.linalg.det(fit_similarity(source, target * [1, 1, -1]).rotation) == pytest.approx(1.0)
 
 
+def test_three_cameras_give_a_similarity_and_two_do_not() -> None:
+    similarity = align_poses(*poses(3))
+    assert similarity.scale == pytest.approx(TRUE_SCALE, rel=1e-9)
+    with pytest.raises(ValueError, match="at least 3 common cameras, got 2"):
+        align_poses(*poses(2))
+
+
 def test_wrong_cameras_do_not_move_the_alignment():
     centers, rotations, moved, moved_rotations = poses(30)
     wrong = moved.copy()
