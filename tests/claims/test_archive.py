@@ -97,10 +97,10 @@ def test_it_is_an_ro_crate(tmp_path: Path) -> None:
     crate = json.loads(content["ro-crate-metadata.json"])
     by_id = {entity["@id"]: entity for entity in crate["@graph"]}
     assert len(by_id) == len(crate["@graph"])
-    assert crate["@context"] == "https://w3id.org/ro/crate/1.1/context"
+    assert crate["@context"] == "https://w3id.org/ro/crate/1.2/context"
     descriptor, root = by_id["ro-crate-metadata.json"], by_id["./"]
     assert descriptor["@type"] == "CreativeWork"
-    assert descriptor["conformsTo"] == {"@id": "https://w3id.org/ro/crate/1.1"}
+    assert descriptor["conformsTo"] == {"@id": "https://w3id.org/ro/crate/1.2"}
     assert descriptor["about"] == {"@id": "./"}
     assert root["@type"] == "Dataset"
     assert all(root[key] for key in ("name", "description", "datePublished"))
@@ -115,7 +115,7 @@ def test_it_is_an_ro_crate(tmp_path: Path) -> None:
             return own.union(*map(references, value.values()))
         return set().union(*map(references, value)) if isinstance(value, list) else set()
 
-    assert references(crate["@graph"]) <= by_id.keys() | {"https://w3id.org/ro/crate/1.1"}
+    assert references(crate["@graph"]) <= by_id.keys() | {"https://w3id.org/ro/crate/1.2"}
 
 
 def cut(file: Path) -> None:

@@ -1,4 +1,4 @@
-"""Description of an archive of results in the terms of RO-Crate 1.1 (w3id.org/ro/crate/1.1, sections 3 to 6 and 8)."""
+"""Description of an archive of results in the terms of RO-Crate 1.2 (w3id.org/ro/crate/1.2)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from gsbench.analysis.results import TrialResult
 
-SPECIFICATION = "https://w3id.org/ro/crate/1.1"
+SPECIFICATION = "https://w3id.org/ro/crate/1.2"
 FILES = {  # media type, and in words what it is
     "results.jsonl": (
         "application/jsonl",
