@@ -91,7 +91,7 @@ def test_no_pixels_and_no_paths_of_the_machine(tmp_path: Path) -> None:
 
 
 def test_it_is_an_ro_crate(tmp_path: Path) -> None:
-    """The rules of RO-Crate 1.1, sections 3 (root data entity), 4 (data entities) and 2 (packaging)."""
+    """The rules of RO-Crate 1.2, sections 3 (root data entity), 4 (data entities) and 2 (packaging)."""
     file = export(tmp_path)
     content = members(file)
     crate = json.loads(content["ro-crate-metadata.json"])

@@ -1,4 +1,4 @@
-"""An experiment's results as one small file that others can read: a zip archive, and an RO-Crate 1.1 at once.
+"""An experiment's results as one small file that others can read: a zip archive, and an RO-Crate 1.2 at once.
 
 It holds, without any pixels but where pictures are asked for:
 
@@ -9,7 +9,7 @@ It holds, without any pixels but where pictures are asked for:
 - ``from_pixels.jsonl``: what declared claims ask of the trials' pictures, where they ask something;
 - ``pictures/``: renders and photographs of test views by trial, where they were asked for;
 - ``archive.json``: the version of this format and the sha256 of the files above;
-- ``ro-crate-metadata.json``: the same in the terms of RO-Crate (w3id.org/ro/crate/1.1), for other tools.
+- ``ro-crate-metadata.json``: the same in the terms of RO-Crate (w3id.org/ro/crate/1.2), for other tools.
 
 Paths of the machine are left out: of folders the last name is kept. The same results make the same archive, bit by bit.
 """
