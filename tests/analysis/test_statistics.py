@@ -182,7 +182,14 @@ CHECKS = 300
 LIMIT = 0.05 + 3 * (0.05 * 0.95 / CHECKS) ** 0.5  # three standard errors above the stated rate
 
 
-@pytest.mark.parametrize("kind", ["normal", "one scene in eight stands out", "a training in ten fails, either arm"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "normal",
+        pytest.param("one scene in eight stands out", marks=pytest.mark.slow),
+        pytest.param("a training in ten fails, either arm", marks=pytest.mark.slow),
+    ],
+)
 def test_no_word_is_untrue_in_more_than_5_percent(kind: str) -> None:
     for effect in (0.0, 0.5, 1.0, 2.0):
         found = rates(KINDS[kind], effect, CHECKS)

@@ -163,6 +163,7 @@ def test_a_failed_seed_ends_the_looks_and_its_return_decides(sweep: Callable[...
     assert verdict.outcome == "supported"
 
 
+@pytest.mark.slow
 def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(sweep: Callable[..., int], runs: Path) -> None:
     assert sweep(Fake(noise)) == 0
     for file in (runs / "stop").glob("*/*/*/results.json"):  # measured long before the second plan
@@ -173,6 +174,7 @@ def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(sweep: Cal
     assert verdict.late
 
 
+@pytest.mark.slow
 def test_another_launcher_of_hydras_gets_one_look_at_a_time(sweep: Callable[..., int]) -> None:
     fake = Fake(noise)
     assert sweep(fake, "hydra/launcher=basic", "launch=serial") == 0

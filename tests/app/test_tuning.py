@@ -152,6 +152,7 @@ def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_th
 
 @pytest.mark.parametrize("stops", [3, 9])  # in the search, and in the sweep
 @pytest.mark.slow
+@pytest.mark.slow
 def test_killed_anywhere_it_goes_on_and_chooses_the_same(
     stops: int, sweep: Sweep, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -173,6 +174,7 @@ def test_killed_anywhere_it_goes_on_and_chooses_the_same(
     "strange",
     [{"tracking.uri": "http://theirs"}, {"densify.volume_threshold": 7.0}, {"densify.stop": "${oc.env:HOME}"}],
 )
+@pytest.mark.slow
 def test_no_record_sets_what_was_not_searched(strange: dict[str, Any], sweep: Sweep, runs: Path) -> None:
     assert sweep(Fake()) == 0
     file = runs / "fair-tune-random-volumetric" / "tuning.json"
@@ -197,6 +199,7 @@ def test_seeds_may_be_added_to_a_tuned_sweep_and_it_may_stop_when_decided(sweep:
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_another_launcher_gets_the_points_and_their_trials(sweep: Sweep) -> None:
     fake = Fake()
     assert sweep(fake, "hydra/launcher=basic", "launch=serial") == 0
@@ -204,6 +207,7 @@ def test_another_launcher_gets_the_points_and_their_trials(sweep: Sweep) -> None
     assert len(fake.tuning("adc")) == len(fake.tuning("volumetric")) == 4
 
 
+@pytest.mark.slow
 def test_a_point_is_judged_on_all_scenes_and_seeds_of_the_tuning(sweep: Sweep, runs: Path) -> None:
     fake = Fake()
     words = ["scene.sector=0,1", "scene.split=sector", "hydra.sweeper.tune.seed='7,8'", "hydra.sweeper.tune.points=2"]
@@ -272,6 +276,7 @@ def test_an_interval_searches_one_arm(runs: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize(("direction", "best"), [("minimize", min), ("maximize", max)])
+@pytest.mark.slow
 def test_a_metric_of_ones_own_is_made_best_in_the_direction_that_is_given(
     direction: str, best: Any, sweep: Sweep, runs: Path
 ) -> None:
@@ -314,6 +319,7 @@ UNEVEN = FILE.replace("        densify.gradient_threshold: tag(log, interval(1e-
 SENTENCE = "Their tuning was unequal: random-adc none and random-volumetric 4 points of 1 seed on validation views."
 
 
+@pytest.mark.slow
 def test_an_arm_that_was_tuned_more_is_said_in_headline_and_tables(sweep: Sweep, runs: Path) -> None:
     assert sweep(Fake(), file=UNEVEN) == 0
     lines = notes(runs)

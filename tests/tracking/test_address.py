@@ -69,6 +69,7 @@ def test_sync_leaves_out_a_trial_whose_configuration_lacks_a_group(
 
 
 @pytest.mark.parametrize("place", ["http://127.0.0.1:{port}/api", "{outside}", "{runs}/mlartifacts/../../outside"])
+@pytest.mark.slow
 def test_artifacts_go_nowhere_else_than_our_own_folder(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -116,6 +116,7 @@ def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs: Path) ->
     assert run.info.status == "FINISHED"
 
 
+@pytest.mark.slow
 def test_curves_of_a_training_in_progress_are_followed(runs: Path, tmp_path: Path) -> None:
     values = trial_values(runs, seed=5)
     folder = begin_trial(values)
@@ -183,6 +184,7 @@ def test_one_process_mirrors_all_trials_of_a_sweep(runs: Path) -> None:
     assert (shown["9"], shown["10"], shown["11"]) == ("FINISHED", "FINISHED", "KILLED")
 
 
+@pytest.mark.slow
 def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(
     runs: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -201,6 +203,7 @@ def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(
     assert run.info.status == "FINISHED"
 
 
+@pytest.mark.slow
 def test_the_trials_process_loads_no_mlflow(runs: Path) -> None:
     """No part of it can then take the process down, and it takes no memory beside a training."""
     values = trial_values(runs, seed=8)
@@ -217,6 +220,7 @@ def test_the_trials_process_loads_no_mlflow(runs: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.slow
 def test_a_database_is_whole_or_absent(tmp_path: Path) -> None:
     """Killed while it makes the tables, a process leaves nothing that stops the next one."""
     code = (

@@ -32,6 +32,7 @@ ARMS: dict[str, tuple[type[Budgeted], dict[str, object]]] = {
 
 
 @pytest.mark.parametrize("arm", ARMS)
+@pytest.mark.slow
 def test_arms_end_within_two_percent_of_one_count(
     arm: str, tiny_scene: Scene, truth: Gaussians, tmp_path: Path
 ) -> None:

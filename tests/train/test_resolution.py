@@ -201,6 +201,7 @@ def rasterizer() -> Rasterizer:
     ],
     ids=["adc", "fastgs", "steepgs", "edgeaware", "mcmc", "mrnf", "gns"],
 )
+@pytest.mark.slow
 def test_interrupted_in_the_middle_it_ends_in_the_same_bits(
     make, tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
 ) -> None:  # type: ignore[no-untyped-def]

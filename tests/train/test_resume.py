@@ -134,6 +134,7 @@ def test_records_later_than_the_checkpoint_and_a_torn_line_are_dropped(tmp_path:
 
 @pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="needs a signal that comes in the middle of a write")
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+@pytest.mark.slow
 def test_a_kill_while_a_resumed_training_tidies_its_records_loses_none(share: float, tmp_path: Path) -> None:
     """The system ends the process as soon as it has written ``share`` of the file."""
     file = tmp_path / "events.jsonl"
