@@ -3,13 +3,17 @@
 import os
 import sys
 import time
+import warnings
 
 if sys.argv[:1] == ["-m"] and {"gsbench", "gsbench.cli"} & set(sys.orig_argv) and not sys.flags.safe_path:
     del sys.path[0]  # `python -m` puts the current folder first, where a capture may hold a module of any name
 
 import zlib  # noqa: F401 - loaded before pycolmap brings its own, with which Pillow's PNG writer crashes
 
-# Before torch is loaded, which reads it then: its idle threads must not spin beside those of our kernels.
+# torch reads this when it is loaded: its idle threads must not spin beside those of our kernels. On a busy machine an
+# optimiser step took ten times as long.
+if "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ:
+    warnings.warn("torch was imported first, so its idle threads spin: import gsbench before it", stacklevel=2)
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 IMPORTED_AT = time.time_ns()  # when this process began to load this package
