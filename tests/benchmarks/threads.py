@@ -40,7 +40,6 @@ from gsbench.train.trainer import Trainer
 THREADS = (2, 4, 8, 16)
 TILE_SHARDS = (8, 16, 32)
 STEPS = 9
-NAMES = {"<lambda>": "fill", "step": "Adam of harmonics"}  # of the functions that do a shard's work
 
 
 def trained(folder: Path, width: int) -> tuple[Gaussians, Scene]:
@@ -73,7 +72,7 @@ class Timed:
                 begin = time.process_time()
                 work(shard, shard + 1)
                 times.append(1e3 * (time.process_time() - begin))
-            self.stages.append((NAMES.get(work.__name__, work.__name__), times))
+            self.stages.append((work.__name__, times))
 
         with mock.patch.object(ShardRunner, "run", timed):
             begin = time.process_time()

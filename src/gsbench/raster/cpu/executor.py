@@ -23,8 +23,7 @@ from gsbench.raster.cpu.binning import (
     sort_by_depth,
     start_tiles,
 )
-from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_backward_tiles, composite_tiles
-from gsbench.raster.cpu.footprint import cover_tiles
+from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_backward_tiles, composite_tiles, cover_tiles
 from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, project_shards
 from gsbench.raster.cpu.shuffle import REST
 from gsbench.raster.cpu.workspace import HEADROOM, Arena, ArenaPool, ShardRunner, TensorPool
@@ -39,15 +38,6 @@ GAUSSIAN_SHARDS = 16
 TILE_SHARDS = 8
 
 
-class Resources:
-    """Threads that the stages run on, and memory for the tensors that they give."""
-
-    def __init__(self, threads: int) -> None:
-        self.runner = ShardRunner(threads)
-        self.tensors = TensorPool()
-        self.pairs_of_shard = 0  # of tile and record: the room that sufficed so far
-
-
 @dataclass
 class ForwardPass:
     """The arrays that the forward pass leaves; their memory belongs to an arena."""
@@ -55,160 +45,6 @@ class ForwardPass:
     frame: at.Frame
     degree: int
     visible: NDArray[np.int64]  # [GAUSSIAN_SHARDS] records
-
-
-def _edges(count: int) -> NDArray[np.int64]:
-    """Where the shards of so many Gaussians or records begin, and the last one ends."""
-    return np.arange(GAUSSIAN_SHARDS + 1) * count // GAUSSIAN_SHARDS
-
-
-def forward(
-    resources: Resources,
-    arena: Arena,
-    gaussians: Gaussians,
-    request: Request,
-    image: Tensor,
-    alpha: Tensor,
-    radii: Tensor,
-) -> ForwardPass:
-    """Project, sort, bin, composite into ``image``, ``alpha`` and ``radii``."""
-    run = resources.runner.run
-    count = len(gaussians)
-    view = at.make_view(request.camera)
-    tiles = view.tiles_x * view.tiles_y
-    arrays = _arrays(gaussians)
-    records = arena.take("records", (count * at.RECORD,), np.float32)
-    record_ints = records.view(np.int32)
-    keys = arena.take("keys", (count,), np.uint64)
-    flags = np.zeros((GAUSSIAN_SHARDS, 2), np.int64)
-    edges = _edges(count)
-    projected = (records, record_ints, keys, radii.numpy(), flags)
-
-    def project(first: int, past: int) -> None:
-        project_shards(at.kernel_memory(), first, past, edges, arrays, request.degree, view, *projected)
-
-    run(GAUSSIAN_SHARDS, project)
-    if flags[:, BAD_VALUE].any():
-        raise_for_values(gaussians)
-
-    order = arena.take("order", (int(flags[:, VISIBLE].sum()),), np.uint64)
-    digits = np.empty((PASSES, BUCKETS), np.int64)
-    spare = arena.take("spare", order.shape, np.uint64)
-    sort_by_depth(edges[:-1], flags[:, VISIBLE].copy(), keys, order, spare, digits)
-
-    counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
-    starts = arena.take("starts", (tiles + 1,), np.int64)
-    made = np.zeros(GAUSSIAN_SHARDS, np.int64)  # pairs of tile and record
-    in_order = (_edges(len(order)), order, records, record_ints)
-
-    def pair(first: int, past: int) -> None:
-        pair_shards(first, past, *in_order, view.tiles_x, LOG2_ALPHA_MIN, counts, pairs, made)
-
-    room = resources.pairs_of_shard
-    pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
-    run(GAUSSIAN_SHARDS, pair)
-    if made.max() > room:  # once in a while, as the scene grows
-        room = resources.pairs_of_shard = int(made.max() * HEADROOM)
-        pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
-        run(GAUSSIAN_SHARDS, pair)
-    start_tiles(counts, starts)
-    total = int(starts[tiles])
-    entries = arena.take("entries", (total,), np.int32)
-    run(GAUSSIAN_SHARDS, lambda first, past: fill_shards(first, past, made, pairs, counts, entries))
-
-    frame = at.Frame(
-        view,
-        request.background.numpy(),
-        records,
-        record_ints,
-        starts,
-        entries,
-        arena.take("masks", (total,), np.uint16),
-        arena.take("processed", (tiles,), np.int64),
-        arena.take("transmittance", (tiles * at.TILE_PIXELS,), np.float32),
-        arena.take("last", (tiles * at.TILE_PIXELS,), np.float32),
-        np.empty(TILE_SHARDS + 1, np.int64),
-        arena.take("tile_shard", (tiles,), np.uint8),
-    )
-    balance_tiles(starts, TILE_SHARDS, frame.bounds, frame.tile_shard)
-    pixels = image.numpy().reshape(-1), alpha.numpy().reshape(-1)
-
-    def composite(first: int, past: int) -> None:
-        composite_tiles(*_tiles(frame, first, past), *pixels)
-
-    run(TILE_SHARDS, composite)
-    return ForwardPass(frame, request.degree, flags[:, VISIBLE])
-
-
-def _tiles(frame: at.Frame, first: int, past: int) -> tuple[Any, ...]:
-    """The arguments that all kernels share which walk through the entries of tiles, for those of a range of shards."""
-    return at.kernel_memory(), int(frame.bounds[first]), int(frame.bounds[past]), frame
-
-
-def backward(
-    resources: Resources,
-    arena: Arena,
-    passed: ForwardPass,
-    gaussians: Gaussians,
-    request: Request,
-    g_image: NDArray[np.float32],
-    g_alpha: NDArray[np.float32],
-    want_splitting: bool,
-) -> Gradients:
-    """The gradients, and those in absolute values where ``request`` has room for them; ``g_alpha`` may be empty."""
-    count, absolute, frame = len(gaussians), request.absolute, passed.frame
-    rows = arena.take("rows", (TILE_SHARDS, count * at.ROW), np.float32, zero=True)
-    want_absolute = None if absolute is None else True
-
-    def composite_backward(first: int, past: int) -> None:
-        composite_backward_tiles(*_tiles(frame, first, past), g_image, g_alpha, rows, want_absolute)
-
-    resources.runner.run(TILE_SHARDS, composite_backward)
-
-    take = resources.tensors.empty
-    gradients = gaussians.map(lambda tensor: take(tuple(tensor.shape)))
-    g_screen = take((count, 2))
-    g_splitting = take((count, 3, 3)) if want_splitting else None
-    common = (
-        _edges(count),
-        passed.visible,
-        _arrays(gaussians),
-        passed.degree,
-        frame,
-        rows.reshape(-1),
-        _arrays(gradients),
-        g_screen.numpy(),
-        np.empty((0, 2), np.float32) if absolute is None else absolute.numpy(),
-        np.empty((0, 9), np.float32) if g_splitting is None else g_splitting.numpy().reshape(-1, 9),
-    )
-
-    def backproject(first: int, past: int) -> None:
-        backproject_shards(at.kernel_memory(), first, past, *common)
-
-    resources.runner.run(GAUSSIAN_SHARDS, backproject)
-    return Gradients(list(gradients.tensors().values()), g_screen, g_splitting)
-
-
-def _arrays(gaussians: Gaussians) -> at.Parameters:
-    means, log_scales, quaternions, logits, sh_dc, sh_rest = (t.detach().numpy() for t in gaussians.tensors().values())
-    return at.Parameters(means, log_scales, quaternions, logits.reshape(-1, 1), sh_dc, sh_rest.reshape(-1, REST))
-
-
-def footprint(
-    resources: Resources, passed: ForwardPass, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
-) -> Footprint:
-    """See ``raster.base.RenderOutput``."""
-    count = len(gaussians)
-    covered = np.zeros((TILE_SHARDS, count), np.int32)
-    sums, distances = np.zeros((2, TILE_SHARDS, count), np.float32)
-    asked = np.empty(0, np.float32) if values is None else values.detach().float().contiguous().numpy().reshape(-1)
-
-    def cover(first: int, past: int) -> None:
-        cover_tiles(*_tiles(passed.frame, first, past), asked, covered, sums, distances)
-
-    resources.runner.run(TILE_SHARDS, cover)
-    totals = (torch.from_numpy(shards.sum(0, dtype=shards.dtype)) for shards in (covered, sums, distances))
-    return Footprint(next(totals), view_depths(gaussians, camera), *totals)
 
 
 class CpuRasterizer(StagedRasterizer[ForwardPass]):
@@ -226,9 +62,11 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         if CONSTANTS.tile != at.TILE:
             raise ValueError(f"the compiled rasterizer has tiles of {at.TILE} px, the contract {CONSTANTS.tile}")
         self.threads = threads or available_cores()
-        self._resources = Resources(self.threads)
+        self._runner = ShardRunner(self.threads)
+        self._tensors = TensorPool()
         self._frames = ArenaPool()
         self._scratch = ArenaPool()
+        self._pairs_of_shard = 0  # of tile and record: the room that sufficed so far
 
     def check(self, gaussians: Gaussians) -> None:
         """Raise ValueError where tensors are not float32 on the CPU."""
@@ -239,13 +77,80 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
     def forward(
         self, lifetime: Lifetime, gaussians: Gaussians, request: Request
     ) -> tuple[Tensor, Tensor, Tensor, ForwardPass]:
-        """See `StagedRasterizer`."""
-        camera, tensors = request.camera, self._resources.tensors
-        image = tensors.empty((camera.height, camera.width, 3))
-        alpha = tensors.empty((camera.height, camera.width))
-        radii = torch.empty(len(gaussians), dtype=torch.int32)
+        """Project, sort, bin, composite; see `StagedRasterizer`."""
+        count, view = len(gaussians), at.make_view(request.camera)
+        image, alpha = self._tensors.empty((view.height, view.width, 3)), self._tensors.empty((view.height, view.width))
+        radii = torch.empty(count, dtype=torch.int32)
         arena = self._frames.lease(lifetime)
-        return image, alpha, radii, forward(self._resources, arena, gaussians, request, image, alpha, radii)
+        records = arena.take("records", (count * at.RECORD,), np.float32)
+        record_ints = records.view(np.int32)
+        keys = arena.take("keys", (count,), np.uint64)
+        flags = np.zeros((GAUSSIAN_SHARDS, 2), np.int64)
+        edges, arrays = _edges(count), _arrays(gaussians)
+        projected = (records, record_ints, keys, radii.numpy(), flags)
+
+        def project(first: int, past: int) -> None:
+            project_shards(at.kernel_memory(), first, past, edges, arrays, request.degree, view, *projected)
+
+        self._runner.run(GAUSSIAN_SHARDS, project)
+        if flags[:, BAD_VALUE].any():
+            raise_for_values(gaussians)
+        order = arena.take("order", (int(flags[:, VISIBLE].sum()),), np.uint64)
+        spare = arena.take("spare", order.shape, np.uint64)
+        sort_by_depth(edges[:-1], flags[:, VISIBLE].copy(), keys, order, spare, np.empty((PASSES, BUCKETS), np.int64))
+        starts, entries = self._list_tiles(arena, view, order, records)
+        tiles, total = view.tiles_x * view.tiles_y, len(entries)
+        frame = at.Frame(
+            view,
+            request.background.numpy(),
+            records,
+            record_ints,
+            starts,
+            entries,
+            arena.take("masks", (total,), np.uint16),
+            arena.take("processed", (tiles,), np.int64),
+            arena.take("transmittance", (tiles * at.TILE_PIXELS,), np.float32),
+            arena.take("last", (tiles * at.TILE_PIXELS,), np.float32),
+            np.empty(TILE_SHARDS + 1, np.int64),
+            arena.take("tile_shard", (tiles,), np.uint8),
+        )
+        balance_tiles(starts, TILE_SHARDS, frame.bounds, frame.tile_shard)
+        pixels = image.numpy().reshape(-1), alpha.numpy().reshape(-1)
+
+        def composite(first: int, past: int) -> None:
+            composite_tiles(*_tiles(frame, first, past), *pixels)
+
+        self._runner.run(TILE_SHARDS, composite)
+        return image, alpha, radii, ForwardPass(frame, request.degree, flags[:, VISIBLE])
+
+    def _list_tiles(
+        self, arena: Arena, view: at.View, order: NDArray[np.uint64], records: NDArray[np.float32]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """Where the list of each tile starts, [tiles + 1], and the records of all lists, front to back."""
+        tiles = view.tiles_x * view.tiles_y
+        counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
+        starts = arena.take("starts", (tiles + 1,), np.int64)
+        made = np.zeros(GAUSSIAN_SHARDS, np.int64)  # pairs of tile and record
+        in_order = (_edges(len(order)), order, records, records.view(np.int32))
+
+        def pair(first: int, past: int) -> None:
+            pair_shards(first, past, *in_order, view.tiles_x, LOG2_ALPHA_MIN, counts, pairs, made)
+
+        room = self._pairs_of_shard
+        pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
+        self._runner.run(GAUSSIAN_SHARDS, pair)
+        if made.max() > room:  # once in a while, as the scene grows
+            room = self._pairs_of_shard = int(made.max() * HEADROOM)
+            pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
+            self._runner.run(GAUSSIAN_SHARDS, pair)
+        start_tiles(counts, starts)
+        entries = arena.take("entries", (int(starts[tiles]),), np.int32)
+
+        def fill(first: int, past: int) -> None:
+            fill_shards(first, past, made, pairs, counts, entries)
+
+        self._runner.run(GAUSSIAN_SHARDS, fill)
+        return starts, entries
 
     def backward(
         self,
@@ -257,26 +162,87 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         want_splitting: bool,
     ) -> Gradients:
         """See `StagedRasterizer`."""
-        g_alpha_array = np.empty(0, np.float32) if g_alpha is None else g_alpha.numpy().reshape(-1)
         lifetime = Lifetime()
         arena = self._scratch.lease(lifetime)
+        rows = arena.take("rows", (TILE_SHARDS, len(gaussians) * at.ROW), np.float32, zero=True)
         try:
-            return backward(
-                self._resources,
-                arena,
-                passed,
-                gaussians,
-                request,
-                g_image.numpy().reshape(-1),
-                g_alpha_array,
-                want_splitting,
-            )
+            self._composite_backward(passed.frame, request, g_image, g_alpha, rows)
+            return self._backproject(passed, gaussians, request.absolute, rows, want_splitting)
         except BaseException:
             arena.drop("rows")  # it must be all zero, and an interrupt may have left sums in it
             raise
+
+    def _composite_backward(
+        self, frame: at.Frame, request: Request, g_image: Tensor, g_alpha: Tensor | None, rows: NDArray[np.float32]
+    ) -> None:
+        g_pixels = g_image.numpy().reshape(-1)
+        g_alphas = np.empty(0, np.float32) if g_alpha is None else g_alpha.numpy().reshape(-1)
+        want_absolute = None if request.absolute is None else True
+
+        def composite_backward(first: int, past: int) -> None:
+            composite_backward_tiles(*_tiles(frame, first, past), g_pixels, g_alphas, rows, want_absolute)
+
+        self._runner.run(TILE_SHARDS, composite_backward)
+
+    def _backproject(
+        self,
+        passed: ForwardPass,
+        gaussians: Gaussians,
+        absolute: Tensor | None,
+        rows: NDArray[np.float32],
+        want_splitting: bool,
+    ) -> Gradients:
+        """The gradients, and those in absolute values where there is room for them."""
+        count, take = len(gaussians), self._tensors.empty
+        gradients = gaussians.map(lambda tensor: take(tuple(tensor.shape)))
+        g_screen = take((count, 2))
+        g_splitting = take((count, 3, 3)) if want_splitting else None
+        arguments = (
+            _edges(count),
+            passed.visible,
+            _arrays(gaussians),
+            passed.degree,
+            passed.frame,
+            rows.reshape(-1),
+            _arrays(gradients),
+            g_screen.numpy(),
+            np.empty((0, 2), np.float32) if absolute is None else absolute.numpy(),
+            np.empty((0, 9), np.float32) if g_splitting is None else g_splitting.numpy().reshape(-1, 9),
+        )
+
+        def backproject(first: int, past: int) -> None:
+            backproject_shards(at.kernel_memory(), first, past, *arguments)
+
+        self._runner.run(GAUSSIAN_SHARDS, backproject)
+        return Gradients(list(gradients.tensors().values()), g_screen, g_splitting)
 
     def footprint(
         self, passed: ForwardPass, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
     ) -> Footprint:
         """See ``raster.base.RenderOutput``."""
-        return footprint(self._resources, passed, gaussians, camera, values)
+        count = len(gaussians)
+        covered = np.zeros((TILE_SHARDS, count), np.int32)
+        sums, distances = np.zeros((2, TILE_SHARDS, count), np.float32)
+        asked = np.empty(0, np.float32) if values is None else values.detach().float().contiguous().numpy().reshape(-1)
+
+        def cover(first: int, past: int) -> None:
+            cover_tiles(*_tiles(passed.frame, first, past), asked, covered, sums, distances)
+
+        self._runner.run(TILE_SHARDS, cover)
+        totals = (torch.from_numpy(shards.sum(0, dtype=shards.dtype)) for shards in (covered, sums, distances))
+        return Footprint(next(totals), view_depths(gaussians, camera), *totals)
+
+
+def _edges(count: int) -> NDArray[np.int64]:
+    """Where the shards of so many Gaussians or records begin, and the last one ends."""
+    return np.arange(GAUSSIAN_SHARDS + 1) * count // GAUSSIAN_SHARDS
+
+
+def _tiles(frame: at.Frame, first: int, past: int) -> tuple[Any, ...]:
+    """The arguments that all kernels share which walk through the entries of tiles, for those of a range of shards."""
+    return at.kernel_memory(), int(frame.bounds[first]), int(frame.bounds[past]), frame
+
+
+def _arrays(gaussians: Gaussians) -> at.Parameters:
+    means, log_scales, quaternions, logits, sh_dc, sh_rest = (t.detach().numpy() for t in gaussians.tensors().values())
+    return at.Parameters(means, log_scales, quaternions, logits.reshape(-1, 1), sh_dc, sh_rest.reshape(-1, REST))
