@@ -49,56 +49,189 @@ class Frame:
     last_slots: Tensor  # [blocks] int64
 
 
-def forward(
-    memory: Workspace,
-    scratch: Workspace,
-    gaussians: Gaussians,
-    request: Request,
-    image: Tensor,
-    alpha: Tensor,
-    radii: Tensor,
-) -> Frame:
-    """Project, sort, bin, composite into ``image``, ``alpha`` and ``radii``. Raises ValueError for bad values."""
-    grid, view = make_grid(request.camera), make_view(request.camera)
-    count, blocks, background = len(gaussians), grid.blocks, request.background
-    flags = scratch.take("flags", 1, torch.int32).zero_()
-    keys = scratch.take("depth_keys", count, torch.int32)
-    projected = _project(memory, gaussians, view, request.degree, keys, radii, flags)
-    units, owners = find_all_units(memory, scratch, gaussians, projected, grid, keys, flags, background)
-    lists = make_lists(memory, scratch, units, owners, blocks)
-    frame = Frame(
-        grid,
-        view,
-        projected,
-        units,
-        lists,
-        memory.take("transmittance", blocks * BLOCK_PIXELS.value, torch.float32),
-        memory.take("last", blocks * BLOCK_PIXELS.value, torch.int32),
-        memory.take("past", blocks, torch.int32),
-        memory.take("borders", count_borders(units.pairs) * BORDER.value, torch.float32),
-        memory.take("last_slots", blocks, torch.int64),
-    )
-    launch_grid(composite, blocks)(
-        lists.order,
-        lists.starts,
-        lists.entries,
-        projected.records,
-        count,
-        background,
-        grid.width,
-        grid.height,
-        grid.blocks_x,
-        image,
-        alpha,
-        frame.transmittance,
-        frame.last,
-        frame.past,
-        frame.borders,
-        lists.slots,
-        frame.last_slots,
-        num_warps=1,
-    )
-    return frame
+class TritonRasterizer(StagedRasterizer[Frame]):
+    """float32 on a GPU, compiled by Triton at first use; the same bits on every run of one GPU.
+
+    Each render keeps its intermediate results until its graph is freed; memory is kept and used again. A render makes
+    the host wait for the device once, to learn how much there is to composite.
+    """
+
+    name = "triton"
+
+    def __init__(self) -> None:
+        if CONSTANTS.tile != TILE.value:
+            raise ValueError(f"the Triton rasterizer has tiles of {TILE.value} px, the contract {CONSTANTS.tile}")
+        self._frames = WorkspacePool()
+        self._scratch = WorkspacePool()
+
+    def check(self, gaussians: Gaussians) -> None:
+        """Raise ValueError where tensors are not float32, or the device's driver cannot be loaded."""
+        if gaussians.means.dtype != torch.float32:
+            raise ValueError(f"means: raster=triton needs float32, got {gaussians.means.dtype}")
+        if gaussians.means.device.type == "cuda":
+            load_driver()
+
+    def forward(
+        self, lifetime: Lifetime, gaussians: Gaussians, request: Request
+    ) -> tuple[Tensor, Tensor, Tensor, Frame]:
+        """Project, sort, bin, composite; see `StagedRasterizer`. Raises ValueError for bad values."""
+        camera, device = request.camera, gaussians.means.device
+        image = torch.empty(camera.height, camera.width, 3, dtype=torch.float32, device=device)
+        alpha = torch.empty(camera.height, camera.width, dtype=torch.float32, device=device)
+        radii = torch.empty(len(gaussians), dtype=torch.int32, device=device)
+        while_drawn = Lifetime()
+        with torch.cuda.device_of(image):
+            memory = self._frames.lease(lifetime, device)
+            scratch = self._scratch.lease(while_drawn, device)
+            grid, view = make_grid(request.camera), make_view(request.camera)
+            count, blocks, background = len(gaussians), grid.blocks, request.background
+            flags = scratch.take("flags", 1, torch.int32).zero_()
+            keys = scratch.take("depth_keys", count, torch.int32)
+            projected = _project(memory, gaussians, view, request.degree, keys, radii, flags)
+            units, owners = find_all_units(memory, scratch, gaussians, projected, grid, keys, flags, background)
+            lists = make_lists(memory, scratch, units, owners, blocks)
+            frame = Frame(
+                grid,
+                view,
+                projected,
+                units,
+                lists,
+                memory.take("transmittance", blocks * BLOCK_PIXELS.value, torch.float32),
+                memory.take("last", blocks * BLOCK_PIXELS.value, torch.int32),
+                memory.take("past", blocks, torch.int32),
+                memory.take("borders", count_borders(units.pairs) * BORDER.value, torch.float32),
+                memory.take("last_slots", blocks, torch.int64),
+            )
+            launch_grid(composite, blocks)(
+                lists.order,
+                lists.starts,
+                lists.entries,
+                projected.records,
+                count,
+                background,
+                grid.width,
+                grid.height,
+                grid.blocks_x,
+                image,
+                alpha,
+                frame.transmittance,
+                frame.last,
+                frame.past,
+                frame.borders,
+                lists.slots,
+                frame.last_slots,
+                num_warps=1,
+            )
+            return image, alpha, radii, frame
+
+    def backward(
+        self,
+        frame: Frame,
+        gaussians: Gaussians,
+        request: Request,
+        g_image: Tensor,
+        g_alpha: Tensor | None,
+        want_splitting: bool,
+    ) -> Gradients:
+        """See `StagedRasterizer`."""
+        lifetime = Lifetime()
+        with torch.cuda.device_of(g_image):
+            scratch = self._scratch.lease(lifetime, g_image.device)
+            grid, units, lists, count = frame.grid, frame.units, frame.lists, len(gaussians)
+            projected, absolute = frame.projected, request.absolute
+            rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)
+            inner = count_borders(units.pairs)
+            launch_grid(composite_backward, inner + grid.blocks)(
+                lists.order,
+                lists.starts,
+                grid.blocks,
+                inner,
+                lists.entries,
+                lists.slots,
+                projected.records,
+                count,
+                request.background,
+                grid.width,
+                grid.height,
+                grid.blocks_x,
+                frame.transmittance,
+                frame.last,
+                frame.past,
+                frame.borders,
+                g_image,
+                g_image if g_alpha is None else g_alpha,
+                rows,
+                HAS_ALPHA=g_alpha is not None,
+                ABSOLUTE=absolute is not None,
+                num_warps=1,
+            )
+            _sum_units(frame, rows)
+            means, log_scales, quaternions, logits, *_ = gaussians.tensors().values()
+            gradients = [torch.zeros_like(tensor) for tensor in gaussians.tensors().values()]
+            g_screen = torch.zeros_like(means[:, :2])
+            g_splitting = means.new_zeros(count, 3, 3) if want_splitting else None
+            launch(backproject, count, 128)(
+                means,
+                log_scales,
+                quaternions,
+                logits,
+                count,
+                frame.view,
+                projected.records.view(torch.int32),
+                projected.color_slopes,
+                projected.row_counts,
+                units.first,
+                units.pair_ends,
+                units.widths,
+                rows,
+                *gradients,
+                g_screen,
+                g_screen if absolute is None else absolute,
+                g_screen if g_splitting is None else g_splitting,
+                DEGREE=request.degree,
+                ABSOLUTE=absolute is not None,
+                SPLITTING=want_splitting,
+            )
+            return Gradients(gradients, g_screen, g_splitting)
+
+    def footprint(self, frame: Frame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None) -> Footprint:
+        """See ``raster.base.RenderOutput``."""
+        lifetime = Lifetime()
+        with torch.cuda.device_of(gaussians.means):
+            scratch = self._scratch.lease(lifetime, gaussians.means.device)
+            units, lists, count, device = frame.units, frame.lists, len(gaussians), gaussians.means.device
+            covered = torch.zeros(count, dtype=torch.int32, device=device)
+            sums, distances = torch.zeros(2, count, device=device)
+            asked = sums if values is None else values.detach().float().contiguous()
+            rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)  # ``cover`` fills three of 16
+            launch_grid(cover, frame.grid.blocks)(
+                lists.starts,
+                lists.entries,
+                lists.slots,
+                frame.projected.records,
+                frame.grid.width,
+                frame.grid.height,
+                frame.grid.blocks_x,
+                frame.last,
+                frame.past,
+                asked,
+                rows,
+                HAS_VALUES=values is not None,
+                num_warps=1,
+            )
+            _sum_units(frame, rows)
+            launch(sum_cover, count, 128)(
+                count,
+                frame.projected.row_counts,
+                units.first,
+                units.pair_ends,
+                units.widths,
+                rows,
+                covered,
+                sums,
+                distances,
+            )
+            return Footprint(covered, view_depths(gaussians, camera), sums, distances)
 
 
 def _project(
@@ -134,175 +267,9 @@ def _project(
     return projected
 
 
-def backward(
-    scratch: Workspace,
-    frame: Frame,
-    gaussians: Gaussians,
-    request: Request,
-    g_image: Tensor,
-    g_alpha: Tensor | None,
-    want_splitting: bool,
-) -> Gradients:
-    """The gradients, and those in absolute values where ``request`` has room for them."""
-    grid, units, lists, count = frame.grid, frame.units, frame.lists, len(gaussians)
-    projected, absolute = frame.projected, request.absolute
-    rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)
-    inner = count_borders(units.pairs)
-    launch_grid(composite_backward, inner + grid.blocks)(
-        lists.order,
-        lists.starts,
-        grid.blocks,
-        inner,
-        lists.entries,
-        lists.slots,
-        projected.records,
-        count,
-        request.background,
-        grid.width,
-        grid.height,
-        grid.blocks_x,
-        frame.transmittance,
-        frame.last,
-        frame.past,
-        frame.borders,
-        g_image,
-        g_image if g_alpha is None else g_alpha,
-        rows,
-        HAS_ALPHA=g_alpha is not None,
-        ABSOLUTE=absolute is not None,
-        num_warps=1,
-    )
-    _sum_units(frame, rows)
-    means, log_scales, quaternions, logits, *_ = gaussians.tensors().values()
-    gradients = [torch.zeros_like(tensor) for tensor in gaussians.tensors().values()]
-    g_screen = torch.zeros_like(means[:, :2])
-    g_splitting = means.new_zeros(count, 3, 3) if want_splitting else None
-    launch(backproject, count, 128)(
-        means,
-        log_scales,
-        quaternions,
-        logits,
-        count,
-        frame.view,
-        projected.records.view(torch.int32),
-        projected.color_slopes,
-        projected.row_counts,
-        units.first,
-        units.pair_ends,
-        units.widths,
-        rows,
-        *gradients,
-        g_screen,
-        g_screen if absolute is None else absolute,
-        g_screen if g_splitting is None else g_splitting,
-        DEGREE=request.degree,
-        ABSOLUTE=absolute is not None,
-        SPLITTING=want_splitting,
-    )
-    return Gradients(gradients, g_screen, g_splitting)
-
-
 def _sum_units(frame: Frame, rows: Tensor) -> None:
     """Add up the ``rows`` of each unit's pairs, in place."""
     units = frame.units
     launch(sum_units, units.number, 32)(
         units.pair_ends, units.widths, units.blocks, frame.last_slots, units.number, rows
     )
-
-
-def footprint(
-    scratch: Workspace, frame: Frame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
-) -> Footprint:
-    """See ``raster.base.RenderOutput``."""
-    units, lists, count, device = frame.units, frame.lists, len(gaussians), gaussians.means.device
-    covered = torch.zeros(count, dtype=torch.int32, device=device)
-    sums, distances = torch.zeros(2, count, device=device)
-    asked = sums if values is None else values.detach().float().contiguous()
-    rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)  # ``cover`` fills three of 16
-    launch_grid(cover, frame.grid.blocks)(
-        lists.starts,
-        lists.entries,
-        lists.slots,
-        frame.projected.records,
-        frame.grid.width,
-        frame.grid.height,
-        frame.grid.blocks_x,
-        frame.last,
-        frame.past,
-        asked,
-        rows,
-        HAS_VALUES=values is not None,
-        num_warps=1,
-    )
-    _sum_units(frame, rows)
-    launch(sum_cover, count, 128)(
-        count,
-        frame.projected.row_counts,
-        units.first,
-        units.pair_ends,
-        units.widths,
-        rows,
-        covered,
-        sums,
-        distances,
-    )
-    return Footprint(covered, view_depths(gaussians, camera), sums, distances)
-
-
-class TritonRasterizer(StagedRasterizer[Frame]):
-    """float32 on a GPU, compiled by Triton at first use; the same bits on every run of one GPU.
-
-    Each render keeps its intermediate results until its graph is freed; memory is kept and used again. A render makes
-    the host wait for the device once, to learn how much there is to composite.
-    """
-
-    name = "triton"
-
-    def __init__(self) -> None:
-        if CONSTANTS.tile != TILE.value:
-            raise ValueError(f"the Triton rasterizer has tiles of {TILE.value} px, the contract {CONSTANTS.tile}")
-        self._frames = WorkspacePool()
-        self._scratch = WorkspacePool()
-
-    def check(self, gaussians: Gaussians) -> None:
-        """Raise ValueError where tensors are not float32, or the device's driver cannot be loaded."""
-        if gaussians.means.dtype != torch.float32:
-            raise ValueError(f"means: raster=triton needs float32, got {gaussians.means.dtype}")
-        if gaussians.means.device.type == "cuda":
-            load_driver()
-
-    def forward(
-        self, lifetime: Lifetime, gaussians: Gaussians, request: Request
-    ) -> tuple[Tensor, Tensor, Tensor, Frame]:
-        """See `StagedRasterizer`."""
-        camera, device = request.camera, gaussians.means.device
-        image = torch.empty(camera.height, camera.width, 3, dtype=torch.float32, device=device)
-        alpha = torch.empty(camera.height, camera.width, dtype=torch.float32, device=device)
-        radii = torch.empty(len(gaussians), dtype=torch.int32, device=device)
-        while_drawn = Lifetime()
-        with torch.cuda.device_of(image):
-            memory = self._frames.lease(lifetime, device)
-            scratch = self._scratch.lease(while_drawn, device)
-            return image, alpha, radii, forward(memory, scratch, gaussians, request, image, alpha, radii)
-
-    def backward(
-        self,
-        frame: Frame,
-        gaussians: Gaussians,
-        request: Request,
-        g_image: Tensor,
-        g_alpha: Tensor | None,
-        want_splitting: bool,
-    ) -> Gradients:
-        """See `StagedRasterizer`."""
-        lifetime = Lifetime()
-        with torch.cuda.device_of(g_image):
-            scratch = self._scratch.lease(lifetime, g_image.device)
-            return backward(scratch, frame, gaussians, request, g_image, g_alpha, want_splitting)
-
-    def footprint(self, frame: Frame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None) -> Footprint:
-        """See ``raster.base.RenderOutput``."""
-        lifetime = Lifetime()
-        with torch.cuda.device_of(gaussians.means):
-            scratch = self._scratch.lease(lifetime, gaussians.means.device)
-            return footprint(scratch, frame, gaussians, camera, values)
