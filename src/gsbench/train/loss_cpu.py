@@ -22,7 +22,7 @@ from gsbench.raster.staged import Lifetime
 from gsbench.system.jit import inlined, kernel
 from gsbench.system.resources import available_cores
 
-SHARDS = 8  # fixed, so that the bits are the same for any number of threads
+SHARDS = 8  # of rows; a thread filters ten rows beside its own
 CHANNELS = 3
 PAD = LANES  # zeros on both sides of a row: at least CHANNELS * WINDOW_RADIUS
 TAPS = 2 * WINDOW_RADIUS + 1
@@ -104,7 +104,8 @@ def similarity_rows(
     derivatives: Any,
     sums: Any,
 ) -> None:
-    """Rows ``begin`` to ``end``, with scratch ``memory``: ``sums`` [2] gets the sum of SSIM and of |image - target|.
+    """Rows ``begin`` to ``end``, with scratch ``memory``: ``sums`` [H, 2] get each row's sum of SSIM and of |image -
+    target|.
 
     ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if not empty, gets the derivative of SSIM's sum with respect to
     the blurred image, its blurred square and its blurred product with the target, between zeros.
@@ -118,7 +119,6 @@ def similarity_rows(
     scratch = ring[MAPS * part :]
     for i in range(0, 4 * padded, LANES):
         store(memory, i, splat(ZERO))
-    total_similarity, total_l1 = 0.0, 0.0
     lane = load(LANE, 0)
     for row in range(begin - WINDOW_RADIUS, end + WINDOW_RADIUS):
         slot = (row + TAPS) % TAPS * length
@@ -132,7 +132,7 @@ def similarity_rows(
                 store(products, i, a * b)
                 l1 += absolute(a - b)
             if begin <= row < end:
-                total_l1 += _sum(l1, scratch)
+                sums[row, 1] = _sum(l1, scratch)
             _blur_row(x, 0, ring, slot, numbers)
             _blur_row(y, 0, ring, part + slot, numbers)
             _blur_row(squares, 0, ring, 2 * part + slot, numbers)
@@ -164,14 +164,12 @@ def similarity_rows(
                 store(derivatives, at, select(inside, d_mean, ZERO))
                 store(derivatives, height * padded + at, select(inside, -value * b1 * inverse, ZERO))
                 store(derivatives, 2 * height * padded + at, select(inside, TWO * a1 * inverse, ZERO))
-        total_similarity += _sum(similarity, scratch)
+        sums[center, 0] = _sum(similarity, scratch)
         if len(derivatives) > 0:
             for m in range(3):
                 start = (m * height + center) * padded
                 store(derivatives, start, splat(ZERO))
                 store(derivatives, start + PAD + length, splat(ZERO))
-    sums[0] = total_similarity
-    sums[1] = total_l1
 
 
 @kernel
@@ -243,7 +241,7 @@ class CompiledLoss:
         wanted = target.contiguous().numpy().reshape(-1)
         divisor = BYTE_MAX if target.dtype == torch.uint8 else ONE
         edges = [height * shard // SHARDS for shard in range(SHARDS + 1)]
-        sums = np.zeros((SHARDS, 2))
+        sums = np.empty((height, 2))
         holder = Lifetime()
         arena = self._arenas.lease(holder)
         padded = -(-width * CHANNELS // LANES) * LANES + 2 * PAD
@@ -252,8 +250,7 @@ class CompiledLoss:
         common = (height, width, pixels, wanted, divisor, derivatives)
 
         def similarity(first: int, past: int) -> None:
-            for shard in range(first, past):
-                similarity_rows(memory[shard], edges[shard], edges[shard + 1], *common, sums[shard])
+            similarity_rows(memory[first], edges[first], edges[past], *common, sums)
 
         self._runner.run(SHARDS, similarity)
         total_similarity, total_l1 = (float(value) / numbers for value in sums.sum(0))
@@ -265,8 +262,7 @@ class CompiledLoss:
         flat = gradient.numpy().reshape(-1)
 
         def differentiate_rows(first: int, past: int) -> None:
-            for shard in range(first, past):
-                gradient_rows(memory[shard], edges[shard], edges[shard + 1], *common, *factors, flat)
+            gradient_rows(memory[first], edges[first], edges[past], *common, *factors, flat)
 
         self._runner.run(SHARDS, differentiate_rows)
         return total_similarity, total_l1, gradient
