@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Points, read_cloud
-from gsbench.init.point_files import read_points, read_similarity
-from gsbench.init.points import GREY, one_in_each_voxel, seen_colors
+from gsbench.init.points import GREY, one_in_each_voxel, read_points, read_similarity, seen_colors
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Capture
 

@@ -27,7 +27,7 @@ from gsbench.runs.code import (
     unnamed_modules,
     user_modules,
 )
-from gsbench.system.imports import import_closure
+from gsbench.system.jit import import_closure
 from gsbench.system.own_modules import allow_modules, allowed_modules
 
 SOURCE = '"""A module."""\nX = 0.8  # weight\n\n\ndef loss(a):\n    """The loss."""\n    return X * a\n'

@@ -16,7 +16,7 @@ from PIL.TiffImagePlugin import IFDRational
 from gsbench.errors import InputError
 from gsbench.gaussians.ply import check_ply, read_ply
 from gsbench.init.colmap.pairs import gps_positions
-from gsbench.init.point_files import read_points, read_similarity
+from gsbench.init.points import read_points, read_similarity
 from gsbench.scene.colmap import read_model
 from gsbench.scene.images import IMAGE_SUFFIXES, exif_orientation, image_size, read_image
 from gsbench.scene.names import check_picture_names

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.system.checkout import Checkout, checkout_of
+from gsbench.system.install import Checkout, checkout_of
 
 
 def test_a_folder_that_the_repository_does_not_follow_is_no_checkout(

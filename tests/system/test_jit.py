@@ -13,8 +13,7 @@ from typing import Any
 import numba
 import pytest
 
-from gsbench.system.imports import PACKAGE, import_closure
-from gsbench.system.jit import cache_base, cache_folder
+from gsbench.system.jit import PACKAGE, cache_base, cache_folder, import_closure
 
 KERNEL_MODULES = sorted(
     path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py") if "\n@kernel\n" in path.read_text()

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from gsbench.errors import InputError
-from gsbench.system.checkout import WorkTrees
+from gsbench.system.install import WorkTrees
 
 Git = Callable[..., str]
 

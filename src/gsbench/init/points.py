@@ -1,4 +1,4 @@
-"""Point clouds of any origin (laser scans, multi-view stereo, depth networks) as the start of a training."""
+"""Points of any origin (laser scans, multi-view stereo, depth networks) as the start of a training, and their files."""
 
 from __future__ import annotations
 
@@ -9,16 +9,105 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.files import file_sha256
+from gsbench.files import file_sha256, require_regular
 from gsbench.init.base import PointCloud, Seed
-from gsbench.init.colmap.alignment import Array
+from gsbench.init.colmap.alignment import Array, Similarity
 from gsbench.init.placed import PlacedCloud, in_view
-from gsbench.init.point_files import read_points, read_similarity
+from gsbench.parsing import one_line
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath
+
+COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts")
+ROTATION_TOLERANCE = 1e-4  # of a matrix that was written with few digits
+
+
+def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
+    """Points [P, 3] float64 and their colours [P, 3], None where the file has none; the suffix says its form.
+
+    ``.ply``: vertices with x, y, z in any order and type, text or binary; colours as whole numbers or in [0, 1].
+    ``.npy`` and text: columns x, y, z, and perhaps red, green, blue. Raises ``InputError`` for a file that cannot be
+    read, holds no point, or a coordinate or colour that is no finite number.
+    """
+    suffix = path.suffix.lower()
+    require_regular(path)
+    try:
+        if suffix == ".ply":
+            points, colors = _read_ply(path)
+        elif suffix == ".npy":
+            points, colors = _columns(np.load(path, allow_pickle=False))
+        elif suffix in TEXT_SUFFIXES:
+            points, colors = _columns(np.loadtxt(path, delimiter="," if suffix == ".csv" else None, ndmin=2))
+        else:
+            raise ValueError(f"known are .ply, .npy, {', '.join(TEXT_SUFFIXES)}")
+    except Exception as error:  # readers raise anything on a damaged file, numpy even what Python's tokenizer raises
+        raise InputError(f"{path}: not a readable file of points ({one_line(str(error))})") from error
+    if len(points) == 0:
+        raise InputError(f"{path}: holds no point")
+    bad = ~np.isfinite(points).all(axis=1)
+    if bad.any():
+        raise InputError(f"{path}: {bad.sum():,} of {len(points):,} points have coordinates that are no finite numbers")
+    if colors is None:
+        return points, None
+    if not np.isfinite(colors.astype(np.float64)).all() or colors.min() < 0:
+        raise InputError(f"{path}: has colours that are negative or no finite numbers")
+    return points, _eight_bits(colors)
+
+
+def read_similarity(path: Path) -> Similarity:
+    """The similarity in a text file of a 4 x 4 matrix: scale times rotation, translation, last row 0 0 0 1.
+
+    Raises ``InputError`` where it is none: another shape, a shear, a mirror image.
+    """
+    require_regular(path)
+    try:
+        matrix = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not a readable matrix ({error})") from error
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        raise InputError(f"{path}: must hold 4 rows of 4 numbers, the last 0 0 0 1")
+    determinant = float(np.linalg.det(matrix[:3, :3]))
+    if determinant <= 0:
+        raise InputError(f"{path}: mirrors or flattens (determinant {determinant:.3g}): must be a similarity")
+    scale = determinant ** (1 / 3)
+    rotation = matrix[:3, :3] / scale
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE:
+        raise InputError(f"{path}: shears or scales unevenly: must be one scale, a rotation and a translation")
+    return Similarity(scale, rotation, matrix[:3, 3])
+
+
+def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
+    vertices = PlyData.read(str(path))["vertex"].data
+    present = vertices.dtype.names or ()
+    lacking = [name for name in "xyz" if name not in present]
+    if lacking:
+        raise ValueError(f"its vertices have no property {', '.join(lacking)}")
+    points = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
+    for names in COLOR_NAMES:
+        if all(name in present for name in names):
+            return points, np.stack([vertices[name] for name in names], axis=1)
+    return points, None
+
+
+def _columns(table: NDArray[np.generic]) -> tuple[Array, NDArray[np.generic] | None]:
+    if table.ndim != 2 or table.shape[1] not in (3, 6) or table.dtype.kind not in "fiu":
+        raise ValueError(f"must be a table of 3 or 6 columns of numbers, is {table.shape} {table.dtype}")
+    return table[:, :3].astype(np.float64), table[:, 3:] if table.shape[1] == 6 else None
+
+
+def _eight_bits(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """Colours as 0 to 255: 16-bit ones divided, floats in [0, 1] multiplied."""
+    values = colors.astype(np.float64)
+    if colors.dtype.kind == "f" and values.max() <= 1.0:
+        values = values * 255
+    elif values.max() > 255:
+        values = values / 257  # 65535 to 255
+    return values.round().clip(0, 255).astype(np.uint8)
+
 
 if TYPE_CHECKING:
     import pycolmap

@@ -4,11 +4,17 @@ The child is a fresh interpreter (never a fork, so no threads or locks are inher
 function needs: the parent's ``__main__`` is not imported again, so it works alike from a console script, a notebook,
 pytest and Hydra. The child, and every program that it started, ends when the parent does, even when the parent is
 killed; no such program outlives the function. On Linux that holds for daemons too; on other systems a program that
-begins a session of its own gets away (`gsbench.system.supervise`).
+begins a session of its own gets away.
+
+
+The process stays behind its own child and ends whatever that leaves running. A daemon forks twice and begins a
+session of its own: then neither its parent nor its process group leads to it. Linux lets a process adopt all orphans among its
+descendants (PR_SET_CHILD_SUBREAPER), so that none can get away from it.
 """
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import pickle
@@ -18,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
@@ -26,7 +33,81 @@ from typing import Any, BinaryIO, ParamSpec, TypeVar
 
 from gsbench.errors import GsbenchError
 from gsbench.system.own_modules import allowed_modules
-from gsbench.system.supervise import go_on_as_child
+
+PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
+SECONDS_TO_END = 5.0  # patience with descendants that do not die of SIGKILL, such as those of another user
+SECONDS_BETWEEN_LOOKS = 0.01
+
+
+def go_on_as_child() -> bool:
+    """Return in a child of this process, which itself never returns: it ends as the child does, and all with it.
+
+    All ends too where the input of this process does, that is where its parent is gone. To be called while there is one
+    thread. Returns False, in this process, where the system has no fork.
+    """
+    if not hasattr(os, "fork"):
+        return False
+    child = os.fork()
+    if child == 0:
+        _control(PR_SET_PDEATHSIG, signal.SIGKILL)
+        return True
+    _control(PR_SET_CHILD_SUBREAPER, 1)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the child may ask its whole process group to end, and wait for it
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    status = 0
+    ended = 0
+    while ended != child:
+        ended, status = os.waitpid(-1, 0)  # adopted orphans are waited for as well
+    end_descendants()
+    _exit_as(os.waitstatus_to_exitcode(status))
+    return True
+
+
+def end_descendants() -> None:
+    """Kill every process that descends from this one; more than once, since they may start others meanwhile."""
+    import psutil  # here: its import takes longer than many a function that is supervised
+
+    deadline = time.monotonic() + SECONDS_TO_END
+    while time.monotonic() < deadline:
+        alive = []
+        for process in psutil.Process().children(recursive=True):
+            with suppress(psutil.Error):
+                if process.status() != psutil.STATUS_ZOMBIE:
+                    alive.append(process)
+                    process.kill()
+        with suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+        if not alive:
+            return
+        time.sleep(SECONDS_BETWEEN_LOOKS)
+
+
+def _end_with_parent() -> None:
+    while os.read(0, 1):
+        pass
+    end_descendants()
+    os.killpg(0, signal.SIGKILL)  # this process too, which leads the group
+
+
+def _exit_as(code: int) -> None:
+    """End as a child did whose exit code was ``code`` (negative: by a signal)."""
+    if code < 0:
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # the child has left its core, if any was wanted
+        with suppress(OSError):
+            signal.signal(-code, signal.SIG_DFL)
+        os.kill(os.getpid(), -code)
+    os._exit(code)
+
+
+def _control(option: int, value: int) -> None:
+    """Linux's prctl; nothing elsewhere."""
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
+
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -15,7 +15,7 @@ from filelock import FileLock
 from gsbench.errors import InputError
 from gsbench.files import atomic, require_own
 from gsbench.runs.layout import ARTIFACTS, DATABASE
-from gsbench.system.checkout import checkout_of
+from gsbench.system.install import checkout_of
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

@@ -21,7 +21,7 @@ from gsbench.launch.declare import declare_questions
 from gsbench.runs.declaration import ERROR_RATE, Declaration
 from gsbench.runs.experiments import make_home
 from gsbench.runs.hashing import sha256_of
-from gsbench.system.checkout import WorkTrees
+from gsbench.system.install import WorkTrees
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, printable
 

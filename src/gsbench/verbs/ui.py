@@ -12,8 +12,8 @@ from pathlib import Path
 
 from gsbench.errors import InputError
 from gsbench.runs.layout import DATABASE
+from gsbench.system.isolate import end_descendants
 from gsbench.system.stopping import stop_on_signals
-from gsbench.system.supervise import end_descendants
 from gsbench.verbs.arguments import ArgumentParser, port
 
 DEFAULT_PORT = 5000

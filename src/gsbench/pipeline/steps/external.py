@@ -28,7 +28,7 @@ from gsbench.pipeline.steps.scene import Views
 from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG, TRAINING
 from gsbench.runs.stages import TRAIN, Step
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
-from gsbench.system.checkout import own_checkout
+from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.own_modules import SAFE_PATH
 from gsbench.words import readable_time

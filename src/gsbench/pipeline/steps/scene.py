@@ -13,8 +13,7 @@ from PIL import Image
 
 from gsbench.files import file_sha256
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.init.point_files import read_points
-from gsbench.init.points import GREY
+from gsbench.init.points import GREY, read_points
 from gsbench.logs import progress
 from gsbench.pipeline.steps.inputs import split_of, step_of
 from gsbench.runs.code import VIEWS_ROOMS, edited, states_of

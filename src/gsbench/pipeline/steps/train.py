@@ -20,7 +20,7 @@ from gsbench.pipeline.steps.inputs import options_of, rasterizer_inputs, step_of
 from gsbench.pipeline.steps.scene import Views
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
 from gsbench.runs.stages import TRAIN, Step
-from gsbench.system.checkout import own_checkout
+from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.memory import peak_memory_mb, reset_peak_memory
 from gsbench.train.options import WITHOUT_EFFECT_ON_MODEL
