@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Points, read_cloud
-from gsbench.init.points import GREY, one_in_each_voxel, read_points, read_similarity, seen_colors
+from gsbench.init.points import GREY, read_points, read_similarity, seen_colors
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Capture
 
@@ -70,16 +70,6 @@ def test_tables(tmp_path: Path, suffix: str, colored: bool):
         np.testing.assert_array_equal(colors, RGB)
     else:
         assert colors is None
-
-
-def test_one_point_in_each_voxel_by_brute_force():
-    points, colors = one_in_each_voxel(XYZ, RGB.astype(np.uint8), 1.5)
-    cubes: dict[tuple[int, ...], list[int]] = {}
-    for index, point in enumerate(XYZ):
-        cubes.setdefault(tuple(np.floor(point / 1.5).astype(int)), []).append(index)
-    np.testing.assert_allclose(points, [XYZ[members].mean(axis=0) for members in cubes.values()], atol=1e-12)
-    np.testing.assert_allclose(colors, [RGB[members].mean(axis=0) for members in cubes.values()], atol=0.5)
-    assert len(points) < len(XYZ)
 
 
 def test_similarity_is_pycolmaps(tmp_path: Path):

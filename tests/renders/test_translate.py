@@ -14,7 +14,7 @@ from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, quantize
-from gsbench.eval.protocol import OTHERS, PAPER, STANDARD, Protocol
+from gsbench.eval.protocol import OTHERS, PAPER, Protocol
 from gsbench.renders.translate import Material, Pictures, in_words, translate
 from tests.eval.test_metrics import brute_force_ssim, mirrored_ssim
 
@@ -88,17 +88,6 @@ def test_what_cannot_be_followed_is_said_and_nothing_is_put_in_its_place() -> No
     assert whole.unknown == {}
     assert found.metrics["psnr"] != whole.metrics["psnr"]
     assert "resampling as it was, since it is not there" in in_words(found)
-
-
-def test_a_crop_leaves_out_the_border() -> None:
-    exact, one, _ = pictures(3)
-    view = next(iter(exact))
-    cropped = Protocol("mine", 1, True, "valid", None, crop=4)
-    found = plain(cropped).evaluate_view(exact[view], one[view])
-    inside = plain(STANDARD).evaluate_view(
-        np.ascontiguousarray(exact[view][4:-4, 4:-4]), np.ascontiguousarray(one[view][4:-4, 4:-4])
-    )
-    assert found == pytest.approx(inside)
 
 
 @pytest.fixture(scope="module")

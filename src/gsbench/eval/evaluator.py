@@ -109,9 +109,6 @@ class Evaluator:
             if fit == "left":
                 image, corrected, target = (x[:, half:] for x in (image, corrected, target))
                 counts = None if counts is None else counts[:, half:]
-        if border := self.protocol.crop:
-            image, corrected, target = (x[border:-border, border:-border] for x in (image, corrected, target))
-            counts = None if counts is None else counts[border:-border, border:-border]
         values = {}
         for key, metric in self._metrics.items():
             if key in self.unavailable:

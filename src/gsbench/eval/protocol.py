@@ -26,10 +26,10 @@ class Protocol:
     ``eight_bit``: renders are rounded to 8 bits (``floor(clamp(255 x + 0.5))``) before they are compared, as a PNG
     would store them. ``ssim_padding``: see ``gsbench.eval.ssim.ssim``. ``lpips``: the variant that tables show as
     *the* LPIPS of this protocol. ``flip_ppd``: pixels per degree of FLIP's viewer. ``psnr_cap``: dB, reported for pairs
-    of higher PSNR; identical images, whose PSNR is infinite and has no number in JSON, get it. ``crop``: pixels
-    left out on each side. ``color_fit``: metrics ``cc_…`` stand beside the others, measured after the colours of each
-    render were fitted to its photograph (`gsbench.eval.correction`): on ``all`` pixels, or on the ``left`` half of the
-    picture, and then everything is measured on its right half.
+    of higher PSNR; identical images, whose PSNR is infinite and has no number in JSON, get it. ``color_fit``: metrics
+    ``cc_…`` stand beside the others, measured after the colours of each render were fitted to its photograph
+    (`gsbench.eval.correction`): on ``all`` pixels, or on the ``left`` half of the picture, and then everything is
+    measured on its right half.
 
     ``shrinking``: how photographs are made smaller, None where they are taken as they come. ``full_size``: they are
     made smaller from those of the full size even where the data set brings smaller ones. ``source``: where these facts
@@ -43,7 +43,6 @@ class Protocol:
     lpips: str | None
     flip_ppd: float = FLIP_PPD
     psnr_cap: float = 100.0
-    crop: int = 0
     shrinking: Shrinking | None = None
     full_size: bool = False
     source: str = ""

@@ -6,15 +6,14 @@ import logging
 from abc import abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from annotated_types import Ge, Interval
 from pydantic import NonNegativeFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.init.base import Preparation, Timer
-from gsbench.init.colmap.initializer import ColmapInitializer
-from gsbench.init.colmap.options import MIN_DETECTION_SIZE, DatabaseTask
+from gsbench.init.colmap.initializer import MIN_DETECTION_SIZE, ColmapInitializer
 from gsbench.init.colmap.pairs import Pairing
 from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.init.networks.features import FeatureSettings
@@ -23,6 +22,9 @@ from gsbench.logs import Progress
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath, Fraction
 from gsbench.weights import WeightsFile, digests_of_unpinned, find_all_weights
+
+if TYPE_CHECKING:
+    from gsbench.init.colmap.database import DatabaseTask
 
 logger = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData
-from pydantic import PositiveFloat, PositiveInt
+from pydantic import PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.files import file_sha256, require_regular
@@ -119,15 +119,14 @@ GREY = 128  # of points that no training photograph shows, where the file has no
 class Points(PlacedCloud):
     """The points of a file under the reference cameras: in their gauge, or moved there by a given similarity.
 
-    ``voxel`` keeps the mean of the points in each cube of that edge (units of the cameras), ``max_points`` then so many
-    at random. Colours that the file lacks come from the nearest training camera's photograph that a point falls into.
+    ``max_points`` keeps so many at random. Colours that the file lacks come from the nearest training camera's
+    photograph that a point falls into.
     """
 
     name: ClassVar[str] = "points"
 
     path: AnyPath
     transform: AnyPath | None = None
-    voxel: PositiveFloat | None = None
     max_points: PositiveInt | None = 200_000
     seed: Seed = 0
 
@@ -146,8 +145,6 @@ class Points(PlacedCloud):
         points, colors = read_points(Path(self.path).expanduser())
         if self.transform is not None:
             points = read_similarity(Path(self.transform).expanduser())(points)
-        if self.voxel is not None:
-            points, colors = one_in_each_voxel(points, colors, self.voxel)
         if self.max_points is not None and len(points) > self.max_points:
             chosen = np.sort(np.random.default_rng(self.seed).permutation(len(points))[: self.max_points])
             points, colors = points[chosen], None if colors is None else colors[chosen]
@@ -160,22 +157,6 @@ class Points(PlacedCloud):
         if colors is None:
             colors = np.where(seen < 0, GREY, seen).astype(np.uint8)
         return PointCloud(points, colors)
-
-
-def one_in_each_voxel(
-    points: Array, colors: NDArray[np.uint8] | None, edge: float
-) -> tuple[Array, NDArray[np.uint8] | None]:
-    """The mean of the points [P, 3], and of their colours, in each cube of a grid; in order of their first point."""
-    _, first, cubes = np.unique(np.floor(points / edge), axis=0, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), dtype=np.int64)
-    rank[np.argsort(first, kind="stable")] = np.arange(len(first))
-    cubes = rank[cubes.reshape(-1)]  # [P]
-    counts = np.bincount(cubes)[:, None]
-
-    def mean(values: Array) -> Array:
-        return np.stack([np.bincount(cubes, column) for column in values.T], axis=1) / counts
-
-    return mean(points), None if colors is None else mean(colors.astype(np.float64)).round().astype(np.uint8)
 
 
 def seen_colors(points: Array, capture: Capture, model: pycolmap.Reconstruction) -> NDArray[np.int16]:

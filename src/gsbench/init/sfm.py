@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from annotated_types import Ge, Interval
@@ -13,11 +13,13 @@ from pydantic import PositiveFloat, PositiveInt
 from gsbench.errors import InputError
 from gsbench.init.base import MODEL_FOLDER, InitReport, Timer
 from gsbench.init.colmap.alignment import Array
-from gsbench.init.colmap.initializer import ColmapInitializer
-from gsbench.init.colmap.options import MIN_DETECTION_SIZE, DatabaseTask
+from gsbench.init.colmap.initializer import MIN_DETECTION_SIZE, ColmapInitializer
 from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
+
+if TYPE_CHECKING:
+    from gsbench.init.colmap.database import DatabaseTask
 
 DEFAULT_PEAK_THRESHOLD = 0.02 / 3  # COLMAP's defaults
 DEFAULT_EDGE_THRESHOLD = 10.0

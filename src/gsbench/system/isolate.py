@@ -6,10 +6,9 @@ pytest and Hydra. The child, and every program that it started, ends when the pa
 killed; no such program outlives the function. On Linux that holds for daemons too; on other systems a program that
 begins a session of its own gets away.
 
-
 The process stays behind its own child and ends whatever that leaves running. A daemon forks twice and begins a
-session of its own: then neither its parent nor its process group leads to it. Linux lets a process adopt all orphans among its
-descendants (PR_SET_CHILD_SUBREAPER), so that none can get away from it.
+session of its own: then neither its parent nor its process group leads to it. Linux lets a process adopt all orphans
+among its descendants (PR_SET_CHILD_SUBREAPER), so that none can get away from it.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from PIL import Image
 from gsbench.logs import Progress
 from gsbench.scene.colmap import rescaled_camera
 from gsbench.scene.images import image_size, read_image
+from gsbench.scene.types import Capture
 
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 VERIFY_CALLS = 20  # COLMAP reports no progress within a call, so it is called for a twentieth of the pairs
@@ -22,6 +24,21 @@ MIN_PAIRS_PER_CALL = 50
 
 
 Groups = Sequence[tuple[pycolmap.Camera, Sequence[str]]]  # each camera with the names of its images
+
+
+@dataclass(frozen=True)
+class DatabaseTask:
+    """Database to be filled, with cameras and images in it, and the pairs of images to be matched.
+
+    ``images`` is a folder with the same names as the capture's in which COLMAP can read every file.
+    """
+
+    database: Path
+    images: Path
+    names: list[str]
+    pairs: list[tuple[str, str]]
+    capture: Capture
+    work_dir: Path
 
 
 def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:

@@ -1,34 +1,120 @@
-"""Base of initialisers that end in COLMAP: checks, preparation, and the job in a process of its own."""
+"""Base of initialisers that end in COLMAP: their options, checks, preparation, and the job in a process of its own.
+
+A subclass adds a database of verified matches.
+"""
 
 from __future__ import annotations
 
 import logging
 import shutil
+from abc import abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+from annotated_types import Ge, Interval
+from pydantic import PositiveFloat
 
 from gsbench.errors import InputError
-from gsbench.init.base import MIN_IMAGES, WORK_FOLDER, Initializer, InitReport, Preparation
-from gsbench.init.colmap.options import ColmapOptions
+from gsbench.init.base import (
+    MIN_IMAGES,
+    WORK_FOLDER,
+    Initializer,
+    InitReport,
+    PointsFrom,
+    Poses,
+    Preparation,
+    Seed,
+    Timer,
+)
+from gsbench.init.colmap.pairs import Pairing
 from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
+from gsbench.settings import Fraction, Threads, check_settings
+from gsbench.system.resources import available_cores
 from gsbench.words import counted
+
+if TYPE_CHECKING:
+    import pycolmap
+
+    from gsbench.init.colmap.database import DatabaseTask
 
 logger = logging.getLogger(__name__)
 
 LOG_FILE = "colmap.log"
+CameraSharing = Literal["single", "per_folder", "per_image"]
+CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+Intrinsics = Literal["estimate", "reference"]
+MIN_DETECTION_SIZE = 32  # px: below it no detector finds anything
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColmapInitializer(ColmapOptions, Initializer):
-    """Base of `Sfm`, `SfmDense`, `Dim` and `SiftKornia`.
+class ColmapInitializer(Initializer):
+    """Base of `Sfm`, `SfmDense`, `Dim` and `SiftKornia`, with the options that they share.
+
+    With ``poses=shared`` the points are triangulated under the reference cameras; with ``poses=own`` cameras and points
+    are estimated and then, where a reference exists, moved into its gauge by a similarity (``align``).
+
+    Unless ``points_from`` is ``all``, test views have no part in the points: under given cameras their photographs are
+    not looked at; where cameras are estimated, all photographs make these, and of the points those of the training
+    views are kept.
 
     The reference's cameras are those of the ``reference`` given to `run`, else those that came with the capture.
     """
 
     is_own_reference: ClassVar[bool] = False  # with poses=shared and no reference: estimate the poses here
+
+    poses: Poses = "shared"
+    align: bool = True
+    camera: CameraSharing = "single"
+    camera_model: CameraModel = "SIMPLE_RADIAL"
+    focal_length: PositiveFloat | None = None
+    intrinsics: Intrinsics = "estimate"
+    pairs: Pairing = "exhaustive"
+    overlap: Annotated[int, Interval(ge=1, le=60)] = 10
+    min_inliers: Annotated[int, Ge(7)] = 15  # a fundamental matrix takes seven
+    min_inlier_ratio: Fraction = 0.0
+    mapper: Literal["auto", "incremental", "global"] = "auto"
+    min_model_size: Annotated[int, Ge(2)] = 3
+    two_view_tracks: bool = False
+    points_from: PointsFrom = "all"
+    seed: Seed = 0
+    threads: Threads | Literal["auto"] = "auto"
+    mapper_threads: Threads = 1
+
+    def __post_init__(self) -> None:
+        check_settings(self, "init")
+
+    @abstractmethod
+    def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
+        """Write features, matches and verified geometries; runs in the isolated process. Returns counts to report."""
+
+    @property
+    def num_threads(self) -> int:
+        """``threads`` as a number; ``auto`` is the cores that this process may use."""
+        return available_cores() if self.threads == "auto" else self.threads
+
+    def packages(self) -> tuple[str, ...]:
+        """The packages whose versions the report states."""
+        return ("pycolmap", "numpy")
+
+    @property
+    def takes_reference_cameras(self) -> bool:
+        """Return whether the cameras (intrinsics at least) are the reference's where there is one."""
+        return self.poses == "shared" or self.intrinsics == "reference"
+
+    def select_images(self, capture: Capture, reference: pycolmap.Reconstruction | None) -> list[str]:
+        """The sorted names of the images to be used: all, or those of the reference where its cameras are taken."""
+        if reference is None or not self.takes_reference_cameras:
+            return sorted(capture.image_names)
+        names = sorted(image.name for image in reference.images.values() if image.has_pose)
+        test = set(capture.test_names) if self.leaves_out(reference) else set()
+        return [name for name in names if name not in test]
+
+    def leaves_out(self, reference: pycolmap.Reconstruction | None) -> bool:
+        """Return whether test photographs are not even looked at, which are not needed where the cameras are given."""
+        return self.points_from != "all" and self.poses == "shared" and reference is not None
 
     def needs_reference(self, capture: Capture) -> bool:
         """Return whether `run` needs a ``reference`` because the capture came without cameras."""

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pycolmap
 
@@ -15,17 +16,19 @@ from gsbench.init.base import OWN_GAUGE_FOLDER, InitReport, Preparation, Timer, 
 from gsbench.init.colmap import database as colmap_database
 from gsbench.init.colmap import mapping, reconstruct
 from gsbench.init.colmap.alignment import Similarity
-from gsbench.init.colmap.options import ColmapOptions, DatabaseTask
 from gsbench.init.colmap.training_points import keep_training_points
 from gsbench.logs import Progress
 from gsbench.scene.types import Capture
+
+if TYPE_CHECKING:
+    from gsbench.init.colmap.initializer import ColmapInitializer
 
 
 @dataclass(frozen=True)
 class Job:
     """One run of an initialiser, as it is handed to the isolated process."""
 
-    options: ColmapOptions
+    options: ColmapInitializer
     capture: Capture
     output_dir: Path
     work_dir: Path
@@ -51,7 +54,7 @@ def build_model(job: Job, progress: Progress) -> InitReport:
     placed = colmap_database.create_database(database, cameras)
     names = [name for name in placed if name in set(seen)]
     pairs = reconstruct.select_pairs(names, options)
-    task = DatabaseTask(database, images, names, pairs, capture, job.work_dir)
+    task = colmap_database.DatabaseTask(database, images, names, pairs, capture, job.work_dir)
     counts = options.fill_database(task, progress, timer)
     counts = {**job.preparation.counts, **counts, **colmap_database.database_counts(database)}
     if counts["pairs_verified"] == 0:

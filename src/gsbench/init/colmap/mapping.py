@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pycolmap
@@ -19,10 +20,12 @@ import pycolmap
 from gsbench.errors import InputError
 from gsbench.init.base import MIN_IMAGES
 from gsbench.init.colmap.database import assume_focal_lengths, cameras_without_prior, verify_pairs
-from gsbench.init.colmap.options import ColmapOptions
 from gsbench.init.colmap.reconstruct import pipeline_options, verification_options
 from gsbench.init.report import REGISTERED_SHARE
 from gsbench.logs import Progress
+
+if TYPE_CHECKING:
+    from gsbench.init.colmap.initializer import ColmapInitializer
 
 SMALL_ANGLE_DEG = 2.0  # of the initial pair; COLMAP's default is 16
 FOCAL_FACTORS = (0.75, 1.0, 1.4)  # focal length over the longest side: lenses of 27, 36 and 50 mm on 35 mm film
@@ -57,7 +60,7 @@ def map_images(
     database: Path,
     images: Path,
     output: Path,
-    options: ColmapOptions,
+    options: ColmapInitializer,
     progress: Progress,
 ) -> Mapped:
     """Cameras and points from the matches in ``database``; of several models the one with the most images.
@@ -96,7 +99,7 @@ def _ways(
     database: Path,
     images: Path,
     output: Path,
-    options: ColmapOptions,
+    options: ColmapInitializer,
     progress: Progress,
     total: int,
 ) -> Iterator[tuple[str, Run]]:
@@ -120,7 +123,9 @@ def _ways(
             yield f"focal length {factor:g} x the longest side", partial(with_focal_lengths, factor)
 
 
-def _with_focal_lengths(database: Path, copy: Path, factor: float, options: ColmapOptions, progress: Progress) -> Path:
+def _with_focal_lengths(
+    database: Path, copy: Path, factor: float, options: ColmapInitializer, progress: Progress
+) -> Path:
     """A copy of the database whose unknown focal lengths are ``factor`` times the longest side, verified anew."""
     shutil.copy(database, copy)
     pairs = assume_focal_lengths(copy, factor)
@@ -132,7 +137,7 @@ def _incremental(
     database: Path,
     images: Path,
     output: Path,
-    settings: ColmapOptions,
+    settings: ColmapInitializer,
     progress: Progress,
     total: int,
     initial_angle: float | None,
@@ -155,7 +160,7 @@ def _incremental(
 
 
 def _global(
-    database: Path, images: Path, output: Path, settings: ColmapOptions, progress: Progress, total: int
+    database: Path, images: Path, output: Path, settings: ColmapInitializer, progress: Progress, total: int
 ) -> Sequence[pycolmap.Reconstruction]:
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = settings.mapper_threads

@@ -8,20 +8,23 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pycolmap
 
 from gsbench.errors import InputError
 from gsbench.init.colmap.alignment import Array, Similarity, align_poses
-from gsbench.init.colmap.options import ColmapOptions
 from gsbench.init.colmap.pairs import exhaustive_pairs, sequential_pairs
 from gsbench.logs import Progress
 from gsbench.scene.colmap import read_reference
 from gsbench.scene.types import Capture
 
+if TYPE_CHECKING:
+    from gsbench.init.colmap.initializer import ColmapInitializer
 
-def verification_options(options: ColmapOptions) -> pycolmap.TwoViewGeometryOptions:
+
+def verification_options(options: ColmapInitializer) -> pycolmap.TwoViewGeometryOptions:
     """COLMAP's geometric verification of a pair's matches."""
     found = pycolmap.TwoViewGeometryOptions()
     found.ransac.random_seed = options.seed
@@ -37,7 +40,7 @@ def load_reference(capture: Capture, reference: Path | None) -> pycolmap.Reconst
     return None if capture.model is None else read_reference(capture)
 
 
-def select_pairs(names: Sequence[str], options: ColmapOptions) -> list[tuple[str, str]]:
+def select_pairs(names: Sequence[str], options: ColmapInitializer) -> list[tuple[str, str]]:
     """The pairs of image names to match; all for ``auto`` and ``lowres``, of which features will tell the best."""
     if options.pairs == "sequential":
         pairs = sequential_pairs(len(names), options.overlap)
@@ -52,7 +55,7 @@ def triangulate(
     output: Path,
     reference: pycolmap.Reconstruction,
     names: Collection[str],
-    options: ColmapOptions,
+    options: ColmapInitializer,
     progress: Progress,
 ) -> pycolmap.Reconstruction:
     """Points from the verified matches of the images ``names`` under the reference's cameras, which stay to the bit.
@@ -131,7 +134,7 @@ def apply_similarity(model: pycolmap.Reconstruction, similarity: Similarity) -> 
     model.transform(pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation))
 
 
-def pipeline_options(options: ColmapOptions) -> pycolmap.IncrementalPipelineOptions:
+def pipeline_options(options: ColmapInitializer) -> pycolmap.IncrementalPipelineOptions:
     """COLMAP's incremental pipeline by our ``options``; the triangulator reads the same."""
     found = pycolmap.IncrementalPipelineOptions()
     found.num_threads = found.mapper.num_threads = options.mapper_threads

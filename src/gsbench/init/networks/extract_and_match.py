@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 
 from gsbench.errors import InputError
 from gsbench.files import file_sha256
 from gsbench.init.base import Preparation, Timer
-from gsbench.init.colmap.options import ColmapOptions
 from gsbench.init.colmap.pairs import STRONGEST, proposed_pairs
 from gsbench.init.colmap.reconstruct import load_reference, select_pairs
 from gsbench.init.networks.extractors import build_extractor, extract_features
@@ -21,6 +21,9 @@ from gsbench.init.networks.matching import build_matcher, match
 from gsbench.logs import Progress
 from gsbench.scene.masks import read_mask
 from gsbench.scene.types import Capture
+
+if TYPE_CHECKING:
+    from gsbench.init.colmap.initializer import ColmapInitializer
 
 CACHE_BYTES = 1 << 30  # of descriptors held in memory while pairs are matched
 NAMES_IN_WARNING = 5
@@ -35,7 +38,7 @@ LOWRES_MATCHES = 20  # a pair with more is matched at full size
 class NetworkJob:
     """Inputs of the isolated process; the weights are checked files, None where none are needed."""
 
-    options: ColmapOptions
+    options: ColmapInitializer
     settings: FeatureSettings
     device: str
     capture: Capture
