@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from gsbench.errors import InputError
-from gsbench.eval.correction import fit_colors
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.geometry import band_errors
+from gsbench.eval.images import fit_colors
 from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import AFFINE, AFFINE_HALF, PROTOCOLS
 from gsbench.scene.camera import Camera

@@ -19,7 +19,7 @@ from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import METRICS, further_keys
 from gsbench.eval.fsim import fsim, phase_congruency
-from gsbench.eval.gmsd import gmsd
+from gsbench.eval.metrics import gmsd
 from gsbench.eval.multiscale import MIN_SIZE, SCALE_WEIGHTS, iw_ssim, ms_ssim
 from gsbench.eval.protocol import PAPER
 

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.eval.correction import fit_colors
 from gsbench.eval.facts import CORRECTED, LPIPS, METRICS, MORE, MetricFacts, facts_of, further_keys, lpips_variants
-from gsbench.eval.images import as_unit_range, where_counted
+from gsbench.eval.images import as_unit_range, fit_colors, where_counted
 from gsbench.eval.measures import Conditions
 from gsbench.eval.metric import MaskedMetric, Metric, UnavailableError
 from gsbench.eval.protocol import Protocol

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsbench.eval import fsim, gmsd, multiscale
+from gsbench.eval import fsim, metrics, multiscale
 from gsbench.eval.dists import VGG, load_dists
 from gsbench.eval.images import exact
 from gsbench.eval.lpips import Lpips, load_lpips
@@ -137,7 +137,7 @@ class Fsim(Structural):
 
 
 class Gmsd(Structural):
-    function, smallest = staticmethod(gmsd.gmsd), gmsd.MIN_SIZE
+    function, smallest = staticmethod(metrics.gmsd), metrics.GMSD_MIN_SIZE
 
 
 class DistsMetric:

@@ -28,7 +28,7 @@ class Protocol:
     *the* LPIPS of this protocol. ``flip_ppd``: pixels per degree of FLIP's viewer. ``psnr_cap``: dB, reported for pairs
     of higher PSNR; identical images, whose PSNR is infinite and has no number in JSON, get it. ``color_fit``: metrics
     ``cc_…`` stand beside the others, measured after the colours of each render were fitted to its photograph
-    (`gsbench.eval.correction`): on ``all`` pixels, or on the ``left`` half of the picture, and then everything is
+    (`gsbench.eval.images`): on ``all`` pixels, or on the ``left`` half of the picture, and then everything is
     measured on its right half.
 
     ``shrinking``: how photographs are made smaller, None where they are taken as they come. ``full_size``: they are
