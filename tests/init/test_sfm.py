@@ -250,7 +250,7 @@ def test_too_few_photos(courtyard: Capture, tmp_path: Path):
         ({"pairs": "all"}, "init.pairs must be .* got 'all'"),
         ({"max_ratio": 1.5}, r"init.max_ratio must be a number in \(0, 1\], got 1.5"),
         ({"max_image_size": 0}, "init.max_image_size must be a whole number of at least 32, got 0"),
-        ({"threads": 0}, "init.threads must be a whole number above 0 or 'auto', got 0"),
+        ({"threads": 0}, r"init.threads must be a whole number in \[1, 4096\] or 'auto', got 0"),
         ({"seed": 0.5}, "init.seed must be a whole number in .*, got 0.5"),
         ({"focal_length": float("nan")}, "init.focal_length must be a number above 0 or null, got nan"),
     ],
