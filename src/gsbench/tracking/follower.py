@@ -17,6 +17,7 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import NoReturn, TextIO
 
+from gsbench.runs.layout import FAILED, RESULTS
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError
 from gsbench.tracking.mirror import TRACKER_FAILED
@@ -68,11 +69,11 @@ def follow() -> NoReturn:
 
 
 class _Followed:
-    """A trial that is to be mirrored; its run is opened when the trial is seen running, or at the end of all."""
+    """A trial that is to be mirrored; its run is opened when the trial runs or has ended, or at the end of all."""
 
     def __init__(self, folder: TrialFolder, program: str | None) -> None:
-        self.folder, self.said, self.has_ended, self.tracker = folder, "", False, ""
-        self._program = program
+        self.folder, self.said, self.has_ended, self.tracker = folder, "", False, "the tracker"
+        self._program, self._told = program, time.time()
         self._run: TrackerRun | None = None
 
     def catch_up(self, last: bool, uri: str | None, anew: bool) -> None:
@@ -80,7 +81,8 @@ class _Followed:
         if self._program is None and not last:
             return
         state = self.folder.state()  # before the curves are read, so that an ended trial's are whole
-        if state == "missing" or (state != "running" and self._run is None and not last):  # it waits for its turn
+        waits = state != "running" and self._run is None and not self._has_ended_since()
+        if state == "missing" or (waits and not last):  # for its turn
             return
         if self._run is None:
             values = self.folder.configuration()
@@ -93,6 +95,14 @@ class _Followed:
             self._run.end()
             self._run.close()
             self.has_ended = True
+
+    def _has_ended_since(self) -> bool:
+        """Return whether the trial has ended since it was told of: what it left before is of an earlier run."""
+        for name in (RESULTS, FAILED):
+            with suppress(OSError):
+                if (self.folder.path / name).stat().st_mtime >= self._told:
+                    return True
+        return False
 
 
 def _serve(work: Callable[[Input, TextIO], object], patience: float) -> NoReturn:
