@@ -18,7 +18,6 @@ from gsbench.analysis.statistics import (
     outcome_of,
     plan_looks,
     student,
-    t_interval,
 )
 from tests.analysis.untruths import KINDS, rates
 
@@ -32,7 +31,6 @@ def test_the_test_of_one_scene_is_the_paired_t_test() -> None:
         interval = found.interval(1 - level)
         assert (interval.low, interval.high) == pytest.approx(expected.confidence_interval(level))
     assert student(np.array([[0.3]])) is None
-    assert t_interval(values) == found.interval()
 
 
 def test_scenes_weigh_alike_and_each_has_a_variance_of_its_own() -> None:

@@ -92,12 +92,6 @@ def error_and_degrees(variances: Array, seeds: int) -> tuple[Array, Array]:
     return np.sqrt(total / seeds) / variances.shape[1], np.maximum(seeds - 1, DEGREES * satterthwaite)
 
 
-def t_interval(values: Array) -> Interval | None:
-    """Student's 95 % interval of the mean of ``values`` [n]; None of a single one."""
-    test = student(values[None])
-    return None if test is None else test.interval()
-
-
 def outcome_of(interval: Interval, sign: int, least: float | None) -> Outcome:
     """The one of four outcomes that an interval of the difference makes of "it has this sign, and matters".
 
