@@ -11,11 +11,9 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
-from PIL.TiffImagePlugin import IFDRational
 
 from gsbench.errors import InputError
 from gsbench.gaussians.ply import check_ply, read_ply
-from gsbench.init.colmap.pairs import gps_positions
 from gsbench.init.points import read_points, read_similarity
 from gsbench.scene.colmap import read_model
 from gsbench.scene.images import IMAGE_SUFFIXES, exif_orientation, image_size, read_image
@@ -149,15 +147,7 @@ def test_the_formats_of_photographs_are_read_whatever_their_name(form: str, tmp_
 def test_a_damaged_exif_is_as_none(exif: bytes, tmp_path: Path) -> None:
     Image.new("RGB", (16, 12)).save(tmp_path / "a.jpg", exif=exif)
     assert exif_orientation(tmp_path / "a.jpg") == 1
-    assert gps_positions([tmp_path / "a.jpg"]) is None
     assert read_image(tmp_path / "a.jpg").shape == (12, 16, 3)
-
-
-def test_positions_that_are_no_numbers_are_as_none(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif.get_ifd(0x8825).update({1: "N", 2: (1.0, 2.0, 3.0), 3: "E", 4: (1.0, 2.0, 3.0), 6: IFDRational(0, 0)})
-    Image.new("RGB", (16, 12)).save(tmp_path / "a.jpg", exif=exif)
-    assert gps_positions([tmp_path / "a.jpg"]) is None
 
 
 def test_names_that_make_no_file_name_are_refused_before_any_work(photos: Path, tmp_path: Path) -> None:

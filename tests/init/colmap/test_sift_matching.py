@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from gsbench.init import MODEL_FOLDER, Sfm
 from gsbench.init.base import Timer
-from gsbench.init.colmap.database import create_database, guessed_groups
-from gsbench.init.colmap.initializer import DatabaseTask
+from gsbench.init.colmap.database import DatabaseTask, create_database, guessed_groups
 from gsbench.init.colmap.pairs import best_pairs
 from gsbench.init.colmap.sift import deal, divide, extract_sift, match_sift
 from gsbench.logs import no_progress
