@@ -196,3 +196,9 @@ def test_metrics_that_are_not_asked_for_leave_no_trace() -> None:
 def test_an_unknown_metric_is_refused() -> None:
     with pytest.raises(InputError, match="choose among ms_ssim, iw_ssim, fsim, gmsd, dists"):
         Evaluator(PAPER, more=["psnr"])
+
+
+@pytest.mark.parametrize("key", FUNCTIONS)
+def test_pictures_of_unlike_sizes_are_refused(key: str) -> None:
+    with pytest.raises(ValueError, match="image"):
+        FUNCTIONS[key](torch.zeros(192, 192, 3), torch.zeros(192, 193, 3))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,13 @@ def test_a_file_that_is_no_ply_is_named(tmp_path: Path) -> None:
     path.write_text("not a ply")
     with pytest.raises(InputError, match=r"b\.ply"):
         read_ply(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_is_no_ply_and_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "model.ply")
+    with pytest.raises(InputError, match=r"model\.ply: not a readable PLY"):
+        read_ply(tmp_path / "model.ply")
 
 
 def test_a_torn_ply_is_named(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from gsbench.gaussians.model import Gaussians
@@ -90,3 +91,9 @@ def test_all_tensors_stay_in_step() -> None:
     shapes = {name: tensor.shape for name, tensor in values.tensors().items()}
     assert {name: state.first.shape for name, state in trainable.adam.items()} == shapes
     assert {name: state.second.shape for name, state in trainable.adam.items()} == shapes
+
+
+def test_values_of_another_shape_are_refused() -> None:
+    trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
+    with pytest.raises(ValueError, match=r"overwrite: opacity_logits has shape \(5,\), got \(4,\)"):
+        trainable.overwrite("opacity_logits", torch.zeros(4, dtype=torch.float64))
