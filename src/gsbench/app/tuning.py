@@ -146,7 +146,7 @@ class Search:
         return point
 
     def record(self) -> TuningRecord:
-        """What is searched, and what was found so far."""
+        """The ranges that are searched, and the points that were found so far."""
         return TuningRecord(
             sweep=self.home.name.removesuffix(f"-tune-{self.arm}"),
             arm=self.arm,
