@@ -53,7 +53,7 @@ class EvalConfig:
     # The metric of the verdict, declared before results are seen; psnr@extrapolation of one question; null: none was.
     primary: str | None = None
     controls: Annotated[dict[str, FolderName], doc(CONTROLS_RULE)] = field(default_factory=dict)  # {longaxis: absgrad}
-    maps: bool = False  # keep maps of depth, volume and distance to the initial cloud: where an arm helps
+    maps: bool = False  # keep maps of depth, volume and distance to the initial cloud; picture large Gaussians
     geometry: bool = False  # measure depths and surfaces of the model, and what floats in front of them
     flicker: bool = False  # measure how neighbouring renders of a camera path differ
     bands: bool = False  # measure errors of the near, the middle and the far third of each view

@@ -47,7 +47,7 @@ EXTRA = "eval.extra"  # where a configuration has the user's own metrics
 def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
     """Render and measure the model of ``trained``, and its snapshots of earlier iterations; or renders as they are.
 
-    ``eval.maps`` also keeps what the report needs to say where an arm helps; ``of_model`` says what is measured of the
+    ``eval.maps`` also keeps maps of the views and pictures large Gaussians; ``of_model`` says what is measured of the
     model itself (`gsbench.eval.options.EvalConfig.of_model`). The key of a training by another program knows nothing of
     the rendering, so it is in this step's.
     """
