@@ -25,7 +25,7 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def no_trials(monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(trial: Any, wait: bool) -> SimpleNamespace:
+    def run(trial: Any, mirror: Any, wait: bool) -> SimpleNamespace:
         return SimpleNamespace(metrics={"psnr": 1.0})
 
     monkeypatch.setattr(serial, "_run", run)

@@ -17,12 +17,12 @@ from tests.finished import write_results
 
 # Some trials of `threshold` by their names, which stay as they are from version to version.
 KNOWN = {
-    "sfm-volumetric-0.001/b1485f85-seed0",
-    "sfm-volumetric-0.003/17977005-seed1",
-    "sfm-volumetric-0.01/5dda5834-seed2",
-    "sfm-volumetric-0.03/6cb49de6-seed0",
-    "sfm-volumetric-0.1/b6c34d08-seed1",
-    "sfm-volumetric-0.3/58024339-seed2",
+    "sfm-volumetric-0.001/668e7765-seed0",
+    "sfm-volumetric-0.003/f79759cb-seed1",
+    "sfm-volumetric-0.01/c26ef915-seed2",
+    "sfm-volumetric-0.03/b5f53a36-seed0",
+    "sfm-volumetric-0.1/11d20d68-seed1",
+    "sfm-volumetric-0.3/6b11384e-seed2",
 }
 
 

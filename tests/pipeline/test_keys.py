@@ -23,11 +23,11 @@ WORDS = [
 BARE = Capture("garden", Path("photos"), ("a.jpg", "b.jpg", "c.jpg"), ("a.jpg",), None, False, "0" * 64)
 KEYS = [
     ("config", "84cbf20c22697c9af1c644d018f019b5237a03fca6c07628d0d2d71de76e239a"),
-    ("init", "33343fcdd1b72fb6244c22140544aa03499aca7308e443aa21bb34b9c1f59ccb"),  # of the cameras
-    ("init", "dfc40b276cecc590ed3121da6e3f42f79ac9437779bd78a389b2ca0aa76ea26a"),
-    ("train", "d75cc1f576b45bcf7cb956ab07a4c615f66a411b26c9d1d731cb564d75c38bdc"),
-    ("ground_truth", "dad1d708601ef56e7e24e4e877bea9616820a81676b8b46fc88f9004865d9847"),
-    ("evaluate", "07d5d48e3d3701ac044558585253c6892dd6fc5afa81ad255942e153bcbbb1f1"),
+    ("init", "6599fceb46df18df358d574ef2868e5bc85c2b8debe3c0b07b0aceb77882c9af"),  # of the cameras
+    ("init", "19174a6b3b6b609d44ce3db01225cc25635b08315e8ddff0edafa7848403a6e5"),
+    ("train", "88c3ca899428dee0fb817e4ebae5b764dfc1916c06f6963ce0ff49d9207658ac"),
+    ("ground_truth", "34c661b8e20d4f0cff6464efb17533ee1bb568d03fb173ac1c93634803011512"),
+    ("evaluate", "96891892dfc2048c6292a3671abee7ef7349c31cedf2d8564b452702f9ff8ace"),
 ]
 
 

@@ -90,7 +90,7 @@ def test_every_way_to_import(tmp_path: Path) -> None:
     files = {
         "__init__.py": "",
         "a.py": "import pack.b\nfrom pack import c\nfrom . import d\nfrom .sub.e import x\nimport os\n",
-        "b.py": "def f():\n    from pack.sub import name\n",
+        "b.py": "def f():\n    from pack.sub import name\nif TYPE_CHECKING:\n    import pack.stranger\n",
         "c.py": "from pack.absent import x\n",
         "d.py": "import pack.a\n",
         "sub/__init__.py": "from ..late import name\n",

@@ -101,7 +101,7 @@ event.register("numba:compile", _Announcement())  # sent where the cache on disk
 def import_closure(source: Path, package: Path = PACKAGE) -> frozenset[Path]:
     """``source`` and every file of ``package`` that it imports, directly or through others.
 
-    Read from the text, wherever the import stands: also inside functions.
+    Read from the text, wherever the import stands: also inside functions, but not for types alone.
     """
     found: set[Path] = set()
     waiting = [source.resolve()]
@@ -141,7 +141,7 @@ def _file(module: str, package: Path) -> Path | None:
 def _names(tree: ast.Module, module: str, is_package: bool) -> Iterator[tuple[str, str | None]]:
     """The modules that import statements name, each with what is taken of it, None for the module itself."""
     package = module if is_package else module.rpartition(".")[0]
-    for node in ast.walk(tree):
+    for node in _that_run(tree):
         if isinstance(node, ast.Import):
             yield from ((alias.name, None) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -149,3 +149,11 @@ def _names(tree: ast.Module, module: str, is_package: bool) -> Iterator[tuple[st
             above = ".".join(parts[: len(parts) - node.level + 1]) if node.level else ""
             source = ".".join(part for part in (above, node.module) if part)
             yield from ((source, alias.name) for alias in node.names)
+
+
+def _that_run(node: ast.AST) -> Iterator[ast.AST]:
+    """The nodes below ``node``, without the bodies of ``if TYPE_CHECKING``."""
+    for child in ast.iter_child_nodes(node):
+        if not (isinstance(child, ast.If) and isinstance(child.test, ast.Name) and child.test.id == "TYPE_CHECKING"):
+            yield child
+            yield from _that_run(child)
