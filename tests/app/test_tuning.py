@@ -303,13 +303,10 @@ def test_the_sheet_says_budget_views_points_and_what_was_chosen(sweep: Sweep, ru
     best = chosen(runs, "volumetric")
     assert "random-volumetric: " + " and ".join(f"{key}={best[key]}" for key in sorted(best)) in volumetric
     assert (
-        "the best of 4 points by psnr of validation views (courtyard; seed 100), before any of these trials. "
-        in volumetric
+        "the best of 4 points by psnr of validation views (courtyard; seed 100; the search "
+        "fair-tune-random-volumetric), before any of these trials. Tried: " in volumetric
     )
-    assert "densify.stop=tag(int, interval(300, 500))" in volumetric
-    assert "the arm as it is was no point" in volumetric
-    assert "the first point was the arm as it is" in adc
-    assert "Tried: 0.0002 (27.59)" in adc
+    assert "Tried: 0.0002 (27.59), " in adc
     page = build_report(load_experiment(runs, "fair"))
     assert "tuning was unequal" not in page
     assert "is the best of 4 points" in page
@@ -343,7 +340,7 @@ def test_trials_from_before_the_tuning_and_with_other_values_are_named(sweep: Sw
         point["settings"]["densify.volume_threshold"] = 0.5
     file.write_text(json.dumps(record))
     lines = notes(runs)
-    assert any("but these trials have other values" in line for line in lines)
+    assert any("These trials have other values." in line for line in lines)
     assert any("random-adc 4 points of 1 seed on validation views and random-volumetric none" in line for line in lines)
     file.write_text("{")
     assert notes(runs)  # a record that is damaged takes nothing else with it

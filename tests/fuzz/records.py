@@ -250,7 +250,6 @@ def _mirror(folder: Path) -> None:
     trial = TrackedTrial(TrialFolder(folder), TrialFolder(folder).configuration())
     assert trial.params()
     assert trial.tags()
-    trial.sweep()
     list(trial.curves({}))
     results = trial.folder.sound_record()
     if results is not None:

@@ -75,8 +75,15 @@ class FinishedTrials:
     def estimate(self, values: Mapping[str, Any]) -> Estimate:
         """Seconds for the whole trial with ``values``, as finished ones took with the same rasterizer.
 
-        By iteration and pixel, of the most alike. The pixels of photographs that no trial has read are not known.
+        By iteration and pixel, of the most alike. The pixels of photographs that no trial has read are not known. A
+        damaged configuration, which ``gsbench status`` reads too, has no estimate.
         """
+        try:
+            return self._estimate(values)
+        except (KeyError, TypeError, AttributeError, ArithmeticError):
+            return Estimate(0.0, 0)
+
+    def _estimate(self, values: Mapping[str, Any]) -> Estimate:
         names = tuple(values[group]["name"] for group in ("scene", "init", "densify"))
         scene = values["scene"]
         pixels = self._pixels.get(_size_of(scene))
