@@ -143,7 +143,7 @@ def _trials(home: Path) -> tuple[TrialResult, ...]:
 
 
 def _conclusion(found: tuple[int, int] | None, search: Search) -> list[str]:
-    """What the search has found, in lines."""
+    """Lines that say what the search has found."""
     if found is None:
         return [
             "The last commit is not shown to be worse than the first: allow more --seeds, or look at another metric."

@@ -126,7 +126,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
     def _list_tiles(
         self, arena: Arena, view: at.View, order: NDArray[np.uint64], records: NDArray[np.float32]
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """Where the list of each tile starts, [tiles + 1], and the records of all lists, front to back."""
+        """Starts of the tiles' lists, [tiles + 1], and the records of all lists, front to back."""
         tiles = view.tiles_x * view.tiles_y
         counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
         starts = arena.take("starts", (tiles + 1,), np.int64)
@@ -234,7 +234,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
 
 
 def _edges(count: int) -> NDArray[np.int64]:
-    """Where the shards of so many Gaussians or records begin, and the last one ends."""
+    """Starts of the shards of so many Gaussians or records, and the end of the last."""
     return np.arange(GAUSSIAN_SHARDS + 1) * count // GAUSSIAN_SHARDS
 
 
