@@ -6,7 +6,8 @@
 A fault is a flipped comparison, another sign, a whole number that is one off, a dropped statement, or two swapped
 arguments. Texts, messages and annotations get none. A fault is caught when a test of ``make test`` fails or hangs. The
 table and the faults that survived are printed as Markdown; a survivor either shows a gap in the tests or changes
-nothing. Triton's kernels are left out: their tests belong to ``make test-all``.
+nothing. The tests of a fault are those of its room, then those elsewhere that import its module. Triton's kernels are
+left out: their tests belong to ``make test-all``.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import ast
 import copy
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -33,7 +35,8 @@ ROOMS = ["analysis", "claims", "densify", "eval", "gaussians", "init", "pipeline
 FURTHER_TESTS = {"pipeline": ["tests/end_to_end/test_smoke.py"]}
 LEFT_OUT = "triton"  # in a path
 SYMMETRIC = {"maximum", "minimum", "min", "max", "add"}  # swapped arguments change nothing
-SECONDS = 600  # for the tests of one room; a fault that makes them hang is caught
+SPEED_ONLY = {"prefetch"}  # calls that change no result
+SECONDS = 1800  # for the tests of one room; a fault that makes them hang is caught
 FLIPPED: dict[type[ast.AST], type[ast.AST]] = {
     **{ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq},
     **{ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or, ast.Or: ast.And},
@@ -88,10 +91,12 @@ def changed_node(node: ast.AST) -> tuple[str, ast.AST] | None:
 
 
 def is_silent(node: ast.AST) -> bool:
-    """True for a message or a text: no test asks for what lies below such a node."""
+    """True for a message, a text or a hint to the processor: no test asks for what lies below such a node."""
     if isinstance(node, ast.Raise | ast.JoinedStr | ast.Assert):
         return True
     called = node.func if isinstance(node, ast.Call) else None
+    if isinstance(called, ast.Name) and called.id in SPEED_ONLY:
+        return True
     return isinstance(called, ast.Attribute) and isinstance(called.value, ast.Name) and called.value.id == "log"
 
 
@@ -172,17 +177,33 @@ def copy_checkout(folder: Path) -> Path:
     return place
 
 
+def tests_of(fault: Fault, place: Path) -> list[str]:
+    """The files of tests for a fault: those most likely to fail first, then the room's, then other rooms'."""
+    module = Path(fault.file).relative_to("src").with_suffix("").as_posix().replace("/", ".")
+    parent, _, name = module.rpartition(".")
+    imports = re.compile(rf"{re.escape(module)}\b|from {re.escape(parent)} import .*\b{name}\b")
+    room = place / "tests" / fault.room
+    named = sorted(room.rglob(f"test_{Path(fault.file).stem}.py"))
+    elsewhere = [
+        path
+        for path in sorted((place / "tests").rglob("test_*.py"))
+        if not path.is_relative_to(room) and imports.search(path.read_text())
+    ]
+    return [path.relative_to(place).as_posix() for path in [*named, room, *elsewhere]]
+
+
 def is_caught(fault: Fault | None, place: Path, room: str) -> bool:
-    """Plant the fault in the copy, run the tests of its room, and take the fault out again."""
-    tests = [f"tests/{room}", *FURTHER_TESTS.get(room, [])]
+    """Plant the fault in the copy, run its tests, and take the fault out again."""
+    tests = [f"tests/{room}"]
     original = b""
     if fault is not None:
-        named = sorted((place / "tests" / room).rglob(f"test_{Path(fault.file).stem}.py"))  # most likely to fail: first
-        tests = [path.relative_to(place).as_posix() for path in named] + tests
+        tests = tests_of(fault, place)
         original = (place / fault.file).read_bytes()
         (place / fault.file).write_bytes(original[: fault.start] + fault.after.encode() + original[fault.end :])
+    tests += FURTHER_TESTS.get(room, [])
     words = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow", "-p", "no:cacheprovider", "-n", "0", *tests]
-    environment = os.environ | {"PYTHONPATH": str(place / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
+    # Byte code is kept of the files as they are, not of faults: two of one second and size would be taken for the same.
+    environment = os.environ | {"PYTHONPATH": str(place / "src"), "PYTHONDONTWRITEBYTECODE": "1" if fault else ""}
     try:
         done = subprocess.run(words, cwd=place, env=environment, capture_output=True, timeout=SECONDS, check=False)
         return done.returncode != 0
@@ -191,6 +212,7 @@ def is_caught(fault: Fault | None, place: Path, room: str) -> bool:
     finally:
         if fault is not None:
             (place / fault.file).write_bytes(original)
+            shutil.copystat(ROOT / fault.file, place / fault.file)  # its byte code is valid again
 
 
 def main() -> int:
