@@ -23,14 +23,13 @@ import tempfile
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import numpy as np
-from IPython.display import Markdown
+from IPython.display import HTML, Markdown
 
 from gsbench.analysis import load_experiment, to_frame
-from gsbench.analysis.errors_by_region import errors_by_region
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.planning import seeds_needed
+from gsbench.analysis.report.pictures import choose_views
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.cli import run
@@ -134,26 +133,22 @@ for difference in (0.05, 0.1, 0.2, 0.5):
 #
 # ## Where it helps
 #
-# The paper's claim is about surfaces with little texture. So the pixels of the test views are sorted into five equal
-# bins by the texture of the ground truth, and the error of both arms is taken in each bin.
+# The view that gains most and the one that gains least, as the report shows them. In the last picture, blue is where
+# the second arm is nearer to the photograph, red where the first is.
 
 # %%
-regions = errors_by_region(pair_trials(experiment.trials, adc, volumetric))
-changes = [change.mean for change in regions.changes]
-bins = np.arange(1, len(changes) + 1)
-figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.4))
-left.plot(bins, regions.first, "o-", label="adc")
-left.plot(bins, regions.second, "o-", label="volumetric")
-left.set(xlabel="texture, from the lowest fifth to the highest", ylabel="mean error, 8-bit levels", xticks=bins)
-left.legend()
-right.bar(bins, changes, color=["C0" if word == "undecided" else "C3" for word in regions.words()])
-right.axhline(0, color="grey", linewidth=1)
-right.set(xlabel="texture, from the lowest fifth to the highest", ylabel="volumetric minus adc", xticks=bins)
-figure.tight_layout()
+views, _ = choose_views(pair_trials(experiment.trials, adc, volumetric))
+rows = []
+for view in (views[-1], views[0]):
+    pictures = [(view.truth, "photograph"), (view.first, "adc"), (view.second, "volumetric")]
+    pictures.append((view.difference, "where they differ"))
+    cells = "".join(
+        f'<td><img src="{uri}" width="200"><br>{name or "where they differ"}</td>' for uri, name in pictures
+    )
+    rows.append(f"<tr>{cells}</tr><tr><td colspan=4>{view.which}: {view.view}</td></tr>")
+HTML(f"<table>{''.join(rows)}</table>")
 
 # %% [markdown]
-# A bar below zero means that the volumetric rule has the smaller error there; a red one is decided, a blue one is not.
-#
 # ## Is the comparison fair?
 #
 # More Gaussians usually mean a better picture. If the arms end with different counts, ask again at equal ones:

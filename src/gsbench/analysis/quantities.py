@@ -51,7 +51,7 @@ def total_seconds(trial: TrialResult) -> float | None:
 
 
 def _textured(trial: TrialResult) -> float:
-    from gsbench.analysis.errors_by_region import textured_error  # here, since only claims about it read pictures
+    from gsbench.analysis.images import textured_error  # here, since only claims about it read pictures
 
     return textured_error(trial)
 

@@ -32,7 +32,7 @@ from typing import Any
 import yaml
 
 from gsbench import __version__
-from gsbench.analysis.errors_by_region import FromPixels, textured_error
+from gsbench.analysis.images import FromPixels, textured_error
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import Experiment, TrialResult, read_experiment, read_views
 from gsbench.claims.crate import crate_metadata

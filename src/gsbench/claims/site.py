@@ -19,7 +19,7 @@ from PIL import Image
 
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.declaration import standing
-from gsbench.analysis.errors_by_region import read_image
+from gsbench.analysis.images import read_image
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.notes import compared_pairs
 from gsbench.analysis.report.build import build_report

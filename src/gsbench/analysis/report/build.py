@@ -10,7 +10,7 @@ from jinja2 import Environment, StrictUndefined
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import standing
-from gsbench.analysis.errors_by_region import read_image
+from gsbench.analysis.images import read_image
 from gsbench.analysis.pairing import BASELINE, choose_pairs, controls_of
 from gsbench.analysis.paper import layout_of, load_paper, paper_tables
 from gsbench.analysis.report.pictures import data_uri

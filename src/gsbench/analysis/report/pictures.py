@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gsbench.analysis.errors_by_region import absolute_error, read_ignored, read_image, view_names
+from gsbench.analysis.images import absolute_error, read_ignored, read_image, view_names
 from gsbench.analysis.results import TrialResult
 from gsbench.errors import InputError
 from gsbench.runs.layout import GROUND_TRUTH, RENDERS

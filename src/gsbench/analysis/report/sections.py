@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsbench.analysis.differences import short_version
-from gsbench.analysis.errors_by_region import RegionErrors, errors_by_region
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.notes import caveats
@@ -49,8 +48,6 @@ class Versus:
     fairness: Table
     costs: tuple[str, ...]
     forests: tuple[str, ...]
-    errors: RegionErrors | None
-    region_chart: str
     views: tuple[WholeView, ...]
     notes: tuple[str, ...]
 
@@ -65,28 +62,19 @@ class Versus:
 
 
 def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> Versus:
-    """Costs, forest plots, errors by texture and whole views of two arms; what cannot be had is said in the notes."""
+    """Costs, forest plots and whole views of two arms; what cannot be had is said in the notes."""
     first, second = judged.first, judged.second
     own = [trial for trial in trials if trial.arm in (first, second)]
     pairs = pair_trials(own, first, second)
     views, faults = choose_views(pairs)
-    notes, region = [*judged.notes, *faults], ""
-    try:
-        found = errors_by_region(pairs)
-        region = _region_chart(found, first, second)
-    except InputError as error:
-        found = None
-        notes.append(f"Errors by texture: not shown, {error}")
     return Versus(
         judged,
         caveats(trials, first, second),
         fairness_table(trials, first, second),
         tuple(_costs(own, first, second)),
         tuple(_forest(verdict) for verdict in judged.verdicts),
-        found,
-        region,
         tuple(views),
-        tuple(dict.fromkeys(notes)),
+        tuple(dict.fromkeys([*judged.notes, *faults])),
     )
 
 
@@ -249,12 +237,6 @@ def _forest(verdict: Verdict) -> str:
         rows.append(ForestRow("mean of scenes", verdict.mean or 0.0, *bounds))
     better = "right of zero is better" if verdict.quantity.direction > 0 else "left of zero is better"
     return forest_plot(f"{verdict.quantity.name}: {better}", rows, "difference", verdict.quantity.direction)
-
-
-def _region_chart(errors: RegionErrors, first: Arm, second: Arm) -> str:
-    labels = ["lowest", *[""] * (len(errors.first) - 2), "highest"]
-    series = [(str(first), errors.first), (str(second), errors.second)]
-    return bar_chart("Error by texture energy of the ground truth", labels, series, "error (8-bit levels)")
 
 
 def _is_number(value: object) -> bool:
