@@ -19,7 +19,7 @@ from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import answer_family
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdicts import PairVerdicts, judge_pairs
-from gsbench.runs.declaration import STAMP, Arm, Declaration, Question, read_declarations, record_text
+from gsbench.runs.declaration import STAMP, Arm, Declaration, Question, open_question, read_declarations, record_text
 from tests.analysis.synthetic import Plan, write_runs
 
 EARLY, LATE = "2020-01-01T00:00:00Z", "2037-01-01T00:00:00Z"
@@ -27,8 +27,8 @@ CLEAR = {"lpips_vgg_raw": -0.05}
 
 
 def declare(runs: Path, *records: tuple[str, str], experiment: str = "exp") -> None:
-    lines = [json.dumps({"metric": metric, "time": moment}) + "\n" for metric, moment in records]
-    (runs / experiment / "declared.jsonl").write_text("".join(lines))
+    entries = [Declaration(time=moment, questions=(open_question(metric),)) for metric, moment in records]
+    (runs / experiment / "declared.jsonl").write_text(record_text(entries))
 
 
 def declared_experiment(runs: Path, *records: tuple[str, str], **plan: object) -> Experiment:
@@ -194,8 +194,9 @@ def test_trials_remember_a_declaration_whose_record_is_gone(tmp_path: Path) -> N
 
 
 def declare_trials(runs: Path, *records: tuple[str, dict[str, list[int]]], metric: str = "lpips_vgg_raw") -> None:
-    lines = [json.dumps({"metric": metric, "time": moment, "trials": trials}) + "\n" for moment, trials in records]
-    (runs / "exp" / "declared.jsonl").write_text("".join(lines))
+    asked = (open_question(metric),)
+    entries = [Declaration(time=moment, questions=asked).to_json() | {"trials": trials} for moment, trials in records]
+    (runs / "exp" / "declared.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in entries))
 
 
 def planned(seeds: list[int], arms: tuple[str, ...] = ("adc", "volumetric")) -> dict[str, list[int]]:
@@ -283,7 +284,7 @@ def test_a_record_that_was_deleted_and_written_anew_does_not_hide_what_was_added
 
 
 def test_records_without_trials_and_damaged_ones_are_read(tmp_path: Path) -> None:
-    """Those of earlier versions declare a metric alone."""
+    """A record may declare a metric alone."""
     experiment = declared_experiment(tmp_path, ("psnr", EARLY))
     found = standing(experiment.folder, experiment.trials)
     assert found is not None

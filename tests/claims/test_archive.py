@@ -22,7 +22,9 @@ MANY = Plan(scenes=[f"scene{k}" for k in range(9)], seeds=range(3), views=25)  #
 def export(tmp_path: Path, plan: Plan = Plan()) -> Path:  # noqa: B008 - never changed
     runs = tmp_path / "runs"
     write_runs(runs, plan)
-    (runs / "exp" / "declared.jsonl").write_text('{"metric": "psnr", "time": "2026-01-01T00:00:00Z"}\n')
+    (runs / "exp" / "declared.jsonl").write_text(
+        '{"questions": [{"metric": "psnr", "sign": 0}], "time": "2026-01-01T00:00:00Z"}\n'
+    )
     write_archive(load_experiment(runs, "exp"), tmp_path / "exp.zip")
     return tmp_path / "exp.zip"
 

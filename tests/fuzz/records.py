@@ -123,8 +123,8 @@ def write_original(runs: Path) -> dict[str, Path]:
     places = {path.relative_to(home).as_posix(): entry for path in (done, failed)}
     (home / "plan.json").write_text(json.dumps({"version": 1, "trials": places}))
     declared = [
-        {"metric": "psnr", "time": "2026-11-21T20:05:00Z"},
-        {"plan": {"a": 1}, "hash": "h", "time": "2026-11-21T20:05:00Z"},
+        {"questions": [{"metric": "psnr", "sign": 0}], "time": "2026-11-21T20:05:00Z"},
+        {"questions": [{"metric": "psnr", "name": "a"}], "looks": [2, 3], "time": "2026-11-21T20:05:00Z"},
     ]
     (home / "declared.jsonl").write_text("".join(json.dumps(line) + "\n" for line in declared))
     tuning = {

@@ -39,7 +39,7 @@ from gsbench.claims.crate import crate_metadata
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_bytes, read_yaml
-from gsbench.runs.declaration import Declaration, read_declarations
+from gsbench.runs.declaration import read_declarations
 from gsbench.runs.layout import CONFIG, DECLARED, FROM_PIXELS, GROUND_TRUTH, PER_VIEW, RENDERS, RESULTS
 from gsbench.settings import is_folder_name
 from gsbench.words import readable_bytes, without_places
@@ -86,7 +86,7 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         ),
         PER_VIEW: _table(rows),
     } | ({DECLARED: read_bytes(declared)} if declared.is_file() else {})
-    if any(metric == TEXTURED.key for one in read_declarations(experiment.folder) for metric in _metrics(one)):
+    if any(q.metric == TEXTURED.key for one in read_declarations(experiment.folder) for q in one.questions):
         contents[PIXELS] = _json_lines(_measured_in_pictures(kept))
     for trial in kept if pictures else ():
         for kind in PICTURES:
@@ -108,13 +108,6 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
             info = zipfile.ZipInfo(name, FIXED_DATE)
             archive.writestr(info, contents[name], zipfile.ZIP_DEFLATED, compresslevel=9)
     return left_out
-
-
-def _metrics(declared: Declaration) -> list[str]:
-    """The metrics that it asks about."""
-    claims = declared.plan.get("claims")
-    published = [str(one.get("metric")) for one in claims if isinstance(one, dict)] if isinstance(claims, list) else []
-    return [question.metric for question in declared.questions] + published
 
 
 def _measured_in_pictures(trials: Sequence[TrialResult]) -> Iterator[dict[str, Any]]:

@@ -17,7 +17,6 @@ from gsbench.analysis.results import read_experiment
 from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.file import Claim, ClaimsFile
-from gsbench.claims.published import resolve
 from gsbench.claims.stopping import Planned, trials_of_look
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.jobs import with_seed
@@ -189,7 +188,7 @@ def recheck(file: ClaimsFile, archive: Path, folder: Path) -> tuple[list[ClaimVe
     every = [one for one in read_declarations(experiment.folder) if one.of_claims]
     if not every:
         raise InputError(f"{archive}: no claims were declared in it: it is no archive of a gsbench check")
-    declaration = resolve(standing_one(every), experiment.trials)
+    declaration = standing_one(every)
     _check_same_claims(file, declaration)
     return claim_verdicts(file, declaration, judge(experiment.trials, declaration)), declaration, every
 

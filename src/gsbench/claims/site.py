@@ -28,7 +28,6 @@ from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import Table, build_table
 from gsbench.analysis.verdicts import headline, judge_pairs
 from gsbench.claims.archive import unpack_archive
-from gsbench.claims.published import resolve
 from gsbench.errors import InputError
 from gsbench.runs.declaration import read_declarations, standing_one
 from gsbench.runs.layout import RENDERS
@@ -128,7 +127,7 @@ def _claims(experiment: Experiment) -> tuple[Verdict, ...]:
     declared = [one for one in read_declarations(experiment.folder) if one.of_claims]
     if not declared:
         return ()
-    judged = judge(experiment.trials, resolve(standing_one(declared), experiment.trials))
+    judged = judge(experiment.trials, standing_one(declared))
     return tuple(verdict for verdict in judged if not verdict.question.versions)
 
 

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from gsbench.parsing import DamagedError, fault_of, read_bytes
+from gsbench.parsing import DamagedError, read_bytes
 from gsbench.records import STRICT, Amount, Count, Record, iterate_rows
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import DECLARED
@@ -100,8 +100,7 @@ class Declaration(Record):
 
     ``looks`` are numbers of seeds, rising: after each of them a question may be decided; none: all is judged once.
     ``trials`` are all that were to be run where the questions name none; None: nobody knows. ``missing`` says by
-    question what of it could not be tested where it was declared, and why. ``plan`` is a plan of claims as earlier
-    versions published it (`gsbench.claims.published`).
+    question what of it could not be tested where it was declared, and why.
     """
 
     time: str
@@ -110,13 +109,10 @@ class Declaration(Record):
     looks: tuple[Count, ...] = ()
     trials: dict[TrialKey, tuple[Count, ...]] | None = None
     missing: dict[str, list[str]] = field(default_factory=dict)
-    plan: dict[str, Any] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         if unix_time(self.time) is None:
             raise ValueError("time is no moment")
-        if fault := fault_of(self.plan):
-            raise ValueError(f"in plan {fault}")
 
     @property
     def moment(self) -> int:
@@ -131,7 +127,7 @@ class Declaration(Record):
     @property
     def of_claims(self) -> bool:
         """Return whether a file of claims was declared, each question of which has a name."""
-        return bool(self.plan) or any(question.name for question in self.questions)
+        return any(question.name for question in self.questions)
 
     @property
     def primary(self) -> str:
@@ -199,9 +195,8 @@ def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) ->
     except DamagedError as error:
         log.warning("left out: %s", error)
         content = b""
-    found = [line.declaration for _, line in iterate_rows(content, _Line, path)]
-    found = [one for one in found if one.questions or one.plan]
-    known = {(one.primary, one.time) for one in found if not one.plan}
+    found = [one for _, one in iterate_rows(content, Declaration, path) if one.questions]
+    known = {(one.primary, one.time) for one in found}
     for one in dict.fromkeys((said.metric, said.time) for said in repeated if said is not None):
         if one not in known and unix_time(one[1]) is not None:
             found.append(Declaration(time=one[1], questions=(open_question(one[0]),)))
@@ -233,23 +228,3 @@ def unix_time(text: object) -> int | None:
         return calendar.timegm(time.strptime(str(text), STAMP))
     except (ValueError, OverflowError):
         return None
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Line(Declaration):
-    """A line of ``declared.jsonl``; those of earlier versions have a ``metric`` with its trials, or a ``plan``."""
-
-    metric: str | None = None
-
-    @property
-    def declaration(self) -> Declaration:
-        questions = self.questions if self.metric is None else (open_question(self.metric),)
-        return Declaration(
-            time=self.time,
-            questions=questions,
-            error_rate=self.error_rate,
-            looks=self.looks,
-            trials=self.trials,
-            missing=self.missing,
-            plan=self.plan,
-        )
