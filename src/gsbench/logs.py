@@ -58,40 +58,22 @@ def printable_output() -> Iterator[None]:
 
 
 class _People(logging.StreamHandler[TextIO]):
-    """Shows lines from INFO on, and all of the loggers that are ``watched``, on what is stderr at that moment."""
-
-    watched: tuple[str, ...] = ()
+    """Shows lines on what is stderr at that moment."""
 
     def emit(self, record: logging.LogRecord) -> None:
         self.stream = sys.stderr  # another than at the start, where a program that calls gsbench redirects it
         super().emit(record)
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        family = f"{record.name}."
-        return record.levelno >= logging.INFO or any(family.startswith(f"{name}.") for name in self.watched)
 
 
 def set_up_logging() -> None:
     """Show what gsbench logs, from INFO on, on stderr."""
     if not LOGGER.handlers:
         handler = _People()
+        handler.setLevel(logging.INFO)
         handler.setFormatter(_Printable("%(message)s"))
         LOGGER.addHandler(handler)
         LOGGER.setLevel(logging.DEBUG)
         LOGGER.propagate = False
-
-
-def show_details(loggers: bool | str | Sequence[str]) -> None:
-    """Show on stderr also what these loggers log for debugging; ``True`` (as ``hydra.verbose``) means gsbench's own."""
-    if isinstance(loggers, bool):
-        loggers = [LOGGER.name] * loggers
-    names = [loggers] if isinstance(loggers, str) else list(loggers)
-    for people in (handler for handler in LOGGER.handlers if isinstance(handler, _People)):
-        people.watched = tuple(names)
-        for logger in map(logging.getLogger, names):
-            logger.setLevel(logging.DEBUG)
-            if not f"{logger.name}.".startswith(f"{LOGGER.name}.") and people not in logger.handlers:
-                logger.addHandler(people)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Plug-ins by which Hydra finds gsbench's launcher and sweepers; what they do stands in ``gsbench.launch``.
+"""Plug-ins by which Hydra finds gsbench's launcher and sweeper; what they do stands in ``gsbench.app.sweep``.
 
 Hydra imports this file at every start, of any Hydra app in the same environment, so it imports Hydra alone.
 """
@@ -18,19 +18,13 @@ from omegaconf import DictConfig
 
 
 class GsbenchLauncher(Launcher):
-    """Launcher that gets all trials of a sweep at once, and runs them as the settings below ``launch`` say."""
+    """Name for what gsbench's sweeper does by itself: to run all trials as the settings below ``launch`` say."""
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        from gsbench.config.jobs import JobContext
-
-        self.context = JobContext(hydra_context.config_loader, hydra_context.callbacks)
-        self.task, self.config = task_function, config
+        pass
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
-        from gsbench.app.sweep import trials_of_jobs
-
-        trials = trials_of_jobs(self.task, self.context, self.config, job_overrides, initial_job_idx)
-        return self.task.launch(trials)  # type: ignore[attr-defined,no-any-return] # a Task of gsbench.app.command
+        raise NotImplementedError
 
 
 class GsbenchSweeper(Sweeper):
@@ -47,8 +41,8 @@ class GsbenchSweeper(Sweeper):
 
         self.begun = Sweep.begin(hydra_context, task_function, config)
 
-    def sweep(self, arguments: list[str]) -> Any:
-        return self.begun.run(self.params, self.tune, arguments)
+    def sweep(self, arguments: list[str]) -> None:
+        self.begun.run(self.params, self.tune, arguments)
 
 
 LAUNCHER = {"_target_": "hydra_plugins.gsbench.GsbenchLauncher"}

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import yaml
 
 from gsbench import cli
 from gsbench.app.command import compose_trials
@@ -36,35 +35,45 @@ SWEEP = ["densify=adc,none", "seed=0,1", "init=random", "tracking=none"]
 
 def test_a_sweep_has_one_time() -> None:
     """Microseconds, so that two of them never agree by chance; each densifier is a composition of its own."""
-    trials = compose_trials([*SWEEP, "name=x-${now:%H%M%S%f}", "hydra.sweep.dir=h/${now:%f}"], multirun=True)
+    trials = compose_trials([*SWEEP, "name=x-${now:%H%M%S%f}", "scene.name=y-${now:%f}"], multirun=True)
     assert len({trial.values["name"] for trial in trials}) == 1
-    assert len({trial.job.composed().hydra.sweep.dir for trial in trials if trial.job is not None}) == 1
+    assert len({trial.values["scene"]["name"] for trial in trials}) == 1
 
 
 @pytest.mark.usefixtures("no_trials")
-def test_a_sweep_leaves_hydras_record_in_a_folder_that_was_asked_for(tmp_path: Path) -> None:
+def test_hydra_leaves_its_record_where_it_runs_the_jobs(tmp_path: Path) -> None:
     folders = ["hydra.sweep.dir=h/${now:%H%M%S%f}", "hydra.sweep.subdir=${hydra:job.num}"]
-    assert cli.run(["-m", *SWEEP, *folders, "--dry-run"]) == 0
+    words = ["-m", *SWEEP, "hydra/launcher=basic", *folders, "hydra.output_subdir=of_hydra"]
+    assert cli.run([*words, "--dry-run"]) == 0
     assert not (tmp_path / "h").exists()
-    assert cli.run(["-m", *SWEEP, *folders]) == 0
+    assert cli.run(words) == 0
     (folder,) = (tmp_path / "h").iterdir()
-    assert sorted(path.name for path in folder.iterdir()) == ["0", "1", "2", "3", "multirun.yaml"]
-    assert yaml.safe_load((folder / "multirun.yaml").read_text())["hydra"]["overrides"]["task"] == SWEEP
+    assert sorted(path.name for path in folder.iterdir()) == ["0", "1", "2", "3"]
+    assert (folder / "3" / "of_hydra" / "config.yaml").is_file()
 
 
-@pytest.mark.usefixtures("no_trials")
-def test_else_there_is_no_record_of_hydras(runs: Path) -> None:
-    assert cli.run(["-m", *SWEEP]) == 0
-    assert not [*runs.rglob("multirun.yaml")]
+@pytest.mark.parametrize(
+    "word",
+    [
+        "hydra.sweep.dir=elsewhere",
+        "hydra.output_subdir=x",
+        "+hydra.job.env_set.OMP_NUM_THREADS='1'",
+        "+hydra.callbacks.log._target_=hydra.experimental.callbacks.LogJobReturnCallback",
+    ],
+)
+def test_what_only_jobs_of_hydras_read_is_refused_without_them(word: str) -> None:
+    with pytest.raises(InputError, match="add hydra/launcher=basic"):
+        compose_trials([*SWEEP, word], multirun=True)
+    assert compose_trials([*SWEEP, word, "hydra/launcher=basic"], multirun=True)
 
 
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["name=x-${hydra:job.num}"], "${hydra:job.num}: a job has it only in a sweep: add -m"),
-        (["densify.name=a${hydra:job.id}"], "${hydra:job.id}: a job has it only in a sweep: add -m"),
-        (["name=${hydra:runtime.output_dir}"], "${hydra:runtime.output_dir}: it is known in a job only"),
-        (["-m", "seed=0,1", "name=x-${hydra:runtime.output_dir}"], "it is known in a job only"),
+        (["name=x-${hydra:job.num}"], "none may ask Hydra"),
+        (["-m", "seed=0,1", "densify.name=a${hydra:job.id}"], "none may ask Hydra"),
+        (["hydra.verbose=true"], "log.txt in a trial's folder holds everything"),
+        (["-m", "hydra/sweeper=basic", "seed=0,1"], "gsbench's own alone"),
         (["-m", "densify=glob([av]*)"], """'densify=glob("[av]*")'"""),
         (["-m", "densify=choice([av,b)"], "is not a setting like key=value"),
         (["-m", "hydra/launcher=joblib", "seed=0,1", "hydra.launcher.jobs=3"], "n_jobs"),
@@ -82,11 +91,6 @@ def test_what_cannot_be_is_refused_in_a_line(words: list[str], text: str, capsys
 def test_a_glob_of_characters_works_as_it_is_advised(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["-m", 'densify=glob("[av]*")', "--dry-run"]) == 0
     assert "sfm-adc" in capsys.readouterr().out
-
-
-def test_a_job_of_a_sweep_has_a_number() -> None:
-    trials = compose_trials(["seed=0,1", "name=x-${hydra:job.num}"], multirun=True)
-    assert [trial.values["name"] for trial in trials] == ["x-0", "x-1"]
 
 
 @pytest.mark.parametrize("words", [["--config-dir", "own", "--help"], ["-h", "--config-dir=own"], ["-m", "--help"]])

@@ -209,7 +209,6 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(
         (["seed=3"], "at least 2 seeds"),
         (["densify=adc"], "this sweep has one"),
         (["launch=slurm", "launch.wait=false"], "launch.wait must be true"),
-        (["hydra/sweeper=basic"], "chooses by itself what to run"),
         (["launch.least_difference=0"], "launch.least_difference"),
         (["launch.stop_when_decided=maybe"], "launch.stop_when_decided"),
     ],

@@ -174,6 +174,6 @@ def test_right_words_are_no_faults() -> None:
     right = """
     gsbench -m scene=garden densify=external/opensplat densify.options.program=x +densify.mine=1 seed=0,1,2 | tee x
     gsbench tables x --format csv   # no=comment
-`densify=glob(*)` `key=interval(a, b)` `train=…` `hydra.verbose=true` `densify/volumetric.py` `~densify.cap`
+`densify=glob(*)` `key=interval(a, b)` `train=…` `densify/volumetric.py` `~densify.cap`
 """
     assert faults_of(right) == []

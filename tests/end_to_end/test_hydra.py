@@ -36,16 +36,15 @@ class Note(Callback):
         self.note(f"{config.hydra.job.num} begins with seed {config.seed}")
 
     def on_job_end(self, config, job_return, **rest):
-        self.note(f"{config.hydra.job.num} ends {job_return.status.name} {job_return._return_value:.3f}")
+        self.note(f"{config.hydra.job.num} ends {job_return.status.name}")
 
     def on_multirun_end(self, config, **rest):
         self.note("sweep ends")
 """
 EXPERIMENT = """# @package _global_
-name: ${hydra:job.name}-${hydra:runtime.choices.densify}
+name: own-${densify.name}
 hydra:
   mode: MULTIRUN
-  verbose: true
   output_subdir: hydra
   job:
     env_set:
@@ -67,38 +66,31 @@ def results_below(folder: Path) -> list[dict[str, float]]:
     return [json.loads(path.read_text()) for path in sorted(folder.rglob("results.json"))]
 
 
-@pytest.mark.parametrize("launch", ["serial", "local"])
-def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path, launch: str) -> None:
+def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path) -> None:
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     (tmp_path / "conf" / "experiment" / "own.yaml").write_text(EXPERIMENT)
     (tmp_path / "notes.py").write_text(CALLBACK)
-    words = ["--config-dir", "conf", "+experiment=own", *TINY, f"launch={launch}", "allow_targets=[notes]"]
+    words = ["--config-dir", "conf", "+experiment=own", *TINY, "hydra/launcher=basic", "allow_targets=[notes]"]
     listed = gsbench(*words, "--dry-run", GSBENCH_RUNS="runs", timeout=SECONDS)
     assert "2 trials: 2 missing" in listed.stdout, listed.stderr
     assert not (tmp_path / "notes.txt").exists()  # where nothing runs, no callback is called
 
     done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
     assert done.returncode == 0, done.stderr
-    results = results_below(tmp_path / "runs" / "gsbench-none")
+    results = results_below(tmp_path / "runs" / "own-none")
     assert [result["seed"] for result in results] == [0, 1]
     notes = (tmp_path / "notes.txt").read_text().splitlines()
     assert (notes[0], notes[-1]) == ("sweep begins", "sweep ends")
-    ends = [f"{i} ends COMPLETED {results[i]['metrics']['psnr']:.3f}" for i in (0, 1)]  # type: ignore[index]
+    ends = [f"{i} ends COMPLETED" for i in (0, 1)]
     assert sorted(notes[1:-1]) == sorted([*(f"{i} begins with seed {i}" for i in (0, 1)), *ends])
     for i in (0, 1):
         assert f"seed: {i}" in (tmp_path / "of_hydra" / str(i) / "hydra" / "config.yaml").read_text()
 
-    again = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
-    assert again.returncode == 0
-    assert (tmp_path / "notes.txt").read_text().splitlines()[len(notes) :] == ["sweep begins", "sweep ends"]
 
-
-@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
-def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, launcher: str) -> None:
-    package = f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher"
-    if find_spec(package) is None:
-        pytest.skip(f"needs {package} (group dev)")
-    words = ["-m", *TINY, f"hydra/launcher={launcher}", "name=x", "seed=0,1"]
+def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path) -> None:
+    if find_spec("hydra_plugins.hydra_joblib_launcher") is None:
+        pytest.skip("needs hydra-joblib-launcher (group dev)")
+    words = ["-m", *TINY, "hydra/launcher=joblib", "name=x", "seed=0,1"]
     done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
     assert done.returncode == 0, done.stderr
     results = sorted((tmp_path / "runs" / "x").rglob("results.json"))
@@ -107,22 +99,6 @@ def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, launc
     written = [path.stat().st_mtime_ns for path in results]
     assert gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS).returncode == 0
     assert [path.stat().st_mtime_ns for path in results] == written  # nothing is done twice
-
-
-@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
-def test_a_callback_of_yours_is_found_in_the_processes_of_another_launcher(
-    gsbench: Run, tmp_path: Path, launcher: str
-) -> None:
-    package = f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher"
-    if find_spec(package) is None:
-        pytest.skip(f"needs {package} (group dev)")
-    (tmp_path / "notes.py").write_text(CALLBACK)
-    own = ["+hydra.callbacks.note={_target_: notes.Note, path: notes.txt}", "allow_targets=[notes]"]
-    words = ["-m", *TINY, f"hydra/launcher={launcher}", "name=x", "seed=0,1", *own]
-    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
-    assert done.returncode == 0, done.stderr
-    notes = (tmp_path / "notes.txt").read_text().splitlines()
-    assert {"sweep begins", "0 begins with seed 0", "1 begins with seed 1", "sweep ends"} <= set(notes)
 
 
 def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(gsbench: Run, tmp_path: Path) -> None:
@@ -147,10 +123,3 @@ def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(gsbench:
     failed = [line for line in done.stderr.splitlines() if line.startswith("gsbench: failed")]
     assert len(failed) == 2
     assert "2 trials: 2 failed" in gsbench("status", "x", GSBENCH_RUNS="runs", timeout=SECONDS).stdout
-
-
-def test_hydras_own_sweeper_with_our_launcher(gsbench: Run) -> None:
-    listed = gsbench(
-        "-m", *TINY, "hydra/sweeper=basic", "seed=0,1,2", "--dry-run", GSBENCH_RUNS="runs", timeout=SECONDS
-    )
-    assert "3 trials: 3 missing" in listed.stdout, listed.stderr

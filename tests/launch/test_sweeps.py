@@ -182,7 +182,7 @@ def test_name_seed_and_machine_are_in_no_hash_and_settings_are() -> None:
         (["foo"], ["'foo' is not a setting like key=value"]),
         (["experiment=table1"], ["+experiment=NAME", "table2"]),
         (["densify._target_=mine.X", "densify.own=1"], ["densify.own", "+densify.own="]),
-        (["hydra/launcher=submitit_slurm"], ["launches sweeps: add -m"]),
+        (["hydra/launcher=joblib"], ["launches sweeps: add -m"]),
         (["launch.parallel=0"], ["launch.parallel must be a whole number above 0"]),
         (["name=../up"], ["name must be a plain folder name"]),
         (["scene=photos"], ["scene.path is not set"]),

@@ -1,7 +1,7 @@
 """gsbench as a Hydra app: a command line becomes trials and an exit code.
 
 Before Hydra runs, one look at the whole configuration refuses what cannot be (`gsbench.config.compose`). Then
-``hydra.main`` runs the task, or makes a sweep of it by its sweeper and its launcher, gsbench's or others.
+``hydra.main`` runs the task, or makes a sweep of it by gsbench's sweeper.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from typing import Any
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
-from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import HydraException
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -25,18 +24,19 @@ from omegaconf.errors import OmegaConfBaseException
 from gsbench.config.command_words import check_words, is_sweep, parse, parse_word
 from gsbench.config.compose import Trial, compose_whole, look_at, ready_trial
 from gsbench.config.hydra_entry import hydra_ready, run_main
-from gsbench.config.jobs import check_output_folder, typed
+from gsbench.config.jobs import typed
 from gsbench.config.messages import explained
 from gsbench.config.trust import PERMISSIONS, check_composed, load_callbacks
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.batch import run_batch
-from gsbench.launch.outcome import Outcome, objective
+from gsbench.launch.outcome import Outcome
 from gsbench.launch.plan import describe_plan
 from gsbench.launch.preflight import check_parts, disk_line, missing_folders, need_no_check
-from gsbench.logs import set_up_logging, show_details
+from gsbench.logs import set_up_logging
 from gsbench.system.own_modules import allow_modules
 
 OWN = "gsbench"  # the names of gsbench's own launcher and sweeper
+OWN_FOLDER = {"dir": "${runs}/.hydra", "subdir": "."}  # of Hydra's files of a sweep, as conf/config.yaml has it
 
 log = logging.getLogger(__name__)
 
@@ -89,7 +89,7 @@ class Task:
     def __reduce__(self) -> tuple[Any, ...]:
         return Task, (self.handle, self.look_only, self.allowed, self.folder)  # nothing of what came together here
 
-    def __call__(self, config: DictConfig) -> float | None:
+    def __call__(self, config: DictConfig) -> None:
         """One trial, as Hydra or another launcher calls it, perhaps in a process of its own; raises how it failed."""
         allow_modules(self.allowed, self.folder)
         set_up_logging()
@@ -102,9 +102,8 @@ class Task:
             raise (InputError if outcome.bad_input else GsbenchError)(outcome.message)
         if hydra.hydra.mode == RunMode.RUN:
             self.outcomes.append(outcome)  # those of a sweep its launcher tells
-        return objective(outcome.metrics or {})
 
-    def launch(self, trials: Sequence[Trial]) -> list[JobReturn]:
+    def launch(self, trials: Sequence[Trial]) -> None:
         """Run a batch of trials; raises GsbenchError where no other trial can succeed either."""
         self.trials += trials
         outcomes = self.handle(trials)
@@ -113,18 +112,6 @@ class Task:
         self.outcomes += outcomes
         if fatal := next((outcome for outcome in outcomes if outcome.fatal), None):
             raise (InputError if fatal.bad_input else GsbenchError)(fatal.message)
-        ended = {outcome.folder: outcome for outcome in outcomes}
-        return [_returned(trial, ended[trial.folder]) for trial in trials]
-
-
-def _returned(trial: Trial, outcome: Outcome) -> JobReturn:
-    words = trial.job.words if trial.job is not None else trial.overrides
-    returned = JobReturn(overrides=list(words), task_name="gsbench")
-    if outcome.status == "done":
-        returned.return_value, returned.status = objective(outcome.metrics or {}), JobStatus.COMPLETED
-    elif outcome.status == "failed":
-        returned.return_value, returned.status = GsbenchError(outcome.message), JobStatus.FAILED
-    return returned  # left to Slurm: not known
 
 
 def run_app(words: Sequence[str], multirun: bool, task: Task) -> None:
@@ -140,9 +127,8 @@ def run_app(words: Sequence[str], multirun: bool, task: Task) -> None:
         if swept and not multirun:
             raise InputError(f"{swept[0]} lists several values: add -m to run one trial for each")
         with explained(words):
-            check_hydra_settings(config, multirun, task.look_only)
+            check_hydra_settings(config, multirun)
         task.allowed = tuple(config[PERMISSIONS])
-        show_details(config.hydra.verbose)
         task.grids = OmegaConf.to_container(config.hydra.sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
         # Hydra would resolve ${…} in the grids when it makes the sweeper; there it is for each trial to do.
         chosen = [*words, *["hydra.sweeper.grids=[]"] * bool(task.grids)]
@@ -154,8 +140,7 @@ def run_app(words: Sequence[str], multirun: bool, task: Task) -> None:
                 return
         task.trials += [] if trial is None else [trial]
         load_callbacks(config, task.allowed)
-    others = {config.hydra.runtime.choices[f"hydra/{name}"] for name in ("launcher", "sweeper")} != {OWN}
-    with explained(words, Exception if others else (HydraException, OmegaConfBaseException)):
+    with explained(words, (HydraException, OmegaConfBaseException, OSError)):  # such as of a folder for Hydra's files
         run_main(task, [*chosen, f"hydra.mode={(RunMode.MULTIRUN if multirun else RunMode.RUN).name}"], task.allowed)
 
 
@@ -180,10 +165,9 @@ def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
     return []
 
 
-def check_hydra_settings(config: DictConfig, multirun: bool, look_only: bool) -> None:
+def check_hydra_settings(config: DictConfig, multirun: bool) -> None:
     """Refuse of Hydra's own settings what cannot be, wherever it was said: on the command line or in a file."""
-    hydra, choices = config.hydra, config.hydra.runtime.choices
-    launcher, sweeper = choices["hydra/launcher"], choices["hydra/sweeper"]
+    hydra, launcher = config.hydra, config.hydra.runtime.choices["hydra/launcher"]
     if hydra.job.chdir:
         raise InputError(
             "hydra.job.chdir=true: trials run where the command was given, from where paths are meant; "
@@ -200,18 +184,22 @@ def check_hydra_settings(config: DictConfig, multirun: bool, look_only: bool) ->
         )
     if launcher != OWN and config.launch.name != "serial":
         raise InputError(f"hydra/launcher={launcher} and launch={config.launch.name} are two launchers: choose one")
-    if not look_only:
-        check_output_folder(config, multirun)
-    if look_only and launcher != OWN and sweeper != OWN:
-        raise InputError(f"hydra/sweeper={sweeper} does not say beforehand what hydra/launcher={launcher} will run")
+    if multirun and launcher == OWN and (unread := _read_by_jobs_of_hydra(hydra)):
+        raise InputError(f"{unread}: in a sweep only Hydra's own launcher reads it: add hydra/launcher=basic")
     if config.launch.stop_when_decided and not multirun:
         raise InputError("launch.stop_when_decided adds seeds to a sweep: add -m, two densifiers and seed=0,1,2,3")
-    if config.launch.stop_when_decided and sweeper != OWN:
-        raise InputError(
-            f"hydra/sweeper={sweeper} chooses by itself what to run: leave it or launch.stop_when_decided out"
-        )
-    if sweeper != OWN and not config.launch.wait:
-        raise InputError(f"hydra/sweeper={sweeper} learns from results, so launch.wait must be true")
+
+
+def _read_by_jobs_of_hydra(hydra: DictConfig) -> str:
+    """The first setting that acts where Hydra runs a job, which gsbench's launcher does not ask it to; "" for none."""
+    raw: Any = OmegaConf.to_container(hydra, resolve=False)
+    given = {
+        "hydra.callbacks": raw["callbacks"],
+        "hydra.job.env_set": raw["job"]["env_set"],
+        "hydra.output_subdir": raw["output_subdir"],
+        "hydra.sweep": raw["sweep"] != OWN_FOLDER,
+    }
+    return next((name for name, value in given.items() if value), "")
 
 
 def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:

@@ -25,7 +25,7 @@ from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import Planned, headline, plan_sweep, run_looks
 from gsbench.config.command_words import parse_word
 from gsbench.config.compose import Trial
-from gsbench.config.jobs import JobContext, begin_sweep, compose_jobs
+from gsbench.config.jobs import compose_jobs, resolve_times
 from gsbench.config.messages import explained
 from gsbench.errors import GsbenchError
 from gsbench.files import checked_runs_folder, make_runs_folder
@@ -50,12 +50,12 @@ class Sweep:
     def begin(cls, context: HydraContext, task: TaskFunction, config: DictConfig) -> Sweep:
         """The work of gsbench's sweeper on what Hydra gives it."""
         assert isinstance(task, Task)
-        context = JobContext(context.config_loader, context.callbacks)
-        begin_sweep(config, record=not task.look_only)
+        config.allow_targets = list(task.allowed)
+        resolve_times(config)
         launcher = Plugins.instance().instantiate_launcher(hydra_context=context, task_function=task, config=config)
         return cls(config, task, context, launcher)
 
-    def run(self, params: Mapping[str, Any], tune: Mapping[str, Any], words: Sequence[str]) -> Sequence[JobReturn]:
+    def run(self, params: Mapping[str, Any], tune: Mapping[str, Any], words: Sequence[str]) -> None:
         """Run all points that the words of the sweep span; ``params`` are the settings and values of
         ``hydra.sweeper.params``, ``tune`` says how the intervals among them are searched before (`gsbench.app.tuning`).
         """
@@ -69,8 +69,10 @@ class Sweep:
             searched = {one.get_key_element(): one for one in given.values() if is_interval(one)}
             intervals += [searched] * len(points)
         trials = self.trials(tuned_jobs(self, tune, jobs, intervals))
-        until_decided = any(trial.values["launch"]["stop_when_decided"] for trial in trials)
-        return self._run_until_decided(trials) if until_decided else self.launch(trials)
+        if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
+            self._run_until_decided(trials)
+        else:
+            self.launch(trials)
 
     def parse(self, words: Sequence[str]) -> list[Override]:
         """The words as Hydra reads them, with the choices of ``glob(*)``."""
@@ -79,25 +81,23 @@ class Sweep:
         with explained(words):
             return OverridesParser.create(self.context.config_loader).parse_overrides(list(words))
 
-    def trials(self, jobs: Sequence[Sequence[str]], first: int = 0) -> list[Trial]:
-        """The trials of jobs, each the list of its words, whose numbers begin at ``first``."""
-        return trials_of_jobs(self.task, self.context, self.config, jobs, first)
+    def trials(self, jobs: Sequence[Sequence[str]]) -> list[Trial]:
+        """The trials of jobs, each the list of its words."""
+        return compose_jobs(self.context.config_loader, self.config, jobs)
 
-    def launch(self, trials: Sequence[Trial], first: int | None = None) -> Sequence[JobReturn]:
+    def launch(self, trials: Sequence[Trial]) -> None:
         """Run trials by the launcher.
 
-        ``first`` is the number of the first job, by which Hydra's launchers name folders; by default the trial's own.
         Another launcher than gsbench's gets them after a look at all, so that what is refused is refused before work.
         """
         name = self.config.hydra.runtime.choices["hydra/launcher"]
         if name == OWN or self.task.look_only:
-            return self.task.launch(trials)
+            self.task.launch(trials)
+            return
         begin_for_another_launcher(trials)
-        jobs = [trial.job for trial in trials if trial.job is not None]
+        jobs = [[word for word in trial.overrides if not parse_word(word).is_hydra_override()] for trial in trials]
         try:
-            returned = self.launcher.launch(
-                [list(job.words) for job in jobs], initial_job_idx=jobs[0].number if first is None else first
-            )
+            returned = self.launcher.launch(jobs, initial_job_idx=len(self.task.trials))
         except GsbenchError:
             raise
         except Exception as error:
@@ -105,9 +105,8 @@ class Sweep:
             raise GsbenchError(f"hydra/launcher={name}: {message} (gsbench status tells how far it came)") from error
         self.task.trials += trials
         self.task.outcomes += [_outcome(trial, ended) for trial, ended in zip(trials, returned, strict=True)]
-        return returned
 
-    def _run_until_decided(self, trials: Sequence[Trial]) -> Sequence[JobReturn]:
+    def _run_until_decided(self, trials: Sequence[Trial]) -> None:
         """Run the trials in planned looks, and no further ones of pairs of arms that are decided.
 
         The launcher must wait for what it runs. Raises InputError for a sweep that cannot be looked at so.
@@ -115,32 +114,21 @@ class Sweep:
         stopping = plan_sweep(trials)
         if self.task.look_only:
             print(stopping.describe())
-            return self.launch(trials)
+            self.launch(trials)
         make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
         stopping = replace(stopping, declaration=declare_questions(stopping.home, stopping.declaration))
-        returned: list[JobReturn] = []
         launched: set[Path] = set()
 
         def run(planned: Sequence[Planned]) -> None:
             batch = [trial for key in planned if (trial := stopping.trials[key]).folder not in launched]
             launched.update(trial.folder for trial in batch)
             if batch:
-                returned.extend(self.launch(batch, first=len(returned)))
+                self.launch(batch)
 
         for verdict in run_looks(stopping.declaration, stopping.judged, run):
             log.info("%s", headline(verdict))
         spared = [trial for trial in trials if trial.folder not in launched and not (trial.folder / RESULTS).exists()]
         log.info("%d of %d trials were not needed", len(spared), len(trials))
-        return returned
-
-
-def trials_of_jobs(
-    task: TaskFunction, context: HydraContext, config: DictConfig, jobs: Sequence[Sequence[str]], first: int
-) -> list[Trial]:
-    """The trials of a sweep's jobs, with what the command line permits."""
-    assert isinstance(task, Task)
-    config.allow_targets = list(task.allowed)
-    return compose_jobs(context, config, jobs, first)
 
 
 def _outcome(trial: Trial, returned: JobReturn) -> Outcome:

@@ -181,22 +181,18 @@ def tuned_jobs(
     tuned = {search.arm: search for search in searches if search.ranges}
     if begun.task.look_only:
         print(_describe(searches))
-    if not _search(begun, list(tuned.values()), first=len(jobs)):
+    if not _search(begun, list(tuned.values())):
         print("what it will choose is not known yet: the arms are listed as they are")
         return untuned
     chosen = {arm: _best_words(search) for arm, search in tuned.items()}
     return [[*job, *chosen.get(trial.folder.parent.name, ())] for job, trial in zip(jobs, trials, strict=True)]
 
 
-def _search(begun: Sweep, searches: Sequence[Search], first: int) -> bool:
-    """Propose, train and judge the points of all arms side by side; False where that is only looked at, and not done.
-
-    ``first`` is the number of the first job.
-    """
+def _search(begun: Sweep, searches: Sequence[Search]) -> bool:
+    """Propose, train and judge the points of all arms side by side; False where one is only looked at, and missing."""
     while asked := [(search, proposal) for search in searches for proposal in search.propose()]:
         words = [search.jobs_of(proposal.params) for search, proposal in asked]
-        trials = begun.trials([job for jobs in words for job in jobs], first)
-        first += len(trials)
+        trials = begun.trials([job for jobs in words for job in jobs])
         of_points = [[trials.pop(0) for _ in jobs] for jobs in words]
         missing = [
             trial

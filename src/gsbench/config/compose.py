@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import copy
 import os
-import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import hydra
-import hydra.utils
 import yaml
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from gsbench.config.command_words import (
@@ -36,24 +33,17 @@ from gsbench.parsing import LOADER, MOST_VALUES
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.own_modules import allow_modules
 
-if TYPE_CHECKING:
-    from gsbench.config.jobs import HydraJob
-
-ASKED = re.compile(r"\$\{hydra:\s*([\w.]+)\s*\}")
-
 
 @dataclass(frozen=True)
 class Trial:
     """A trial as it is asked for: its resolved values, the overrides that give them, and where its files lie.
 
-    ``job`` is what Hydra knows of the trial where it runs as a job of a sweep. One that was ``recorded`` is read from
-    its own ``config.yaml``, and no overrides give it. Raises InputError for values that would make run what their
-    ``allow_targets`` does not name, wherever they come from.
+    One that was ``recorded`` is read from its own ``config.yaml``, and no overrides give it. Raises InputError for
+    values that would make run what their ``allow_targets`` does not name, wherever they come from.
     """
 
     values: dict[str, Any]
     overrides: tuple[str, ...]
-    job: HydraJob | None = field(default=None, compare=False, repr=False)
     recorded: bool = False
 
     def __post_init__(self) -> None:
@@ -144,61 +134,31 @@ def compose_one(overrides: Sequence[str], modules: str | None = None) -> Trial:
         return ready_trial(compose_whole(overrides, modules), overrides)
 
 
-def ready_trial(config: DictConfig, overrides: Sequence[str], job: HydraJob | None = None) -> Trial:
-    """The trial of a composed configuration, checked; ``config`` stays as it is."""
-    return resolved(checked_config(config, overrides), overrides, job)
-
-
-def checked_config(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
-    """Check ``config`` and return the trial's part of it: a copy without Hydra's own node ``hydra``."""
-    with explained(overrides):  # such as an interpolation that leads nowhere
-        trial = without_hydra(config)
-        _check_asked(trial)
-        check(trial)
-    return trial
-
-
-def resolved(config: DictConfig, overrides: Sequence[str], job: HydraJob | None) -> Trial:
-    """The trial of a checked configuration."""
+def ready_trial(config: DictConfig, overrides: Sequence[str]) -> Trial:
+    """The trial of a composed configuration, which stays as it is."""
     with explained(overrides):
-        return Trial(plain(config), tuple(overrides), job)
+        return checked_trial(without_hydra(config), overrides)
+
+
+def checked_trial(config: DictConfig, overrides: Sequence[str]) -> Trial:
+    """The trial of a configuration without Hydra's node, whose values are checked, and converted in place."""
+    with explained(overrides):  # such as an interpolation that leads nowhere
+        check(config)
+        return Trial(plain(config), tuple(overrides))
 
 
 def without_hydra(config: DictConfig) -> DictConfig:
-    """A copy without the node ``hydra``, which stays known to the values that ask for it."""
+    """The trial's part of a composed configuration: a copy without Hydra's own node ``hydra``."""
     trial = copy.deepcopy(config)
-    if "hydra" in trial:  # else Hydra has taken it already, and knows it: it runs the job
+    if "hydra" in trial:  # else Hydra has taken it already: it runs the job
         with open_dict(trial):
             del trial["hydra"]
-        if asks_hydra(trial):
-            HydraConfig.instance().set_config(config)
     return trial
 
 
 def has_part(config: DictConfig, key: str) -> bool:
     """Return whether a configuration has the part ``key``, with dots."""
     return OmegaConf.select(config, key) is not None
-
-
-def asks_hydra(trial: DictConfig) -> bool:
-    """Return whether a value asks Hydra (``${hydra:…}``): such a value differs from trial to trial, or may."""
-    return "${hydra" in raw_text(trial)
-
-
-def raw_text(config: DictConfig) -> str:
-    """All that stands in a configuration, before any ``${…}`` is resolved."""
-    return repr(OmegaConf.to_container(config, resolve=False))
-
-
-def _check_asked(trial: DictConfig) -> None:
-    """Refuse ``${hydra:…}`` for what is not known yet, which Hydra would make None or nothing in a text."""
-    config: Any = HydraConfig.instance().cfg
-    for path in ASKED.findall(raw_text(trial)):
-        parent, _, key = f"hydra.{path}".rpartition(".")
-        node = OmegaConf.select(config, parent)
-        if path == "runtime.output_dir" or OmegaConf.is_missing(node, key):
-            reason = "a job has it only in a sweep: add -m" if path.startswith("job.") else "it is known in a job only"
-            raise InputError(f"${{hydra:{path}}}: {reason}")
 
 
 def options_text(folders: Sequence[Path] = ()) -> str:

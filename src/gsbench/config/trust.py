@@ -12,7 +12,7 @@ from __future__ import annotations
 import importlib
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +63,7 @@ HYDRAS_CALLBACKS = tuple(
     f"hydra.experimental.callbacks.{name}" for name in ("LogJobReturnCallback", "PickleJobInfoCallback")
 )
 MADE_BY_HYDRA = ("callbacks", "launcher", "sweeper")  # nodes below `hydra` of which Hydra makes objects
+PLUGINS = ("GsbenchLauncher", "BasicLauncher", "JoblibLauncher", "GsbenchSweeper")  # the classes that it may make
 # Resolvers that make texts and numbers. Those that make mappings of texts (oc.create, oc.decode, oc.dict) could make a
 # class's name after it was looked for; others, of plug-ins, could do anything.
 RESOLVERS = ("hydra", "now", "oc.env", "oc.select", "python_version")
@@ -70,7 +71,6 @@ RESOLVERS = ("hydra", "now", "oc.env", "oc.select", "python_version")
 HYDRAS_VALUES = ("${hydra_override_dirname:}", "${hydra_deprecated_override_dirname:}")
 PUBLIC_CLASS = re.compile(rf"{PACKAGE}\.\w+\.[A-Z]\w*")  # known by its name; importing it may take seconds
 NO_LOGGING = {"version": 1, "root": None, "disable_existing_loggers": False}
-SHELL_SETTINGS = ("setup", "python", "srun_args", "additional_parameters")  # of submitit's launchers: lines and options
 # Settings that a file's sweep may not give its jobs: the look at the whole comes before these are composed.
 NOT_SWEPT = re.compile(rf"[\s+~]*(hydra|{PERMISSIONS})\s*([./@:=\[]|$)")
 
@@ -191,25 +191,18 @@ def check_composed(config: DictConfig, allowed: Sequence[str]) -> None:
     for place, target in targets_in(raw):
         _check_place(place, target, allowed, known)
     if "hydra" in raw:  # else Hydra has taken it already: it runs the job
-        _check_hydra(raw["hydra"], allowed, known)
+        _check_hydra(raw["hydra"], allowed)
         _check_copies(config, raw["hydra"])
 
 
-def known_plugins() -> dict[str, set[str]]:
-    """The settings of each launcher and sweeper that is installed, by the import path of its class."""
-    from hydra.core.config_store import ConfigNode, ConfigStore
+def known_plugins() -> set[str]:
+    """The import paths of the launchers and of the sweeper that gsbench works with, as far as they are installed."""
     from hydra.core.plugins import Plugins
     from hydra.plugins.launcher import Launcher
     from hydra.plugins.sweeper import Sweeper
 
-    known: dict[str, set[str]] = {}
-    for kind in (Launcher, Sweeper):
-        known |= {f"{found.__module__}.{found.__name__}": set() for found in Plugins.instance().discover(kind)}
-    for group in ("launcher", "sweeper"):
-        for entry in ConfigStore.instance().repo.get("hydra", {}).get(group, {}).values():
-            if isinstance(entry, ConfigNode) and (target := entry.node.get(TARGET)) in known:
-                known[target] |= {str(key) for key in entry.node}
-    return known
+    every = [found for kind in (Launcher, Sweeper) for found in Plugins.instance().discover(kind)]
+    return {f"{found.__module__}.{found.__name__}" for found in every if found.__name__ in PLUGINS}
 
 
 def _entries(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str, Any]]:
@@ -231,6 +224,8 @@ def _check_interpolation(place: tuple[str, ...], key: str, value: str) -> None:
     except GrammarParseError:  # nothing can be made of it; Hydra says so where somebody asks for the value
         return
     for name in resolvers:
+        if name == "hydra" and place[:1] != ("hydra",):
+            raise InputError(f"{where}={value}: a trial has its settings from gsbench, so none may ask Hydra")
         if name not in RESOLVERS:
             raise InputError(f"{where}={value}: ${{{name}:…}} is not resolved here, only {', '.join(RESOLVERS)}")
 
@@ -243,14 +238,15 @@ def _resolvers(tree: Any) -> Iterator[str]:
         yield from _resolvers(child)
 
 
-def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str], plugins: Mapping[str, set[str]]) -> None:
+def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str], plugins: Collection[str]) -> None:
     """Refuse a class at a ``place``: Hydra imports what a name leads to, and calls it."""
     group = ".".join(place)
     if not isinstance(target, str) or target == "???":
         return  # a schema or Hydra says what is wrong with it, and nothing can be made of it
     if place in (("hydra", "launcher"), ("hydra", "sweeper")):
         if target not in plugins:
-            raise InputError(f"{group}.{TARGET}={target} is no {place[-1]} that is installed")
+            known = "basic and joblib, beside gsbench's own" if place[-1] == "launcher" else "gsbench's own alone"
+            raise InputError(f"{group}.{TARGET}={target} is no {place[-1]} that gsbench works with: {known}")
         return
     # Of gsbench's own classes each is for its group: `densify._target_=gsbench.init.…` would run another's constructor.
     own = HYDRAS_CALLBACKS if place[:2] == ("hydra", "callbacks") and len(place) == 3 else homes_of(place)
@@ -259,7 +255,7 @@ def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str], pl
         load_class(target, group, allowed)  # such as gsbench.densify.adc.torch.load
 
 
-def _check_hydra(hydra: Any, allowed: Sequence[str], plugins: Mapping[str, set[str]]) -> None:
+def _check_hydra(hydra: Any, allowed: Sequence[str]) -> None:
     """Refuse of Hydra's own settings what starts code other than by naming a class."""
     for name in ("job", "job.env_set", "job_logging", "hydra_logging", *MADE_BY_HYDRA):
         node = hydra
@@ -267,6 +263,8 @@ def _check_hydra(hydra: Any, allowed: Sequence[str], plugins: Mapping[str, set[s
             node = node.get(key) if isinstance(node, dict) else node
         if isinstance(node, str):
             raise InputError(f"hydra.{name}={node}: write the settings themselves here, as ${{…}} may become others")
+    if hydra.get("verbose"):
+        raise InputError("hydra.verbose: leave it out, since log.txt in a trial's folder holds everything")
     # logging's configuration names classes and functions ("class", "()", "ext://") that are called
     for group in ("job_logging", "hydra_logging"):
         if {**NO_LOGGING, **(hydra.get(group) or {})} != NO_LOGGING:
@@ -284,29 +282,6 @@ def _check_hydra(hydra: Any, allowed: Sequence[str], plugins: Mapping[str, set[s
                 raise InputError(
                     f"{'.'.join(place)}: {text} cannot differ from job to job, and no file can allow it: type it"
                 )
-    launcher = hydra.get("launcher") or {}
-    for place, key, value in _entries(launcher, ("hydra", "launcher")):
-        if isinstance(value, str) and not value.isprintable():  # a line break would begin a command in Slurm's script
-            raise InputError(f"{'.'.join((*place, key))} must be one line, got {value!r}")
-    _check_launcher(launcher, allowed, plugins)
-
-
-def _check_launcher(launcher: dict[str, Any], allowed: Sequence[str], plugins: Mapping[str, set[str]]) -> None:
-    """Refuse of a launcher's settings those that reach a shell, and those that its plug-in does not know.
-
-    submitit's hand the latter on to Slurm's script under their names, lines for a shell among them (``teardown``).
-    """
-    known = plugins.get(launcher.get(TARGET, ""), set())
-    for key, value in launcher.items():
-        if SHELL in allowed or not value or key == TARGET:
-            continue
-        if key in SHELL_SETTINGS:
-            why = "runs in a shell"
-        elif key not in known:
-            why = "is no setting that this launcher lists, and may run in a shell"
-        else:
-            continue
-        raise InputError(f"hydra.launcher.{key}={value!r} {why}; if you trust it, {to_type([SHELL], allowed)}")
 
 
 def _check_copies(config: DictConfig, hydra: dict[str, Any]) -> None:

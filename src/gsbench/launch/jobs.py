@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsbench.config.compose import Trial
-from gsbench.config.jobs import HydraJob
 from gsbench.files import require_own
 from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.queue import forget_submission
@@ -49,7 +48,6 @@ class TrialJob:
     path: list[str]  # sys.path of the submitting process
     own: dict[str, str]  # the user's modules that it may import, and where they lie
     visible_gpus: str | None  # its CUDA_VISIBLE_DEVICES
-    job: HydraJob | None = None
 
     def __call__(self) -> Outcome:
         sys.path[:] = [*self.path, *(entry for entry in sys.path if entry not in self.path)]
@@ -69,7 +67,7 @@ class TrialJob:
 
                 # Where the sweep's process runs here, it mirrors all of its trials.
                 mirror = stack.enter_context(Mirror(idle=launch["name"] == "local"))
-                outcome = run_one(Trial(self.values, (), self.job), mirror, wait=True)
+                outcome = run_one(Trial(self.values, ()), mirror, wait=True)
                 if launch["name"] == "slurm":
                     with suppress(OSError):
                         forget_submission(outcome.folder)
@@ -186,5 +184,4 @@ class _Outcomes(pickle.Unpickler):
 def job_of(trial: Trial) -> TrialJob:
     """The trial as a job of the environment that this process has."""
     path = [entry for entry in sys.path if entry]
-    job = trial.job if trial.job is not None and trial.job.has_effect else None
-    return TrialJob(trial.values, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"), job)
+    return TrialJob(trial.values, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"))

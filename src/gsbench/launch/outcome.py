@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,7 +12,6 @@ from gsbench.runs.layout import LOG
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 
-OBJECTIVE = "psnr"  # what a trial returns to Hydra's sweepers
 Status = Literal["done", "failed", "queued"]
 
 
@@ -29,7 +27,6 @@ class Outcome:
     message: str = ""
     bad_input: bool = False
     fatal: bool = False  # no other trial can succeed either
-    metrics: Mapping[str, float] | None = None  # of a trial that is done
 
     @property
     def label(self) -> str:
@@ -39,7 +36,7 @@ class Outcome:
 def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:
     """The outcome of a trial that is complete."""
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
-    return Outcome(folder, "done", metrics, metrics=results.metrics)
+    return Outcome(folder, "done", metrics)
 
 
 def outcome_of_error(folder: Path, error: Exception) -> Outcome:
@@ -48,8 +45,3 @@ def outcome_of_error(folder: Path, error: Exception) -> Outcome:
         return Outcome(folder, "failed", str(error), isinstance(error, InputError), isinstance(error, DiskFullError))
     text = f"{type(error).__name__}: {error}".splitlines()[0]
     return Outcome(folder, "failed", f"{text}; the traceback is in {folder / LOG}")
-
-
-def objective(metrics: Mapping[str, float]) -> float | None:
-    """The values that a trial with these metrics returns to Hydra's sweepers and callbacks."""
-    return metrics.get(OBJECTIVE)

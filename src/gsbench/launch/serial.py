@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from functools import partial
 
 from gsbench.config.compose import Trial
-from gsbench.launch.outcome import Outcome, objective, outcome_of_error, outcome_of_results
-from gsbench.runs.layout import LOCK
-from gsbench.runs.trial_folder import TrialFolder
+from gsbench.launch.outcome import Outcome, outcome_of_error, outcome_of_results
 from gsbench.runs.trial_record import TrialRecord
-from gsbench.system.locks import BusyError, describe_holder, is_held
+from gsbench.system.locks import BusyError
 from gsbench.tracking import Mirror
 
 log = logging.getLogger(__name__)
@@ -37,18 +34,12 @@ def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
 
 def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
     """Run one trial; only BusyError, and what ends the program, is raised."""
-    folder = trial.folder
     try:
-        if trial.job is None or not trial.job.has_effect:
-            return outcome_of_results(folder, _run(trial, mirror, wait))
-        if not wait and is_held(folder / LOCK):  # before Hydra's callbacks hear of a start
-            raise BusyError(f"{TrialFolder(folder).label}: {describe_holder(folder / LOCK)} is at it")
-        results = trial.job.run(partial(_run, trial, mirror, wait), lambda results: objective(results.metrics))
-        return outcome_of_results(folder, results)
+        return outcome_of_results(trial.folder, _run(trial, mirror, wait))
     except BusyError:
         raise
     except Exception as error:  # noqa: BLE001 - a failed trial does not stop the others
-        return outcome_of_error(folder, error)
+        return outcome_of_error(trial.folder, error)
 
 
 def _run(trial: Trial, mirror: Mirror, wait: bool) -> TrialRecord:
