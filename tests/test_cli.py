@@ -21,8 +21,7 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.launch.plan import add_to_plan
-from gsbench.runs.explain_cache import explain_steps
-from gsbench.runs.stages import EVALUATE, INIT, TRAIN, Step
+from gsbench.runs.stages import TRAIN, Step
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.stopping import Stopped
@@ -215,31 +214,7 @@ def test_sog_names_the_program_that_writes_it(
     assert "`splat-transform a.ply a.compressed.ply`" in capsys.readouterr().err
 
 
-# ---- explain --stale, ui, doctor
-
-
-def test_stale_names_the_fields_that_differ(tmp_path: Path) -> None:
-    store = Store(tmp_path / "store")
-
-    def nothing(folder: Path) -> None:
-        pass
-
-    asked = [
-        Step(INIT, {"capture": "c", "options": {"seed": 0}}, nothing),
-        Step(TRAIN, {"densify": {"volume_threshold": 0.5, "stop": 100}, "seed": 0}, nothing),
-        Step(EVALUATE, {"train": "t"}, nothing),
-    ]
-    store.get(asked[0])
-    store.get(Step(TRAIN, {"densify": {"volume_threshold": 0.03, "stop": 100}, "seed": 0}, nothing))
-    store.get(Step(TRAIN, {"densify": {"volume_threshold": 0.03, "stop": 90}, "seed": 7}, nothing))
-    lines = explain_steps(asked, store)
-    assert lines[0].split()[0] == "init"
-    assert "in the store" in lines[0]
-    assert "not in the store" in lines[1]
-    assert lines[2] == "    densify.volume_threshold: 0.03 there, 0.5 wanted"
-    assert lines[4] == "    the store has no result of evaluate yet"
-    (store.path(asked[0]) / "manifest.json").write_text("{")
-    assert "damaged: manifest.json is missing or unreadable" in explain_steps(asked, store)[0]
+# ---- ui, doctor
 
 
 def test_ui_needs_a_database(capsys: pytest.CaptureFixture[str]) -> None:

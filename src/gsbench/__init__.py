@@ -2,7 +2,6 @@
 
 import os
 import sys
-import time
 import warnings
 
 if sys.argv[:1] == ["-m"] and {"gsbench", "gsbench.cli"} & set(sys.orig_argv) and not sys.flags.safe_path:
@@ -16,5 +15,4 @@ if "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ:
     warnings.warn("torch was imported first, so its idle threads spin: import gsbench before it", stacklevel=2)
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-IMPORTED_AT = time.time_ns()  # when this process began to load this package
 __version__ = "0.1.0"

@@ -13,8 +13,19 @@ import pytest
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.claims.archive import write_archive
-from gsbench.claims.bisect import SPARE, first_worse, most_steps
-from gsbench.claims.gate import NOT_DECIDED, PASSED, WORSE, Gate, ask, describe, deviations, result_of
+from gsbench.claims.gate import (
+    NOT_DECIDED,
+    PASSED,
+    SPARE,
+    WORSE,
+    Gate,
+    ask,
+    describe,
+    deviations,
+    first_worse,
+    most_steps,
+    result_of,
+)
 from gsbench.claims.stopping import run_looks
 from gsbench.cli import run
 from gsbench.errors import InputError

@@ -122,9 +122,9 @@ def test_renders_stand_in_the_table_with_a_verdict(
     (runs / "mlflow.db").unlink()  # a copy of a runs folder has the database of where it was
     for words in (["status", "small"], ["explain", "small:courtyard:psnr:theirs"], ["sync", "small"]):
         assert run(words) == 0
-    for words in (["view"], ["export", "--out", "x.ply"], ["explain", "--stale"]):
+    for words in (["view"], ["export", "--out", "x.ply"]):
         capsys.readouterr()
-        assert run([*words, str(entered) if "--stale" in words else "small:courtyard:theirs"]) == 2
+        assert run([*words, "small:courtyard:theirs"]) == 2
         assert "renders" in capsys.readouterr().err
 
 

@@ -6,7 +6,6 @@ import hashlib
 import importlib
 import shutil
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from gsbench.runs.code import (
     PACKAGE,
     ROOMS,
     changed_rooms,
-    changed_while_running,
+    changed_since_asked,
     edited,
     has_changed_since_import,
     module_digest,
@@ -56,7 +55,6 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A copy of gsbench that is not the one that runs, without files of a release, read as by a new process."""
     copy = shutil.copytree(PACKAGE, tmp_path / "gsbench", ignore=shutil.ignore_patterns("__pycache__", "*.json"))
     monkeypatch.setattr(code, "PACKAGE", copy)
-    monkeypatch.setattr(code, "IMPORTED_AT", time.time_ns() + 10**12)
     again()
     yield copy
     again()
@@ -64,7 +62,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def again() -> None:
     """As in another process."""
-    for cached in (code._released, code._state, code._files):
+    for cached in (code._released, code._state, code._noted):
         cached.cache_clear()
 
 
@@ -154,28 +152,12 @@ def test_where_all_is_as_released_nothing_is_in_the_key(package: Path, monkeypat
     assert changed_rooms(released) == []
 
 
-def test_an_edit_of_what_is_loaded_is_taken_for_unknown(
-    package: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    before = states_of(["train"])
-    (package / "train" / "loss.py").touch()
-    monkeypatch.setattr(code, "IMPORTED_AT", time.time_ns() - 10**9)
-    monkeypatch.setitem(sys.modules, "gsbench.train.loss", sys)
-    again()
-    assert changed_rooms(before) == ["train"]
-    assert "was edited when it had been loaded" in caplog.text
-
-
-def test_what_is_loaded_after_an_edit_is_told(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "gsbench.train.journal", raising=False)
-    monkeypatch.setitem(sys.modules, "gsbench.train.loss", sys)
-    states_of(["train"])
-    changed_while_running(["train"], in_processes=False)
-    for name in ("loss.py", "journal.py"):
-        with (package / "train" / name).open("a") as file:
-            file.write("MORE = 1\n")
-    assert changed_while_running(["train"], in_processes=False) == ["train/journal.py"]
-    assert changed_while_running(["train"], in_processes=True) == ["train/journal.py", "train/loss.py"]
+def test_an_edit_while_this_process_works_is_told(package: Path) -> None:
+    states_of(["train", "scene"])
+    assert changed_since_asked(["train", "scene"]) == []
+    with (package / "train" / "loss.py").open("a") as file:
+        file.write("MORE = 1\n")
+    assert changed_since_asked(["train", "scene"]) == ["train"]
 
 
 # ---- the user's code

@@ -10,7 +10,7 @@ import os
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,14 +18,13 @@ from typing import Annotated
 from pydantic import AfterValidator
 
 from gsbench.config.compose import Trial
-from gsbench.errors import GsbenchError
 from gsbench.files import require_own, write_json
 from gsbench.launch.finished import FinishedTrials
 from gsbench.launch.queue import ask_queue, state_in_queue
 from gsbench.parsing import DamagedError
 from gsbench.records import Amount, Record, read_typed
 from gsbench.runs.experiments import make_home
-from gsbench.runs.layout import PLAN, RESULTS, STORE
+from gsbench.runs.layout import PLAN, RESULTS
 from gsbench.settings import is_folder_name
 from gsbench.system.locks import hold
 from gsbench.words import counted, readable_time
@@ -121,33 +120,12 @@ def _write(home: Path, trials: dict[Path, PlannedTrial]) -> None:
 # ---- what a dry run says
 
 
-def _stage_finder(trials: Sequence[Trial]) -> Callable[[Trial], list[str]]:
-    """A function that tells which stages of a trial are in the store; loads torch only where there is such a store."""
-    store = trials[0].files.runs / STORE
-    if not store.is_dir():
-        return lambda trial: []
-    from gsbench.pipeline.parts import Parts
-    from gsbench.pipeline.wiring import StepFinder
-    from gsbench.runs.store import Store
-
-    finder = StepFinder(Store(store))
-
-    def built(trial: Trial) -> list[str]:
-        try:
-            return finder.built_stages(Parts(trial.values))
-        except GsbenchError:  # what is missing here is named elsewhere, or known where the trial will run
-            return []
-
-    return built
-
-
 def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
     """Lines for ``--dry-run``: each trial with its state, and the time that the unfinished ones will take."""
     lines: list[str] = []
     remaining, unknown, learned = 0.0, 0, 0
     counts: Counter[str] = Counter()
     finished = FinishedTrials(trials[0].files.runs)
-    built_stages = _stage_finder(trials)
     queue = ask_queue(trial.folder for trial in trials)
     for trial in trials:
         folder = trial.files
@@ -166,8 +144,6 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
             remaining += estimate.seconds * (1 - min(1.0, done))
             learned = max(learned, estimate.learned_from)
             unknown += estimate.learned_from == 0
-            if built := built_stages(trial):
-                note = f"  the store has its {', '.join(built)}"
         counts[state] += 1
         lines.append(f"{state:<8} {folder.label}{note}")
     summary = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])

@@ -36,7 +36,7 @@ from gsbench.init.base import Initializer
 from gsbench.pipeline.steps.inputs import UserCode
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.raster.executors import AUTO, offers, resolve
-from gsbench.runs.code import OWN, has_changed_since_import, module_digest, unnamed_modules, user_modules
+from gsbench.runs.code import OWN, module_digest, unnamed_modules, user_modules
 from gsbench.runs.declaration import metric_and_question
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import checked, unknown_setting
@@ -287,10 +287,8 @@ def locate(target: str, group: str, allow_targets: list[str]) -> type:
     if target.startswith(OWN):
         return found
     module, named = target.split(".")[0], {name.split(".")[0] for name in allow_targets}
-    if module_digest(module) is None:
+    if module_digest(module) is None:  # the first call notes the files as they are, while they are what runs
         log.warning("no file of %s was found: results do not know its version", target)
-    if has_changed_since_import(module):  # the first call notes the files as they are, while they are what runs
-        log.warning("the code of %s has changed since it was imported: this process goes on with what it was", target)
     if unnamed := unnamed_modules(before, {module, *named}):
         words = ", ".join(unnamed)
         log.warning("%s imports %s, whose versions results do not know: name them in allow_targets too", target, words)

@@ -1,13 +1,8 @@
-"""The one place that wires a trial: its steps in order, from its parts.
-
-A run builds the steps, ``--dry-run`` and ``explain --stale`` only ask for their keys.
-"""
+"""The one place that wires a trial: its steps in order, from its parts."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from collections.abc import Iterator
 
 from gsbench.init import Sfm
 from gsbench.pipeline.parts import Parts
@@ -18,7 +13,6 @@ from gsbench.pipeline.steps.scene import CaptureSource, Views, ground_truth_step
 from gsbench.pipeline.steps.train import train_step
 from gsbench.runs.stages import Step
 from gsbench.runs.store import Store
-from gsbench.scene.options import SceneConfig
 from gsbench.scene.types import Capture
 
 
@@ -29,10 +23,8 @@ class TrialSteps:
     capture: Capture  # what the steps look at: without what masks ignore
     views: Views
 
-    def __init__(
-        self, parts: Parts, store: Store, source_of: Callable[[SceneConfig], CaptureSource] = CaptureSource
-    ) -> None:
-        self.parts, self.store, self._source_of = parts, store, source_of
+    def __init__(self, parts: Parts, store: Store) -> None:
+        self.parts, self.store = parts, store
 
     def steps(self) -> Iterator[Step]:
         """The steps in order. A caller that wants results builds each before it asks for the next.
@@ -41,7 +33,7 @@ class TrialSteps:
         fingerprint is known, so where they are not in the store, theirs is the last step.
         """
         parts, store = self.parts, self.store
-        source = self._source_of(parts.scene)
+        source = CaptureSource(parts.scene)
         made = source.step
         if made is not None:
             yield made
@@ -64,23 +56,3 @@ class TrialSteps:
         yield trained
         yield ground_truth_step(self.views)
         yield evaluate_step(self.views, trained, parts)
-
-
-class StepFinder:
-    """Finder of the steps of trials that are in the store; reads the photographs of a scene once for all of them."""
-
-    def __init__(self, store: Store) -> None:
-        self.store = store
-        self._sources: dict[str, CaptureSource] = {}
-
-    def built_stages(self, parts: Parts) -> list[str]:
-        """The stages of the trial with these parts whose results are there, up to the first that is not."""
-        built = []
-        for step in TrialSteps(parts, self.store, self._source_of).steps():
-            if self.store.find(step) is None:
-                break
-            built.append(step.stage.name)
-        return built
-
-    def _source_of(self, options: SceneConfig) -> CaptureSource:
-        return self._sources.setdefault(json.dumps(asdict(options)), CaptureSource(options))

@@ -10,18 +10,14 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib.util
-import logging
 import sys
 import sysconfig
-import uuid
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cache
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any
 
-from gsbench import IMPORTED_AT
 from gsbench.files import write_json
 from gsbench.parsing import DamagedError, read_json
 
@@ -49,18 +45,7 @@ VIEWS_ROOMS = ("scene",)  # of the prepared photographs beside the store
 INSTALLED = frozenset({"site-packages", "dist-packages"})  # folders of packages that are known by their versions
 CODE_SUFFIXES = frozenset({".py", ".so", ".pyd", ".c", ".cpp", ".cu", ".h", ".cuh"})
 
-log = logging.getLogger(__name__)
-
-
 # ---- gsbench's own code
-
-
-@dataclass(frozen=True)
-class _File:
-    """A file of gsbench as it was when this process first asked."""
-
-    digest: str
-    loaded: bool  # whether this process had run it by then
 
 
 def states_of(rooms: Iterable[str]) -> dict[str, str]:
@@ -78,43 +63,24 @@ def changed_rooms(recorded: Mapping[str, str]) -> list[str]:
     return [room for room, state in recorded.items() if _state(room) != state]
 
 
-def changed_while_running(rooms: Iterable[str], in_processes: bool) -> list[str]:
-    """The files of ``rooms`` that may have run in another state than was noted: they were edited, then loaded.
+def changed_since_asked(rooms: Iterable[str]) -> list[str]:
+    """The rooms whose files are other ones than when their state was first asked for."""
+    return [room for room in rooms if _digest(_contents(room)) != _noted(room)]
 
-    With ``in_processes``, the work was done in processes of their own, which load all anew.
-    """
-    changed = set()
-    for room in rooms:
-        now = {name: hashlib.sha256(content).hexdigest() for name, content in _contents(room).items()}
-        noted = _files(room)
-        for name in now.keys() | noted.keys():
-            file = noted.get(name)
-            if (file is None or in_processes or not file.loaded) and now.get(name) != (file and file.digest):
-                changed.add(name)
-    return sorted(changed)
+
+@cache
+def _noted(room: str) -> str:
+    """The digest of a room's files as they were when this process first asked."""
+    return _digest(_contents(room))
 
 
 @cache
 def _state(room: str) -> str:
-    contents, released = _contents(room), _released().get(room) or {}
-    for name, file in _files(room).items():
-        if file.loaded and (PACKAGE / name).stat().st_mtime_ns > IMPORTED_AT:
-            log.warning(
-                "gsbench's %s was edited when it had been loaded: start again, else it is unknown what ran", name
-            )
-            return uuid.uuid4().hex[:DIGEST_CHARACTERS]
-    if released.get("bytes") == _digest(contents):  # as nearly always where gsbench is installed: nothing is parsed
+    released, noted = _released().get(room) or {}, _noted(room)
+    if released.get("bytes") == noted:  # as nearly always where gsbench is installed: nothing is parsed
         return AS_RELEASED
-    digest = _digest({name: syntax_of(content) for name, content in contents.items()})
+    digest = _digest({name: syntax_of(content) for name, content in _contents(room).items()})
     return AS_RELEASED if digest == released.get("syntax") else digest
-
-
-@cache
-def _files(room: str) -> dict[str, _File]:
-    return {
-        name: _File(hashlib.sha256(content).hexdigest(), _module(name) in sys.modules)
-        for name, content in _contents(room).items()
-    }
 
 
 def _contents(room: str) -> dict[str, bytes]:
@@ -122,10 +88,6 @@ def _contents(room: str) -> dict[str, bytes]:
     place = PACKAGE / room
     files = [place] if place.suffix else sorted(place.rglob("*.py"))
     return {file.relative_to(PACKAGE).as_posix(): file.read_bytes() for file in files if file.is_file()}
-
-
-def _module(file: str) -> str:
-    return f"{PACKAGE.name}.{file.removesuffix('.py').removesuffix('/__init__').replace('/', '.')}"
 
 
 def _digest(contents: Mapping[str, bytes]) -> str:

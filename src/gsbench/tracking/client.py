@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import getpass
+import json
 import logging
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from filelock import FileLock
 
@@ -167,3 +169,48 @@ def _create_sqlite(uri: str) -> None:
     with atomic(Path(name)) as temporary:
         store = SqlAlchemyStore(f"sqlite:///{temporary}", str(Path(name).parent / ARTIFACTS))
         store.engine.dispose()
+
+
+# ---- the page that compares the trials of an experiment: final metrics first
+#
+# MLflow draws one chart for each metric, in alphabetical sections, the final ones last. A view that is shared under a
+# name is a tag of its experiment, from which the page takes sections, charts and columns. An MLflow that cannot read
+# the tag shows its own page.
+
+VIEW = "gsbench"  # the name of the view
+VIEW_TAG = f"mlflow.sharedViewState.{VIEW}"
+SECTION = "Final metrics"
+BARS = ("psnr", "ssim", "lpips_vgg_raw", "lpips_vgg", "flip", "num_gaussians", "seconds_train")
+COLUMNS = ("arm", "scene.name", "seed")  # parameters, beside the runs
+MAX_RUNS = 100
+
+
+def comparison_url(base: str, client: MlflowClient, experiment_id: str) -> str:
+    """The page's address on the server ``base``; the experiment is given its view, if it lacks it."""
+    wanted = json.dumps(_view(), separators=(",", ":"))
+    if client.get_experiment(experiment_id).tags.get(VIEW_TAG) != wanted:
+        client.set_experiment_tag(experiment_id, VIEW_TAG, wanted)
+    ordered = f"orderByKey={quote('params.`arm`')}&orderByAsc=true"
+    words = f"viewStateShareKey={VIEW}&compareRunsMode=CHART&workflowType=machine_learning&{ordered}"
+    return f"{base}/#/experiments/{experiment_id}/runs?{words}"
+
+
+def _view() -> dict[str, Any]:
+    charts = [_chart("BAR", key, metricKey=key, displayName=key) for key in BARS]
+    charts.append(
+        _chart("PARALLEL", "all", selectedParams=["arm"], selectedMetrics=["num_gaussians", "psnr"], showAllRuns=True)
+    )
+    section = {"uuid": VIEW, "name": SECTION, "display": True, "isReordered": True, "deleted": False}
+    return {
+        "compareRunSections": [section],
+        "compareRunCharts": charts,
+        "isAccordionReordered": True,  # else sections are sorted by name
+        "hideEmptyCharts": True,
+        "runsHiddenMode": "SHOW_ALL",  # else charts show the ten youngest runs, and the baseline is mostly the oldest
+        "selectedColumns": [f"params.`{name}`" for name in COLUMNS] + [f"metrics.`{name}`" for name in BARS],
+    }
+
+
+def _chart(kind: str, name: str, **settings: Any) -> dict[str, Any]:
+    common = {"runsCountToCompare": MAX_RUNS, "metricSectionId": VIEW, "deleted": False, "isGenerated": False}
+    return {"type": kind, "uuid": f"{VIEW}-{name}"} | common | settings

@@ -23,7 +23,7 @@ VERBS = {
         "one answer from the results of many, which export --results wrote",
     ),
     "site": ("gsbench.verbs.site", "a static site from archives: tables that sort, verdicts, reports"),
-    "explain": ("gsbench.verbs.explain", "how a table's number came about; with --stale, why a stage is computed anew"),
+    "explain": ("gsbench.verbs.explain", "how a table's number came about"),
     "status": ("gsbench.verbs.status", "what an experiment has done, runs, failed and misses"),
     "retry": ("gsbench.verbs.retry", "run what failed, was stopped or is missing of an experiment"),
     "bench": ("gsbench.verbs.bench", "time rasterizers and the training step"),

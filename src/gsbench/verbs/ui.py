@@ -51,8 +51,7 @@ def address_of(base: str, uri: str, runs: Path, experiment: str | None) -> str:
 
     Raises InputError where there is none of that name. Where there is none at all, it is the address of the list.
     """
-    from gsbench.tracking import connect
-    from gsbench.tracking.comparison import comparison_url
+    from gsbench.tracking.client import comparison_url, connect
 
     client = connect(uri, runs)
     known = {each.name: each for each in client.search_experiments(order_by=["last_update_time DESC"])}

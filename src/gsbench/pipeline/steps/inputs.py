@@ -12,7 +12,7 @@ from gsbench.raster import Rasterizer
 from gsbench.runs.code import (
     OWN,
     ROOMS,
-    changed_while_running,
+    changed_since_asked,
     edited,
     has_changed_since_import,
     states_of,
@@ -85,14 +85,15 @@ def step_of(
     states = states_of(rooms)
 
     def check() -> None:
-        late = [f"gsbench's {file}" for file in changed_while_running(rooms, in_processes)]
-        if in_processes:
-            late += [f"the code of {name}" for name in user.modules if has_changed_since_import(name)]
+        late = [f"gsbench's {room}" for room in changed_since_asked(rooms)]
+        late += [f"the code of {name}" for name in user.modules if has_changed_since_import(name)]
         if late:
             raise InputError(f"{', '.join(late)} changed while {stage.name} ran, which may have used both: start again")
 
     changed = edited(states)
-    return Step(stage, inputs | ({"code": changed} if changed else {}), build, states, check)
+    every = inputs | ({"code": changed} if changed else {})
+    # What this process has imported stays as it was; processes that a build starts import what is there then.
+    return Step(stage, every, build, states, check) if in_processes else Step(stage, every, build, states)
 
 
 def _plain(value: Any) -> Any:
