@@ -15,8 +15,8 @@ from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import Trial
 from gsbench.launch.declare import declare, declared_metrics, planned_trials
-from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
+from gsbench.launch.serial import Outcome, outcome_of_results
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.layout import CONFIG, RESULTS
 from gsbench.runs.trial_record import record_from

@@ -22,8 +22,8 @@ from gsbench.app.tuning import TuneSettings
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError
 from gsbench.launch.declare import declare, declared_metrics, planned_trials
-from gsbench.launch.outcome import Outcome, outcome_of_error, outcome_of_results
 from gsbench.launch.plan import add_to_plan
+from gsbench.launch.serial import Outcome, outcome_of_error, outcome_of_results
 from gsbench.runs.declaration import Arm
 from gsbench.runs.layout import CONFIG, RESULTS
 from gsbench.runs.trial_record import record_from

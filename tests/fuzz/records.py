@@ -29,8 +29,8 @@ from gsbench.analysis.table_formats import to_html
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.tuning import tuning_lines
 from gsbench.errors import InputError
-from gsbench.launch import queue
-from gsbench.launch.finished import FinishedTrials
+from gsbench.launch import states
+from gsbench.launch.dry_run import FinishedTrials
 from gsbench.launch.plan import read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.runs.declaration import read_declarations
@@ -273,7 +273,7 @@ def main(folder: Path, first: int, count: int, only: str | None) -> None:
     runs = folder / "runs"
     shutil.rmtree(runs, ignore_errors=True)
     places = write_original(runs)
-    queue.read_queue = lambda users: {}  # Slurm has no part in this, and may take its time
+    states.read_queue = lambda users: {}  # Slurm has no part in this, and may take its time
     warnings = Noticed()
     logging.getLogger("gsbench").addHandler(warnings)
     logging.getLogger("gsbench").propagate = False

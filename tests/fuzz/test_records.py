@@ -43,7 +43,7 @@ def test_damaged_files_are_left_out_or_read_right(tmp_path: Path) -> None:
 @pytest.fixture
 def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
-    monkeypatch.setattr("gsbench.launch.queue.read_queue", lambda users: {})
+    monkeypatch.setattr("gsbench.launch.states.read_queue", lambda users: {})
     return write_original(tmp_path)
 
 

@@ -13,7 +13,7 @@ import pytest
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.jobs import clouds_first, collect, job_folder
-from gsbench.launch.outcome import Outcome
+from gsbench.launch.serial import Outcome
 
 
 class Bomb:
@@ -39,7 +39,7 @@ def collected(folder: Path, returned: Any) -> Outcome:
 
 
 def test_an_outcome_comes_back(folder: Path) -> None:
-    outcome = Outcome(folder / "trial", "failed", "no luck", bad_input=True, metrics={"psnr": 1.5})
+    outcome = Outcome(folder / "trial", "failed", "no luck", bad_input=True)
     assert collected(folder, ("success", outcome)) == outcome
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 
 from gsbench.config.compose import compose_one
-from gsbench.launch.preflight import borrowed_names, disk_line
+from gsbench.launch.batch import borrowed_names
 
 OWN = "densify._target_=mine.Patient"
 
@@ -29,11 +27,3 @@ def test_a_class_of_ones_own_under_a_name_of_ours_is_told(words: list[str], said
     assert len(lines) == len(said)
     for line, word in zip(lines, said, strict=True):
         assert line.endswith(word)
-
-
-def test_much_disk_for_a_sweep_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=100 * 10**9))
-    trials = [compose_one(["densify=adc", "densify.max_gaussians=3000000"])]
-    assert disk_line(trials * 78).startswith("disk: up to 58 GB for the models of 78 trials, 100 GB are free in ")
-    assert disk_line(trials) == ""
-    assert disk_line([compose_one(["densify=adc", "densify.max_gaussians=null"])] * 10**4) == ""

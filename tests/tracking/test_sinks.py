@@ -13,7 +13,7 @@ from PIL import Image
 
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
-from gsbench.launch.preflight import check_trackers
+from gsbench.launch.batch import check_trackers
 from gsbench.tracking import connect, ensure_experiment
 from gsbench.tracking.mlflow_sink import STATE
 from tests.tracking.helpers import (

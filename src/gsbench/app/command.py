@@ -28,10 +28,9 @@ from gsbench.config.jobs import typed
 from gsbench.config.messages import explained
 from gsbench.config.trust import PERMISSIONS, check_composed, load_callbacks
 from gsbench.errors import GsbenchError, InputError
-from gsbench.launch.batch import run_batch
-from gsbench.launch.outcome import Outcome
-from gsbench.launch.plan import describe_plan
-from gsbench.launch.preflight import check_parts, disk_line, missing_folders, need_no_check
+from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
+from gsbench.launch.dry_run import describe_plan
+from gsbench.launch.serial import Outcome
 from gsbench.logs import set_up_logging
 from gsbench.system.own_modules import allow_modules
 
@@ -161,7 +160,7 @@ def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
     if not need_no_check(trials):
         check_parts(trials, here=False)
     lines = describe_plan(trials, trials[0].values["launch"]["parallel"])
-    print("\n".join([*lines, *filter(None, [disk_line(trials)]), *missing_folders(trials)]))
+    print("\n".join([*lines, *missing_folders(trials)]))
     return []
 
 

@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import logging
+import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from gsbench.config.command_words import options
 from gsbench.config.compose import Trial
+from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.declare import declare, declared_metrics, planned_trials
-from gsbench.launch.outcome import Outcome, outcome_of_results
 from gsbench.launch.plan import add_to_plan
-from gsbench.launch.preflight import (
-    borrowed_names,
-    check_parts,
-    check_trackers,
-    disk_line,
-    missing_folders,
-    missing_weights,
-)
-from gsbench.launch.serial import run_serial
+from gsbench.launch.serial import Outcome, outcome_of_results, run_serial
+from gsbench.runs.code import OWN
 from gsbench.runs.layout import STORE
 from gsbench.runs.stages import STAGES
 from gsbench.runs.store import Store
+from gsbench.system.install import install_command
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking import Mirror
 
@@ -74,9 +71,8 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
     check_parts(unfinished, here=launcher != "slurm")
     if launcher != "slurm":
         check_trackers(unfinished)
-    for line in [*borrowed_names(unfinished), disk_line(unfinished)]:
-        if line:
-            log.warning("%s", line)
+    for line in borrowed_names(unfinished):
+        log.warning("%s", line)
     try:
         make_runs_folder(runs)
     except OSError as error:
@@ -121,3 +117,85 @@ def _unavailable(options: str) -> frozenset[str]:
     from gsbench.pipeline.parts import make_evaluator
 
     return frozenset(make_evaluator(EvalConfig(**json.loads(options))).awaited)
+
+
+# ---- checks before any trial starts: wrong options of components, folders and devices that are not there
+
+
+def missing_folders(trials: Sequence[Trial]) -> list[str]:
+    """A line for each folder of photographs, model or weights that trials name and that is not there, and the mend."""
+    from gsbench.datasets.catalog import how_to_get
+    from gsbench.scene.readers import missing_folder, missing_model
+
+    given = [scene for scene in (trial.values["scene"] for trial in trials) if scene["kind"] != "courtyard"]
+    scenes = {(scene["name"], scene["path"]) for scene in given}
+    folders = [(name, Path(path).expanduser()) for name, path in sorted(scenes, key=str)]
+    missing = [(name, folder) for name, folder in folders if not folder.is_dir()]
+    lines = [missing_folder(name, folder) for name, folder in missing]
+    models = {(scene["name"], scene["path"], scene["sparse"]) for scene in given if scene["kind"] == "colmap"}
+    for name, path, sparse in sorted(models, key=str):
+        if (root := Path(path).expanduser()).is_dir() and (line := missing_model(name, root, sparse)):
+            lines.append(line)
+    return lines + ([how_to_get(missing)] if missing else []) + missing_weights(trials)
+
+
+def missing_weights(trials: Sequence[Trial]) -> list[str]:
+    """A line for each folder of weights that the trials name and that is not there."""
+    named = {
+        (group, str(folder))
+        for group in ("eval", "init")
+        for folder in (trial.values[group].get("weights") for trial in trials)
+        if folder is not None
+    }
+    return [
+        f"{group}.weights={folder}: no such folder; without it, weights are looked for where gsbench keeps them"
+        for group, folder in sorted(named)
+        if not Path(folder).expanduser().is_dir()
+    ]
+
+
+def check_parts(trials: Sequence[Trial], here: bool) -> None:
+    """Refuse what the parts of the trials do not take.
+
+    With ``here``, the trials will run on this machine, whose devices are known. Raises InputError naming the key.
+    """
+    from gsbench.pipeline.parts import Parts
+
+    for trial in trials:
+        Parts(trial.values).check(here)
+
+
+def check_trackers(trials: Sequence[Trial]) -> None:
+    """Raise InputError where a trial's tracker needs a package that is not installed."""
+    for sink in sorted({t.values["tracking"]["sink"] for t in trials if t.values["tracking"]["enabled"]}):
+        if importlib.util.find_spec(sink) is None:
+            raise InputError(f"tracking.sink={sink} needs a package: {install_command(sink)} (or pip install {sink})")
+
+
+def borrowed_names(trials: Sequence[Trial]) -> list[str]:
+    """A line for each class of the user's that would be shown under the name of one of gsbench's own."""
+    named = {
+        (group, str(part.get("name")), str(part["_target_"]))
+        for trial in trials
+        for group, part in ((group, trial.values[group]) for group in ("densify", "init"))
+        if part.get("_target_") is not None and not str(part["_target_"]).startswith(OWN)
+    }
+    return [
+        f"{target} is shown as {name}, like gsbench's own: "
+        f"give it a name, {group}.name={target.rpartition('.')[2].lower()}"
+        for group, name, target in sorted(named)
+        if name in options(group)
+    ]
+
+
+def need_no_check(trials: Sequence[Trial]) -> bool:
+    """Return whether the trials take their components as they ship, whose options gsbench's own tests have checked.
+
+    A dry run then answers without loading torch.
+    """
+    for word in {word for trial in trials for word in trial.overrides}:
+        key, _, value = word.lstrip("+~").partition("=")
+        group = re.split("[./@]", key)[0]
+        if group == "hydra" or (group in (*COMPONENTS, "raster", "train") and value not in options(key)):
+            return False
+    return True

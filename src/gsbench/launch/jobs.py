@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 from gsbench.config.compose import Trial
 from gsbench.files import require_own
-from gsbench.launch.outcome import Outcome, outcome_of_results
-from gsbench.launch.queue import forget_submission
+from gsbench.launch.serial import Outcome, outcome_of_results
+from gsbench.launch.states import forget_submission
 from gsbench.runs.hashing import sha256_of
 from gsbench.runs.layout import JOBS
 from gsbench.runs.trial_folder import TrialFolder

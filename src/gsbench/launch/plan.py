@@ -9,7 +9,6 @@ import logging
 import os
 import shutil
 import time
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,21 +18,17 @@ from pydantic import AfterValidator
 
 from gsbench.config.compose import Trial
 from gsbench.files import require_own, write_json
-from gsbench.launch.finished import FinishedTrials
-from gsbench.launch.queue import ask_queue, state_in_queue
 from gsbench.parsing import DamagedError
 from gsbench.records import Amount, Record, read_typed
 from gsbench.runs.experiments import make_home
 from gsbench.runs.layout import PLAN, RESULTS
 from gsbench.settings import is_folder_name
 from gsbench.system.locks import hold
-from gsbench.words import counted, readable_time
 
 log = logging.getLogger(__name__)
 
 PLAN_VERSION = 1
 LEVELS = 3  # scene, arm, trial
-STATES = ("done", "partial", "missing", "running", "queued", "failed", "damaged")  # in the order of a summary
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,47 +110,3 @@ def read_plan(home: Path) -> dict[Path, PlannedTrial]:
 def _write(home: Path, trials: dict[Path, PlannedTrial]) -> None:
     names = {folder.relative_to(home).as_posix(): trial for folder, trial in trials.items()}
     write_json(home / PLAN, PlanFile(version=PLAN_VERSION, trials=names).to_json())
-
-
-# ---- what a dry run says
-
-
-def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
-    """Lines for ``--dry-run``: each trial with its state, and the time that the unfinished ones will take."""
-    lines: list[str] = []
-    remaining, unknown, learned = 0.0, 0, 0
-    counts: Counter[str] = Counter()
-    finished = FinishedTrials(trials[0].files.runs)
-    queue = ask_queue(trial.folder for trial in trials)
-    for trial in trials:
-        folder = trial.files
-        state: str = folder.state()
-        if state not in ("done", "running"):
-            state = state_in_queue(folder.path, queue) or state
-        note = ""
-        if state == "done":
-            if reason := folder.why_not_done(trial.values):
-                note = f"  will be checked: {reason}"
-        elif shared := finished.elsewhere(folder):
-            note = f"  as in {shared}: nothing to compute"
-        else:
-            estimate = finished.estimate(trial.values)
-            done = folder.stage_and_step()[1] / max(1, trial.values["train"]["iterations"])
-            remaining += estimate.seconds * (1 - min(1.0, done))
-            learned = max(learned, estimate.learned_from)
-            unknown += estimate.learned_from == 0
-        counts[state] += 1
-        lines.append(f"{state:<8} {folder.label}{note}")
-    summary = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])
-    lines.append(f"{counted(len(trials), 'trial')}: {summary}")
-    if counts["done"] == len(trials):
-        return lines
-    if unknown:
-        time = "no estimate, since no finished trial tells how long one takes here with its rasterizer and pictures"
-    elif learned == 0:
-        time = "seconds, since other experiments have the results"
-    else:
-        at_once = f", {parallel} at once" if parallel > 1 else ""
-        took = readable_time(remaining / parallel)
-        time = f"about {took}{at_once}, judged by {counted(learned, 'finished trial')}"
-    return [*lines, f"time: {time}"]

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.launch.jobs import SECONDS_BETWEEN_POLLS, collect, job_folder, job_of
-from gsbench.launch.outcome import Outcome
-from gsbench.launch.queue import (
+from gsbench.launch.serial import Outcome
+from gsbench.launch.states import (
     ask_queue,
     current_user,
     forget_submission,

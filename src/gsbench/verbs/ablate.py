@@ -22,7 +22,7 @@ from gsbench.claims.ablation import (
 )
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
-from gsbench.launch.plan import describe_plan
+from gsbench.launch.dry_run import describe_plan
 from gsbench.runs.layout import SEED
 from gsbench.settings import Switch
 from gsbench.verbs.arguments import ArgumentParser, names

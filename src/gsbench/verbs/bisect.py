@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.app.versions import add_question, first_trials
 from gsbench.claims.gate import BASELINE, NEW, Gate, ask, describe, first_worse, most_steps, result_of
 from gsbench.claims.stopping import Planned, run_looks
 from gsbench.errors import InputError, TrainingError
@@ -21,7 +22,6 @@ from gsbench.runs.experiments import make_home
 from gsbench.runs.hashing import sha256_of
 from gsbench.system.install import WorkTrees
 from gsbench.verbs.arguments import ArgumentParser
-from gsbench.verbs.gate import add_question, first_trials
 from gsbench.words import counted, printable
 
 FOUND, NOT_FOUND = 0, 3

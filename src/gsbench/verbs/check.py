@@ -13,9 +13,9 @@ from gsbench.claims.stopping import Planned, run_looks
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, place_of, write_text
+from gsbench.launch.batch import missing_folders
 from gsbench.launch.declare import declare_questions
-from gsbench.launch.plan import describe_plan
-from gsbench.launch.preflight import missing_folders
+from gsbench.launch.dry_run import describe_plan
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs.arguments import ArgumentParser, path

@@ -11,7 +11,8 @@ from gsbench.config.command_words import key_of, typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
-from gsbench.launch.plan import PlannedTrial, describe_plan, forget, read_plan
+from gsbench.launch.dry_run import describe_plan
+from gsbench.launch.plan import PlannedTrial, forget, read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.runs.experiments import experiment_home
 from gsbench.runs.layout import CONFIG

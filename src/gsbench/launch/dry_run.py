@@ -1,22 +1,26 @@
-"""Finished trials, and what they tell of those to come: which are done elsewhere, and how long others take.
+"""What a dry run says: the state of each trial, what was done elsewhere, and the time that the others take.
 
-All are read once, so that ten thousand planned trials can be held against ten thousand finished ones. Loads no torch.
+All finished trials are read once, so that ten thousand planned ones can be held against ten thousand. Loads no torch.
 """
 
 from __future__ import annotations
 
 import json
-from collections import defaultdict
-from collections.abc import Mapping
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 from typing import Any
 
+from gsbench.config.compose import Trial
+from gsbench.launch.states import ask_queue, state_in_queue
 from gsbench.parsing import DamagedError
 from gsbench.runs.layout import RESULTS, TRIAL_GLOB
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.words import counted, readable_time
 
+STATES = ("done", "partial", "missing", "running", "queued", "failed", "damaged")  # in the order of a summary
 # Of scene, init and densify, which must be the same: most alike first.
 ALIKE = ((True, True, True), (True, False, True), (True, False, False), (False, False, True), (False, False, False))
 OF_SIZE = ("name", "path", "width", "height", "downscale", "max_size")  # settings of a scene that set its pixels
@@ -101,3 +105,44 @@ class FinishedTrials:
 
 def _size_of(scene: Mapping[str, Any]) -> str:
     return json.dumps({name: scene.get(name) for name in OF_SIZE})
+
+
+def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
+    """Lines for ``--dry-run``: each trial with its state, and the time that the unfinished ones will take."""
+    lines: list[str] = []
+    remaining, unknown, learned = 0.0, 0, 0
+    counts: Counter[str] = Counter()
+    finished = FinishedTrials(trials[0].files.runs)
+    queue = ask_queue(trial.folder for trial in trials)
+    for trial in trials:
+        folder = trial.files
+        state: str = folder.state()
+        if state not in ("done", "running"):
+            state = state_in_queue(folder.path, queue) or state
+        note = ""
+        if state == "done":
+            if reason := folder.why_not_done(trial.values):
+                note = f"  will be checked: {reason}"
+        elif shared := finished.elsewhere(folder):
+            note = f"  as in {shared}: nothing to compute"
+        else:
+            estimate = finished.estimate(trial.values)
+            done = folder.stage_and_step()[1] / max(1, trial.values["train"]["iterations"])
+            remaining += estimate.seconds * (1 - min(1.0, done))
+            learned = max(learned, estimate.learned_from)
+            unknown += estimate.learned_from == 0
+        counts[state] += 1
+        lines.append(f"{state:<8} {folder.label}{note}")
+    summary = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])
+    lines.append(f"{counted(len(trials), 'trial')}: {summary}")
+    if counts["done"] == len(trials):
+        return lines
+    if unknown:
+        time = "no estimate, since no finished trial tells how long one takes here with its rasterizer and pictures"
+    elif learned == 0:
+        time = "seconds, since other experiments have the results"
+    else:
+        at_once = f", {parallel} at once" if parallel > 1 else ""
+        took = readable_time(remaining / parallel)
+        time = f"about {took}{at_once}, judged by {counted(learned, 'finished trial')}"
+    return [*lines, f"time: {time}"]
