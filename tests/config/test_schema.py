@@ -206,7 +206,7 @@ def test_hash_ignores_what_cannot_change_a_result() -> None:
 
 
 def test_asking_for_more_metrics_is_another_result() -> None:
-    words = ("eval.more=[gmsd]", "eval.geometry=true", "eval.flicker=true")
+    words = ("eval.more=[gmsd]", "eval.fps=[640,480]", "eval.fps=[64,48]")
     assert len({config_hash(composed(*word)) for word in [(), *((word,) for word in words)]}) == 4
 
 
@@ -216,15 +216,15 @@ def test_asking_for_more_metrics_is_another_result() -> None:
         (["eval.more=[psnr]"], "eval.more"),
         (["eval.more=[gmsd,gmsd]"], "at most once"),
         (["eval.primary=gmsd"], "add gmsd to eval.more"),
-        (["eval.primary=floaters", "eval.flicker=true"], "add eval.geometry=true"),
-        (["eval.primary=flicker"], "add eval.flicker=true"),
-        (["eval.extra.floaters._target_=mine.Mine", "allow_targets=[mine]"], "none of"),
+        (["eval.primary=fps"], "add eval.fps=[1920,1080]"),
+        (["eval.fps=[640]"], "eval.fps must be two sides in px"),
+        (["eval.extra.fps._target_=mine.Mine", "allow_targets=[mine]"], "none of"),
     ],
 )
 def test_metrics_that_are_not_measured_or_known_are_refused(words: list[str], said: str) -> None:
     with pytest.raises(InputError, match=re.escape(said)):
         composed(*words)
-    assert composed("eval.primary=floaters", "eval.geometry=true")["eval"]["primary"] == "floaters"
+    assert composed("eval.primary=fps", "eval.fps=[640,480]")["eval"]["primary"] == "fps"
 
 
 def test_hash_follows_the_source_of_a_users_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

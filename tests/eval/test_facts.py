@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +14,8 @@ import torch
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import (
-    DERIVED,
+    FPS,
     METRICS,
-    OF_MODELS,
     MetricFacts,
     facts_of,
     find,
@@ -50,11 +48,11 @@ def test_every_metric_can_be_imported_and_is_described(facts: MetricFacts) -> No
 
 
 def test_the_evaluator_knows_exactly_the_metrics_of_the_table() -> None:
-    evaluator = Evaluator(replace(PAPER, color_fit="all"), lpips=["vgg"], more=further_keys(), download=False)
+    evaluator = Evaluator(PAPER, lpips=["vgg"], more=further_keys(), download=False)
     values = evaluator.evaluate_view(IMAGE, IMAGE)
     of_images = {facts.key for facts in METRICS}
-    assert (values.keys() | evaluator.unavailable.keys()) - {"cc_gain"} == of_images
-    assert set(known_keys()) == of_images | {facts.key for facts in (*DERIVED, *OF_MODELS)}
+    assert values.keys() | evaluator.unavailable.keys() == of_images
+    assert set(known_keys()) == of_images | {FPS.key}
     assert all(f"lpips_{protocol.lpips}" in known_keys() for protocol in PROTOCOLS.values())
     assert set(lpips_variants()) == {"vgg_raw", "vgg", "alex", "squeeze"}
 
@@ -129,7 +127,7 @@ def test_a_metric_that_says_nothing_has_no_direction() -> None:
 
 def test_the_page_on_metrics_shows_the_table() -> None:
     page = (Path(__file__).parents[2] / "docs" / "metric.md").read_text(encoding="utf-8")
-    for facts in (*METRICS, *OF_MODELS):
+    for facts in (*METRICS, FPS):
         better = "more" if facts.direction > 0 else "less"
         low, high = ("" if bound is None else f"{bound:g}" for bound in (facts.lowest, facts.highest))
         cells = (f"`{facts.key}`", facts.name, better, low, high, facts.words)

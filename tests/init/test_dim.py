@@ -22,9 +22,9 @@ from gsbench.init.networks.extractors import SUPERPOINT_BORDER, build_extractor,
 from gsbench.init.networks.features import Features, FeatureStore
 from gsbench.init.networks.matching import MutualNearest, build_matcher, match
 from gsbench.logs import no_progress
-from gsbench.scene.courtyard.render import surface_distance
 from gsbench.scene.types import Capture
 from gsbench.weights import MissingWeights, load_state
+from tests.scene.courtyard.surfaces import surface_distance
 
 CPU = torch.device("cpu")
 

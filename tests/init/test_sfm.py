@@ -17,8 +17,8 @@ from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, OWN_GAUGE_FOLDER, PICTURE_FILE, REPORT_FILE, Jittered, Sfm, SfmDense, read_cloud
 from gsbench.init.base import InitReport
 from gsbench.init.colmap.initializer import WORK_FOLDER
-from gsbench.scene.courtyard.render import surface_distance
 from gsbench.scene.types import Capture
+from tests.scene.courtyard.surfaces import surface_distance
 
 
 def digest(model: Path) -> str:

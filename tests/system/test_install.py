@@ -20,7 +20,7 @@ def test_the_name_is_that_of_the_project_file() -> None:
     project = content["project"]
     assert project["name"] == DISTRIBUTION
     assert list(project["scripts"]) == ["gsbench"]
-    assert f"{DISTRIBUTION}[dim,search,tensorboard,video,view]" in content["dependency-groups"]["dev"]
+    assert f"{DISTRIBUTION}[dim,search,tensorboard,view]" in content["dependency-groups"]["dev"]
 
 
 def test_from_a_checkout_the_hint_installs_the_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,10 +11,12 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from gsbench.errors import InputError
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
 from gsbench.view.picture import photograph_at, side_by_side
 from gsbench.view.server import fitting_fov, level_up, mean_up, page_camera
+from gsbench.view.trials import read_causes
 
 
 def smooth_image(height: int, width: int) -> np.ndarray:
@@ -117,3 +120,10 @@ def test_mean_up_points_up() -> None:
 def test_what_is_no_camera_is_not_drawn(wxyz: tuple, position: tuple, fov: float, aspect: float) -> None:
     with pytest.raises(ValueError, match=r"no camera|is not drawn"):
         page_camera(np.array(wxyz, float), np.array(position, float), fov, aspect, 540, 1)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no zip", b"no zip at all"])
+def test_a_record_of_causes_that_is_damaged_is_one_line(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "lineage.npz").write_bytes(content)
+    with pytest.raises(InputError, match=r"lineage\.npz cannot be read"):
+        read_causes(tmp_path / "lineage.npz", 1)

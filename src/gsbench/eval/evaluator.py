@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.eval.facts import CORRECTED, LPIPS, METRICS, MORE, MetricFacts, facts_of, further_keys, lpips_variants
-from gsbench.eval.images import as_unit_range, fit_colors, where_counted
+from gsbench.eval.facts import LPIPS, METRICS, MORE, MetricFacts, facts_of, further_keys, lpips_variants
+from gsbench.eval.images import as_unit_range, where_counted
 from gsbench.eval.measures import Conditions
 from gsbench.eval.metric import MaskedMetric, Metric, UnavailableError
 from gsbench.eval.protocol import Protocol
@@ -61,13 +61,10 @@ class Evaluator:
         self.own = {name: facts_of(name, metric) for name, metric in extra.items()}
         wanted = {f"{LPIPS}{variant}" for variant in (variants if lpips is None else lpips)}
         wanted |= {facts.key for facts in METRICS if not facts.setting} | ({"flip"} if flip else set()) | set(more)
-        if protocol.color_fit is not None:
-            corrected = {facts.key for facts in METRICS if facts.setting == CORRECTED and facts.target}
-            wanted |= corrected if f"{LPIPS}vgg" in wanted else corrected - {"cc_lpips"}
         conditions = Conditions(protocol, self.device, weights, download)
         self._metrics: dict[str, Metric] = {}
         for facts in METRICS:
-            if facts.setting in (MORE, CORRECTED) and facts.key not in wanted:
+            if facts.setting == MORE and facts.key not in wanted:
                 continue  # left unsaid: such a metric may be younger than the results of others
             try:
                 if facts.key not in wanted:
@@ -76,7 +73,6 @@ class Evaluator:
             except UnavailableError as error:
                 self._leave_out(facts.key, error)
         self._metrics |= extra
-        self._corrected = {facts.key for facts in METRICS if facts.setting == CORRECTED}
 
     def evaluate_view(
         self,
@@ -95,33 +91,17 @@ class Evaluator:
         image, target = self._prepare(render), self._prepare(ground_truth)  # [H, W, 3]
         counts = None if mask is None else torch.as_tensor(mask, device=self.device)  # [H, W]
         image = where_counted(image, target, None if counts is None else counts[..., None])
-        corrected = image
-        if fit := self.protocol.color_fit:
-            fitted = torch.ones(image.shape[:2], dtype=torch.bool, device=self.device) if counts is None else counts
-            half = image.shape[1] // 2
-            if fit == "left":
-                fitted = fitted & (torch.arange(image.shape[1], device=self.device) < half)
-            if bool(fitted.any()):
-                corrected = where_counted(
-                    fit_colors(image, target, fitted), target, None if counts is None else counts[..., None]
-                )
-            if fit == "left":
-                image, corrected, target = (x[:, half:] for x in (image, corrected, target))
-                counts = None if counts is None else counts[:, half:]
         values = {}
         for key, metric in self._metrics.items():
             if key in self.unavailable:
                 continue
             try:
-                seen = corrected if key in self._corrected else image
-                value = self._measured(key, metric, seen, target, counts)
+                value = self._measured(key, metric, image, target, counts)
                 if not math.isfinite(value):
                     raise UnavailableError(f"the value of a view is {value}")
                 values[key] = value
             except UnavailableError as error:
                 self._leave_out(key, error)
-        if "cc_psnr" in values:
-            values["cc_gain"] = values["cc_psnr"] - values["psnr"]
         return values
 
     def _measured(self, key: str, metric: Metric, image: Tensor, target: Tensor, counts: Tensor | None) -> float:
@@ -164,8 +144,6 @@ class Evaluator:
         if tensor.dtype != torch.uint8:
             if not bool(tensor.isfinite().all()):
                 raise TrainingError("a render holds values that are not finite: the trained model is broken")
-            if not self.protocol.eight_bit:
-                return tensor.float().clamp(0, 1)
             tensor = quantize(tensor)
         return as_unit_range(tensor, torch.float32)
 

@@ -14,9 +14,6 @@ from gsbench.errors import InputError
 from gsbench.runs.trial_record import MetricRecord
 
 MORE = "eval.more"  # lists metrics that are computed only if named there
-# Settings that ask for what is measured of a model.
-GEOMETRY, FLICKER, BANDS, SPEED = "eval.geometry", "eval.flicker", "eval.bands", "eval.fps"
-CORRECTED = "eval.protocol"  # asks, by a protocol that fits colours, for metrics after that fit
 LPIPS = "lpips_"  # how the keys of LPIPS start; what follows names the variant, as in ``eval.lpips``
 DECIMALS = 3  # of a metric that does not say
 
@@ -84,17 +81,6 @@ def _structural(key: str, label: str, direction: int, class_name: str, highest: 
     )
 
 
-def _corrected(
-    key: str, label: str, class_name: str, direction: int, decimals: int, worthwhile: float, words: str, unit: str = ""
-) -> MetricFacts:
-    """A metric of the render whose colours were fitted to the photograph, computed by protocols that fit them."""
-    options = {"net": "vgg", "raw": False} if class_name == "LpipsMetric" else {}
-    return MetricFacts(
-        key, label, direction, decimals, unit, worthwhile, setting=CORRECTED, target=f"{MEASURES}.{class_name}",
-        options=options, lowest=-1.0 if class_name == "Ssim" else 0.0, words=words,
-    )  # fmt: skip
-
-
 METRICS = (
     MetricFacts(
         "psnr", "PSNR", 1, 2, "dB", 0.1, target=f"{MEASURES}.Psnr", lowest=0.0, words="mean squared error, logarithmic"
@@ -133,57 +119,12 @@ METRICS = (
     _structural("iw_ssim", "IW-SSIM", 1, "IwSsim", 1.0, "the same, weighted by the information that a place carries"),
     _structural("fsim", "FSIMc", 1, "Fsim", 1.0, "edges and lines: phase congruency, contrast and colour there"),
     _structural("gmsd", "GMSD", -1, "Gmsd", 0.5, "how unevenly the gradients agree"),
-    MetricFacts(
-        "dists",
-        "DISTS",
-        -1,
-        3,
-        "",
-        0.005,
-        True,
-        setting=MORE,
-        target=f"{MEASURES}.DistsMetric",
-        lowest=0.0,
-        words="textures and structures that vgg sees, wherever a texture's grains lie",
-    ),
-    _corrected("cc_psnr", "PSNR, colours fitted", "Psnr", 1, 2, 0.1, "PSNR after a fit of each view's colours", "dB"),
-    _corrected("cc_ssim", "SSIM, colours fitted", "Ssim", 1, 3, 0.005, "SSIM after it"),
-    _corrected("cc_lpips", "LPIPS VGG, colours fitted", "LpipsMetric", -1, 3, 0.005, "LPIPS after it"),
 )
-
-
-def _of_model(
-    key: str, label: str, direction: int, worthwhile: float | None, words: str, unit: str = "%", setting: str = GEOMETRY
-) -> MetricFacts:
-    """A metric that needs the model and its cameras, not a pair of images; `gsbench.pipeline` computes it."""
-    highest = 100.0 if unit == "%" and not label.startswith("depth") else None
-    return MetricFacts(
-        key, label, direction, 2, unit, worthwhile, setting=setting, lowest=0.0, highest=highest, words=words
-    )
-
-
-OF_MODELS = (
-    _of_model("depth_error", "depth error", -1, 0.2, "mean error of the render's depth, of the true depth"),
-    _of_model("off_surface", "off surface", -1, 1.0, "pixels whose surface lies over 5 cm from a true one"),
-    _of_model("completeness", "completeness", 1, 1.0, "true surface with a rendered one within 5 cm"),
-    _of_model("point_depth_error", "depth error at points", -1, 0.2, "median, at points that only test views see"),
-    _of_model("floaters", "floaters", -1, 0.5, "opacity in front of the first surface"),
-    _of_model(
-        "flicker", "flicker", -1, 0.1, "change of a point's colour between frames of a path", "levels", setting=FLICKER
-    ),
-    _of_model("error_near", "error near", -1, 0.2, "mean error of each view's nearest third", "levels", setting=BANDS),
-    _of_model("error_middle", "error in the middle", -1, 0.2, "that of its middle third", "levels", setting=BANDS),
-    _of_model("error_far", "error far", -1, 0.2, "that of its farthest third", "levels", setting=BANDS),
-    _of_model("fps", "speed", 1, None, "renders of the test views at one size", "frames/s", setting=SPEED),
+# Of the trained model, not of its pictures; an evaluation measures it by itself.
+FPS = MetricFacts(
+    "fps", "speed", 1, 2, "frames/s", setting="eval.fps", lowest=0.0, words="renders of the test views at one size"
 )
-
-
-DERIVED = (
-    MetricFacts(
-        "cc_gain", "gain by fitted colours", 0, 2, "dB", setting=CORRECTED, words="what the fit adds to PSNR: no merit"
-    ),
-)
-ALL = (*METRICS, *DERIVED, *OF_MODELS)  # in the order of tables
+ALL = (*METRICS, FPS)  # in the order of tables
 
 
 def known_keys() -> tuple[str, ...]:

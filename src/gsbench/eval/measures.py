@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from gsbench.eval import fsim, metrics, multiscale
-from gsbench.eval.dists import VGG, load_dists
 from gsbench.eval.images import exact
 from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import UnavailableError
@@ -138,20 +137,6 @@ class Fsim(Structural):
 
 class Gmsd(Structural):
     function, smallest = staticmethod(metrics.gmsd), metrics.GMSD_MIN_SIZE
-
-
-class DistsMetric:
-    """DISTS, by VGG16 and its own weights, where these are at hand."""
-
-    def __init__(self, conditions: Conditions) -> None:
-        try:
-            self._network = load_dists(conditions.weights, conditions.download, conditions.device)
-        except MissingWeights as error:
-            raise UnavailableError(str(error), awaited=True) from None
-
-    def measure(self, image: Tensor, truth: Tensor) -> float:
-        _need_size(image, VGG.min_size)
-        return float(self._network(image, truth))
 
 
 def _need_size(image: Tensor, smallest: int) -> None:

@@ -11,7 +11,7 @@ from annotated_types import Interval, Len, Predicate, doc
 from pydantic import PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.eval.facts import CORRECTED, LPIPS, MORE, OF_MODELS, SPEED, find, further_keys, known_keys, lpips_variants
+from gsbench.eval.facts import FPS, LPIPS, MORE, find, further_keys, known_keys, lpips_variants
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.runs.declaration import AT, QUESTIONS, metric_and_question
 from gsbench.settings import MISSING, FolderName, PathName, check_settings
@@ -54,9 +54,6 @@ class EvalConfig:
     primary: str | None = None
     controls: Annotated[dict[str, FolderName], doc(CONTROLS_RULE)] = field(default_factory=dict)  # {longaxis: absgrad}
     maps: bool = False  # keep maps of depth, volume and distance to the initial cloud; picture large Gaussians
-    geometry: bool = False  # measure depths and surfaces of the model, and what floats in front of them
-    flicker: bool = False  # measure how neighbouring renders of a camera path differ
-    bands: bool = False  # measure errors of the near, the middle and the far third of each view
     fps: Annotated[list[Side], Len(2, 2), doc(FPS_RULE)] | None = None  # [1920, 1080]: speed at this size, px
     weights: PathName | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
     download: bool = True  # fetch missing weights, checked by checksum
@@ -78,12 +75,6 @@ class EvalConfig:
             if metric not in self.extra:
                 self._check_primary(metric)
 
-    @property
-    def of_model(self) -> dict[str, Any]:
-        """Settings by name that say what is measured of a model, those that ask for nothing left out."""
-        settings = {name: getattr(self, name) for name in ("geometry", "flicker", "bands", "fps")}
-        return {name: value for name, value in settings.items() if value}
-
     def _check_primary(self, key: str) -> None:
         """Raise InputError unless one of gsbench's own metrics, which these settings ask for, has this key."""
         facts = find(key)
@@ -95,11 +86,8 @@ class EvalConfig:
             )
         if facts.setting == "eval.flip" and not self.flip:
             raise InputError("eval.primary=flip is not measured with eval.flip=false")
-        if facts in OF_MODELS and facts.setting.removeprefix("eval.") not in self.of_model:
-            value = "[1920,1080]" if facts.setting == SPEED else "true"
-            raise InputError(f"eval.primary={key} is not measured: add {facts.setting}={value}")
-        if facts.setting == CORRECTED and PROTOCOLS[self.protocol].color_fit is None:
-            raise InputError(f"eval.primary={key} is not measured: it takes eval=affine or eval=affine_half")
+        if facts is FPS and self.fps is None:
+            raise InputError("eval.primary=fps is not measured: add eval.fps=[1920,1080]")
         if facts.setting == MORE and key not in self.more:
             raise InputError(f"eval.primary={key} is not measured: add {key} to eval.more")
         if facts.setting == "eval.lpips" and key.removeprefix(LPIPS) not in self.lpips:

@@ -37,9 +37,8 @@ def ssim(image: Tensor, target: Tensor, padding: SsimPadding = "zero") -> Tensor
 
     Images are [H, W, 3] in [0, 1] (the value is a 0-dimensional tensor) or a batch [B, 3, H, W] (the values are [B]).
     ``padding`` says what happens at the border: "zero" pads the images with zeros and averages the full map, as the
-    evaluation of 3DGS does; "reflect" mirrors them about their border pixels and averages the full map, as torchmetrics
-    1.8.2 does; "valid" averages over the pixels whose window lies inside the image, as scikit-image does. Raises
-    ValueError for shapes and sizes that do not fit.
+    evaluation of 3DGS does; "valid" averages over the pixels whose window lies inside the image, as scikit-image does.
+    Raises ValueError for shapes and sizes that do not fit.
     """
     check_pair(image, target)
     if padding not in get_args(SsimPadding):
@@ -47,8 +46,6 @@ def ssim(image: Tensor, target: Tensor, padding: SsimPadding = "zero") -> Tensor
     x, y = as_batch(image), as_batch(target)  # [B, 3, H, W] each
     if padding == "valid":
         check_size(x, WINDOW_SIZE, "ssim without padding")
-    elif padding == "reflect":
-        check_size(x, WINDOW_RADIUS + 1, "ssim with mirrored borders")
     luminance, structure = ssim_parts(x, y, padding)
     values = (luminance * structure).flatten(1).mean(dim=1)  # [B]
     return values[0] if image.ndim == 3 else values
@@ -91,8 +88,8 @@ def ssim_parts(x: Tensor, y: Tensor, padding: SsimPadding, data_range: float = 1
 
 def _blur(images: Tensor, padding: SsimPadding) -> Tensor:
     """Filter every channel of [B, C, H, W] with the window, one axis after the other."""
-    if padding != "valid":
-        images = F.pad(images, [WINDOW_RADIUS] * 4, mode="constant" if padding == "zero" else "reflect")
+    if padding == "zero":
+        images = F.pad(images, [WINDOW_RADIUS] * 4)
     for axis in (2, 3):
         size = images.shape[axis] - WINDOW_SIZE + 1
         # Shifted sums: several times faster on a CPU than a depthwise convolution with one channel per group.

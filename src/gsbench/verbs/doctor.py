@@ -6,7 +6,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from importlib.metadata import PackageNotFoundError, packages_distributions, version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -25,7 +25,6 @@ OPTIONAL = {  # module -> what needs it, and the extra that brings it
     "optuna": ("searches (hydra.sweeper.tune)", "search"),
     "tensorboard": ("tracking=tensorboard", "tensorboard"),
     "viser": ("gsbench view", "view"),
-    "cv2": ("gsbench video to .mp4", "video"),
     "wandb": ("tracking=wandb", "wandb"),
 }
 
@@ -68,9 +67,8 @@ def check_packages() -> Iterator[Finding]:
     for name in REQUIRED:
         installed = _version(name)
         yield Finding("bad" if installed is None else "ok", name, installed or f"missing: {install_command()}")
-    distributions = packages_distributions()  # cv2 comes in several
     for name, (purpose, extra) in OPTIONAL.items():
-        installed = _version(distributions.get(name, [name])[0])
+        installed = _version(name)
         text = installed or f"not installed; needed for {purpose}: {install_command(extra)}"
         yield Finding("ok" if installed else "note", name, text)
 
@@ -124,14 +122,12 @@ def check_triton() -> Iterator[Finding]:
 
 def check_weights() -> Iterator[Finding]:
     """Weights that are at hand; nothing is downloaded."""
-    from gsbench.eval.dists import ALPHA_BETA
     from gsbench.eval.lpips import BACKBONES, find_any
     from gsbench.init.networks.weights import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
     from gsbench.weights import WEIGHTS_VARIABLE, MissingWeights, hub_cache
 
     wanted = {f"LPIPS {name}": backbone.features for name, backbone in BACKBONES.items()}
     wanted |= {f"LPIPS {name} heads": (backbone.heads,) for name, backbone in BACKBONES.items()}
-    wanted["DISTS, with LPIPS vgg"] = (ALPHA_BETA,)
     wanted |= {f"init=dim {name}": (spec,) for name, spec in EXTRACTOR_WEIGHTS.items()}
     wanted |= {f"LightGlue for {name}": (spec,) for name, spec in LIGHTGLUE_WEIGHTS.items()}
     for purpose, specs in wanted.items():

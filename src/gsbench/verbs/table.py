@@ -31,6 +31,5 @@ VERBS = {
     "ui": ("gsbench.verbs.ui", "open the MLflow dashboard on this machine"),
     "export": ("gsbench.verbs.export", "copy a trained model, an initial cloud or an experiment's results for others"),
     "view": ("gsbench.verbs.view", "look at trained models in the browser: one, or two side by side"),
-    "video": ("gsbench.verbs.video", "film a trained model: along its cameras, or round the scene"),
     "doctor": ("gsbench.verbs.doctor", "check this machine and say what is missing"),
 }

@@ -26,8 +26,6 @@ from gsbench.scene.colmap import (
     pinhole_camera,
     points_of,
     read_model,
-    reference_cameras,
-    registered_names,
 )
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
@@ -124,12 +122,6 @@ def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
     if len(causes) != num_gaussians:
         raise InputError(f"{path} is of {len(causes)} Gaussians, the model has {num_gaussians}: run this trial again")
     return causes
-
-
-def placed_cameras(trial: TrialResult) -> list[Camera]:
-    """The places and directions of all cameras of the trial, test views included; not for rendering."""
-    model = read_model(_model_folder(trial))
-    return reference_cameras(model, registered_names(model))
 
 
 def _model_folder(trial: TrialResult) -> Path:

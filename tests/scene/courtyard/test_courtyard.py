@@ -12,10 +12,11 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.layout import BOX, SPHERE, build_layout
-from gsbench.scene.courtyard.render import courtyard_cameras, render_courtyard, render_view, surface_distance
+from gsbench.scene.courtyard.render import courtyard_cameras, render_courtyard, render_view
 from gsbench.scene.load import load_scene
 from gsbench.scene.readers import read_colmap
 from tests.scene.cameras import cameras_of
+from tests.scene.courtyard.surfaces import surface_distance
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import shutil
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,6 @@ from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.logs import progress
 from gsbench.pipeline.steps.inputs import UserCode, options_of, rasterizer_inputs, step_of
-from gsbench.pipeline.steps.model_metrics import ModelMetrics, measure_model, nothing_known
 from gsbench.pipeline.steps.pictures import draw_ellipsoids, view_maps
 from gsbench.pipeline.steps.scene import Views
 from gsbench.raster import Rasterizer
@@ -42,19 +42,20 @@ if TYPE_CHECKING:
     from gsbench.pipeline.parts import Parts
 
 EXTRA = "eval.extra"  # where a configuration has the user's own metrics
+TIMED_RENDERS = 5  # of each view, for its speed
 
 
 def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
     """Render and measure the model of ``trained``, and its snapshots of earlier iterations; or renders as they are.
 
-    ``eval.maps`` also keeps maps of the views and pictures large Gaussians; ``of_model`` says what is measured of the
-    model itself (`gsbench.eval.options.EvalConfig.of_model`). The key of a training by another program knows nothing of
-    the rendering, so it is in this step's.
+    ``eval.maps`` also keeps maps of the views and pictures large Gaussians; ``eval.fps`` is the size at which the
+    speed of rendering is measured. The key of a training by another program knows nothing of the rendering, so it is
+    in this step's.
     """
     if parts.program is not None and not parts.program.leaves_model:
         return _measure_step(views, trained, parts)
     rasterizer, evaluator, device = parts.rasterizer, parts.evaluator, parts.device
-    background, maps, of_model = parts.train.background, parts.eval.maps, parts.eval.of_model
+    background, maps, size = parts.train.background, parts.eval.maps, parts.eval.fps
     earlier, user = parts.measured_earlier, parts.user_code
     inputs: dict[str, Any] = {
         "train": trained.key,
@@ -66,7 +67,7 @@ def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
         inputs["earlier"] = list(earlier)
     if parts.program is not None:
         inputs |= {"raster": rasterizer_inputs(rasterizer, user), "background": list(background)}
-    inputs |= _further_metrics(evaluator, user) | dict(of_model)
+    inputs |= _further_metrics(evaluator, user, size)
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
@@ -97,21 +98,23 @@ def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
         if maps:
             write_maps(folder / MAPS, scene, views.store.path(views.init), gaussians, rasterizer)
             draw_figures(folder / FIGURES, folder / RENDERS, scene, training, gaussians)
-        found = measure_model(of_model, rasterizer, gaussians, views, color, folder / RENDERS)
-        _write_metrics(folder, evaluator, per_view, found, scene, at)
+        if size is not None:
+            for view, speed in measure_speed(rasterizer, gaussians, scene, color, size).items():
+                per_view[view]["fps"] = speed
+        _write_metrics(folder, evaluator, per_view, scene, at=at)
 
     return step_of(EVALUATE, inputs, build, user)
 
 
 def _measure_step(views: Views, trained: Step, parts: Parts) -> Step:
     """Measure the renders that another program left in ``trained``, as they are."""
-    evaluator, of_model, user = parts.evaluator, parts.eval.of_model, parts.user_code
+    evaluator, size, user = parts.evaluator, parts.eval.fps, parts.user_code
     inputs: dict[str, Any] = {
         "renders": trained.key,
         "protocol": evaluator.protocol.id,
         "unavailable": sorted(evaluator.unavailable),
     }
-    inputs |= _further_metrics(evaluator, user) | dict(of_model)
+    inputs |= _further_metrics(evaluator, user, size)
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
@@ -123,41 +126,59 @@ def _measure_step(views: Views, trained: Step, parts: Parts) -> Step:
                     read_image(folder / RENDERS / png_name(view.name)), view.image, view.mask
                 )
                 report("views", done, len(scene.test))
-        unknown = nothing_known(of_model, "another program's renders are known, not its model")
-        _write_metrics(folder, evaluator, per_view, [unknown], scene)
+        unknown = {} if size is None else {"fps": "another program's renders are known, not its model"}
+        _write_metrics(folder, evaluator, per_view, scene, unknown)
 
     return step_of(EVALUATE, inputs, build, user)
 
 
-def _further_metrics(evaluator: Evaluator, user: UserCode) -> dict[str, Any]:
-    """The user's own metrics and those of ``eval.more`` as they enter a key; nothing where there are none."""
+def _further_metrics(evaluator: Evaluator, user: UserCode, size: Sequence[int] | None) -> dict[str, Any]:
+    """The user's own metrics, ``eval.more`` and ``eval.fps`` as they enter a key; nothing where there are none."""
     own = {name: options_of("eval", metric, user, f"{EXTRA}.{name}") for name, metric in evaluator.extra.items()}
-    further: dict[str, Any] = {"extra": own, "more": list(evaluator.more)}
+    further: dict[str, Any] = {"extra": own, "more": list(evaluator.more), "fps": size}
     return {name: value for name, value in further.items() if value}
+
+
+def measure_speed(
+    rasterizer: Rasterizer, gaussians: Gaussians, scene: Scene, background: torch.Tensor, size: Sequence[int]
+) -> dict[str, float]:
+    """Renders a second of each test view at ``size`` (width, height) px: each rendered once, then timed."""
+    speeds = {}
+
+    def now() -> float:
+        if background.device.type == "cuda":  # renders are queued there
+            torch.cuda.synchronize(background.device)
+        return time.perf_counter()
+
+    for view in scene.test:
+        # The whole picture at another size, stretched if need be, so that the same Gaussians are in view.
+        camera = view.camera.resized(*size)
+        with torch.no_grad():
+            rasterizer.render(gaussians, camera, MAX_SH_DEGREE, background)
+            start = now()
+            for _ in range(TIMED_RENDERS):
+                rasterizer.render(gaussians, camera, MAX_SH_DEGREE, background)
+            speeds[view.name] = TIMED_RENDERS / (now() - start)
+    return speeds
 
 
 def _write_metrics(
     folder: Path,
     evaluator: Evaluator,
     per_view: Mapping[str, Mapping[str, float]],
-    of_model: Sequence[ModelMetrics],
     scene: Scene,
+    unavailable: Mapping[str, str] = MappingProxyType({}),
     at: Mapping[str, Earlier] = MappingProxyType({}),
 ) -> None:
-    """Write the metrics of images and of the model, by view and as means; views with their nearest training views."""
-    rows = {view: dict(row) for view, row in per_view.items()}
-    for found in of_model:
-        for view, row in found.per_view.items():
-            rows[view] |= row
+    """Write the metrics by view and as means; views with their nearest training views."""
     cameras, training = ([view.camera for view in views] for views in (scene.test, scene.train))
     near = nearness(cameras, training, scene.extent)
     places = {view.name: place for view, place in zip(scene.test, near, strict=True)}  # no metrics: they are in no mean
     if any(view.mask is not None for view in [*scene.train, *scene.test]):
         places = {view.name: places[view.name] | {COUNTED: view.counted} for view in scene.test}
-    write_per_view(folder / PER_VIEW, {view: row | places.get(view, {}) for view, row in rows.items()})
-    summary = replace(summary_of(evaluator, rows), at=dict(at))
-    for found in of_model:
-        summary = replace(summary, unavailable=summary.unavailable | found.unavailable)
+    write_per_view(folder / PER_VIEW, {view: dict(row) | places.get(view, {}) for view, row in per_view.items()})
+    summary = summary_of(evaluator, per_view)
+    summary = replace(summary, at=dict(at), unavailable=summary.unavailable | dict(unavailable))
     write_json(folder / METRICS, summary.to_json())
 
 

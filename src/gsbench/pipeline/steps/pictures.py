@@ -48,13 +48,6 @@ def view_maps(
     return {name: values.astype(np.float32) for name, values in maps.items()}
 
 
-def surface_depth(rasterizer: Rasterizer, gaussians: Gaussians, camera: Camera) -> NDArray[np.float64]:
-    """The view z [H, W] of what each pixel shows, as in `view_maps`; not a number where no surface is seen."""
-    view_z = _view_z(gaussians, camera).clamp_min(0)
-    features = torch.stack([view_z, torch.zeros_like(view_z), torch.zeros_like(view_z)], -1)  # [N, 3]
-    return _mean_seen(*paint(rasterizer, gaussians, features, camera))[..., 0].double().cpu().numpy()
-
-
 def paint(rasterizer: Rasterizer, gaussians: Gaussians, features: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """The Gaussians blended with ``features`` [N, 3], none negative, as colours: sums [H, W, 3], and alpha [H, W]."""
     painted = Gaussians(**(gaussians.tensors() | {"sh_dc": rgb_to_dc(features)}))

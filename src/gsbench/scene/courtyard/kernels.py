@@ -1,4 +1,4 @@
-"""Ray casting and distances for the courtyard, compiled with numba; scalar and without any shared state."""
+"""Ray casting for the courtyard, compiled with numba; scalar and without any shared state."""
 
 from __future__ import annotations
 
@@ -147,14 +147,6 @@ def nearest_surface(kind, center, rotation, size, start, low, high, x, y, z, lim
             lx, ly, lz = to_local(rotation[i], rx, ry, rz)
             best = min(best, abs(signed_distance(kind[i], size[i], lx, ly, lz)))
     return best
-
-
-@kernel
-def distances(kind, center, rotation, size, start, low, high, points, limit, result):
-    """`nearest_surface` of points [P, 3] into ``result`` [P]."""
-    for p in range(len(points)):
-        x, y, z = points[p, 0], points[p, 1], points[p, 2]
-        result[p] = nearest_surface(kind, center, rotation, size, start, low, high, x, y, z, limit)
 
 
 @inlined

@@ -7,9 +7,8 @@ for structure from motion beside the low-texture ground on which 3DGS grows over
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from math import cos, inf, pi, radians, sin, sqrt, tan
+from math import cos, pi, radians, sin, tan
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +17,8 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.camera import Camera
-from gsbench.scene.courtyard.kernels import SKY, cast, distances, render, to_local
+from gsbench.scene.courtyard.kernels import render
 from gsbench.scene.courtyard.layout import Layout, build_layout
-from gsbench.system.jit import kernel
 
 VERSION = 1  # raise when the pictures change
 MAX_STEP = radians(7.5)  # between neighbouring views; wider steps gave wrong SfM models on scenes like this one
@@ -94,59 +92,3 @@ def render_view(layout: Layout, camera: Camera, seed: int) -> NDArray[np.uint8]:
         (camera.fx, camera.fy, camera.cx, camera.cy), image, seed,
     )  # fmt: skip
     return image
-
-
-def surface_distance(points: NDArray[np.float64], seed: int = 0, limit: float = 1e3) -> NDArray[np.float64]:
-    """The distance in m from points [P, 3] (world coordinates) to the nearest true surface, at most ``limit``; [P].
-
-    Exact outside all solids; inside, the distance to the nearest surface of any primitive, hidden ones included.
-    """
-    layout = build_layout(seed)
-    result = np.empty(len(points))
-    distances(
-        layout.kind, layout.center, layout.rotation, layout.size,
-        layout.group_start, layout.group_low, layout.group_high,
-        np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3), limit, result,
-    )  # fmt: skip
-    return result
-
-
-def courtyard_depth(camera: Camera, seed: int = 0) -> NDArray[np.float64]:
-    """The depth along z, in m, that the centre of each pixel sees, [H, W]; infinite in the sky.
-
-    ``camera`` is in the courtyard's own coordinates, ``seed`` that of its pictures (``scene.seed``).
-    """
-    layout = build_layout(seed)
-    depth = np.empty((camera.height, camera.width))
-    _depths(
-        layout.kind, layout.center, layout.rotation, layout.size,
-        layout.group_start, layout.group_low, layout.group_high,
-        np.ascontiguousarray(camera.rotation), np.ascontiguousarray(camera.center),
-        (camera.fx, camera.fy, camera.cx, camera.cy), depth,
-    )  # fmt: skip
-    return depth
-
-
-@kernel
-def _depths(
-    kind: Any,
-    center: Any,
-    rotation: Any,
-    size: Any,
-    start: Any,
-    low: Any,
-    high: Any,
-    camera_rotation: Any,
-    origin: Any,
-    intrinsics: Any,
-    depth: Any,
-) -> None:
-    fx, fy, cx, cy = intrinsics
-    ox, oy, oz = origin
-    for row in range(depth.shape[0]):
-        for column in range(depth.shape[1]):
-            across, down = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
-            scale = 1.0 / sqrt(across * across + down * down + 1.0)
-            dx, dy, dz = to_local(camera_rotation, across * scale, down * scale, scale)
-            distance, hit = cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz, False)
-            depth[row, column] = inf if hit == SKY else distance * scale

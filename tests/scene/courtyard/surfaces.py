@@ -1,0 +1,45 @@
+"""The distance of points from the surfaces of the courtyard, which tests of geometry are held against."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gsbench.scene.courtyard.kernels import nearest_surface
+from gsbench.scene.courtyard.layout import build_layout
+
+
+def surface_distance(points: NDArray[np.float64], seed: int = 0, limit: float = 1e3) -> NDArray[np.float64]:
+    """The distance in m from points [P, 3] (world coordinates) to the nearest true surface, at most ``limit``; [P].
+
+    Exact outside all solids; inside, the distance to the nearest surface of any primitive, hidden ones included.
+    """
+    layout = build_layout(seed)
+    result = np.empty(len(points))
+    _distances(
+        layout.kind, layout.center, layout.rotation, layout.size,
+        layout.group_start, layout.group_low, layout.group_high,
+        np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3), limit, result,
+    )  # fmt: skip
+    return result
+
+
+@njit
+def _distances(
+    kind: Any,
+    center: Any,
+    rotation: Any,
+    size: Any,
+    start: Any,
+    low: Any,
+    high: Any,
+    points: Any,
+    limit: float,
+    result: Any,
+) -> None:
+    for p in range(len(points)):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        result[p] = nearest_surface(kind, center, rotation, size, start, low, high, x, y, z, limit)
