@@ -18,9 +18,15 @@ from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Dim, SiftKornia, read_cloud
 from gsbench.init.networks import extract_and_match
 from gsbench.init.networks.extract_and_match import NetworkJob, at_low_resolution, choose_pairs, open_store
-from gsbench.init.networks.extractors import SUPERPOINT_BORDER, build_extractor, extract_features
+from gsbench.init.networks.extractors import (
+    SUPERPOINT_BORDER,
+    MutualNearest,
+    build_extractor,
+    build_matcher,
+    extract_features,
+    match,
+)
 from gsbench.init.networks.features import Features, FeatureStore
-from gsbench.init.networks.matching import MutualNearest, build_matcher, match
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 from gsbench.weights import MissingWeights, load_state

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsbench.scene.camera import Camera
+from gsbench.scene.camera import ANGLE, DISTANCE, Camera, nearness
 from gsbench.scene.courtyard.render import ring_camera
 from gsbench.scene.hold_out import arrange, sector_of
-from gsbench.scene.nearness import ANGLE, DISTANCE, nearness
 from tests.scene import cameras
 
 looking = partial(cameras.looking, size=(40, 30), focal=50.0)

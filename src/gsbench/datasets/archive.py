@@ -1,11 +1,13 @@
-"""Zip archives of scenes, here or on a server: which members are wanted, and each of them on the disk, checked.
+"""Zip archives of scenes, here or on a server, and what of them comes here: which members are wanted, and each checked.
 
-Of an archive on a server only the directory and the wanted members come, each by a request of its own (remotezip).
+Of an archive on a server only the directory and the wanted members come, each by a request of its own (remotezip). A
+scene appears in the data folder when all that was missing of it is here.
 """
 
 from __future__ import annotations
 
 import lzma
+import shutil
 import struct
 import zipfile
 import zlib
@@ -15,9 +17,12 @@ from errno import EINVAL
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from gsbench.downloads import USER_AGENT, Patience, retried
+from gsbench.datasets.catalog import SceneFiles
+from gsbench.downloads import USER_AGENT, FetchError, Patience, retried
 from gsbench.errors import InputError
 from gsbench.files import CHUNK, atomic, require_regular
+from gsbench.logs import Progress
+from gsbench.words import counted, readable_bytes
 
 MAX_NAME_BYTES = 220  # file systems end at 255 for each folder, and a file that is being written has a longer name
 
@@ -172,3 +177,52 @@ def _cause(error: Exception, member: zipfile.ZipInfo) -> Exception:
     if isinstance(error, NotImplementedError | RuntimeError):
         return InputError(f"{member.filename} is packed in a way that cannot be read here ({error})")
     return error
+
+
+STAGING = ".fetch"  # below the data folder: what has come so far
+
+
+def missing_parts(data: Path, files: SceneFiles) -> tuple[str, ...]:
+    """The folders of a scene that are not in the folder ``data``; one that is there is whole."""
+    return tuple(part for part in files.parts if not (data / files.folder / part).exists())
+
+
+def fetch_scene(
+    archive: zipfile.ZipFile, folder: str, where: str, data: Path, files: SceneFiles, patience: Patience, say: Progress
+) -> str:
+    """Bring what is missing of a scene out of its ``archive``, where it lies in ``folder``; returns a line about it.
+
+    ``where`` is the archive's place, for errors; ``say`` is told bytes. The caller holds the lock of ``data``.
+    """
+    parts, staging = missing_parts(data, files), data / STAGING / files.scene
+    members = members_of(archive, folder, parts, where)
+    for path in [path for path in staging.rglob("*") if path.is_file()]:
+        if path.relative_to(staging).as_posix() not in members:
+            path.unlink()  # of an earlier fetch that wanted something else
+    missing = {
+        name: info for name, info in members.items() if not holds(staging / name, info.file_size, info.CRC)
+    }  # of what came before it was stopped, nothing comes again
+    total, done = sum(info.file_size for info in missing.values()), 0
+
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+        say(files.scene, done, total)
+
+    for name, info in sorted(missing.items(), key=lambda member: member[1].header_offset):
+        for is_last_try in (False, True):  # of damage on the way; a cut connection is tried again within
+            try:
+                retried(lambda: extract(archive, info, staging / name, advance), where, patience)  # noqa: B023
+                break
+            except DamagedError as error:
+                if is_last_try:
+                    raise FetchError(
+                        f"{where}: {info.filename} arrives damaged ({error}): try again later, or give another address "
+                        "with --mirror"
+                    ) from error
+    for part in parts:  # each by one rename, so that no folder of images is ever half there
+        (data / files.folder / part).parent.mkdir(parents=True, exist_ok=True)
+        shutil.move(staging / part, data / files.folder / part)
+    shutil.rmtree(staging, ignore_errors=True)
+    size = sum(info.file_size for info in members.values())
+    return f"{counted(len(members), 'file')}, {readable_bytes(size)}, in {data / files.folder} ({', '.join(parts)})"

@@ -16,8 +16,7 @@ from gsbench.init.base import (
 from gsbench.init.dataset import Dataset
 from gsbench.init.dim import Dim, SiftKornia
 from gsbench.init.placed import Carved, Random
-from gsbench.init.ply import Ply
-from gsbench.init.points import Points
+from gsbench.init.points import Ply, Points
 from gsbench.init.sfm import Jittered, Sfm, SfmDense
 from gsbench.logs import Progress
 

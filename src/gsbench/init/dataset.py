@@ -79,7 +79,7 @@ def _copy_model(job: tuple[Dataset, Capture, Path], progress: Progress) -> InitR
 def _of_training(capture: Capture, model: pycolmap.Reconstruction, work: Path) -> TrainingPoints:
     """Leave in ``model`` the points that training views alone vouch for."""
     from gsbench.init.colmap.database import readable_images
-    from gsbench.init.colmap.training_points import keep_training_points
+    from gsbench.init.colmap.reconstruct import keep_training_points
 
     work.mkdir(parents=True, exist_ok=True)
     try:

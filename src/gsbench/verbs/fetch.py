@@ -8,9 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from gsbench.datasets.archive import opened
+from gsbench.datasets.archive import STAGING, fetch_scene, missing_parts, opened
 from gsbench.datasets.catalog import DATA_VARIABLE, Dataset, data_dir, read_catalog, wanted_files
-from gsbench.datasets.fetch import STAGING, fetch_scene, missing_parts
 from gsbench.downloads import Patience
 from gsbench.errors import InputError
 from gsbench.files import remove_temporaries, storage_errors

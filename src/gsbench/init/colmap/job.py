@@ -16,7 +16,7 @@ from gsbench.init.base import OWN_GAUGE_FOLDER, InitReport, Preparation, Timer, 
 from gsbench.init.colmap import database as colmap_database
 from gsbench.init.colmap import mapping, reconstruct
 from gsbench.init.colmap.alignment import Similarity
-from gsbench.init.colmap.training_points import keep_training_points
+from gsbench.init.colmap.reconstruct import keep_training_points
 from gsbench.logs import Progress
 from gsbench.scene.types import Capture
 

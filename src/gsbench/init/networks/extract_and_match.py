@@ -15,9 +15,8 @@ from gsbench.files import file_sha256
 from gsbench.init.base import Preparation, Timer
 from gsbench.init.colmap.pairs import STRONGEST, proposed_pairs
 from gsbench.init.colmap.reconstruct import load_reference, select_pairs
-from gsbench.init.networks.extractors import build_extractor, extract_features
+from gsbench.init.networks.extractors import build_extractor, build_matcher, extract_features, match
 from gsbench.init.networks.features import Features, FeatureSettings, FeatureStore
-from gsbench.init.networks.matching import build_matcher, match
 from gsbench.logs import Progress
 from gsbench.scene.masks import read_mask
 from gsbench.scene.types import Capture

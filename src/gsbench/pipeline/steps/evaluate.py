@@ -32,9 +32,9 @@ from gsbench.raster import Rasterizer
 from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, MAPS, METRICS, PER_VIEW, POINT_CLOUD, RENDERS
 from gsbench.runs.stages import EVALUATE, Step
 from gsbench.runs.trial_record import Earlier, Evaluation
+from gsbench.scene.camera import COUNTED, nearness
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
-from gsbench.scene.nearness import COUNTED, nearness
 from gsbench.scene.types import Scene
 from gsbench.train.trainer import snapshot_file
 
