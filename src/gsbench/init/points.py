@@ -114,9 +114,6 @@ def _eight_bits(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
     return values.round().clip(0, 255).astype(np.uint8)
 
 
-if TYPE_CHECKING:
-    import pycolmap
-
 GREY = 128  # of points that no training photograph shows, where the file has no colours
 
 

@@ -123,7 +123,7 @@ def check_triton() -> Iterator[Finding]:
 def check_weights() -> Iterator[Finding]:
     """Weights that are at hand; nothing is downloaded."""
     from gsbench.eval.lpips import BACKBONES, find_any
-    from gsbench.init.networks.weights import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
+    from gsbench.init.dim import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
     from gsbench.weights import WEIGHTS_VARIABLE, MissingWeights, hub_cache
 
     wanted = {f"LPIPS {name}": backbone.features for name, backbone in BACKBONES.items()}
