@@ -13,7 +13,7 @@ from typing import Any
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
 from gsbench.tracking import Mirror
-from gsbench.tracking.run import TrackerRun
+from gsbench.tracking.trial import TrackerRun
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = 150
@@ -44,9 +44,9 @@ def following(settings: dict[str, Any], folder: Path) -> Iterator[None]:
         yield
 
 
-def mirror_trial(settings: dict[str, Any], folder: Path, values: dict[str, Any], anew: bool = False) -> bool:
+def mirror_trial(settings: dict[str, Any], folder: Path, values: dict[str, Any]) -> bool:
     """Mirror what is missing of an ended trial; False if nothing was missing. Raises what the tracker raises."""
-    run = TrackerRun(settings, TrialFolder(folder), values, anew=anew)
+    run = TrackerRun(settings, TrialFolder(folder), values)
     try:
         if run.is_complete:
             return False

@@ -143,7 +143,7 @@ def test_the_mirror_of_a_moved_runs_folder_is_made_again_from_the_files(runs: Pa
         mirror_trial(options(), folder, values)
     (moved / "mlflow.db").unlink()
     shutil.rmtree(moved / "mlartifacts")
-    said = list(sync([TrialFolder(folder)], None, anew=False))  # by a process that has not opened the old one
+    said = list(sync([TrialFolder(folder)], None))  # by a process that has not opened the old one
     assert said == [f"mirrored {TrialFolder(folder).label}", "1 trial mirrored, 0 were"]
     assert list((moved / "mlartifacts" / "tracked").rglob("results.json"))
 
@@ -163,13 +163,12 @@ def test_the_comparison_shows_final_metrics_first(runs: Path) -> None:
         address_of("http://127.0.0.1:5000", default_uri(runs), runs, "nothing")
 
 
-def test_a_rebuilt_mirror_shows_each_trial_once(runs: Path) -> None:
+def test_a_run_that_was_deleted_is_mirrored_anew(runs: Path) -> None:
     client, run = mirrored(runs, seed=28)
-    client.set_tag(run.info.run_id, "psnr", "meddled")
+    client.delete_run(run.info.run_id)
     values = trial_values(runs, seed=28)
-    assert mirror_trial(options(), TrialFolder.of(values).path, values, anew=True)
+    assert mirror_trial(options(), TrialFolder.of(values).path, values)
     (again,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "28"]
     assert again.info.run_id != run.info.run_id
-    assert "psnr" not in again.data.tags
     assert history(client, again.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
     assert "results.json" in artifacts(client, again)

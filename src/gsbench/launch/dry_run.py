@@ -1,4 +1,4 @@
-"""What a dry run says: the state of each trial, what was done elsewhere, and the time that the others take.
+"""Listing for a dry run: the state of each trial, what was done elsewhere, and the time that the others take.
 
 All finished trials are read once, so that ten thousand planned ones can be held against ten thousand. Loads no torch.
 """

@@ -21,8 +21,8 @@ from gsbench.runs.layout import FAILED, RESULTS
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError
 from gsbench.tracking.mirror import TRACKER_FAILED
-from gsbench.tracking.run import TrackerRun
 from gsbench.tracking.sink import name_of
+from gsbench.tracking.trial import TrackerRun
 
 SECONDS_AFTER_PARENT = 10.0  # to tell the tracker that the trials' process is gone
 
@@ -37,10 +37,9 @@ def follow() -> NoReturn:
     """Mirror the trials whose folders come as lines of the input, until they have ended; says what it mirrored.
 
     The words of the command: the program that runs the trials, "" where they have ended long ago; the time between two
-    looks and the patience of the process that waits for this one, in s; the tracker's address if one was typed; and
-    "anew" where what the tracker shows is to be deleted first.
+    looks and the patience of the process that waits for this one, in s; the tracker's address if one was typed.
     """
-    program, pause, patience, uri, anew = sys.argv[2:7]
+    program, pause, patience, uri = sys.argv[2:6]
 
     def work(told: Input, out: TextIO) -> None:
         trials: list[_Followed] = []
@@ -54,7 +53,7 @@ def follow() -> NoReturn:
                 last = True
             for trial in trials:
                 try:
-                    trial.catch_up(last, uri or None, bool(anew))
+                    trial.catch_up(last, uri or None)
                 except BusyError:
                     trial.said = f"{trial.folder.label} is being mirrored by another process"
                 except Exception as error:  # whatever the tracker raises: it is tried again, and at last said
@@ -76,7 +75,7 @@ class _Followed:
         self._program, self._told = program, time.time()
         self._run: TrackerRun | None = None
 
-    def catch_up(self, last: bool, uri: str | None, anew: bool) -> None:
+    def catch_up(self, last: bool, uri: str | None) -> None:
         """Send what the files have gained, and that the trial has ended; ``last`` says that all trials have."""
         if self._program is None and not last:
             return
@@ -88,7 +87,7 @@ class _Followed:
             values = self.folder.configuration()
             options = values["tracking"] | ({"uri": uri} if uri else {})
             self.tracker = name_of(options)
-            self._run = TrackerRun(options, self.folder, values, self._program, anew)
+            self._run = TrackerRun(options, self.folder, values, self._program)
             self.said = "" if self._run.is_complete else f"mirrored {self.folder.label}"
         self._run.add_curves()
         if state != "running":

@@ -81,11 +81,11 @@ class Mirror:
         log.warning("tracking: %s; the files are complete, `gsbench sync` mirrors them later", error)
 
 
-def sync(folders: Iterable[TrialFolder], uri: str | None, anew: bool) -> Iterator[str]:
+def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
     """Mirror what the tracker missed of ended trials; yields a line for each that is new there or left out, and one
     for all.
 
-    With ``anew``, what the tracker shows is deleted first. Raises MirrorError where the tracker does not take it.
+    Raises MirrorError where the tracker does not take it.
     """
     places = []
     for folder in folders:
@@ -107,7 +107,7 @@ def sync(folders: Iterable[TrialFolder], uri: str | None, anew: bool) -> Iterato
             )
             continue
         places.append(str(folder.path))
-    process = FollowerProcess("", 1.0, 0.0, uri, anew)
+    process = FollowerProcess("", 1.0, 0.0, uri)
     try:
         new = 0
         for line in process.lines(places):
@@ -127,8 +127,8 @@ class MirrorError(Exception):
 class FollowerProcess:
     """A fresh interpreter that runs `gsbench.tracking.follower.follow`. Raises OSError where it cannot start."""
 
-    def __init__(self, program: str, pause: float, patience: float, uri: str | None = None, anew: bool = False) -> None:
-        words = (program, str(pause), str(patience), uri or "", "anew" if anew else "")
+    def __init__(self, program: str, pause: float, patience: float, uri: str | None = None) -> None:
+        words = (program, str(pause), str(patience), uri or "")
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - the process's for all its life
         self._process = subprocess.Popen(
             python_command("gsbench.tracking.follower", "follow", *words),

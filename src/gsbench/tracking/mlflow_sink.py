@@ -107,10 +107,6 @@ class MlflowSink:
                     self.client.log_artifact(self.run_id, str(self._trial.folder.path / name))
         self.client.set_terminated(self.run_id, status)
 
-    def remove(self) -> None:
-        """Delete the run."""
-        self.client.delete_run(self.run_id)
-
     def _find_run(self, experiment_id: str, token: str) -> Any:
         """The run that has the token; None where there is none, or it was deleted."""
         found = self.client.search_runs([experiment_id], f"tags.`{TOKEN_TAG}` = '{token}'", max_results=1)

@@ -58,9 +58,6 @@ class Sink(Protocol):
         ...
         ...     def stop(self, status, reason):
         ...         print(status, reason)
-        ...
-        ...     def remove(self):
-        ...         pass
 
         >>> sink: Sink = Printed()
         >>> sink.log([Point("loss", 0.5, step=100, seconds=1.0)])
@@ -84,9 +81,6 @@ class Sink(Protocol):
 
     def stop(self, status: str, reason: str | None) -> None:
         """Show that the trial ended without results: ``status`` KILLED, or FAILED for a ``reason``."""
-
-    def remove(self) -> None:
-        """Delete the run."""
 
 
 def name_of(options: dict[str, Any]) -> str:

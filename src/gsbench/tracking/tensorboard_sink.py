@@ -31,7 +31,7 @@ class TensorBoardSink:
         from torch.utils.tensorboard import SummaryWriter
 
         require_own(self._trial.folder.runs, self._folder)
-        self.remove()
+        shutil.rmtree(self._folder, ignore_errors=True)
         self._writer = SummaryWriter(str(self._folder))
         for name, values in (("settings", self._trial.params()), ("trial", self._trial.tags())):
             table = "".join(f"| {key} | {value} |\n" for key, value in values.items())
@@ -60,7 +60,3 @@ class TensorBoardSink:
         """Write why the trial ended."""
         self._writer.add_text("status", status if reason is None else f"{status}: {reason}")
         self._writer.flush()
-
-    def remove(self) -> None:
-        """Delete the trial's event files."""
-        shutil.rmtree(self._folder, ignore_errors=True)

@@ -79,6 +79,3 @@ class WandbSink:
         """Finish the run with what went wrong."""
         self._run.summary["error" if reason else "status"] = reason or status
         self._run.finish(1)
-
-    def remove(self) -> None:
-        """Leave the run: deleting it is for its owner, on the page of the project. Another will be made."""

@@ -21,7 +21,6 @@ def main(argv: Sequence[str], runs: Path) -> int:
         "--uri",
         help="the tracker, such as http://127.0.0.1:5000 (else $MLFLOW_TRACKING_URI, else the runs folder's own)",
     )
-    parser.add_argument("--rebuild", action="store_true", help="delete what the tracker shows of them, mirror anew")
     options = parser.parse_args(argv)
     homes = (
         [experiment_home(runs, options.experiment)]
@@ -30,7 +29,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     )
     try:
         folders = [TrialFolder(Path(place)) for home in homes for place in sorted(places_of_trials(home))]
-        for line in sync(folders, options.uri, options.rebuild):
+        for line in sync(folders, options.uri):
             print(line, flush=True)
     except (MirrorError, OSError) as error:
         raise GsbenchError(f"{error}; the files are complete: try again") from error

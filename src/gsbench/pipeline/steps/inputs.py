@@ -92,7 +92,7 @@ def step_of(
 
     changed = edited(states)
     every = inputs | ({"code": changed} if changed else {})
-    # What this process has imported stays as it was; processes that a build starts import what is there then.
+    # This process runs on as it was imported; processes that a build starts import what is there then.
     return Step(stage, every, build, states, check) if in_processes else Step(stage, every, build, states)
 
 
