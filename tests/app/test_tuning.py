@@ -25,9 +25,9 @@ from gsbench.launch.declare import declare, declared_metrics, planned_trials
 from gsbench.launch.plan import add_to_plan
 from gsbench.launch.serial import Outcome, outcome_of_error, outcome_of_results
 from gsbench.runs.declaration import Arm
+from gsbench.runs.experiments import TuningRecord, read_tuning
 from gsbench.runs.layout import CONFIG, RESULTS
 from gsbench.runs.trial_record import record_from
-from gsbench.runs.tuning_record import TuningRecord, read_tuning
 from hydra_plugins.gsbench import TUNE
 from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.launch.test_declare import TINY

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.system import memory
-from gsbench.system.memory import MIB, peak_memory_mb, peak_resident_mb, reset_peak_memory
+from gsbench.system import resources as memory
+from gsbench.system.resources import MIB, peak_memory_mb, peak_resident_mb, reset_peak_memory
 
 CPU = torch.device("cpu")
 LARGE_MB = 200

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from gsbench.analysis.differences import differing_keys
 from gsbench.analysis.results import Arm, TrialResult, by_key, read_experiment
 from gsbench.records import read_if_sound
+from gsbench.runs.experiments import Point, TuningRecord
 from gsbench.runs.layout import TUNING
-from gsbench.runs.tuning_record import Point, TuningRecord
 from gsbench.words import counted, listed
 
 MOST_VALUES = 8  # points of a search that are named

@@ -23,9 +23,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config.command_words import check_words, is_sweep, parse, parse_word
 from gsbench.config.compose import Trial, compose_whole, look_at, ready_trial
-from gsbench.config.hydra_entry import hydra_ready, run_main
+from gsbench.config.hydra_entry import explained, hydra_ready, run_main
 from gsbench.config.jobs import typed
-from gsbench.config.messages import explained
 from gsbench.config.trust import PERMISSIONS, check_composed, load_callbacks
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch

@@ -25,8 +25,8 @@ from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import Planned, headline, plan_sweep, run_looks
 from gsbench.config.command_words import parse_word
 from gsbench.config.compose import Trial
+from gsbench.config.hydra_entry import explained
 from gsbench.config.jobs import compose_jobs, resolve_times
-from gsbench.config.messages import explained
 from gsbench.errors import GsbenchError
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.batch import begin_for_another_launcher

@@ -31,9 +31,8 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.facts import find, known_keys
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.runs.declaration import metric_and_question
-from gsbench.runs.experiments import make_home
+from gsbench.runs.experiments import Point, TuningRecord, make_home
 from gsbench.runs.layout import TUNING
-from gsbench.runs.tuning_record import Point, TuningRecord
 from gsbench.settings import check_settings
 from gsbench.system.install import install_command
 from gsbench.words import closest, counted, listed

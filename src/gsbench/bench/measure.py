@@ -20,7 +20,7 @@ from gsbench.pipeline.parts import build_rasterizer
 from gsbench.raster.base import Rasterizer
 from gsbench.raster.executors import find
 from gsbench.system.isolate import run_isolated
-from gsbench.system.memory import peak_memory_mb, reset_peak_memory
+from gsbench.system.resources import peak_memory_mb, reset_peak_memory
 from gsbench.train.device import keep_float32
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer

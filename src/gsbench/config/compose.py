@@ -24,8 +24,7 @@ from gsbench.config.command_words import (
     searched_folders,
     typed_permissions,
 )
-from gsbench.config.hydra_entry import CONFIG_NAME, hydra_ready
-from gsbench.config.messages import explained
+from gsbench.config.hydra_entry import CONFIG_NAME, explained, hydra_ready
 from gsbench.config.schema import check, plain
 from gsbench.config.trust import PERMISSIONS, check_composed, check_permissions
 from gsbench.errors import InputError

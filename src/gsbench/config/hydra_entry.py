@@ -1,21 +1,27 @@
-"""Hydra's two entrances: composing a configuration, and running an app."""
+"""Hydra's two entrances, composing a configuration and running an app; and its errors in one line."""
 
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
 from typing import Any
 
 import hydra
 import hydra.utils
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
 
+from gsbench.config.command_words import GROUPS, options
 from gsbench.config.schema import register_schemas
 from gsbench.config.trust import HYDRAS_CALLBACKS
+from gsbench.errors import GsbenchError, InputError
 from gsbench.system.install import conf_dir
+from gsbench.words import closest
 
 CONFIG_NAME = "config"  # conf/config.yaml
 # Hydra 1.3 wants to be told whose defaults hold; from 1.4 on there is one set of them, and being told is warned of.
@@ -74,3 +80,127 @@ class _WithoutHydrasLine:
 
     def write(self, text: str) -> int:
         return len(text) if text.startswith(HYDRAS_LINE) else int(self._stream.write(text))
+
+
+# ---- errors
+
+MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood
+HINTS = {  # where a word may name a class of the user's, or a plug-in of Hydra's that is not installed
+    **{group: f"; a class of your own is named by {group}._target_" for group in ("densify", "init", "raster")},
+    "hydra/launcher": "; other launchers are packages of their own, which launch=serial, local or slurm do not need",
+    "hydra/sweeper": "; others are packages of their own; a search is an interval and hydra.sweeper.tune.points",
+}
+
+Errors = type[Exception] | tuple[type[Exception], ...]
+
+
+@contextmanager
+def explained(overrides: Sequence[str], errors: Errors = Exception) -> Iterator[None]:
+    """Raise what the block raises of ``errors`` as InputError, one line in terms of the words that were given.
+
+    While Hydra composes, errors of any kind come from what the user gave.
+    """
+    try:
+        yield
+    except GsbenchError:
+        raise
+    except errors as error:
+        raise InputError(explain(error, overrides)) from error
+
+
+def explain(error: BaseException, overrides: Sequence[str]) -> str:
+    """Hydra's error in one line that names the key, what is allowed, and the nearest choice."""
+    text = " ".join(_chain(error))
+    override = re.search(r"Could not override '([^']+)'", text)
+    unknown = re.search(r"Key '([^']+)' (?:is not in struct|not in '[^']+')", text)
+    if unknown:
+        return _unknown_setting(unknown.group(1), override.group(1) if override else None, text, overrides)
+    group = re.search(
+        r"Could not override '([\w/]+)'\.?\s*(?:Did you mean to override|No match in the defaults list)", text
+    )
+    if group:
+        word = group.group(1)
+        known = [*GROUPS, *_keys_below("", overrides)]
+        return f"{word} is not a group or setting{closest(word, known)} (groups: {', '.join(GROUPS)})"
+    missing = re.search(
+        r"Could not find '([^']+)'.*?Available options in '([^']+)':\s*(.*?)(?:\n\n|Config search|$)", text, re.S
+    )
+    if missing:
+        wanted, name = missing.group(1), missing.group(2)
+        choices = sorted({*options(name), *re.findall(r"[\w.-]+", missing.group(3))})
+        word = wanted.rpartition("/")[2]
+        near = closest(word, choices) or HINTS.get(name, "")
+        return f"{name}={word} does not exist{near} (choose: {', '.join(choices)})"
+    absent = re.search(r"[Mm]issing mandatory value: ([\w.]+)", text)
+    if absent:
+        return f"{absent.group(1)} is not set: give it a value"
+    folder = re.search(r"provider=.* path=(.*) is not available", text)
+    if folder:
+        return f"hydra.searchpath names {folder.group(1)}: no such folder"
+    place = re.search(r"full_key: ([\w.\[\]]+)", text)
+    text = re.sub(r"\s*(full_key|reference_type|object_type)[:=].*", "", text)
+    return (f"{place.group(1)}: " if place else "") + " ".join(text.split())[:MAX_MESSAGE]
+
+
+def _unknown_setting(bad: str, given: str | None, text: str, overrides: Sequence[str]) -> str:
+    """A key ``bad`` that nothing has: ``given`` with the whole key on the command line, else in a file."""
+    if given and given.startswith("hydra.sweeper.params."):
+        return f"{given}: params are for files of experiments; type {given.partition('params.')[2]}=… itself, with -m"
+    if bad in ("grids", "tune"):
+        what = "joins grids" if bad == "grids" else "tunes arms"
+        return f"hydra.sweeper.{bad}: gsbench's own sweeper alone {what}, so leave out hydra/sweeper"
+    key = given or bad
+    parent = key[: key.rindex(bad)].rstrip(".") if bad in key else key.rpartition(".")[0]
+    where = re.search(r"In '([^']+)'", text)
+    file = ""
+    if where and not given:  # in a YAML file, whose folder is the group; an experiment's tells the key by its place
+        group, _, name = where.group(1).rpartition("/")
+        full = re.search(r"full_key: ([\w.]+)", text)
+        key = full.group(1) if full and full.group(1).endswith(bad) else f"{group}.{bad}"
+        file, parent = f" in {group}/{name}.yaml", key.rpartition(".")[0]
+    known = _keys_below(parent, overrides)
+    own = any(word.startswith(f"{parent}._target_=") for word in overrides)
+    hint = f"; a key that only your class has is added with a plus: +{key}=…" if own else ""
+    near = belongs_to(parent, bad) or closest(bad, known) or _places_of(key)
+    return (
+        f"{key} is not a setting{file}{near}{hint} ({parent or 'top level'} has: {', '.join(known) or 'no settings'})"
+    )
+
+
+def _places_of(key: str) -> str:
+    """``; did you mean scene.path?`` for a key without its group."""
+    groups = [group for group in GROUPS if group != "experiment"] if "." not in key else []
+    places = [f"{group}.{key}" for group in groups if key in _keys_below(group, [])]
+    return f"; did you mean {' or '.join(places)}?" if places else ""
+
+
+def belongs_to(group: str, key: str) -> str:
+    """``; it belongs to densify=volumetric`` where other choices of a group have the setting; else nothing."""
+    if group not in GROUPS:
+        return ""
+    states = re.compile(rf"^{re.escape(key)}:", re.M)
+    files = {name: Path(conf_dir(), group, f"{name}.yaml") for name in options(group) if "/" not in name}
+    having = [name for name, file in files.items() if states.search(file.read_text(encoding="utf-8"))]
+    return f"; it belongs to {group}={' or '.join(having[:3])}" if having else ""
+
+
+def _chain(error: BaseException | None) -> list[str]:
+    messages = []
+    while error is not None:
+        messages.append(str(error))
+        error = error.__cause__
+    return messages
+
+
+def _keys_below(parent: str, overrides: Sequence[str]) -> list[str]:
+    """The settings below ``parent`` with the group choices among ``overrides``, as far as these compose."""
+    groups = (*GROUPS, "hydra/launcher", "hydra/sweeper")
+    choices = [word for word in overrides if re.fullmatch(r"[\w/]+=[\w/-]+", word) and word.split("=")[0] in groups]
+    with hydra_ready():
+        try:
+            config = hydra.compose(CONFIG_NAME, choices, return_hydra_config=True)
+        except Exception:  # noqa: BLE001 - the choices may be what is wrong
+            config = hydra.compose(CONFIG_NAME, [], return_hydra_config=True)
+    node = OmegaConf.select(config, parent) if parent else config
+    hidden = "_target_" if parent.startswith("hydra") else "hydra"  # a plug-in is chosen by its name
+    return [str(key) for key in node if key != hidden] if isinstance(node, DictConfig) else []

@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config.command_words import check_search_path, parse_word
 from gsbench.config.compose import Trial, checked_trial, look_at, without_hydra
-from gsbench.config.messages import explained
+from gsbench.config.hydra_entry import explained
 from gsbench.config.schema import Config
 from gsbench.settings import checked
 

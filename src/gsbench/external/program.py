@@ -13,7 +13,7 @@ import psutil
 
 from gsbench.errors import TrainingError
 from gsbench.system.isolate import CrashError, describe_exit, run_isolated, telling_tail
-from gsbench.system.memory import MIB, peak_child_mb
+from gsbench.system.resources import MIB, peak_child_mb
 from gsbench.words import readable_time
 
 SECONDS_BETWEEN_LOOKS = 0.5  # at the memory of the program and its children

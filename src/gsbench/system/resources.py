@@ -1,25 +1,46 @@
-"""Cores, GPUs and slots for trials that run at once on a machine. Loads no torch."""
+"""Cores, GPUs and slots for trials that run at once on a machine, and the memory that they take at most.
+
+Peak memory is that of the GPU where the work is there, else of this process. Loads no torch.
+"""
 
 from __future__ import annotations
 
+import logging
 import os
+import re
 import socket
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import psutil
 
 from gsbench.system.locks import BusyError, hold
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+if TYPE_CHECKING:
+    import torch
+
+MIB = 2**20
+STATUS = Path("/proc/self/status")
+CLEAR_REFS = Path("/proc/self/clear_refs")
+RESET_PEAK = "5"  # what Linux takes as "start VmHWM anew", see proc(5)
 SECONDS_BETWEEN_TRIES = 0.5
 CORES_OF_TRIAL = 4  # beyond, more trials at once gain more than more threads of one
 MEMORY_OF_TRIAL, MEMORY_OF_GAUSSIAN = 545 * 2**20, 1592  # bytes, of a training on the CPU
 USUAL_GAUSSIANS = 1_000_000  # where nothing limits them
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+log = logging.getLogger(__name__)
 
 
 def available_threads(parallel: int = 1) -> int:
@@ -92,3 +113,53 @@ def assign_threads(threads: int | str, parallel: int) -> None:
 def available_cores() -> int:
     """The cores that this process may use, at least 1."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+# ---- memory
+
+
+def reset_peak_memory(device: torch.device) -> None:
+    """Start a new measurement of peak memory, where the platform can (Linux, CUDA)."""
+    if device.type == "cuda":
+        import torch
+
+        torch.cuda.reset_peak_memory_stats(device)
+        return
+    try:
+        CLEAR_REFS.write_text(RESET_PEAK)
+    except OSError:
+        log.debug("peak memory cannot be reset here: it counts from the start of the process")
+
+
+def peak_memory_mb(device: torch.device) -> float:
+    """Peak since `reset_peak_memory`: of torch's allocations on a GPU, else of this process's resident memory; MiB."""
+    if device.type == "cuda":
+        import torch
+
+        return torch.cuda.max_memory_allocated(device) / MIB
+    return peak_resident_mb()
+
+
+def peak_resident_mb() -> float:
+    """The most memory that this process had resident; MiB.
+
+    Linux's own count comes first: ``ru_maxrss`` begins at what the parent had when it started this process, and cannot
+    be reset.
+    """
+    if STATUS.exists():
+        found = re.search(r"VmHWM:\s+(\d+) kB", STATUS.read_text())
+        if found:
+            return int(found.group(1)) * 1024 / MIB
+    if resource is not None:
+        return _max_resident_mb(resource.RUSAGE_SELF)
+    return float(psutil.Process().memory_info().peak_wset) / MIB
+
+
+def peak_child_mb() -> float:
+    """The most that any one ended child of this process had resident; MiB, 0 where the platform does not say."""
+    return 0.0 if resource is None else _max_resident_mb(resource.RUSAGE_CHILDREN)
+
+
+def _max_resident_mb(who: int) -> float:
+    unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss: bytes there, else kB
+    return resource.getrusage(who).ru_maxrss * unit / MIB

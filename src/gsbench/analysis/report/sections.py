@@ -25,7 +25,7 @@ from gsbench.eval.facts import find
 from gsbench.events import RefineEvent
 from gsbench.parsing import DamagedError
 from gsbench.runs import layout
-from gsbench.runs.tuning_record import read_tuning
+from gsbench.runs.experiments import read_tuning
 from gsbench.words import counted, signed
 
 log = logging.getLogger(__name__)

@@ -22,7 +22,7 @@ from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
 from gsbench.runs.stages import TRAIN, Step
 from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine
-from gsbench.system.memory import peak_memory_mb, reset_peak_memory
+from gsbench.system.resources import peak_memory_mb, reset_peak_memory
 from gsbench.train.options import WITHOUT_EFFECT_ON_MODEL
 from gsbench.train.trainer import Status, Trainer
 
