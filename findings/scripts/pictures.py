@@ -32,6 +32,7 @@ def _cap(trial: TrialResult) -> str:
 
 # By the name of the picture, of the experiment findings_NAME: arm, control, and which trials make a pair of rows each.
 SHOWN: dict[str, tuple[str, str, KindOf, Sequence[str]]] = {
+    "plants": ("volumetric", "adc", _split, ("interpolation", "extrapolation")),
     "volume": ("volumetric", "adc", _split, ("interpolation", "extrapolation")),
     "dimension": ("volumetric-1", "adc", _split, ("interpolation", "extrapolation")),
     "full": ("volumetric", "adc", _cap, ("governor", "soft")),
@@ -51,6 +52,8 @@ def for_and_against(
         found: list[tuple[float, str, Sequence[TrialResult]]] = []
         for scene in dict.fromkeys(trial.scene for trial in trials):
             own = _first_seeds([trial for trial in trials if (trial.scene, kind_of(trial)) == (scene, kind)])
+            if not own:  # a scene that was not split so
+                continue
             one, other = read_views(own[control]), read_views(own[rule])
             found += [(other[view][LPIPS] - one[view][LPIPS], view, list(own.values())) for view in other]
         found.sort(key=lambda entry: entry[:2])

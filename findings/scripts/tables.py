@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from gsbench.analysis.verdicts import p_text
 from gsbench.claims.check import ClaimVerdict, recheck
 from gsbench.claims.file import read_claims
 from gsbench.words import counted, signed
@@ -38,6 +39,10 @@ KEYS = ["split", "scene", "seed"]  # of a pair of trials
 
 # The claims of the paper's rule, in the README's table: archive, claim, what was asked of LPIPS.
 ASKED = [
+    ("plants", "plants_between_cameras", "**plants**, 20,000 Gaussians each, between the cameras"),
+    ("plants", "plants_where_no_camera_went", "plants, a sector of neighbouring cameras held out"),
+    ("plants", "others_between_cameras", "no plants, between the cameras (claimed: within 0.010)"),
+    ("plants", "others_where_no_camera_went", "no plants, sector (claimed: within 0.010)"),
     ("volume", "rule_between_cameras", "the paper's rule, 20,000 Gaussians each, views between the cameras"),
     ("volume", "rule_where_no_camera_went", "the same, a sector of neighbouring cameras held out"),
     ("volume", "once_between_cameras", "without runaway splits, between the cameras"),
@@ -152,11 +157,16 @@ def scenes_table(name: str, arms: Sequence[str], against: str = "adc") -> str:
     found = {arm: differences(frame, arm, against, LPIPS) for arm in arms}
     columns = [(split, arm) for split in SPLITS if split in set(frame.split) for arm in arms]
     rows = [
-        [str(scene), *(mean_with_interval(found[arm].loc[split, scene], 3) for split, arm in columns)]
+        [str(scene), *(_scene_cell(found[arm], split, scene) for split, arm in columns)]
         for scene in sorted(set(frame.scene))
     ]
     means = [over_scenes(found[arm].loc[split], 3) for split, arm in columns]
     return table(["scene", *(f"{arm}, {SPLITS[split]}" for split, arm in columns)], [*rows, ["*mean*", *means]])
+
+
+def _scene_cell(found: pd.Series, split: str, scene: str) -> str:
+    """A scene's mean difference; "" where the scene was not split so."""
+    return mean_with_interval(found.loc[split, scene], 3) if (split, scene) in found.index.droplevel("seed") else ""
 
 
 def metrics_table(name: str, arms: Sequence[str], against: str = "adc") -> str:
@@ -186,6 +196,27 @@ def shares_table(name: str, arms: Sequence[str]) -> str:
     return table(["scene", "initial points", *arms], rows)
 
 
+def correlations_table(names: Sequence[str], arm: str = "volumetric") -> str:
+    """A split a row: over the scenes of all archives, Spearman's correlation of LPIPS minus adc's with two facts."""
+    rows = []
+    for split, word in SPLITS.items():
+        facts = []
+        for name in names:
+            frame = read_trials(name)
+            own = frame[(frame.arm == arm) & (frame.split == split)]
+            by_scene = own.groupby("scene")[[*GROWTH, "num_init_points"]].sum()
+            change = differences(frame, arm, "adc", LPIPS).loc[split].groupby("scene").mean()
+            share = by_scene[GROWTH[0]] / by_scene[list(GROWTH)].sum(axis=1)
+            facts.append(
+                pd.DataFrame({"change": change, "share": share, "points": own.groupby("scene").num_init_points.mean()})
+            )
+        joined = pd.concat(facts)
+        found = [stats.spearmanr(joined.change, joined[key]) for key in ("share", "points")]
+        cells = [f"{signed(one.statistic, '.2f')} (p {p_text(one.pvalue)})" for one in found]
+        rows.append([f"{word}, {len(joined)} scenes", *cells])
+    return table(["LPIPS of the rule minus adc's, by scene", "share split by volume", "initial points"], rows)
+
+
 def views_table(name: str) -> str:
     """A scene a row: its held-out views under both splits, how far the nearest training view is, and adc's PSNR."""
     with zipfile.ZipFile(ARCHIVES / f"{name}.zip") as archive:
@@ -201,7 +232,7 @@ def views_table(name: str) -> str:
         "adc's PSNR": psnr.map("{:.2f}".format),
     }
     rows = [
-        [str(scene), *(column[scene, split] for column in columns.values() for split in SPLITS)]
+        [str(scene), *(column.get((scene, split), "") for column in columns.values() for split in SPLITS)]
         for scene in sorted(set(frame.scene))
     ]
     return table(["scene", *(f"{title}, {word}" for title in columns for word in SPLITS.values())], rows)
@@ -289,6 +320,13 @@ def sections() -> list[tuple[str, list[Callable[[], str] | str]]]:
     by_volume = "Of all that is split or cloned, the share that is split by volume:"
     held_out = "Held-out views; medians of angle and distance (scene extents) to the nearest training view:"
     return [
+        ("Plants and others", [
+            made(claims_table, "plants"), "LPIPS by scene:", made(scenes_table, "plants", ("volumetric",)),
+            "All metrics:", made(metrics_table, "plants", ("volumetric",)),
+            by_volume, made(shares_table, "plants", ("volumetric",)),
+            "Together with the eight scenes below, exploratory:", made(correlations_table, ("plants", "volume")),
+            held_out, made(views_table, "plants"),
+        ]),
         ("Eight scenes at one count", [
             made(claims_table, "volume"), "LPIPS by scene:", made(scenes_table, "volume", both),
             "All metrics:", made(metrics_table, "volume", both), by_volume, made(shares_table, "volume", both),
