@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from gsbench.config.compose import compose_one
+from gsbench.pipeline import wiring
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps import init as init_module
 from gsbench.pipeline.steps import inputs as inputs_module
@@ -22,7 +23,7 @@ WORDS = [
 ]  # fmt: skip
 BARE = Capture("garden", Path("photos"), ("a.jpg", "b.jpg", "c.jpg"), ("a.jpg",), None, False, "0" * 64)
 KEYS = [
-    ("config", "84cbf20c22697c9af1c644d018f019b5237a03fca6c07628d0d2d71de76e239a"),
+    ("config", "efb880968c80cdd904651c24a9fa44e607e6283f150f6dbad8f47651f0e9d49f"),
     ("init", "6599fceb46df18df358d574ef2868e5bc85c2b8debe3c0b07b0aceb77882c9af"),  # of the cameras
     ("init", "19174a6b3b6b609d44ce3db01225cc25635b08315e8ddff0edafa7848403a6e5"),
     ("train", "88c3ca899428dee0fb817e4ebae5b764dfc1916c06f6963ce0ff49d9207658ac"),
@@ -41,6 +42,7 @@ def test_the_keys_of_a_known_trial_stay(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(init_module, "version", lambda package: "4.0.0")
     monkeypatch.setattr(inputs_module, "edited", lambda files: {})  # as in a release
     values = compose_one(WORDS).values
-    trial = TrialSteps(Parts(values), Store(tmp_path / "store"), BareSource)
+    monkeypatch.setattr(wiring, "CaptureSource", BareSource)
+    trial = TrialSteps(Parts(values), Store(tmp_path / "store"))
     keys = [("config", config_hash(values)), *((step.stage.name, step.key) for step in trial.steps())]
     assert keys == KEYS

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from gsbench.config.compose import compose_one
+from gsbench.pipeline import wiring
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.scene import makers_of_views
 from gsbench.pipeline.wiring import TrialSteps
@@ -44,11 +45,16 @@ def _forget() -> None:
         sys.modules.pop(name, None)
 
 
+@pytest.fixture(autouse=True)
+def bare_capture(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wiring, "CaptureSource", BareSource)
+
+
 def keys_of(home: Path, *words: str) -> dict[str, str]:
     """The keys of a trial as a new process would find them, by stage, and the hash of its configuration."""
     _forget()
     values = compose_one([*WORDS, f"allow_targets=[{','.join(MODULES)}]", *words]).values
-    steps = list(TrialSteps(Parts(values), Store(home / "store"), BareSource).steps())
+    steps = list(TrialSteps(Parts(values), Store(home / "store")).steps())
     return {"config": config_hash(values)} | {step.stage.name: step.key for step in steps}
 
 
