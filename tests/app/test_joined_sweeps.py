@@ -17,12 +17,12 @@ from tests.finished import write_results
 
 # Some trials of `threshold` by their names, which stay as they are from version to version.
 KNOWN = {
-    "sfm-volumetric-0.001/668e7765-seed0",
-    "sfm-volumetric-0.003/f79759cb-seed1",
-    "sfm-volumetric-0.01/c26ef915-seed2",
-    "sfm-volumetric-0.03/b5f53a36-seed0",
-    "sfm-volumetric-0.1/11d20d68-seed1",
-    "sfm-volumetric-0.3/6b11384e-seed2",
+    "sfm-volumetric-0.001/65c55ebe-seed0",
+    "sfm-volumetric-0.003/d280b464-seed1",
+    "sfm-volumetric-0.01/e8907559-seed2",
+    "sfm-volumetric-0.03/3681018c-seed0",
+    "sfm-volumetric-0.1/203719ce-seed1",
+    "sfm-volumetric-0.3/5c9e184d-seed2",
 }
 
 
