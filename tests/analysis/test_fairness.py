@@ -129,9 +129,25 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path: Path) -> None:
     for name, content in (("other", '{"points": [3, {"settings": []}]}'), ("broken", "{")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "tuning.json").write_text(content)
-    (line,) = [note for note in sheet(tmp_path, "volumetric").notes if note.startswith("Tuning.")]
+
+    def tuning() -> list[str]:
+        return [note for note in sheet(tmp_path, "volumetric").notes if note.startswith("Tuning.")]
+
+    (line,) = tuning()
     assert "densify.volume_threshold=0.1 is the best of 2 points by psnr of validation views" in line
     assert line.endswith("Tried: 0.1 (27.6), 0.06841 (27.5). These trials have other values.")
+    alike = [point | {"value": 27.5} for point in points]
+    (tmp_path / "vth" / "tuning.json").write_text(json.dumps(record | {"points": alike}))
+    assert tuning()[-1].endswith("All points are equal to the last bit: what was tuned never acted.")
+    (tmp_path / "vth" / "tuning.json").write_text(json.dumps(record | {"points": alike[1:]}))
+    unequal, line = tuning()
+    assert unequal == (
+        "Tuning. Their tuning was unequal: sfm-adc none and sfm-volumetric 1 point of 1 seed on validation views."
+    )
+    assert "equal to the last bit" not in line
+    nothing = [point | {"value": None} for point in points]
+    (tmp_path / "vth" / "tuning.json").write_text(json.dumps(record | {"points": nothing}))
+    assert tuning() == ["Tuning. sfm-volumetric: the search vth found nothing."]
 
 
 # --- where it stands

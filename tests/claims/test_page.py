@@ -19,6 +19,7 @@ from tests.analysis.synthetic import Plan, write_runs
 from tests.claims.test_check import content
 
 EARLY = "2020-01-01T00:00:00Z"
+SIZE = "nine scenes, 30,000 iterations"
 
 
 def made(runs: Path, scenes: Sequence[str], seeds: int = 4, **plan: Any) -> list[TrialResult]:
@@ -29,7 +30,7 @@ def made(runs: Path, scenes: Sequence[str], seeds: int = 4, **plan: Any) -> list
 def page_of(trials: Sequence[TrialResult]) -> Page:
     """The page of one claim about all scenes of the trials."""
     names = list(dict.fromkeys(trial.scene for trial in trials))
-    file = parse_claims(content() | {"scenes": {name: {"scene": "courtyard"} for name in names}})
+    file = parse_claims(content() | {"size": SIZE, "scenes": {name: {"scene": "courtyard"} for name in names}})
     keys = {(trial.scene, trial.densify): trial.key for trial in trials}
     question = file.question(file.claims[0], {name: (keys[name, "adc"], keys[name, "volumetric"]) for name in names})
     declared = Declaration(time=EARLY, questions=(question,), looks=file.looks)
@@ -42,6 +43,7 @@ def test_from_six_scenes_on_scenes_like_these_are_asked_beside_the_verdict(tmp_p
     assert page.sections[0].verdict.word == "supported"
     assert ("scenes like these: supported; it is higher in 6 of 6" in to_text(page)) == (len(scenes) == 6)
     assert "A verdict is about these scenes" in to_text(page)
+    assert f"The paper: {SIZE}." in to_text(page)
 
 
 def test_the_page_says_where_machines_and_clouds_of_its_trials_differ(tmp_path: Path) -> None:

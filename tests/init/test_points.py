@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Points, read_cloud
+from gsbench.init.base import PointCloud
 from gsbench.init.points import GREY, read_points, read_similarity, seen_colors
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Capture
@@ -165,3 +166,9 @@ def test_a_file_that_is_not_there_and_photos_without_cameras(bare_photos: Captur
         Points(path="nowhere.ply")
     np.save(tmp_path / "a.npy", XYZ)
     assert Points(path=tmp_path / "a.npy").needs_reference(replace(bare_photos))
+
+
+@pytest.mark.parametrize(("shape", "kind"), [((4, 2), "float64"), ((4,), "float64"), ((4, 3), "float32")])
+def test_a_cloud_takes_rows_of_three_coordinates_alone(shape: tuple[int, ...], kind: str) -> None:
+    with pytest.raises(ValueError, match="points must be"):
+        PointCloud(np.zeros(shape, kind), np.zeros(shape, np.uint8))
