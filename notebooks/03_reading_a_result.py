@@ -140,12 +140,11 @@ for difference in (0.05, 0.1, 0.2, 0.5):
 views, _ = choose_views(pair_trials(experiment.trials, adc, volumetric))
 rows = []
 for view in (views[-1], views[0]):
-    pictures = [(view.truth, "photograph"), (view.first, "adc"), (view.second, "volumetric")]
-    pictures.append((view.difference, "where they differ"))
+    pictures = [(view.first, "adc"), (view.second, "volumetric"), (view.difference, "where they differ")]
     cells = "".join(
         f'<td><img src="{uri}" width="200"><br>{name or "where they differ"}</td>' for uri, name in pictures
     )
-    rows.append(f"<tr>{cells}</tr><tr><td colspan=4>{view.which}: {view.view}</td></tr>")
+    rows.append(f"<tr>{cells}</tr><tr><td colspan=3>{view.which}: {view.view}</td></tr>")
 HTML(f"<table>{''.join(rows)}</table>")
 
 # %% [markdown]
