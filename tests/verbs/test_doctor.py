@@ -85,7 +85,7 @@ def test_rasterizers_on_a_gpu(gpus: None, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_triton_that_is_too_old_is_said_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_version", lambda package: "3.3.1")
+    monkeypatch.setattr(doctor, "version_of", lambda package: "3.3.1")
     monkeypatch.setattr(importlib.metadata, "version", lambda package: "3.3.1")
     ((verdict, text),) = said(doctor.check_triton())
     assert verdict == "note"

@@ -115,6 +115,7 @@ class Sweep:
         if self.task.look_only:
             print(stopping.describe())
             self.launch(trials)
+            return
         make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
         stopping = replace(stopping, declaration=declare_questions(stopping.home, stopping.declaration))
         launched: set[Path] = set()

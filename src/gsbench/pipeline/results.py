@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from gsbench.runs.code import user_modules
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.hashing import config_hash, flatten, sha256_of
 from gsbench.runs.layout import EVENTS
+from gsbench.runs.made_of import version_of
 from gsbench.runs.rows import read_rows
 from gsbench.runs.stages import EVALUATE, INIT, STAGES, TRAIN
 from gsbench.runs.store import Entry, read_manifest
@@ -166,9 +166,4 @@ def cloud_hash(init: Path) -> str:
 def versions() -> dict[str, str]:
     """Versions of what a result depends on."""
     found = {"python": sys.version.split()[0], "gsbench": __version__}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found
+    return found | {package: known for package in PACKAGES if (known := version_of(package)) is not None}

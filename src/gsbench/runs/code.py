@@ -65,21 +65,21 @@ def changed_rooms(recorded: Mapping[str, str]) -> list[str]:
 
 def changed_since_asked(rooms: Iterable[str]) -> list[str]:
     """The rooms whose files are other ones than when their state was first asked for."""
-    return [room for room in rooms if _digest(_contents(room)) != _noted(room)]
+    return [room for room in rooms if _contents(room) != _noted(room)]
 
 
 @cache
-def _noted(room: str) -> str:
-    """The digest of a room's files as they were when this process first asked."""
-    return _digest(_contents(room))
+def _noted(room: str) -> dict[str, bytes]:
+    """The files of a room as they were when this process first asked."""
+    return _contents(room)
 
 
 @cache
 def _state(room: str) -> str:
     released, noted = _released().get(room) or {}, _noted(room)
-    if released.get("bytes") == noted:  # as nearly always where gsbench is installed: nothing is parsed
+    if released.get("bytes") == _digest(noted):  # as nearly always where gsbench is installed: nothing is parsed
         return AS_RELEASED
-    digest = _digest({name: syntax_of(content) for name, content in _contents(room).items()})
+    digest = _digest({name: syntax_of(content) for name, content in noted.items()})
     return AS_RELEASED if digest == released.get("syntax") else digest
 
 

@@ -6,12 +6,12 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 from gsbench.raster.executors import EXECUTORS, find, resolve
 from gsbench.runs.layout import STORE
+from gsbench.runs.made_of import version_of
 from gsbench.system.install import install_command
 from gsbench.system.resources import available_threads, installed_gpus
 from gsbench.verbs.arguments import ArgumentParser
@@ -65,10 +65,10 @@ def check_packages() -> Iterator[Finding]:
     yield Finding("ok", "gsbench", f"{__version__} in {Path(__file__).resolve().parents[1]}")
     yield Finding("ok", "python", f"{sys.version.split()[0]} ({sys.executable}), {available_threads()} cores to use")
     for name in REQUIRED:
-        installed = _version(name)
+        installed = version_of(name)
         yield Finding("bad" if installed is None else "ok", name, installed or f"missing: {install_command()}")
     for name, (purpose, extra) in OPTIONAL.items():
-        installed = _version(name)
+        installed = version_of(name)
         text = installed or f"not installed; needed for {purpose}: {install_command(extra)}"
         yield Finding("ok" if installed else "note", name, text)
 
@@ -112,7 +112,7 @@ def check_triton() -> Iterator[Finding]:
     """Check the compiler that raster=triton needs at its first run on a GPU."""
     from gsbench.raster.triton.launch import missing_tools
 
-    if _version("triton") is None:  # torch for CUDA would have brought it along
+    if version_of("triton") is None:  # torch for CUDA would have brought it along
         return
     if fault := find("triton").too_old():
         yield Finding("note", "triton", f"raster=triton {fault}")
@@ -164,10 +164,3 @@ def check_store(runs: Path) -> Iterator[Finding]:
         except ValueError as error:
             yield Finding("note", "store", f"{folder}: {error}; delete the folder, and the next run builds it again")
     yield Finding("ok", "store", f"{sound:,} results are as they were written")
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
