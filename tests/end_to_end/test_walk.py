@@ -83,19 +83,19 @@ def test_from_the_yaml_to_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(owner, name, watched)
 
     compositions = 0
-    compose_job = jobs.HydraJob.composed
+    look_at = jobs.look_at  # at each job's configuration, as Hydra has composed it
 
-    def counted(job: jobs.HydraJob) -> Any:
+    def counted(*given: Any) -> Any:
         nonlocal compositions
         compositions += 1
-        return compose_job(job)
+        return look_at(*given)
 
-    monkeypatch.setattr(jobs.HydraJob, "composed", counted)
+    monkeypatch.setattr(jobs, "look_at", counted)
     watch(settings, "_converted", lambda value, field, cls, key: key == KEY)
     watch(Volumetric, "split_by_volume")
     watch(TrainableGaussians, "edit", lambda *given: calls["split_by_volume"] > 0)
     assert run(["-m", *TRIAL, f"runs={tmp_path}"]) == 0
-    assert compositions == 1  # before the sweep: not again when a job begins on which Hydra has no effect
+    assert compositions == 1  # before the sweep: not again when a trial begins
     assert calls["_converted"] == 2  # checked before the sweep, built when the trial begins
     assert len(stacks) == 3
     passed = way(stacks)
