@@ -240,7 +240,7 @@ def test_ui_serves_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_doctor_names_the_packages_that_triton_compiles_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_version", lambda package: "3.7.1")
+    monkeypatch.setattr(doctor, "version_of", lambda package: "3.7.1")
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
     (finding,) = doctor.check_triton()
