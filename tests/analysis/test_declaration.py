@@ -18,7 +18,7 @@ from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import answer_family
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.verdicts import PairVerdicts, judge_pairs
+from gsbench.analysis.verdicts import PairVerdicts, families, judge_pairs
 from gsbench.runs.declaration import STAMP, Arm, Declaration, Question, open_question, read_declarations, record_text
 from tests.analysis.synthetic import Plan, write_runs
 
@@ -134,6 +134,11 @@ def test_a_declared_metric_without_weights_is_undecided_and_no_other_takes_its_p
     (one,) = judged(experiment)
     assert "lpips_alex" not in [verdict.quantity.key for verdict in one.verdicts]
     assert {one.role(verdict) for verdict in one.verdicts} == {"secondary"}
+    assert one.notes == ("LPIPS Alex: weights file alexnet.pth not found",)
+    assert families([one]) == [
+        "Secondary: all other metrics of all pairs of arms, 4 tests adjusted by Holm among themselves; "
+        "they do not make the verdict."
+    ]
     reason = "LPIPS Alex, which was declared, has no value (weights file alexnet.pth not found)"
     assert f"no verdict, since {reason}" in build_report(experiment)
     (note,) = (note for note in build_table(experiment).notes if note.startswith("Verdict"))

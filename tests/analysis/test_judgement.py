@@ -75,6 +75,18 @@ def test_ratios_are_taken_of_logarithms(make_experiment: Callable[..., Experimen
     assert verdict.shown(np.log(1.284)) == "+28.4 %"
 
 
+@pytest.mark.parametrize("densify", ["adc", "volumetric"])
+def test_of_nothing_no_ratio_is_taken(make_experiment: Callable[..., Experiment], densify: str) -> None:
+    trials = make_experiment(scenes=("garden",)).trials
+    for trial in trials:
+        if (trial.densify, trial.seed) == (densify, 1):
+            trial.record.metrics["psnr"] = 0.0
+    assert pair(trials, PSNR).seeds == 3
+    found = pair(trials, replace(PSNR, relative=True))
+    assert found.rows[0].seeds == (0, 2)
+    assert "garden seed 1: PSNR (dB) is 0, of which no ratio can be taken" in found.left_out
+
+
 def test_a_look_waits_for_every_scene_and_stops_where_it_is_decided(make_experiment: Callable[..., Experiment]) -> None:
     trials = make_experiment(effect={"psnr": 3.0}).trials
     declared = Declaration(time=EARLY, questions=(named(trials),), looks=(2, 3))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import xml.etree.ElementTree as ElementTree
 from html.parser import HTMLParser
@@ -16,16 +17,16 @@ from plyfile import PlyData
 from gsbench.analysis.images import texture_energy
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.report.build import build_report, trial_figures
-from gsbench.analysis.report.charts import ForestRow, Series, bar_chart, forest_plot, line_chart
+from gsbench.analysis.report.charts import ForestRow, Series, _Axis, bar_chart, forest_plot, line_chart
 from gsbench.analysis.report.pictures import choose_views
-from gsbench.analysis.report.sections import mean_by_step
+from gsbench.analysis.report.sections import _threshold, mean_by_step
 from gsbench.analysis.report.volumes import log10_volumes, share_above, volume_histogram
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.verdicts import by_scene_lines, headline, judge_pairs
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Arm
 from gsbench.verbs import report
-from tests.analysis.synthetic import Plan, write_runs
+from tests.analysis.synthetic import Plan, write_arms, write_runs
 
 ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
 
@@ -214,6 +215,54 @@ def test_a_line_chart_puts_values_where_they_belong() -> None:
     (x0, y0), (x1, y1), (x2, y2) = points
     assert x1 - x0 == pytest.approx(x2 - x1, abs=0.2)
     assert y0 == y2 > y1  # up is smaller in SVG
+
+
+@pytest.mark.parametrize("log", [False, True])
+@pytest.mark.parametrize(
+    "values", [(2, 5), (3, 3), (0.3, 40), (1e-9, 1e9), (0.011, 0.012), (7000, 30000), (99.5, 101), (1, 1e6)]
+)
+def test_an_axis_has_round_ticks_within_its_range(values: tuple[float, float], log: bool) -> None:
+    """Its range goes a little beyond the values; on a logarithmic one of no two decades, ends and middle are named."""
+    axis = _Axis(values, log, 100.0, 300.0)
+    places = [axis.place(tick) for tick in axis.ticks]
+    assert 2 <= len(places) <= 12
+    assert places == sorted(set(places))
+    assert 100 - 1e-9 <= places[0] < places[-1] <= 300 + 1e-9
+    ends = sorted(axis.place(value) for value in values)
+    assert ends == pytest.approx([200, 200] if values[0] == values[1] else [100 + 200 / 27, 300 - 200 / 27])
+    assert len({axis.label(tick) for tick in axis.ticks}) == len(places)
+    decades = [math.log10(tick) for tick in axis.ticks] if log else []
+    if not log:
+        step = axis.ticks[1] - axis.ticks[0]
+        assert np.diff(axis.ticks) == pytest.approx(step)
+        assert [tick / step for tick in axis.ticks] == pytest.approx([round(tick / step) for tick in axis.ticks])
+    elif decades != [round(decade) for decade in decades]:
+        assert places == pytest.approx([100, 200, 300])
+
+
+def test_an_axis_from_zero_begins_at_zero() -> None:
+    axis = _Axis([0.0, 10.0], False, 0.0, 104.0)
+    assert [axis.place(value) for value in (0, 5, 10)] == pytest.approx([0, 50, 100])
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"volume_threshold": 0.03}, 0.03),
+        ({"volume_threshold": 0.03, "threshold_mode": "absolute"}, 0.03),
+        ({"volume_threshold": 0.03, "threshold_mode": "extent_relative"}, None),
+        ({"volume_threshold": "auto"}, None),
+        ({}, None),
+    ],
+)
+def test_the_threshold_of_a_chart_is_the_one_that_all_arms_have_in_scene_units(
+    tmp_path: Path, settings: dict[str, object], expected: float | None
+) -> None:
+    write_arms(tmp_path, {"adc": {}, "volumetric": settings}, seeds=(0,))
+    assert _threshold(load_experiment(tmp_path, "exp").trials) == expected
+    write_arms(tmp_path / "b", {"mcmc": {"volume_threshold": 0.05}, "volumetric": settings}, seeds=(0,))
+    own = 0.05 if expected is None and "auto" not in settings.values() else None
+    assert _threshold(load_experiment(tmp_path / "b", "exp").trials) == own
 
 
 def test_nothing_to_draw_is_an_empty_string() -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbench.analysis.quantities import choose_quantities
+from gsbench.analysis.quantities import choose_quantities, quantity
 from gsbench.analysis.report.sections import change_words, cost_change
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.table_formats import escape_latex, to_csv, to_html, to_html_page, to_latex, to_markdown
@@ -316,3 +316,28 @@ def test_latex_has_as_many_cells_as_columns(make_experiment: Make) -> None:
 def test_results_written_by_hand_are_plain_json(make_experiment: Make) -> None:
     trial = make_experiment().trials[0]
     assert json.loads((trial.path / "results.json").read_text())["metrics"] == trial.metrics
+
+
+@pytest.mark.parametrize(
+    ("gaussians", "seconds", "headings"),
+    [
+        (999_999, 599.9, ["Gaussians (k)", "train (s)", "initial points (k)", "total (min)"]),
+        (1_000_000, 600.0, ["Gaussians (M)", "train (min)", "initial points (k)", "total (min)"]),
+        (900, 2.0, ["Gaussians (k)", "train (s)", "initial points (k)", "total (s)"]),
+    ],
+)
+def test_counts_from_a_million_and_times_from_ten_minutes_have_the_larger_unit(
+    tmp_path: Path, gaussians: int, seconds: float, headings: list[str]
+) -> None:
+    write_runs(tmp_path, Plan(scenes=("garden",), seeds=(0,)))
+    trials = load_experiment(tmp_path, "exp").trials
+    object.__setattr__(trials[0].record, "num_gaussians", gaussians)
+    trials[0].record.seconds.update(train=seconds, init=5.0, evaluate=2.0)
+    found = [quantity(name, trials[:1]) for name in ("num_gaussians", "train", "init_points", "total_time")]
+    assert [one.name.partition(" ↓")[0] for one in found] == headings
+    values = [one.read(trials[0]) for one in found]
+    scales = [{"(s)": 1, "(min)": 60, "(k)": 1e3, "(M)": 1e6}[name.split()[-1]] for name in headings]
+    own = [gaussians, seconds, 3000, seconds + 7]
+    assert values == pytest.approx([value / scale for value, scale in zip(own, scales, strict=True)])
+    fixed = [quantity(name, trials[:1]) for name in ("gaussians_millions", "train_minutes", "peak_memory_mb")]
+    assert [one.read(trials[0]) for one in fixed] == pytest.approx([gaussians / 1e6, seconds / 60, 900])

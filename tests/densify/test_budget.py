@@ -172,6 +172,17 @@ def test_far_over_its_target_a_round_prunes_more_of_the_faint() -> None:
     assert event.after == 60 - event.pruned_opacity == 30
 
 
+@pytest.mark.parametrize(("target", "culls"), [(199, False), (198, True)])
+def test_up_to_one_percent_over_its_target_a_count_is_not_culled(target: int, culls: bool) -> None:
+    densifier = ADC(max_gaussians=200, cap="governor", gradient_threshold=1.0, prune_size=100.0)
+    trainable, _ = prepared(densifier, 5, count=200)
+    densifier.max_gaussians = target
+    trainable.values.opacity_logits.data.copy_(torch.logit(torch.linspace(0.006, 0.06, 200, dtype=torch.float64)))
+    event = densifier.refine(14_900, trainable, generator(0))
+    assert (event.cull > 1) == culls
+    assert event.after == (target if culls else 200)
+
+
 def test_a_governed_mcmc_adds_what_is_missing() -> None:
     gaussians = random_gaussians(40)
     densifier = MCMC(start=0, stop=301, interval=100, max_gaussians=100, cap="governor")

@@ -91,7 +91,8 @@ def test_edges_are_those_that_pillow_finds(seed: int) -> None:
     image[3:9, 4:12] = torch.tensor([200, 30, 90], dtype=torch.uint8)
     np.testing.assert_allclose(edge_map(image), find_edges(image), atol=1e-6)
     assert not edge_map(torch.full((5, 5, 3), 90, dtype=torch.uint8)).any()
-    assert edge_map(image[:2]).shape == (2, 17)
+    for narrow in (image[:1], image[:2], image[:, :2], image[:, :1], image[:1, :1]):
+        assert torch.equal(edge_map(narrow), torch.zeros(narrow.shape[:2]))
 
 
 def test_blended_sums_are_sums_of_alpha_and_transmittance() -> None:
@@ -223,6 +224,21 @@ def test_taming_prunes_half_as_many_draws_as_there_are_to_prune() -> None:
     assert late.pruned_opacity == late.pruned_size == 0  # after 27 rounds no more
     assert densifier.statistics["score"].shape == (COUNT,)
     assert not densifier.statistics["score"].any()
+
+
+def test_taming_prunes_rather_those_of_low_score() -> None:
+    """Of forty faint ones the twenty of the highest score are drawn a million times as rarely."""
+    densifier = Taming(max_gaussians=COUNT, cap="hard")
+    trainable, _ = started(densifier, 1)
+    trainable.values.opacity_logits.data[:40] = -9.0
+    densifier.statistics["score"] = torch.where(torch.arange(COUNT) % 2 == 0, 1e6, 1.0)
+    refinement = at(600, trainable, torch.Generator().manual_seed(0))
+    before = trainable.values.means.detach().clone()
+    densifier.prune(refinement)
+    gone = [row for row in range(COUNT) if not (trainable.values.means == before[row]).all(-1).any()]
+    assert gone
+    assert all(row % 2 == 1 and row < 40 for row in gone)
+    assert refinement.event.pruned_opacity == len(gone) <= 20
 
 
 def test_taming_follows_its_curve_and_ends_at_the_budget() -> None:

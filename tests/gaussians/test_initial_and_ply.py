@@ -13,7 +13,7 @@ from plyfile import PlyData
 
 from gsbench.errors import InputError
 from gsbench.gaussians.initial import gaussians_from_cloud
-from gsbench.gaussians.ply import read_ply, write_ply
+from gsbench.gaussians.ply import check_ply, read_ply, write_ply
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -91,6 +91,21 @@ def rewritten(path: Path, old: bytes, new: bytes) -> Path:
     assert content.count(old) == 1
     path.write_bytes(content.replace(old, new))
     return path
+
+
+@pytest.mark.parametrize(("text", "bytes_each"), [(False, 61 * 4 + 8), (True, 62 * 2)])
+def test_more_than_a_file_can_hold_is_not_read(tmp_path: Path, text: bool, bytes_each: int) -> None:
+    """Its header alone says so: of 62 numbers, one of double precision; in text each takes two characters or more."""
+    write_ply(random_gaussians(4), tmp_path / "a.ply")
+    path = rewritten(tmp_path / "a.ply", b"property float opacity", b"property double opacity")
+    path = rewritten(path, b"element vertex 4", b"element vertex 1000000")
+    if text:
+        path = rewritten(path, b"format binary_little_endian", b"format ascii")
+    with pytest.raises(InputError, match=f"cut short: its header promises {1_000_000 * bytes_each} bytes or more"):
+        check_ply(path)
+    check_ply(rewritten(path, b"element vertex 1000000", b"element vertex 2"))
+    with pytest.raises(InputError, match="counts below zero"):
+        check_ply(rewritten(path, b"element vertex 2", b"element vertex -1"))
 
 
 @pytest.mark.parametrize(

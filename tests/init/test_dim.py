@@ -240,6 +240,27 @@ class TestContracts:
         assert (keypoints < torch.tensor([101, 75])).all()
 
 
+@pytest.mark.parametrize(
+    ("extractor", "threshold", "radius"), [("superpoint", 0.0005, 3), ("aliked", 0.2, 2), ("disk", 0.0, 2)]
+)
+def test_detection_settings_are_the_extractors_own_unless_given(
+    extractor: str, threshold: float, radius: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As deep-image-matching and the authors have them; the files are those of the networks in use."""
+    own = Dim(extractor=extractor, matcher="mutual_nearest", weights=tmp_path, download=False)  # type: ignore[arg-type]
+    found = own.feature_settings()
+    assert (found.keypoint_threshold, found.nms_radius) == (threshold, radius)
+    given = replace(own, keypoint_threshold=0.0, nms_radius=7).feature_settings()
+    assert (given.keypoint_threshold, given.nms_radius) == (0.0, 7)
+    monkeypatch.setattr(
+        "gsbench.init.dim.find_all_weights", lambda files, folder, download: [f.names[0] for f in files]
+    )
+    name = {"superpoint": "superpoint.safetensors", "aliked": "aliked-n16.pth", "disk": "depth-save.pth"}[extractor]
+    assert own.find_weights() == (name, None)
+    assert replace(own, matcher="lightglue").find_weights() == (name, f"{extractor}_lightglue_v0-1_arxiv-pth")
+    assert ("transformers" in own.packages()) == (extractor == "superpoint")
+
+
 class TestErrors:
     def test_missing_weights_are_named_before_any_work(self, courtyard: Capture, tmp_path: Path):
         with pytest.raises(MissingWeights, match=r"superpoint.safetensors, superpoint_lightglue_v0-1_arxiv-pth"):

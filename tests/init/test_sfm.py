@@ -42,9 +42,17 @@ def own(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[I
 
 
 @pytest.fixture(scope="module")
-def shared(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[InitReport, Path]:
+def told() -> list[tuple[str, int, int | None]]:
+    """What the run of the fixture ``shared`` said of its progress."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def shared(
+    courtyard: Capture, told: list[tuple[str, int, int | None]], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[InitReport, Path]:
     output = tmp_path_factory.mktemp("shared")
-    return Sfm().run(courtyard, output), output
+    return Sfm().run(courtyard, output, lambda phase, done, total, note="": told.append((phase, done, total))), output
 
 
 @pytest.mark.slow
@@ -132,6 +140,40 @@ def test_output_is_complete_and_the_work_folder_is_gone(shared: tuple[InitReport
     assert {"extract", "match", "triangulate"} == set(report.seconds)
     assert Image.open(output / PICTURE_FILE).size[0] > 500
     assert not (output / WORK_FOLDER).exists()
+
+
+def test_every_phase_is_told_from_its_start_to_its_end(shared: tuple[InitReport, Path], told: list) -> None:
+    phases = {phase: [state for state in told if state[0] == phase] for phase, _, _ in told}
+    assert list(phases) == ["extract", "match", "triangulate"]
+    for (_, first, _), *_, (_, last, total) in phases.values():
+        assert (first, last) == (0, total)
+    assert [states[-1][2] for states in phases.values()] == [8, 28, 1]
+
+
+@pytest.mark.parametrize(
+    ("poses", "intrinsics", "points_from", "names", "needed"),
+    [
+        ("shared", "estimate", "all", "bcd", False),
+        ("shared", "reference", "all", "bcd", True),
+        ("shared", "estimate", "train", "cd", False),
+        ("own", "reference", "train", "bcd", True),
+        ("own", "estimate", "train", "abcd", False),
+    ],
+)
+def test_whose_cameras_are_taken_and_which_photographs_are_used(
+    poses: str, intrinsics: str, points_from: str, names: str, needed: bool
+) -> None:
+    """Of four photographs, b is a test view and a is not in the reference."""
+    options = Sfm(poses=poses, intrinsics=intrinsics, points_from=points_from)  # type: ignore[arg-type]
+    capture = Capture("x", Path("x"), ("a", "b", "c", "d"), ("b",), None, False, "0")
+    made = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=3, num_points3D=3)
+    reference = pycolmap.synthesize_dataset(made)
+    for image, name in zip(reference.images.values(), "dcb", strict=True):
+        image.name = name
+    assert options.select_images(capture, reference) == list(names)
+    assert options.select_images(capture, None) == list("abcd")
+    assert options.needs_reference(capture) == needed
+    assert not options.needs_reference(replace(capture, model=Path("m")))
 
 
 @pytest.mark.slow

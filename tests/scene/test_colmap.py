@@ -12,6 +12,7 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import points_of, read_model, read_reference, write_model
+from gsbench.scene.colmap_files import ModelChecks
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap, read_photos
 from tests.scene.cameras import cameras_of
@@ -122,3 +123,59 @@ def test_written_cameras_project_alike(tmp_path: Path, text: bool):
         back = cameras_of(model)[name]
         np.testing.assert_allclose(back.rotation, camera.rotation, atol=1e-12)
         np.testing.assert_allclose(back.center, model.find_image_with_name(name).projection_center(), atol=1e-12)
+
+
+POSE = (1.0, 0, 0, 0, 0, 0, 5)
+LARGEST = {"camera": 2**32 - 2, "image": 2**32 - 2, "point": 2**64 - 2}  # COLMAP's numbers for "none" are one above
+
+
+def sound_model() -> list[tuple[str, tuple]]:
+    """The calls of `ModelChecks` for a model with two images and two points, each with numbers at both ends."""
+    return [
+        ("camera", (0, "SIMPLE_PINHOLE", 1, 1, (0.5, 0, 0))),
+        ("camera", (LARGEST["camera"], "OPENCV", 40, 30, (50.0, 50, 20, 15, 0, -0.1, 0, 0))),
+        ("image", (0, POSE, 0, "a.png", 0)),
+        ("image", (LARGEST["image"], POSE, LARGEST["camera"], "b.png", 3)),
+        ("point", (0, (0.0, 0, 0), [])),
+        ("point", (LARGEST["point"], (-1.0, 2, 3), [(LARGEST["image"], 0), (LARGEST["image"], 2)])),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("call", "argument", "value", "said"),
+    [
+        (None, 0, None, ""),
+        *(
+            (place, 0, number, f"{kind} {number} is there twice, or has no number")
+            for place, kind in ((1, "camera"), (3, "image"), (5, "point"))
+            for number in (0, LARGEST[kind] + 1, -1)
+        ),
+        (0, 2, 0, "camera 0 is damaged"),
+        (0, 3, 0, "camera 0 is damaged"),
+        (0, 4, (0.0, 1, 1), "camera 0 is damaged"),
+        (1, 4, (50.0, 0, 20, 15, 0, 0, 0, 0), "is damaged"),
+        (1, 4, (50.0, 50, 20, 15, np.nan, 0, 0, 0), "is damaged"),
+        (2, 1, (0.0, 0, 0, 0, 0, 0, 5), "has no pose that can be used"),
+        (2, 1, (1.0, 0, 0, 0, 0, 0, np.inf), "has no pose that can be used"),
+        (2, 1, (1.0, 0, 0, 0, 0, 0), "has no pose that can be used"),
+        (2, 2, 7, "image 0 names camera 7, which the model lacks"),
+        (2, 3, "", "image 0 has no name of its own"),
+        (3, 3, "a.png", "has no name of its own"),
+        (4, 1, (0.0, np.nan, 0), "point 0 lies nowhere"),
+        (5, 2, [(LARGEST["image"], 3)], "2D point 3 of image"),
+        (5, 2, [(LARGEST["image"], -1)], "2D point -1 of image"),
+        (5, 2, [(9, 0)], "2D point 0 of image 9"),
+        (4, 2, [(0, 0)], "2D point 0 of image 0"),
+    ],
+)
+def test_what_no_model_may_hold_is_refused(call: int | None, argument: int, value: object, said: str) -> None:
+    checks = ModelChecks()
+    for place, (name, arguments) in enumerate(sound_model()):
+        if place != call:
+            getattr(checks, name)(*arguments)
+            continue
+        changed = [value if number == argument else given for number, given in enumerate(arguments)]
+        with pytest.raises(InputError, match=said):
+            getattr(checks, name)(*changed)
+        return
+    assert call is None

@@ -81,6 +81,17 @@ def test_parallel_and_outward_looking_cameras_are_cut_by_planes() -> None:
     assert "do not look at one place" in arrange(outward).description
 
 
+def test_a_first_camera_straight_above_has_no_azimuth_to_count_from() -> None:
+    """All directions in which it looks and their means are exact here, so that it is above to the last digit."""
+    around = np.array([[3.0, 0, 0], [0, 3, 0], [-3, 0, 0], [0, -3, 0]])
+    level = [looking(place, np.zeros(3)) for place in around]
+    above = np.array([[[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], [[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]])
+    top = [Camera(40, 30, 50.0, 50.0, 20.0, 15.0, turn, -turn @ [0, 0, 3.0]) for turn in above]
+    found = arrange([*top, *level])
+    assert "none in 360 degrees around its centre" in found.description
+    assert sorted(found.order) == list(range(6))
+
+
 def test_an_exact_ring_is_cut_alike_whatever_the_last_digits_are() -> None:
     cameras = [ring_camera(k * 2 * np.pi / 48, 40, 30) for k in range(48)]
     noise = np.random.default_rng(0).normal(scale=1e-12, size=(48, 3))

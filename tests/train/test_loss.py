@@ -9,6 +9,7 @@ from skimage.metrics import structural_similarity
 
 from gsbench.eval.ssim import ssim_map, window
 from gsbench.train.loss import PhotometricLoss, photometric_loss, torch_photometric_loss
+from gsbench.train.loss_cpu import CompiledLoss
 
 SIZES = [(3, 4), (11, 16), (37, 53), (64, 65), (100, 21)]
 
@@ -54,6 +55,16 @@ def test_zero_padding() -> None:
     expected = (2 * share * share * 0.5 + 1e-4) / (share**2 * 1.25 + 1e-4)
     expected *= (2 * 0.5 * variance + 9e-4) / (1.25 * variance + 9e-4)
     assert ssim_map(ones, ones / 2)[0, 0, 0].item() == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_kernels_are_taken_on_a_cpu_in_single_precision_and_torch_elsewhere() -> None:
+    loss, (image, target) = PhotometricLoss(0.3, threads=1), _images(12, 13)
+    expected, _, _ = loss(image.double(), target)
+    assert not loss._compiled
+    assert float(loss(image, target)[0]) == pytest.approx(float(expected), rel=1e-5)
+    assert isinstance(loss._compiled["cpu"], CompiledLoss)
+    assert loss(image.to("meta"), target.to("meta"))[0].device.type == "meta"
+    assert loss._compiled["meta"](image.double(), target)[0] == expected
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)

@@ -1,4 +1,4 @@
-"""Losses that arrive late from a device are the same losses, and none that is not finite gets past a checkpoint."""
+"""Losses from a device that is behind are the same losses, one that is not finite passes no checkpoint; and volumes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsbench.raster.readback import Readback
-from gsbench.train.journal import LossLog
+from gsbench.train.journal import LossLog, volume_histogram
 
 
 def scalars(step: int, total: float | None = None) -> tuple[Tensor, ...]:
@@ -57,3 +57,17 @@ def test_regularisers_of_another_type_and_graphs_are_taken() -> None:
     leaf = torch.ones((), requires_grad=True)
     losses.add(1, leaf * 2, torch.tensor(0.5), torch.tensor(0.25), (leaf * 3).double())
     assert losses.settle() == {"step": 1, "loss": 2.0, "l1": 0.5, "ssim": 0.25}
+
+
+def test_volumes_are_counted_by_quarter_decades() -> None:
+    """One by one; what is beyond the ends counts in the outermost bins."""
+    log_scales = torch.randn(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 4 - 4
+    log_scales[0], log_scales[1] = -50.0, 50.0
+    counts = [0] * 84
+    for scales in log_scales.exp().tolist():
+        volume = math.log10(4 / 3 * math.pi * math.prod(scales))
+        counts[min(max(math.floor((volume + 18) * 4), 0), 83)] += 1
+    record = volume_histogram(700, log_scales)
+    assert (record["step"], record["counts"]) == (700, counts)
+    assert record["log10_edges"] == pytest.approx([-18 + k / 4 for k in range(85)])
+    assert min(counts[0], counts[-1]) > 0

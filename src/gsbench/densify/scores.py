@@ -72,9 +72,8 @@ def edge_map(image: Tensor) -> Tensor:
     level = (rgb[..., 0] * LUMINANCE[0] + rgb[..., 1] * LUMINANCE[1] + rgb[..., 2] * LUMINANCE[2] + HALF) >> SHIFT
     edges = torch.zeros_like(level)
     height, width = level.shape
-    if height > 2 and width > 2:
-        around = sum(level[y : height - 2 + y, x : width - 2 + x] for y in range(3) for x in range(3))
-        edges[1:-1, 1:-1] = (9 * level[1:-1, 1:-1] - around).clamp(0, 255)
+    around = sum(level[y : height - 2 + y, x : width - 2 + x] for y in range(3) for x in range(3))
+    edges[1:-1, 1:-1] = (9 * level[1:-1, 1:-1] - around).clamp(0, 255)
     return to_unit_range(edges.float())
 
 

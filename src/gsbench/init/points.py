@@ -147,9 +147,8 @@ class Points(PlacedCloud):
         points, colors = read_points(Path(self.path).expanduser())
         if self.transform is not None:
             points = read_similarity(Path(self.transform).expanduser())(points)
-        if self.max_points is not None and len(points) > self.max_points:
-            chosen = np.sort(np.random.default_rng(self.seed).permutation(len(points))[: self.max_points])
-            points, colors = points[chosen], None if colors is None else colors[chosen]
+        chosen = np.sort(np.random.default_rng(self.seed).permutation(len(points))[: self.max_points])
+        points, colors = points[chosen], None if colors is None else colors[chosen]
         seen = seen_colors(points, capture, model)
         if (seen < 0).all():
             raise InputError(

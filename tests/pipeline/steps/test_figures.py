@@ -28,6 +28,7 @@ def test_only_the_voluminous_is_outlined() -> None:
     black = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
     picture = np.asarray(draw_ellipsoids(black, gaussians, causes, camera, 0.03))
     drawn, legend = np.split(picture, [camera.height])
+    assert len(legend) % 14 == 0  # px of a line
     in_legend = {tuple(color) for color in legend.reshape(-1, 3).tolist()}
     assert Cause.SPLIT_VOLUME.color in in_legend
     assert Cause.CLONE.color not in in_legend

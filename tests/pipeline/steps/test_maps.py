@@ -15,26 +15,26 @@ from gsbench.raster.reference import ReferenceRasterizer
 from tests.train.conftest import orbit_camera
 
 
-def test_maps_of_a_flat_wall() -> None:
-    """Opaque discs on the plane z = 3 in front of a camera at the origin; the nearest initial point is 0.5 behind
-    it."""
-    x, y = np.meshgrid(np.linspace(-3, 3, 41), np.linspace(-3, 3, 41))
-    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, 3.0)], 1)
-    n = len(points)
+@pytest.mark.parametrize("z", [3.0, 0.6])
+def test_maps_of_a_flat_wall(z: float) -> None:
+    """Opaque discs on a plane in front of a camera at the origin; the nearest initial point is z / 6 behind it."""
+    x, y = np.meshgrid(np.linspace(-z, z, 41), np.linspace(-z, z, 41))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, z)], 1)
+    n, width = len(points), 0.04 * z
     wall = Gaussians(
         means=torch.from_numpy(points).float(),
-        log_scales=torch.tensor([[math.log(0.12), math.log(0.12), math.log(1e-3)]]).repeat(n, 1),
+        log_scales=torch.tensor([[math.log(width), math.log(width), math.log(1e-3)]]).repeat(n, 1),
         quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
         opacity_logits=torch.full((n,), 4.0),
         sh_dc=torch.zeros(n, 3),
         sh_rest=torch.zeros(n, 15, 3),
     )
     camera = orbit_camera(0.0)
-    maps = view_maps(ReferenceRasterizer(), wall, camera, cKDTree(points + np.array([0, 0, 0.5])))
-    assert np.nanmax(np.abs(maps["depth"] - 3)) < 0.01
+    maps = view_maps(ReferenceRasterizer(), wall, camera, cKDTree(points + np.array([0, 0, z / 6])))
+    assert np.nanmax(np.abs(maps["depth"] - z)) < 0.01
     assert np.isfinite(maps["depth"]).mean() > 0.99
-    assert np.nanmedian(maps["distance"]) == pytest.approx(0.5, abs=0.02)
-    assert np.nanmedian(maps["volume"]) == pytest.approx(4 / 3 * math.pi * 0.12 * 0.12 * 1e-3, rel=0.01)
+    assert np.nanmedian(maps["distance"]) == pytest.approx(z / 6, rel=0.04)
+    assert np.nanmedian(maps["volume"]) == pytest.approx(4 / 3 * math.pi * width * width * 1e-3, rel=0.01)
 
 
 def test_what_is_not_covered_is_no_number() -> None:

@@ -12,11 +12,11 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.layout import BOX, SPHERE, build_layout
-from gsbench.scene.courtyard.render import courtyard_cameras, render_courtyard, render_view
+from gsbench.scene.courtyard.render import courtyard_cameras, render_courtyard, render_view, ring_camera
 from gsbench.scene.load import load_scene
 from gsbench.scene.readers import read_colmap
 from tests.scene.cameras import cameras_of
-from tests.scene.courtyard.surfaces import surface_distance
+from tests.scene.courtyard.surfaces import fingerprint, surface_distance
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +89,58 @@ def test_pictures_have_detail_and_a_quiet_lawn(capture_dir: Path):
         assert image.std() > 30
         lawn = (image[..., 1] > image[..., 0]) & (image[..., 1] > 1.3 * image[..., 2])
         assert lawn.mean() > 0.1
+
+
+SOLIDS = {  # by seed: `fingerprint` of each array
+    0: {
+        "kind": 2.40082644628,
+        "center": 2.68978164699,
+        "rotation": 1.24221935441,
+        "size": 1.85863751001,
+        "material": 16.5082644628,
+        "tint": 0.720867768595,
+        "group_start": 448.657894737,
+        "group_low": -3.32277161153,
+        "group_high": 4.69082471145,
+    },
+    1: {
+        "kind": 2.40082644628,
+        "center": 2.7090538477,
+        "rotation": 1.24086155279,
+        "size": 1.84866386926,
+        "material": 16.5082644628,
+        "tint": 0.705592286501,
+        "group_start": 448.657894737,
+        "group_low": -3.34776899908,
+        "group_high": 4.68710385441,
+    },
+}
+PICTURES = [  # of each view: `fingerprint` of red, green and blue, about four times their means
+    [485.889, 471.442, 398.571],
+    [503.88, 484.926, 420.694],
+    [525.847, 486.092, 373.444],
+    [594.197, 543.535, 447.332],
+    [681.529, 655.972, 519.084],
+    [682.639, 660.308, 501.558],
+    [639.138, 588.323, 468.105],
+    [580.38, 526.467, 411.01],
+]
+
+
+@pytest.mark.parametrize("seed", SOLIDS)
+def test_the_things_are_those_of_this_version(seed: int):
+    """Raise the courtyard's VERSION where they change."""
+    made = {name: fingerprint(values) for name, values in vars(build_layout(seed)).items()}
+    assert made == pytest.approx(SOLIDS[seed], rel=1e-9), made
+
+
+def test_the_pictures_are_those_of_this_version():
+    """Eight views around, of another seed: raise the courtyard's VERSION where they change."""
+    made = []
+    for angle in np.arange(8) * np.pi / 4:
+        picture = render_view(build_layout(1), ring_camera(angle, 80, 60), 1)
+        made.append([fingerprint(picture[..., channel]) for channel in range(3)])
+    np.testing.assert_allclose(made, PICTURES, atol=0.02, err_msg=str(np.round(made, 3).tolist()))
 
 
 def test_seeds_differ():

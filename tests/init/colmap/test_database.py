@@ -1,0 +1,156 @@
+"""COLMAP's database as pycolmap reads it back: who shares a camera, which features are strongest, what is counted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from gsbench.init import Sfm
+from gsbench.init.colmap import database as made
+from gsbench.init.colmap import sift
+
+SIZES = {"a.png": (40, 30), "b.png": (40, 30), "c.png": (40, 32), "left/a.png": (40, 30), "left/b.png": (40, 30)}
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> Path:
+    for name, size in SIZES.items():
+        (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", size).save(tmp_path / "images" / name)
+    return tmp_path / "images"
+
+
+@pytest.fixture
+def database(images: Path, tmp_path: Path) -> Path:
+    """Cameras and images without features; the names are given in no order."""
+    made.create_database(
+        tmp_path / "database.db", made.guessed_groups(images, list(SIZES)[::-1], "single", "SIMPLE_RADIAL", None)
+    )
+    return tmp_path / "database.db"
+
+
+@pytest.mark.parametrize(
+    ("sharing", "expected"),
+    [
+        ("single", [{"a.png", "b.png", "left/a.png", "left/b.png"}, {"c.png"}]),
+        ("per_folder", [{"a.png", "b.png"}, {"c.png"}, {"left/a.png", "left/b.png"}]),
+        ("per_image", [{name} for name in SIZES]),
+    ],
+)
+def test_who_shares_a_camera(images: Path, sharing: str, expected: list[set[str]]) -> None:
+    groups = made.guessed_groups(images, list(SIZES), sharing, "SIMPLE_RADIAL", None)
+    assert [set(names) for _, names in groups] == expected
+    for camera, names in groups:
+        assert (camera.width, camera.height) == SIZES[names[0]]
+        assert (camera.focal_length, camera.has_prior_focal_length) == (1.2 * 40, False)
+    known = made.guessed_groups(images, list(SIZES), sharing, "SIMPLE_RADIAL", 51.0)
+    assert all((camera.focal_length, camera.has_prior_focal_length) == (51.0, True) for camera, _ in known)
+
+
+def test_ids_follow_the_names_and_each_camera_has_a_rig(database: Path) -> None:
+    with pycolmap.Database.open(database) as opened:
+        stored = sorted(opened.read_all_images(), key=lambda image: image.image_id)
+        assert [image.name for image in stored] == sorted(SIZES)
+        assert made.image_ids(database) == {image.name: image.image_id for image in stored}
+        assert len(opened.read_all_rigs()) == len(opened.read_all_cameras()) == 2
+        by_id = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+        assert {image.name: (by_id[image.camera_id].width, by_id[image.camera_id].height) for image in stored} == SIZES
+    with made.image_ids_as_names(database) as names:
+        assert made.image_ids(database) == {str(number): number for number in map(int, names.values())}
+    assert made.image_ids(database).keys() == SIZES.keys()
+
+
+def test_the_strongest_features_are_those_of_the_largest_area(database: Path) -> None:
+    rng = np.random.default_rng(0)
+    keypoints = rng.normal(size=(12, 6)).astype(np.float32)
+    descriptors = rng.integers(0, 256, (12, 128), dtype=np.uint8)
+    with pycolmap.Database.open(database) as opened:
+        number = made.image_ids(database)["b.png"]
+        opened.write_keypoints(number, keypoints)
+        opened.write_descriptors(number, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors))
+        opened.write_keypoints(made.image_ids(database)["a.png"], keypoints[:1])
+        opened.write_descriptors(
+            made.image_ids(database)["a.png"],
+            pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors[:1]),
+        )
+        opened.write_keypoints(made.image_ids(database)["c.png"], keypoints[:0])
+        opened.write_descriptors(
+            made.image_ids(database)["c.png"],
+            pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors[:0]),
+        )
+    areas = [abs(np.linalg.det(row[2:].reshape(2, 2))) for row in keypoints.astype(float)]
+    order = sorted(range(12), key=lambda row: -areas[row])
+    np.testing.assert_array_equal(made.strongest_descriptors(database, "b.png", 5), descriptors[order[:5]])
+    np.testing.assert_array_equal(made.strongest_descriptors(database, "a.png", 5), descriptors[:1])
+    assert made.strongest_descriptors(database, "c.png", 5).shape == (0, 128)
+
+
+def test_counts_are_of_pairs_with_inliers(database: Path) -> None:
+    made.write_keypoints(database, {name: np.ones((10 + place, 2)) for place, name in enumerate(SIZES)})
+    matches = np.stack([np.arange(9), np.arange(9)], axis=1)
+    made.write_matches(
+        database, {("a.png", "b.png"): matches, ("b.png", "c.png"): matches, ("a.png", "c.png"): matches}
+    )
+    ids = made.image_ids(database)
+    with pycolmap.Database.open(database) as opened:
+        for names, count in ((("a.png", "b.png"), 1), (("b.png", "c.png"), 7), (("a.png", "c.png"), 0)):
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+            geometry.inlier_matches = matches[:count].astype(np.uint32)
+            opened.write_two_view_geometry(*(ids[name] for name in names), geometry)
+    assert made.database_counts(database) == {
+        "features": 10 + 11 + 12 + 13 + 14, "pairs_matched": 3, "pairs_verified": 2, "inlier_matches": 8,
+    }  # fmt: skip
+
+
+def test_guessed_focal_lengths_become_known_ones(database: Path) -> None:
+    made.write_keypoints(database, dict.fromkeys(SIZES, np.ones((3, 2))))
+    some, none = np.zeros((1, 2)), np.zeros((0, 2))
+    made.write_matches(database, {("c.png", "b.png"): some, ("a.png", "b.png"): some, ("a.png", "c.png"): none})
+    assert made.cameras_without_prior(database)
+    assert made.assume_focal_lengths(database, 0.9) == [("a.png", "b.png"), ("b.png", "c.png")]
+    assert not made.cameras_without_prior(database)
+    with pycolmap.Database.open(database) as opened:
+        assert [camera.focal_length for camera in opened.read_all_cameras()] == [36.0, 36.0]
+    assert made.assume_focal_lengths(database, 5.0) == [("a.png", "b.png"), ("b.png", "c.png")]
+    with pycolmap.Database.open(database) as opened:
+        assert [camera.focal_length for camera in opened.read_all_cameras()] == [36.0, 36.0]
+
+
+@pytest.mark.parametrize(("count", "each"), [(30, 50), (120, 50), (2100, 105)])
+def test_verification_tells_its_progress_in_parts(
+    database: Path, monkeypatch: pytest.MonkeyPatch, count: int, each: int
+) -> None:
+    """Of fifty pairs, or of a twentieth of them; each pair is listed once, by the ids of its images."""
+    pairs, listed, told = [("a.png", "b.png"), ("left/a.png", "c.png")] * (count // 2), [], []
+    monkeypatch.setattr(
+        pycolmap, "verify_matches", lambda path, file, options: listed.append(Path(file).read_text().splitlines())
+    )
+    made.verify_pairs(database, pairs, None, lambda phase, done, total: told.append((phase, done, total)))
+    assert told == [("verify", done, count) for done in (*range(0, count, each), count)]
+    ids = made.image_ids(database)
+    assert [line for part in listed for line in part] == [f"{ids[first]} {ids[second]}" for first, second in pairs]
+    assert not list(database.parent.glob("*.txt"))
+
+
+@pytest.mark.parametrize(("threads", "each"), [(1, 8), (4, 8), (9, 18)])
+def test_features_are_extracted_of_eight_images_at_a_time_or_two_a_thread(
+    images: Path, monkeypatch: pytest.MonkeyPatch, threads: int, each: int
+) -> None:
+    calls, told, names = [], [], [f"{number}.png" for number in range(40)]
+    monkeypatch.setattr(pycolmap, "extract_features", lambda *paths, **options: calls.append(options))
+    masks = images if threads == 4 else None
+    settings = Sfm(max_image_size=500, max_num_features=70, peak_threshold=0.01, edge_threshold=9.0, first_octave=1)
+    sift.extract_sift(Path("x.db"), images, names, settings, threads, lambda *state: told.append(state), masks)
+    assert [name for call in calls for name in call["image_names"]] == names
+    assert told == [("extract", done, 40) for done in (*range(0, 40, each), 40)]
+    for call in calls:
+        options = call["extraction_options"]
+        assert (options.num_threads, options.use_gpu, options.max_image_size) == (threads, False, 500)
+        assert (options.sift.max_num_features, options.sift.first_octave) == (70, 1)
+        assert (options.sift.peak_threshold, options.sift.edge_threshold) == (0.01, 9.0)
+        assert Path(call["reader_options"].mask_path) == (masks or Path())

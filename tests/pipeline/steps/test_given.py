@@ -1,0 +1,168 @@
+"""What steps hand on: another program gets the training views and the settings, an initialiser its cameras."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from gsbench.errors import InputError, TrainingError
+from gsbench.external.settings import External
+from gsbench.gaussians.ply import write_ply
+from gsbench.init.base import MODEL_FOLDER
+from gsbench.pipeline.steps.external import external_step
+from gsbench.pipeline.steps.init import init_step
+from gsbench.runs.stages import INIT, Step
+from gsbench.runs.store import Store
+from gsbench.scene.colmap import write_model
+from gsbench.scene.types import Capture, Scene, View
+from tests.gaussians.helpers import random_gaussians
+from tests.train.conftest import orbit_camera
+
+CLOUD_STEP = Step(INIT, {}, lambda folder: None)
+PROGRAM = """
+import json, os, shutil, sys
+data, output, cameras, model, *rest = sys.argv[1:]
+there = sorted(os.path.relpath(os.path.join(at, name), data) for at, _, names in os.walk(data) for name in names)
+frames = json.load(open(cameras + "/transforms.json"))["frames"] if os.path.isdir(cameras) else []
+print(json.dumps({"there": there, "rest": rest, "frames": [frame["file_path"] for frame in frames],
+                  "own": [name for name in os.environ if name.startswith("GSBENCH_")], "set": os.environ.get("SET")}))
+if model != "none":
+    shutil.copy(model, output + "/result.ply")
+"""
+
+
+@pytest.fixture
+def views(tmp_path: Path) -> Any:
+    """Four training views and two test views of noise, and a cloud of seven points."""
+    rng = np.random.default_rng(0)
+    made = [View(f"{k}.png", orbit_camera(0.1 * k), rng.integers(0, 256, (32, 40, 3), np.uint8)) for k in range(6)]
+    store = Store(tmp_path / "store")
+    cloud = (rng.normal(size=(7, 3)), rng.integers(0, 256, (7, 3), np.uint8))
+    write_model(store.path(CLOUD_STEP) / MODEL_FOLDER, {view.name: view.camera for view in made}, cloud=cloud)
+    scene = Scene("made", tuple(made[2:]), tuple(made[:2]))
+    capture = Capture("made", tmp_path, (), (), None, False, "0")
+    return SimpleNamespace(capture=capture, inputs={"capture": "0"}, init=CLOUD_STEP, store=store, scene=scene)
+
+
+def parts_of(seed: int = 5) -> Any:
+    return SimpleNamespace(
+        values={"densify": {"name": "other"}}, train=SimpleNamespace(iterations=900), seed=seed, threads=3,
+        device=torch.device("cpu"),
+    )  # fmt: skip
+
+
+def trainer(tmp_path: Path, model: str, cameras: bool = True, **settings: Any) -> External:
+    (tmp_path / "program.py").write_text(PROGRAM)
+    words = ["{data}", "{output}", "{test_cameras}" if cameras else "none", model]
+    rest = ["{iterations}", "{seed}", "{device}", "{threads}", "{kind}"]
+    command = [sys.executable, str(tmp_path / "program.py"), *words, *rest]
+    return External(
+        command=command, result="*.ply", version="7", options={"kind": "a b"}, environment={"SET": "{seed}"}, **settings
+    )
+
+
+@pytest.mark.parametrize("cameras", [True, False])
+def test_a_program_is_given_the_training_views_and_the_settings(
+    views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cameras: bool
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", "here")
+    gaussians = random_gaussians(9, dtype=torch.float32)
+    write_ply(gaussians, tmp_path / "model.ply")
+    program = trainer(tmp_path, str(tmp_path / "model.ply"), cameras)
+    step = external_step(views, program, parts_of())
+    folder = tmp_path / "built"
+    folder.mkdir()
+    step.build(folder)
+    said = json.loads((folder / "trainer.log").read_text().splitlines()[-1])
+    assert [name for name in said["there"] if name.startswith("images")] == [f"images/{k}.png" for k in range(2, 6)]
+    assert "sparse/0/points3D.bin" in said["there"]
+    assert said["rest"] == ["900", "5", "cpu", "3", "a b"]
+    assert said["frames"] == (["0.png", "1.png"] if cameras else [])
+    assert (said["own"], said["set"]) == ([], "5")
+    summary = json.loads((folder / "training.json").read_text())
+    assert (summary["num_gaussians"], summary["num_init_points"], summary["iterations"]) == (9, 7, 900)
+    assert summary["trained_by"]["command"][2:4] == ["{data}", "{output}"]
+    assert summary["trained_by"]["version"] == "7"
+    assert summary["seconds"] > 0
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "events.jsonl", "lineage.npz", "point_cloud.ply", "trainer.log", "training.json",
+    ]  # fmt: skip
+    keys = {external_step(views, program, parts_of(seed)).key for seed in (5, 6)}
+    assert len(keys) == 2
+    assert step.key in keys
+
+
+def test_a_program_without_a_result_is_named_with_its_log(views: Any, tmp_path: Path) -> None:
+    step = external_step(views, trainer(tmp_path, "none"), parts_of())
+    (tmp_path / "built").mkdir()
+    with pytest.raises(TrainingError, match=r"ended well, but .*; log: .*trainer\.log"):
+        step.build(tmp_path / "built")
+    assert not any((tmp_path / "built" / "work").glob("data/*"))
+
+
+def test_the_version_that_a_program_tells_must_be_the_one_that_is_set(views: Any, tmp_path: Path) -> None:
+    write_ply(random_gaussians(9, dtype=torch.float32), tmp_path / "model.ply")
+    for said, fits in (("other 7.1", True), ("other 8", False)):
+        tells = f"{shlex.quote(sys.executable)} -c \"print('{said}')\""
+        step = external_step(views, trainer(tmp_path, str(tmp_path / "model.ply"), version_command=tells), parts_of())
+        folder = tmp_path / said
+        folder.mkdir()
+        if fits:
+            step.build(folder)
+            assert json.loads((folder / "training.json").read_text())["trained_by"]["said"] == said
+        else:
+            with pytest.raises(InputError, match=r"densify\.version"):
+                step.build(folder)
+
+
+def test_a_program_is_not_told_of_masks(views: Any, tmp_path: Path) -> None:
+    views.capture = replace(views.capture, masks={"0.png": tmp_path})
+    with pytest.raises(InputError, match="not told of masks"):
+        external_step(views, trainer(tmp_path, "none"), parts_of())
+
+
+@dataclass
+class Noting:
+    """An initialiser that keeps what it was given."""
+
+    count: int = 3
+    name = "noting"
+
+    def content(self) -> str:
+        return "c"
+
+    def run(self, capture: Capture, folder: Path, report: Any, reference: Path | None) -> None:
+        (folder / "given").write_text(str(reference))
+
+
+@pytest.mark.parametrize("has_reference", [False, True])
+def test_an_initialiser_gets_the_cameras_that_stand_in_for_those_that_did_not_come(
+    tmp_path: Path, has_reference: bool
+) -> None:
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
+    store, capture = Store(tmp_path / "store"), Capture("made", tmp_path, ("a.png",), (), None, False, "0")
+    reference = CLOUD_STEP if has_reference else None
+    step = init_step(store, capture, Noting(), reference)  # type: ignore[arg-type]
+    step.build(tmp_path)
+    assert (tmp_path / "given").read_text() == str(store.path(CLOUD_STEP) / MODEL_FOLDER if has_reference else None)
+    assert step.inputs["reference"] == (CLOUD_STEP.key if has_reference else None)
+    assert step.inputs["options"]["count"] == 3
+    others = [
+        init_step(store, capture, Noting(4), reference),  # type: ignore[arg-type]
+        init_step(store, replace(capture, fingerprint="1"), Noting(), reference),  # type: ignore[arg-type]
+        init_step(store, replace(capture, test_names=("a.png",)), Noting(), reference),  # type: ignore[arg-type]
+    ]
+    assert len({step.key, *(other.key for other in others)}) == 4
+    (tmp_path / "a.png").write_bytes(b"torn")
+    with pytest.raises(InputError, match=r"a\.png"):
+        step.build(tmp_path)

@@ -1,0 +1,207 @@
+"""What a ray meets, against dense samples of it and against trying every primitive; and the pinned textures.
+
+The functions run as plain Python here: nothing is compiled, and the pinned values are the same on every processor.
+"""
+
+from __future__ import annotations
+
+from math import inf
+from types import FunctionType, ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gsbench.scene.courtyard import kernels, layout, textures
+from gsbench.scene.courtyard.layout import BOX, SPHERE, TUBE, build_layout
+from tests.scene.courtyard.surfaces import fingerprint
+
+
+def uncompiled(*modules: ModuleType) -> SimpleNamespace:
+    """The functions of ``modules``, which call one another, as Python runs them."""
+    names = {name: value for module in modules for name, value in vars(module).items()}
+    for name, value in list(names.items()):
+        if hasattr(value, "py_func"):
+            names[name] = FunctionType(value.py_func.__code__, names)
+    return SimpleNamespace(**names)
+
+
+PLAIN = uncompiled(textures, kernels)
+LAYOUT = build_layout(0)
+SOLIDS = [LAYOUT.kind, LAYOUT.center, LAYOUT.rotation, LAYOUT.size]
+GROUPS = [LAYOUT.group_start, LAYOUT.group_low, LAYOUT.group_high]
+SHAPES = {
+    "box": (BOX, (0.5, 0.8, 0.3)),
+    "sphere": (SPHERE, (0.7, 0.7, 0.7)),
+    "tube": (TUBE, (0.6, 0.4, 0.0)),
+    "tube with a bore": (TUBE, (0.8, 0.5, 0.5)),
+}
+
+
+def is_inside(kind: int, size: tuple[float, float, float], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which of ``points`` [P, 3] lie in the solid; [P]."""
+    if kind == BOX:
+        return (np.abs(points) < size).all(axis=-1)
+    if kind == SPHERE:
+        return np.linalg.norm(points, axis=-1) < size[0]
+    radii = np.hypot(points[:, 0], points[:, 1])
+    return (radii < size[0]) & (radii > size[2]) & (np.abs(points[:, 2]) < size[1])
+
+
+def rays(seed: int, count: int, reach: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Origins and unit directions: from around a place towards it, some of them along an axis."""
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(count, 3))
+    directions[: count // 4] = np.eye(3)[rng.integers(0, 3, count // 4)]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return list(zip(rng.uniform(-0.7, 0.7, (count, 3)) - reach * directions, directions, strict=True))
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_ray_meets_a_solid_where_its_samples_enter_it(name: str) -> None:
+    kind, size = SHAPES[name]
+    starts = [*rays(0, 120, 2.0), *(rays(1, 40, 0.0) if size[2] == 0.5 else [])]
+    steps, hits = np.linspace(1e-4, 4.0, 8001), 0
+    for origin, direction in starts:
+        inside = is_inside(kind, size, origin + steps[:, None] * direction)
+        if inside[0] or 0 < inside.sum() < 5:
+            continue  # starts within, or grazes
+        found = PLAIN.hit_primitive(kind, size, *origin, *direction)
+        if inside.any():
+            hits += 1
+            first = int(inside.argmax())
+            assert steps[first - 1] <= found <= steps[first]
+        else:
+            assert found == inf
+    assert 30 < hits < len(starts)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_normals_are_the_gradient_of_the_distance(name: str) -> None:
+    kind, size = SHAPES[name]
+    tried = 0
+    for origin, direction in [*rays(2, 80, 2.0), *(rays(3, 40, 0.0) if size[2] == 0.5 else [])]:
+        t = PLAIN.hit_primitive(kind, size, *origin, *direction)
+        if t == inf or is_inside(kind, size, origin[None])[0]:
+            continue
+        tried += 1
+        point = origin + t * direction
+        moved = [[PLAIN.signed_distance(kind, size, *(point + s * step)) for s in (1, -1)] for step in 1e-6 * np.eye(3)]
+        *normal, u, v = PLAIN.local_normal(kind, size, *point)
+        np.testing.assert_allclose(normal, np.diff(moved, axis=1)[:, 0] / -2e-6, atol=1e-4)
+        assert np.dot(normal, direction) < 0
+        x, y, z = point
+        if kind == BOX:  # along the longer side of the face, then along the other
+            along = sorted((axis for axis in range(3) if normal[axis] == 0), key=lambda axis: -size[axis])
+            assert [u, v] == [point[axis] for axis in along]
+        elif kind == TUBE:
+            on_end = abs(normal[2]) == 1
+            assert (u, v) == pytest.approx((x, y) if on_end else (np.arctan2(y, x) * size[0], z))
+    assert tried > 20
+
+
+def test_the_first_hit_is_that_of_trying_every_primitive() -> None:
+    """Groups and bounding spheres leave out only what a ray misses."""
+    found = set()
+    for origin, direction in rays(4, 60, 4.0):
+        origin = origin * [1, 1, 0.2] + [0, 0, 1.5]
+        local = [
+            PLAIN.hit_primitive(kind, size, *((origin - center) @ turn), *(direction @ turn))
+            for kind, center, turn, size in zip(*SOLIDS, strict=True)
+        ]
+        ground = -origin[2] / direction[2] if direction[2] < 0 else inf
+        expected = min(ground, *local)
+        index = PLAIN.SKY if expected == inf else PLAIN.GROUND if expected == ground else int(np.argmin(local))
+        t, hit = PLAIN.cast(*SOLIDS, *GROUPS, *origin, *direction, False)
+        assert (hit, t) == (index, pytest.approx(expected))
+        _, anything = PLAIN.cast(*SOLIDS, *GROUPS, *origin, *direction, True)
+        assert (anything == PLAIN.SKY) == (min(local) == inf)
+        found.add(hit)
+    assert {PLAIN.GROUND, PLAIN.SKY} < found
+    assert len(found) > 10
+
+
+def test_the_nearest_surface_is_that_of_trying_every_primitive() -> None:
+    rng = np.random.default_rng(5)
+    for point in np.concatenate([rng.uniform([-7, -7, 0], [7, 7, 3], (40, 3)), LAYOUT.center[::6] + 0.1]):
+        distances = [
+            abs(PLAIN.signed_distance(kind, size, *((point - center) @ turn)))
+            for kind, center, turn, size in zip(*SOLIDS, strict=True)
+        ]
+        expected = min(abs(point[2]), *distances)
+        for limit in (0.2, 5.0):
+            found = PLAIN.nearest_surface(*SOLIDS, *GROUPS, *point, limit)
+            assert found == pytest.approx(min(expected, limit))
+
+
+PINNED = {
+    "STONE": 2.15099404635,
+    "PLASTER": 2.10749344022,
+    "WOOD": 2.03019665981,
+    "PAINT": 2.01363866779,
+    "TILES": 1.49564206505,
+    "LEAVES": 1.84745020596,
+    "CLAY": 2.00755787828,
+    "WATER": 1.93673376397,
+    "GLASS": 1.93673376397,
+    "METAL": 2.13302043339,
+    "LOG": 2.82793984728,
+    "GROUND": 0.437537909304,
+    "SKY": 3.09869215768,
+}  # by `fingerprint`
+
+
+@pytest.mark.parametrize("name", PINNED)
+def test_textures_are_those_of_this_version(name: str) -> None:
+    """Lightness and warmth, or a colour, at points near and far: raise the courtyard's VERSION where they change."""
+    rng = np.random.default_rng(6)
+    values = []
+    for footprint in (0.0005, 0.004, 0.015, 0.05, 0.2):
+        for px, py, pz, u, v in rng.uniform(-1.2, 1.2, (60, 5)):
+            if name == "GROUND":
+                values.append(PLAIN.ground(6 * px, 6 * py, footprint, 3))
+            elif name == "SKY":
+                values.append(PLAIN.sky(px, py, pz, 3))
+            else:
+                values.append(PLAIN.shade_factors(getattr(layout, name), px, py, pz, u, v, footprint, 3))
+                values.append(
+                    PLAIN.shade_factors(getattr(layout, name), u / 8, v / 8, 0.45, u / 8, v / 8, footprint, 3)
+                )
+    assert np.isfinite(values).all()
+    assert fingerprint(np.array(values)) == pytest.approx(PINNED[name], rel=1e-9), fingerprint(np.array(values))
+
+
+def test_noise_is_its_cells_at_their_corners_and_smooth_between() -> None:
+    for i in range(-3, 3):
+        corner = 2 * PLAIN.random_cell(i, 4 - i, 0, 7) - 1
+        assert PLAIN.noise2(i, 4 - i, 7) == pytest.approx(corner)
+        assert PLAIN.noise3(i, 4 - i, 0, 7) == pytest.approx(corner)
+        for x, y in ((i + 1e-4, 4 - i), (i - 1e-4, 4 - i), (i, 4 - i + 1e-4), (i, 4 - i - 1e-4)):
+            assert PLAIN.noise2(x, y, 7) == pytest.approx(corner, abs=1e-9)  # no slope at a corner
+    cells = np.array([PLAIN.random_cell(i, j, k, 0) for i in range(-8, 8) for j in range(-8, 8) for k in range(4)])
+    assert 0 <= cells.min() < 0.01 < 0.99 < cells.max() < 1
+    counts, _ = np.histogram(cells, bins=8, range=(0, 1))
+    assert np.abs(counts - 128).max() < 5 * 128**0.5
+
+
+def test_pebbles_are_the_two_nearest_of_all_feature_points() -> None:
+    rng = np.random.default_rng(8)
+    cells = [(i, j) for i in range(-9, 9) for j in range(-9, 9)]
+    places = np.array([[i + PLAIN.random_cell(i, j, 1, 2), j + PLAIN.random_cell(i, j, 2, 2)] for i, j in cells])
+    for x, y in rng.uniform(-1, 1, (40, 2)):
+        distances = np.linalg.norm(places - [x / 0.2, y / 0.2], axis=1)
+        nearest, second = np.argsort(distances)[:2]
+        first, border, shade = PLAIN.pebbles(x, y, 0.2, 2)
+        assert first == pytest.approx(distances[nearest])
+        assert border == pytest.approx(distances[second] - distances[nearest])
+        assert shade == PLAIN.random_cell(*cells[nearest], 3, 2)
+
+
+def test_light_is_encoded_as_srgb_up_to_a_soft_shoulder() -> None:
+    for value in np.linspace(0, 0.6, 20) / kernels.EXPOSURE:
+        light = kernels.EXPOSURE * value
+        srgb = 12.92 * light if light <= 0.0031308 else 1.055 * light ** (1 / 2.4) - 0.055
+        assert PLAIN.encode(value) == np.floor(255 * srgb + 0.5)
+    bright = [PLAIN.encode(value) for value in np.linspace(0.6, 6, 200)]
+    assert np.diff(bright).min() >= 0
+    assert bright[-1] == 255
