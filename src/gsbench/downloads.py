@@ -47,7 +47,7 @@ def retried(action: Callable[[], T], url: str, patience: Patience) -> T:
             return action()
         except requests.exceptions.SSLError as error:
             raise InputError(
-                f"{url}: the certificate is not trusted here ({error}): mend it, or give --mirror"
+                f"{url}: the certificate is not trusted here ({error}): fix it, or give --mirror"
             ) from None
         except (requests.exceptions.InvalidURL, requests.exceptions.InvalidSchema) as error:
             raise InputError(f"{url}: no address that can be fetched ({error}): give another with --mirror") from None

@@ -140,7 +140,9 @@ def _require_plain(path: Path, mode: int) -> None:
 
 
 def _no_plain_file(path: Path) -> InputError:
-    return InputError(f"{path} is a link or no regular file, which gsbench does not follow in a runs folder: remove it")
+    return InputError(
+        f"{path} is a link or not a regular file, and gsbench follows no links in a runs folder: remove it"
+    )
 
 
 def require_regular(path: Path) -> None:
@@ -228,8 +230,8 @@ def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
         )
     if number == errno.ENOLCK:
         return InputError(
-            f"the file system of {place} has no locks ({os.strerror(number)}), without which trials would disturb each "
-            "other: set runs=FOLDER or GSBENCH_RUNS to another one, or have its lock service started"
+            f"the file system of {place} has no locks ({os.strerror(number)}), so trials would disturb each other: "
+            "set runs=FOLDER or GSBENCH_RUNS to another file system, or start its lock service"
         )
     if number in BROKEN:
         return InputError(

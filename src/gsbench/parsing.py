@@ -167,7 +167,7 @@ def _key_that_stands_twice(text: str) -> str:
             for key, value in node.value:
                 if isinstance(key, yaml.ScalarNode):
                     if key.value in keys:
-                        return f"{key.value!r} stands twice in it (line {key.start_mark.line + 1})"
+                        return f"{key.value!r} is in it twice (line {key.start_mark.line + 1})"
                     keys.add(key.value)
                 waiting.append(value)
         elif isinstance(node, yaml.SequenceNode):

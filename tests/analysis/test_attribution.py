@@ -138,9 +138,11 @@ def test_what_another_program_did_is_many_ingredients_at_once(tmp_path: Path) ->
     program = {"_target_": "gsbench.densify.External", "command": "train"}
     trials = trials_of(tmp_path, {"adc": densifier("adc"), "3dgs": program, "brush": program})
     assert sentence(trials, "adc", "3dgs") == (
-        "sfm-3dgs differs from sfm-adc by all that the program 3dgs does otherwise."
+        "sfm-3dgs differs from sfm-adc by everything that the program 3dgs does differently."
     )
-    assert "the program brush does otherwise and all that the program 3dgs" in sentence(trials, "3dgs", "brush")
+    assert "the program brush does differently and everything that the program 3dgs" in sentence(
+        trials, "3dgs", "brush"
+    )
 
 
 def test_what_was_trained_elsewhere_is_not_known(tmp_path: Path) -> None:

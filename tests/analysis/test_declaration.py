@@ -99,7 +99,7 @@ def test_a_verdict_that_only_a_single_test_would_give_is_none_in_a_family() -> N
 def test_the_report_says_what_was_declared_and_what_is_secondary(tmp_path: Path) -> None:
     page = build_report(declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR, views=3, random_seed=1))
     assert "LPIPS VGG raw was declared beforehand (eval.primary, 2020-01-01 00:00 UTC), before any of the 12" in page
-    assert "on these scenes: better in LPIPS VGG raw, which was declared beforehand." in page
+    assert "on these scenes: better in LPIPS VGG raw, the metric declared beforehand." in page
     assert "Secondary, adjusted for their number: undecided in" in page
     assert "Interval and p are adjusted" in page
     assert "No metric was declared" not in page
@@ -136,10 +136,9 @@ def test_a_declared_metric_without_weights_is_undecided_and_no_other_takes_its_p
     assert {one.role(verdict) for verdict in one.verdicts} == {"secondary"}
     assert one.notes == ("LPIPS Alex: weights file alexnet.pth not found",)
     assert families([one]) == [
-        "Secondary: all other metrics of all pairs of arms, 4 tests adjusted by Holm among themselves; "
-        "they do not make the verdict."
+        "All other metrics are secondary and do not decide the verdict; Holm adjusts them for 4 tests."
     ]
-    reason = "LPIPS Alex, which was declared, has no value (weights file alexnet.pth not found)"
+    reason = "the declared metric LPIPS Alex has no value (weights file alexnet.pth not found)"
     assert f"no verdict, since {reason}" in build_report(experiment)
     (note,) = (note for note in build_table(experiment).notes if note.startswith("Verdict"))
     assert "none, since lpips_alex has no value: weights file alexnet.pth not found" in note
@@ -153,10 +152,10 @@ def test_a_declaration_after_results_is_said_and_gives_no_place_of_its_own(tmp_p
     (one,) = judged(experiment)
     assert {(one.role(verdict), verdict.family) for verdict in one.verdicts} == {("", 4)}
     page = build_report(experiment)
-    assert "LPIPS VGG raw was declared when results were there" in page
+    assert "LPIPS VGG raw was declared too late" in page
     assert "12 of the 12 trials had been measured" in page
     assert "all metrics adjusted for their number: better in LPIPS VGG raw" in page
-    assert "which was declared beforehand" not in page
+    assert "declared beforehand." not in page
 
 
 def test_a_declaration_that_took_the_place_of_another_is_said(tmp_path: Path) -> None:
@@ -164,7 +163,7 @@ def test_a_declaration_that_took_the_place_of_another_is_said(tmp_path: Path) ->
     found = standing(experiment.folder, experiment.trials)
     assert found is not None
     assert found.metric == "flip"
-    assert any("Before it, psnr was declared (2020-01-01 00:00 UTC)." in line for line in found.sentences("FLIP"))
+    assert any("Declared before it: psnr (2020-01-01 00:00 UTC)." in line for line in found.sentences("FLIP"))
 
 
 def test_what_was_measured_before_counts_also_where_results_were_written_later(tmp_path: Path) -> None:
@@ -228,19 +227,19 @@ WHOLE = planned([0, 1, 2])
 @pytest.mark.parametrize(
     ("trials", "words"),
     [
-        (planned([0, 1]), "4 of the 12 trials were added when"),
-        (planned([0]), "8 of the 12 trials were added when"),
-        (planned([0, 1, 2], ("adc",)), "6 of the 12 trials were added when"),
+        (planned([0, 1]), "4 of the 12 trials were added after"),
+        (planned([0]), "8 of the 12 trials were added after"),
+        (planned([0, 1, 2], ("adc",)), "6 of the 12 trials were added after"),
         (
             {key: seeds for key, seeds in WHOLE.items() if "garden" not in key},
-            "6 of the 12 trials were added when",
+            "6 of the 12 trials were added after",
         ),
-        (WHOLE | {"garden/sfm-adc/c0ffee00": [0, 1]}, "1 of the 12 trials were added when"),
+        (WHOLE | {"garden/sfm-adc/c0ffee00": [0, 1]}, "1 of the 12 trials were added after"),
         (
             {key.replace("c0ff", "aaaa"): seeds for key, seeds in WHOLE.items()},
-            "12 of the 12 trials were added when",
+            "12 of the 12 trials were added after",
         ),
-        ({}, "12 of the 12 trials were added when"),
+        ({}, "12 of the 12 trials were added after"),
     ],
 )
 @pytest.mark.parametrize("recorded", [True, False], ids=["by a command", "past the record"])
@@ -259,8 +258,8 @@ def test_the_report_says_that_trials_were_added(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, effect=CLEAR, views=3)
     declare_trials(tmp_path, (EARLY, planned([0, 1])))
     page = build_report(experiment)
-    assert "4 of the 12 trials were added when results were there" in page
-    assert "which was declared beforehand" not in page
+    assert "4 of the 12 trials were added after the first result" in page
+    assert "declared beforehand." not in page
     assert "All metrics of all pairs of arms are one family, 4 tests adjusted by Holm." in page
 
 
@@ -270,7 +269,7 @@ def test_declared_trials_that_are_missing_are_said(tmp_path: Path) -> None:
     found = standing(experiment.folder, experiment.trials)
     assert found is not None
     assert found.beforehand
-    assert any("4 of the 16 declared trials are not there yet" in line for line in found.sentences("LPIPS"))
+    assert any("4 of the 16 declared trials are still missing" in line for line in found.sentences("LPIPS"))
 
 
 def test_a_record_that_was_deleted_and_written_anew_does_not_hide_what_was_added(tmp_path: Path) -> None:

@@ -100,7 +100,7 @@ def test_trials_without_any_record_still_have_a_sheet(tmp_path: Path, paths: lis
     assert shown(table)["rounds of the densifier"] == ("not recorded", "not recorded", "")
     assert shown(table)["seconds of training"][1] == "not recorded"
     assert shown(table)["code"] == ("gsbench 0.1.0", "not recorded", UNLIKE)
-    assert "what is not recorded" in table.notes[0]
+    assert "settings that are not recorded" in table.notes[0]
 
 
 # --- tuning
@@ -138,11 +138,11 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path: Path) -> None:
     assert line.endswith("Tried: 0.1 (27.6), 0.06841 (27.5). These trials have other values.")
     alike = [point | {"value": 27.5} for point in points]
     (tmp_path / "vth" / "tuning.json").write_text(json.dumps(record | {"points": alike}))
-    assert tuning()[-1].endswith("All points are equal to the last bit: what was tuned never acted.")
+    assert tuning()[-1].endswith("All points are equal to the last bit: the tuned setting had no effect.")
     (tmp_path / "vth" / "tuning.json").write_text(json.dumps(record | {"points": alike[1:]}))
     unequal, line = tuning()
     assert unequal == (
-        "Tuning. Their tuning was unequal: sfm-adc none and sfm-volumetric 1 point of 1 seed on validation views."
+        "Tuning. They were not tuned alike: sfm-adc none and sfm-volumetric 1 point of 1 seed on validation views."
     )
     assert "equal to the last bit" not in line
     nothing = [point | {"value": None} for point in points]

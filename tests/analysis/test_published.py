@@ -48,7 +48,7 @@ def test_ours_stand_beside_the_printed_numbers(tmp_path: Path, capsys: pytest.Ca
 
 def test_what_cannot_be_compared_is_said(tmp_path: Path) -> None:
     one_trial(tmp_path, 0, psnr=1.0, _scene="nowhere")
-    with pytest.raises(InputError, match="of which no trial is here"):
+    with pytest.raises(InputError, match="no trial here is of one of them"):
         published_table(load_experiment(tmp_path, "exp").trials, "3dgs-mcmc")
     with pytest.raises(InputError, match=r"no published numbers '3dsg'.*did you mean 3dgs"):
         load_published("3dsg")

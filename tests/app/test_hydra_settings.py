@@ -70,8 +70,8 @@ def test_what_only_jobs_of_hydras_read_is_refused_without_them(word: str) -> Non
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["name=x-${hydra:job.num}"], "none may ask Hydra"),
-        (["-m", "seed=0,1", "densify.name=a${hydra:job.id}"], "none may ask Hydra"),
+        (["name=x-${hydra:job.num}"], "so they cannot read Hydra's"),
+        (["-m", "seed=0,1", "densify.name=a${hydra:job.id}"], "so they cannot read Hydra's"),
         (["hydra.verbose=true"], "log.txt in a trial's folder holds everything"),
         (["-m", "hydra/sweeper=basic", "seed=0,1"], "gsbench's own alone"),
         (["-m", "densify=glob([av]*)"], """'densify=glob("[av]*")'"""),

@@ -128,7 +128,7 @@ def test_seeds_of_planned_looks_are_declared_at_once_and_cost_the_metric_nothing
     assert found is not None
     assert (found.beforehand, found.added) == (True, ())
     missing = 0 if psnr is noise else 4
-    assert any(f"{missing} of the 8 declared trials are not there" in line for line in found.sentences("PSNR"))
+    assert any(f"{missing} of the 8 declared trials are missing" in line for line in found.sentences("PSNR"))
     assert any("Seeds come in planned looks" in line for line in found.sentences("PSNR"))
 
 

@@ -313,7 +313,7 @@ def test_the_sheet_says_budget_views_points_and_what_was_chosen(sweep: Sweep, ru
 
 
 UNEVEN = FILE.replace("        densify.gradient_threshold: tag(log, interval(1e-4, 4e-4))\n", "")
-SENTENCE = "Their tuning was unequal: random-adc none and random-volumetric 4 points of 1 seed on validation views."
+SENTENCE = "They were not tuned alike: random-adc none and random-volumetric 4 points of 1 seed on validation views."
 
 
 @pytest.mark.slow
@@ -321,7 +321,7 @@ def test_an_arm_that_was_tuned_more_is_said_in_headline_and_tables(sweep: Sweep,
     assert sweep(Fake(), file=UNEVEN) == 0
     lines = notes(runs)
     assert f"Tuning. {SENTENCE}" in lines
-    assert "Tuning. random-adc: left as it is by the tuning of its sweep." in lines
+    assert "Tuning. random-adc: not tuned, although its sweep tuned other arms." in lines
     page = build_report(load_experiment(runs, "fair"))
     assert page.index("<strong>random-volumetric against") < page.index(SENTENCE) < page.index("<summary>Fairness")
     assert any(SENTENCE in note for note in build_table(load_experiment(runs, "fair")).notes)
@@ -366,8 +366,8 @@ MISTAKES = [
         "leave one of",
     ),
     (FILE.replace("densify.stop", "densify.stpo"), "", "did you mean"),
-    (FILE.replace("densify.stop", "scene.max_size"), "", "of what all arms are measured by"),
-    (FILE.replace("densify.stop", "seed"), "", "of what all arms are measured by"),
+    (FILE.replace("densify.stop", "scene.max_size"), "", "belongs to what all arms share"),
+    (FILE.replace("densify.stop", "seed"), "", "belongs to what all arms share"),
     (FILE.replace(INTERVAL, "tag(log, interval(0, 1e-1))"), "", "densify.volume_threshold"),
     (FILE.replace(INTERVAL, "interval(1e-3"), "", "densify.volume_threshold"),
 ]

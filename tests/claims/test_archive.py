@@ -159,10 +159,10 @@ def flip_a_bit(file: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (cut, "no whole zip"),
+        (cut, "not a complete zip"),
         (flip_a_bit, "exp.zip: "),
-        (lambda file: file.write_bytes(b""), "no whole zip"),
-        (lambda file: file.write_text("results"), "no whole zip"),
+        (lambda file: file.write_bytes(b""), "not a complete zip"),
+        (lambda file: file.write_text("results"), "not a complete zip"),
         (lambda file: file.unlink(), "no such file"),
         (edit("results.jsonl", b'"psnr":2', b'"psnr":3'), "results.jsonl was changed after the export"),
         (edit("per_view.csv", b"view000", b"view00x"), "per_view.csv was changed"),
@@ -172,7 +172,10 @@ def flip_a_bit(file: Path) -> None:
         (edit("archive.json", b"{", b"["), "not JSON"),
         (drop("archive.json"), "lacks archive.json"),
         (drop("configurations.jsonl"), "lacks configurations.jsonl"),
-        (resigned("results.jsonl", b'"folder":"courtyard/', b'"folder":"../../../tmp/'), "no folder of a trial"),
+        (
+            resigned("results.jsonl", b'"folder":"courtyard/', b'"folder":"../../../tmp/'),
+            "cannot be the folder of a trial",
+        ),
         (resigned("results.jsonl", b'"folder":"courtyard/', b'"folder":"room/'), "foreign"),
         (resigned("results.jsonl", b'"status":"complete"', b'"status":"well"'), "unfinished"),
         (resigned("results.jsonl", b"{", b"["), "not that of an archive"),
@@ -182,7 +185,7 @@ def flip_a_bit(file: Path) -> None:
         (resigned("configurations.jsonl", b"-seed1", b"-seed0"), "configuration says seed 1, its results 0"),
         (resigned("per_view.csv", b"-seed1,", b"-seed9,"), "per_view.csv"),
         (edit("archive.json", b"{", b"[" * 200_000), "not JSON"),
-        (edit("archive.json", b'"experiment": "exp"', b'"experiment": "../up"'), "no name of an experiment"),
+        (edit("archive.json", b'"experiment": "exp"', b'"experiment": "../up"'), "cannot be the name of an experiment"),
     ],
 )
 def test_damage_of_every_kind_is_one_line_and_leaves_nothing(

@@ -184,7 +184,7 @@ def test_files_that_cannot_be_read_say_so(tmp_path: Path) -> None:
     for text, message in (
         ("a: [", "not YAML"),
         ("name: a\nname: b\n", "stands twice"),
-        ("a: {b: [{c: 1, c: 2}]}", r"'c' stands twice in it \(line 1\)"),
+        ("a: {b: [{c: 1, c: 2}]}", r"'c' is in it twice \(line 1\)"),
         ("", "mapping"),
         ("name: 2001-99-99", "not YAML"),
         ("name: 2001-01-01", "of type date"),

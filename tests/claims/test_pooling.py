@@ -141,7 +141,7 @@ def test_unlike_budgets_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[
     steered = archive(tmp_path, "steered", budget={"max_gaussians": 20_000, "cap": "governor"})
     growing = archive(tmp_path, "growing", seed=1, budget={"max_gaussians": None, "cap": None})
     assert run(["pool", str(steered), str(growing), "--arm", "volumetric"]) == 0
-    sentence = "caution: unlike budgets (steered: 20,000 Gaussians (governor); growing: none)"
+    sentence = "caution: the budgets differ (steered: 20,000 Gaussians (governor); growing: none)"
     assert sentence in capsys.readouterr().out
 
 
@@ -185,7 +185,7 @@ def test_bad_sources_are_a_line_each_and_the_others_are_pooled(
     assert "of 2 studies" in captured.out
     lines = captured.err.splitlines()
     for name, reason in (
-        ("cut.zip", "no whole zip"),
+        ("cut.zip", "not a complete zip"),
         ("twin.zip", "would count twice"),
         ("other.zip", "has no pair of volumetric and adc (there are sfm-adc, sfm-mcmc)"),
         ("single", "has one pair"),

@@ -186,7 +186,9 @@ def test_a_picture_that_leads_elsewhere_is_refused(tmp_path: Path, name: str) ->
     file = archive(tmp_path, Plan())
     rewrite(file, add)
     before = {path for path in tmp_path.rglob("*") if "inside" not in path.parts}
-    with pytest.raises(InputError, match=r"no picture of a trial|no folder of a trial|not that of an archive"):
+    with pytest.raises(
+        InputError, match=r"cannot be a picture of a trial|cannot be the folder of a trial|not that of an archive"
+    ):
         unpack_archive(file, tmp_path / "inside")
     assert {path for path in tmp_path.rglob("*") if "inside" not in path.parts} == before
 

@@ -46,7 +46,7 @@ DIRECTORY, LOCAL = b"PK\x01\x02", b"PK\x03\x04"
 @pytest.mark.parametrize("version", [64, 99, 255])
 def test_an_archive_of_a_later_version_is_refused(version: int, tmp_path: Path) -> None:
     data = patched(packed("s/images/a.jpg"), DIRECTORY, 6, "<H", version)
-    with pytest.raises(InputError, match="is no whole zip archive"):
+    with pytest.raises(InputError, match="is not a complete zip archive"):
         open_archive(io.BytesIO(data), "x.zip")
 
 

@@ -229,4 +229,4 @@ def test_names_that_lead_elsewhere_are_refused(
 def test_not_a_zip(fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (server.folder / "360_v2.zip").write_text("<html>this file has moved</html>")
     assert fetch("mipnerf360", "garden") == BAD_INPUT
-    assert "360_v2.zip is no whole zip archive" in capsys.readouterr().err
+    assert "360_v2.zip is not a complete zip archive" in capsys.readouterr().err

@@ -112,7 +112,7 @@ def test_at_the_end_of_its_time_the_budget_is_met_whatever_the_opacities(caplog:
     event = densifier.refine(23_000, trainable, torch.Generator().manual_seed(0))
     assert (event.pruned_opacity, event.after) == (COUNT - 20, 20)
     assert event.balances()
-    assert f"ended with {COUNT} Gaussians, and {COUNT - 20} of them were drawn to go" in caplog.text
+    assert f"ended with {COUNT} Gaussians, and {COUNT - 20} of them were removed at random" in caplog.text
 
 
 def test_a_selection_that_has_met_its_budget_warns_of_nothing(caplog: pytest.LogCaptureFixture) -> None:

@@ -44,7 +44,7 @@ def test_arms_of_any_origin_are_told_apart_and_those_that_come_late_cost_the_dec
 
     assert run(["-m", *TINY, *OWN, "densify.interval=40", "allow_targets=[patient_arm]"]) == 0
     notes = tables()
-    assert "but 2 of the 6 trials were added when results were there" in notes
+    assert "but 2 of the 6 trials were added after the first result" in notes
     assert "random-patient differs from random-adc by rule patient_arm.Patient and schedule" in notes
     sheet = tables("--layout", "fairness", "--format", "latex")
     assert "densify.patience & -- & 4" in sheet

@@ -117,7 +117,7 @@ def test_renders_stand_in_the_table_with_a_verdict(
     text = (runs / "small" / "report.html").read_text()
     # Two seeds decide nothing among three metrics, however much better these renders are.
     assert "random-theirs against random-adc, on this scene: undecided in PSNR" in text
-    assert "by what a training elsewhere did, of which nothing is recorded" in text
+    assert "by a training elsewhere, which left no record" in text
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     (runs / "mlflow.db").unlink()  # a copy of a runs folder has the database of where it was
     for words in (["status", "small"], ["explain", "small:courtyard:psnr:theirs"], ["sync", "small"]):

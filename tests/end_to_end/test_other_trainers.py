@@ -123,7 +123,7 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(
             for arm in ("adc", "cloud", "painter", "folder")}  # fmt: skip
     assert "2.0" in rows["cloud"]  # thousand Gaussians: one a point
     assert [row.count("n/a") for row in rows.values()] == [1, 1, 2, 3]  # LPIPS; Gaussians of renders; their time
-    assert "its model rendered by gsbench (its time is that of the whole program, its budget its own): " \
+    assert "its model rendered by gsbench (its time is that of the whole program, and it sets its own budget): " \
         "random-cloud (version 1.2.3)." in table  # fmt: skip
     assert "its own renders measured as they are (its time" in table
     assert "Renders of another program, measured as they are (its conditions are not known): random-folder." in table
@@ -207,7 +207,7 @@ def test_done_is_done_and_another_version_is_another_result(
 
 
 BAD = {
-    "exit": "ended early (exit code 1); its last words: Error: the painter has no paint; log: ",
+    "exit": "ended early (exit code 1); its last lines: Error: the painter has no paint; log: ",
     "nothing": "left no point_cloud/iteration_40/*.ply (densify.result); it wrote notes.txt; log: ",
     "torn": "it is cut short: its header promises",
     "nan": "f_dc_1 is not a finite number everywhere",
@@ -251,7 +251,7 @@ def test_one_that_hangs_is_ended(
     words = ["--config-dir", str(trainers), *COURTYARD, "densify=cloud", "densify.options.mode=hang"]
     assert run([*words, "densify.time_limit_minutes=0.25"]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
-    assert "python still ran after 15 s (densify.time_limit_minutes); its last words: " in said
+    assert "python still ran after 15 s (densify.time_limit_minutes); its last lines: " in said
     log = Path(said.rpartition("log: ")[2]).read_text()
     pids = [int(word) for line in log.splitlines() if line.startswith("pids ") for word in line.split()[1:]]
     assert len(pids) == 2

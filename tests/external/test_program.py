@@ -145,7 +145,7 @@ def test_nothing_is_left_running(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("code", "limit", "said"),
     [
-        ("raise SystemExit('Error: no paint')", None, r"ended early \(exit code 1\); its last words: Error: no paint"),
+        ("raise SystemExit('Error: no paint')", None, r"ended early \(exit code 1\); its last lines: Error: no paint"),
         ("import os; os.kill(os.getpid(), 9)", None, "crashed .SIGKILL, perhaps out of memory."),
         ("import time; print('working', flush=True); time.sleep(600)", 3.0, "still ran after 3 s"),
     ],

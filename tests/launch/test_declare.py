@@ -74,7 +74,7 @@ def test_one_command_cannot_declare_two(tmp_path: Path, capsys: pytest.CaptureFi
     with pytest.raises(InputError, match=r"trials of exp declare eval\.primary=psnr and eval\.primary=ssim"):
         declared_metrics(trials)
     assert run(["-m", *TINY, "eval.primary=psnr,ssim", f"runs={tmp_path}"]) == 2
-    assert "eval.primary makes no other trial" in capsys.readouterr().err
+    assert "eval.primary does not make a different trial" in capsys.readouterr().err
 
 
 def test_claims_are_kept_beside_declared_metrics(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

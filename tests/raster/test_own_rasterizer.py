@@ -94,7 +94,9 @@ def test_without_a_footprint_it_is_refused_where_one_is_asked_for(folder: Path) 
     values = composed(*OWN)
     rasterizer = build_rasterizer(values["raster"], values["allow_targets"], CPU)
     check_offers(ADC(), "adc", rasterizer.name, rasterizer)
-    with pytest.raises(InputError, match=r"densify=pixelgs asks .* raster=untiled does not say; take raster=reference"):
+    with pytest.raises(
+        InputError, match=r"densify=pixelgs needs .* raster=untiled does not give them; take raster=reference"
+    ):
         check_offers(PixelGS(), "pixelgs", rasterizer.name, rasterizer)
     rasterizer.has_footprint = True  # type: ignore[attr-defined]
     check_offers(PixelGS(), "pixelgs", rasterizer.name, rasterizer)

@@ -100,6 +100,6 @@ def test_no_link_among_the_artifacts_is_written_through(tmp_path: Path) -> None:
     shown.symlink_to(private)
     state = json.loads((folder / STATE).read_text())
     (folder / STATE).write_text(json.dumps(state | {"complete": None}))
-    with pytest.raises(InputError, match="does not follow"):
+    with pytest.raises(InputError, match="follows no links"):
         mirror_trial(options(), folder, values)
     assert private.read_text() == "secret"

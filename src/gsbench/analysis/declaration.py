@@ -52,16 +52,16 @@ class ActiveDeclaration:
         every = counted(self.trials, "trial")
         if self.seen:
             lines = [
-                f"{name} was declared when results were there (eval.primary, {when}): {len(self.seen)} of "
-                f"the {every} had been measured, so it is adjusted with all other metrics. Trials with "
-                "other seeds under another name would test it."
+                f"{name} was declared too late (eval.primary, {when}): {len(self.seen)} of the {every} had been "
+                "measured. So it is adjusted together with all other metrics. To test it, run other seeds under "
+                "another name."
             ]
         elif self.added:
             lines = [
                 f"{name} was declared beforehand (eval.primary, {when}), but {len(self.added)} of the {every} were "
-                "added when results were there, so it is adjusted with all other metrics: who adds trials until "
-                "something is found will find something. Trials with other seeds under another name, all asked for by "
-                "one command, would test it."
+                "added after the first result. So it is adjusted together with all other metrics: adding trials until "
+                "an effect appears finds effects that do not exist. To test it, run other seeds under another name, "
+                "all by one command."
             ]
         else:
             lines = [f"{name} was declared beforehand (eval.primary, {when}), before any of the {every} was measured."]
@@ -71,14 +71,14 @@ class ActiveDeclaration:
             lines.append(
                 "Seeds come in planned looks (launch.stop_when_decided), which each interval takes into account; "
                 f"{missing} "
-                f"of the {planned} declared trials are not there."
+                f"of the {planned} declared trials are missing."
             )
         elif missing:
             lines.append(
-                f"{missing} of the {planned} declared trials are not there yet: until they are, this is a look at a "
-                "part, and who ends at a look that pleases finds more than there is."
+                f"{missing} of the {planned} declared trials are still missing, so this is an early look. Do not stop "
+                "here because the result pleases: that finds effects that do not exist."
             )
-        return lines + [f"Before it, {one.primary} was declared ({one.when})." for one in self.earlier]
+        return lines + [f"Declared before it: {one.primary} ({one.when})." for one in self.earlier]
 
 
 def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration | None:

@@ -25,9 +25,9 @@ IGNORED_SETTINGS = (
     *("eval.primary", "eval.controls", "densify.switches"),
 )
 MOST_NAMED = 6  # ingredients that a headline names before it counts
-NO_RECORD = "what is not recorded (a trial has no readable config.yaml)"
-ELSEWHERE = "what a training elsewhere did, of which nothing is recorded"
-BY_PROGRAM = "all that the program {} does otherwise"
+NO_RECORD = "settings that are not recorded (a trial has no readable config.yaml)"
+ELSEWHERE = "a training elsewhere, which left no record"
+BY_PROGRAM = "everything that the program {} does differently"
 TARGET, INIT = "densify._target_", "initial cloud"
 
 # Settings with one name for several keys. All others are called as their key, without the group of the densifier.

@@ -173,9 +173,8 @@ def _asked(trials: Sequence[TrialResult], question: Question, declaration: Decla
     if pairs.rows and question.scenes and all(_is_equal(both) for row in pairs.rows for both in row.trials):
         count = sum(len(row.trials) for row in pairs.rows)
         reason = (
-            f"both arms of {counted(count, 'pair')} of trials are equal to the last bit: what they differ in never "
-            "acted "
-            "at this size"
+            f"both arms of {counted(count, 'pair')} of trials are equal to the last bit: the settings that differ had "
+            "no effect at this size"
         )
         return replace(verdict, untestable=reason, final=True)
     return verdict

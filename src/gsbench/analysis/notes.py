@@ -32,7 +32,11 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
         own = [t for t in others if bool(t.program) == here and t.record.evaluated_from == measured]
         versions = sorted({(f"{trial.init}-{trial.densify}", trial.trainer_version) for trial in own})
         arms = ", ".join(f"{arm} (version {version})" if here else arm for arm, version in versions)
-        limits = "its time is that of the whole program, its budget its own" if here else "its conditions are not known"
+        limits = (
+            "its time is that of the whole program, and it sets its own budget"
+            if here
+            else "its conditions are not known"
+        )
         notes += [f"{what} ({limits}): {arms}."] if own else []
     return notes
 
@@ -53,7 +57,9 @@ def comparison_notes(experiment: Experiment) -> list[str]:
     for first, second in pairs:
         if _are_equal(by_arm[first], by_arm[second]):
             names = f"{second} and {first}"
-            notes.append(f"{names} are equal to the last bit in all their trials: what they differ in never acted.")
+            notes.append(
+                f"{names} are equal to the last bit in all their trials: the settings that differ had no effect."
+            )
     said = (caveats([*by_arm[first], *by_arm[second]], first, second) for first, second in pairs)
     return notes + list(filter(None, said))
 
@@ -105,8 +111,8 @@ def counts_sentence(trials: Sequence[TrialResult], first: Arm, second: Arm) -> s
         return ""
     more = f"{abs(change):.0%}".replace("%", " %") + (" more" if change > 0 else " fewer")
     return (
-        f"{second} has {more} Gaussians than {first}: this is no comparison at one count, which "
-        "densify.cap=governor makes."
+        f"{second} has {more} Gaussians than {first}, so this does not compare at equal counts; "
+        "densify.cap=governor makes the counts equal."
     )
 
 
@@ -119,8 +125,8 @@ def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
     listed = "; ".join(f"{kind}: {counted(count, 'trial')}" for kind, count in kinds.most_common())
     rest = f"; not recorded: {unknown}" if unknown else ""
     return [
-        f"The trials ran on {len(kinds)} kinds of machine, on which equal settings give unlike last digits and, after "
-        f"thousands of iterations, unlike trials: {listed}{rest}."
+        f"The trials ran on {len(kinds)} kinds of machine: {listed}{rest}. There equal settings give other last digits "
+        "and, after thousands of iterations, other results."
     ]
 
 
@@ -155,7 +161,7 @@ def points_notes(trials: Sequence[TrialResult]) -> list[str]:
     notes = []
     for init, choice in sorted({(trial.init, _points_from(trial)) for trial in trials}):
         if choice == "all":
-            notes.append(f"Initial points of {init}: from all views, test views too (init.points_from=all).")
+            notes.append(f"Initial points of {init}: from all views, test views included (init.points_from=all).")
         elif choice:
             notes.append(f"Initial points of {init}: from training views alone (init.points_from={choice}).")
     return notes

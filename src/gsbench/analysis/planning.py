@@ -57,7 +57,7 @@ def components(differences: Sequence[NDArray[np.float64]]) -> Components:
     """
     degrees = sum(len(values) - 1 for values in differences)
     if degrees == 0:
-        raise InputError("planning needs pilot trials of two seeds at least in some scene")
+        raise InputError("planning needs pilot trials with at least two seeds of one scene")
     within = math.sqrt(sum(float(((values - values.mean()) ** 2).sum()) for values in differences) / degrees)
     counts = np.array([len(values) for values in differences], dtype=float)
     total = int(counts.sum())
@@ -122,7 +122,7 @@ def sizes_needed(difference: float, found: Components, like_these: bool) -> list
     seeds than a design before it. A statement about scenes like these starts at ``MIN_SCENES``.
     """
     if difference == 0 or not math.isfinite(difference):
-        raise InputError(f"the difference to be resolved must be a number other than 0, got {difference}")
+        raise InputError(f"the difference to resolve must be a number other than 0, got {difference}")
     chosen: list[Size] = []
     for scenes in range(MIN_SCENES if like_these else 1, MAX_SCENES + 1):
         most = chosen[-1].seeds - 1 if chosen else MAX_SEEDS

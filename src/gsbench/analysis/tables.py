@@ -243,10 +243,10 @@ def _reading_notes(
 ) -> list[str]:
     spread = "trials" if by_scene else "the trials' means of scenes"
     if expected == 1:
-        notes = ["One trial a cell, so no deviation is known."]
+        notes = ["One trial per cell, so there is no deviation."]
     else:
         notes = [f"Mean over {expected} trials; ± is the deviation (n − 1) over {spread}."]
-    notes.append("Bold: best mean of a scene after rounding, which is no test.")
+    notes.append("Bold: best mean of a scene after rounding; this is not a test.")
     cells = grid.values()
     if any(0 < cell.count < expected or not cell.trials for cell in cells):
         notes.append(f"(k/{expected}): only k of {expected} trials have a value; —: none.")

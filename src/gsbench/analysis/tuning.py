@@ -12,7 +12,7 @@ from gsbench.runs.layout import TUNING
 from gsbench.words import counted, listed
 
 MOST_VALUES = 8  # points of a search that are named
-NOTHING = "No tuning is recorded: one choice of settings an arm was run here. What was tried elsewhere is not known."
+NOTHING = "No tuning is recorded: each arm ran with one choice of settings. What was tried elsewhere is not known."
 VIEWS = "validation views"  # on which every search judges its points
 NO_BUDGET = "none"
 
@@ -28,13 +28,13 @@ def tuning_lines(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[str
         searches = _searches(own[0])
         lines += [_search_line(own, name, record) for name, record in searches.items()]
         if not searches and any(record.sweep == _sweep(own[0]) for record in _records(own[0]).values()):
-            lines.append(f"{_arm_in_records(own[0])}: left as it is by the tuning of its sweep.")
+            lines.append(f"{_arm_in_records(own[0])}: not tuned, although its sweep tuned other arms.")
         lines += _tried_here(trials, own[0])
     return lines or [NOTHING]
 
 
 def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
-    """``Their tuning was unequal: sfm-adc none, sfm-volumetric 6 points of 1 seed on validation views.``
+    """``They were not tuned alike: sfm-adc none, sfm-volumetric 6 points of 1 seed on validation views.``
 
     Empty where two arms had the same budget. What counts are searches whose best has the very values of an arm; several
     values that were all run as arms are no search, since each has its verdict.
@@ -43,7 +43,7 @@ def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
     if len(set(budgets)) < 2:
         return ""
     said = listed([f"{arm} {budget}" for arm, budget in zip(pair, budgets, strict=True)])
-    return f"Their tuning was unequal: {said}."
+    return f"They were not tuned alike: {said}."
 
 
 def _budget(trial: TrialResult) -> str:
@@ -96,7 +96,7 @@ def _search_line(own: Sequence[TrialResult], experiment: str, search: TuningReco
     if not _has_values(trial, best):
         line += " These trials have other values."
     if len(search.points) > 1 and len({point.value for point in search.points}) == 1:
-        line += " All points are equal to the last bit: what was tuned never acted."
+        line += " All points are equal to the last bit: the tuned setting had no effect."
     return line
 
 
@@ -104,7 +104,7 @@ def _when(own: Sequence[TrialResult], experiment: str) -> str:
     """Say whether the trials of the search were measured before these, by their files."""
     times = [trial.measured for trial in read_experiment(own[0].path.parents[3] / experiment).trials]
     if not times:
-        return "whose own trials are not there"
+        return "whose own trials are missing"
     later = sum(trial.measured < max(times) for trial in own)
     return f"ended when {later} of these {len(own)} trials had been measured" if later else "before any of these trials"
 

@@ -94,7 +94,7 @@ def judge_pairs(
             notes.append(f"{one.name}: {reason}")
             missing = reason if primary is not None and one.key == primary.key else missing
         if primary is not None and not primary.direction:
-            missing = "whether more of it is better is not known"
+            missing = "nobody said whether more or less of it is better"
             notes.append(f"{primary.name}: {missing}")
         alone = declared is not None and declared.beforehand
         judged.append(PairVerdicts(*pair, tuple(found), tuple(notes), primary, alone, missing))
@@ -142,17 +142,17 @@ def headline(judged: PairVerdicts) -> str:
     where = _scope(verdicts[0])
     if all(one.equal for one in verdicts):
         return (
-            f"{against}, on {where}: equal in every metric, to the last bit. What they differ in never acted: look at "
-            "the events, and at train.densify_start and densify_stop."
+            f"{against}, on {where}: equal in every metric, to the last bit. The settings that differ had no effect: "
+            "look at the events, and at train.densify_start and densify_stop."
         )
     if all(one.interval is None for one in verdicts):
         return f"{against}: no verdict, one trial of each on {where}; run more seeds."
     if judged.missing and judged.declared is not None:
         return (
-            f"{against}: no verdict, since {judged.declared.name}, which was declared, has no value ({judged.missing})."
+            f"{against}: no verdict, since the declared metric {judged.declared.name} has no value ({judged.missing})."
         )
     if judged.role(verdicts[0]) == DECLARED:
-        return f"{against}, on {where}: {_by_word(verdicts[:1])}, which was declared beforehand."
+        return f"{against}, on {where}: {_by_word(verdicts[:1])}, the metric declared beforehand."
     adjusted = "" if judged.declared is None else ", all metrics adjusted for their number"
     return f"{against}, on {where}{adjusted}: {_by_word(verdicts)}."
 
@@ -239,13 +239,13 @@ def families(judged: Sequence[PairVerdicts]) -> list[str]:
             looks |= bool(verdict.question.seeds)
     lines = []
     if DECLARED in sizes:
-        how = "tested as it is" if sizes[DECLARED] == 1 else f"adjusted by Holm for {sizes[DECLARED]} pairs of arms"
+        how = (
+            "not adjusted: it is one test" if sizes[DECLARED] == 1 else f"adjusted by Holm for {sizes[DECLARED]} tests"
+        )
         lines.append(f"The declared metric is {'judged at each planned look' if looks else how}.")
     if SECONDARY in sizes:
-        how = "sharing 5 % equally at each look" if looks else f"{sizes[SECONDARY]} tests adjusted by Holm"
-        lines.append(
-            f"Secondary: all other metrics of all pairs of arms, {how} among themselves; they do not make the verdict."
-        )
+        how = "at each look they share 5 % equally" if looks else f"Holm adjusts them for {sizes[SECONDARY]} tests"
+        lines.append(f"All other metrics are secondary and do not decide the verdict; {how}.")
     if "" in sizes:
         none = any(one.declared is None for one in judged)
         opening = "No metric was declared beforehand (eval.primary): all" if none else "All"
@@ -288,7 +288,7 @@ def outlying_words(verdict: Verdict) -> str:
     if not verdict.outlying:
         return ""
     labels, word = some_of([trial.label for trial in verdict.outlying]), WORDS[verdict.without or "undecided"]
-    return f"far outside the other seeds of its scene and arm: {labels}; without: {word}"
+    return f"far outside the other seeds of its scene and arm: {labels}; without it: {word}"
 
 
 def p_text(p: float) -> str:

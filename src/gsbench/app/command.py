@@ -168,7 +168,7 @@ def check_hydra_settings(config: DictConfig, multirun: bool) -> None:
     hydra, launcher = config.hydra, config.hydra.runtime.choices["hydra/launcher"]
     if hydra.job.chdir:
         raise InputError(
-            "hydra.job.chdir=true: trials run where the command was given, from where paths are meant; "
+            "hydra.job.chdir=true: trials run in the folder where the command was given, and paths start there; "
             "${hydra:runtime.output_dir} names Hydra's folder"
         )
     if not multirun and hydra.mode is None and (hydra.sweeper.get("params") or hydra.sweeper.get("grids")):

@@ -344,7 +344,7 @@ def distribution(override: Override) -> BaseDistribution:
     check_makes_trials(override)
     key = override.get_key_element()
     if bare(key).partition(".")[0] in (*MEASURED_ON, *REPLACED):
-        raise InputError(f"{key} is no setting of an arm, but of what all arms are measured by: give it a value")
+        raise InputError(f"{key} belongs to what all arms share, not to one arm: give it a value")
     sweep: Any = override.value()
     low, high, log_scale = sweep.start, sweep.end, "log" in sweep.tags
     try:

@@ -58,8 +58,8 @@ def choose_switches(found: Mapping[str, Switch], names: Sequence[str], densify: 
             )
     if not found:
         raise InputError(
-            f"densify={densify} declares no switch that is on: name one by --switch NAME:KEY=VALUE, the setting that "
-            "takes it out (docs/claims.md)"
+            f"densify={densify} declares no switch that is on: name one by --switch NAME:KEY=VALUE, where the setting "
+            "turns a part off (docs/claims.md)"
         )
     chosen = {name: found[name] for name in names or found}
     if len(chosen) > MAX_SWITCHES:
@@ -83,7 +83,7 @@ def runs_to_train(switches: Mapping[str, Switch]) -> list[Run]:
         seen, place = [name], switches[name].within
         while place in switches:
             if place in seen:
-                raise InputError(f"the switches {', '.join(seen)} stand within each other in a circle")
+                raise InputError(f"the switches {', '.join(seen)} form a circle: each is within the next")
             seen, place = [*seen, place], switches[place].within
     sizes = range(len(switches) + 1)
     every = [Run(chosen) for size in sizes for chosen in itertools.combinations(switches, size)]

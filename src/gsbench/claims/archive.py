@@ -177,7 +177,7 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     except (json.JSONDecodeError, RecursionError) as error:
         raise InputError(f"its {MANIFEST} is not JSON ({error})") from None
     except (OSError, zipfile.BadZipFile, zlib.error, LZMAError, EOFError, NotImplementedError, RuntimeError) as error:
-        raise InputError(f"it is no whole zip archive ({error}): fetch or export it again") from None
+        raise InputError(f"it is not a complete zip archive ({error}): fetch or export it again") from None
     except UnicodeDecodeError:
         raise InputError(f"its {MANIFEST} is not UTF-8") from None
     for name, content in contents.items():
@@ -206,7 +206,7 @@ def _unpack(home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: 
     """Write the files of every trial as gsbench has them."""
     for folder, results in trials:
         if (home / folder).exists():
-            raise InputError(f"the trial {folder} stands twice in it")
+            raise InputError(f"the trial {folder} is in it twice")
         (home / folder).mkdir(parents=True)
         (home / folder / RESULTS).write_text(json.dumps(results), encoding="utf-8")
     known = dict(trials)
@@ -240,7 +240,7 @@ def _unpack_picture(home: Path, name: str, content: bytes) -> None:
     """Write a picture of a test view into its trial's folder; raises InputError for a name that leads elsewhere."""
     folder, kind, file = name.removeprefix(f"{PICTURES_FOLDER}/").rsplit("/", 2)
     if kind not in PICTURES or not is_folder_name(file) or not (home / _place(folder) / RESULTS).is_file():
-        raise InputError(f"{name!r} can be no picture of a trial")
+        raise InputError(f"{name!r} cannot be a picture of a trial")
     (home / folder / kind).mkdir(exist_ok=True)
     (home / folder / kind / file).write_bytes(content)
 
@@ -252,7 +252,7 @@ def _folder(trial: TrialResult) -> str:
 
 def _name(name: object) -> str:
     if not isinstance(name, str) or not is_folder_name(name):
-        raise InputError(f"{name!r} can be no name of an experiment")
+        raise InputError(f"{name!r} cannot be the name of an experiment")
     return name
 
 
@@ -260,7 +260,7 @@ def _place(folder: object) -> str:
     """The folder of a trial, which must not lead anywhere else."""
     parts = str(folder).split("/")
     if len(parts) != 3 or not all(map(is_folder_name, parts)):
-        raise InputError(f"{folder!r} can be no folder of a trial")
+        raise InputError(f"{folder!r} cannot be the folder of a trial")
     return str(folder)
 
 

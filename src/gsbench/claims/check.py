@@ -58,11 +58,11 @@ class ClaimVerdict:
         if verdict.outcome == SUPPORTED:
             return f"it is {claim.direction}{self._by_least()}"
         if verdict.outcome == "refuted":
-            return f"it is not {claim.direction} but the contrary" if claim.sign else f"it differs by more than {least}"
+            return f"it is the opposite of {claim.direction}" if claim.sign else f"it differs by more than {least}"
         if verdict.hangs and verdict.final:
-            return "it hangs on trials far outside the others"
+            return "it depends on trials far outside the others"
         if verdict.final:
-            return f"after all {verdict.pairs.seeds} seeds neither a difference nor its being below {least} is sure"
+            return f"all {verdict.pairs.seeds} seeds show neither a difference nor that it is below {least}"
         waits = "trials are missing: the next look waits for them"
         return waits + (f"; failed: {some_of(list(self.failed))}" if self.failed else "")
 
@@ -71,7 +71,7 @@ class ClaimVerdict:
         if verdict.interval is None or verdict.least is None:
             return ""
         smallest = verdict.interval.low if self.claim.sign > 0 else -verdict.interval.high
-        return "" if smallest >= verdict.least else f"; whether by {self.claim.effect} or more is open"
+        return "" if smallest >= verdict.least else f"; by {self.claim.effect} or more is not shown"
 
 
 @dataclass(frozen=True)
@@ -204,14 +204,14 @@ def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
             if getattr(asked, what) != getattr(was, what):
                 raise InputError(
                     f"claim {claim.id}: its {what} was {getattr(was, what)} when it was declared ({declaration.when}), "
-                    f"and is {getattr(asked, what)} in the file: give the file as it was then"
+                    f"and is {getattr(asked, what)} in the file: use the file as it was then"
                 )
         if (claim.baseline, claim.arm) != tuple(arm.densify for arm in (was.baseline, was.arm) if arm is not None):
             raise InputError(
-                f"claim {claim.id}: other arms were declared ({declaration.when}): give the file as it was"
+                f"claim {claim.id}: other arms were declared ({declaration.when}): use the file as it was then"
             )
     if unknown := declared.keys() - {claim.id for claim in file.claims}:
-        raise InputError(f"claims were declared that the file lacks: {', '.join(sorted(unknown))}")
+        raise InputError(f"the file lacks claims that were declared: {', '.join(sorted(unknown))}")
 
 
 def _folder_of(trial: Trial) -> str:

@@ -44,7 +44,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,60}")
 KEY = re.compile(r"[+]?\w+([./]\w+)*")  # of a setting
 GIVEN_BY_CHECK = ("name", "seed", "runs", "eval.primary")  # settings that the plan sets by itself
 MOST_ALPHA = 0.2
-NO_SIZE = "the whole of a claim hangs on it: 0.005, or 10% of the baseline's value"
+NO_SIZE = "the whole claim depends on it: 0.005, or 10% of the baseline's value"
 DIRECTIONS = {"higher": 1, "lower": -1, "same": 0}
 
 Name = Annotated[str, Predicate(lambda name: NAME.fullmatch(name) is not None), doc("letters, digits, _ and -")]
@@ -249,7 +249,7 @@ def _check_claim(claim: Claim, file: ClaimsFile) -> None:
                 f"(there are {', '.join(file.arms)})"
             )
     if claim.baseline == claim.arm:
-        raise InputError(f"{where}: {claim.arm} is held against itself: name two arms")
+        raise InputError(f"{where}: {claim.arm} is compared with itself: name two arms")
     for scene in claim.scenes:
         if scene not in file.scenes:
             raise InputError(
@@ -257,7 +257,7 @@ def _check_claim(claim: Claim, file: ClaimsFile) -> None:
                 f"(there are {', '.join(file.scenes)})"
             )
     if len(set(claim.scenes)) < len(claim.scenes):
-        raise InputError(f"{where}: a scene stands twice in {', '.join(claim.scenes)}")
+        raise InputError(f"{where}: a scene is listed twice in {', '.join(claim.scenes)}")
     for group, settings in (("budget", claim.budget), ("split", claim.split)):
         _check_settings(settings, f"{where}, {group}")
     _check_metric(claim, file)

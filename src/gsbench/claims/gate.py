@@ -66,14 +66,14 @@ def ask(
         facts = facts_for(metric, values)
         sign, usual = facts.direction, facts.worthwhile
     if not sign:
-        raise InputError(f"--metric {metric}: whether more or less of it is better is not known")
+        raise InputError(f"--metric {metric}: nobody said whether more or less of it is better")
     if least is None and usual is None:
-        raise InputError(f"what of {metric} matters is not known: give --least, such as 0.1 or 10%")
+        raise InputError(f"{metric} has no usual least difference that matters: give --least, such as 0.1 or 10%")
     size = read_least(str(usual) if least is None else least, "--least")
     if metric in COSTS and not size.relative:
         raise InputError(f"--least of {metric} must be a part, such as 10%, got {size}")
     if len(seeds) < FIRST_LOOK:
-        raise InputError(f"a gate needs {FIRST_LOOK} seeds at least, of which there is {len(seeds)}: allow more")
+        raise InputError(f"a gate needs at least {FIRST_LOOK} seeds, and there is {len(seeds)}: allow more")
     question = Question(
         metric=metric,
         sign=sign,
@@ -132,8 +132,8 @@ def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> l
     kinds = [sorted({trial.machine or "not recorded" for trial in own}) for own in (baseline, new)]
     if kinds[0] != kinds[1]:
         lines.append(
-            f"deviation: the baseline was made on another kind of machine ({listed(kinds[0])}) than the new trials "
-            f"({listed(kinds[1])}), by which alone last digits and, after long training, trials differ"
+            f"deviation: the baseline ran on another kind of machine ({listed(kinds[0])}) than the new trials "
+            f"({listed(kinds[1])}); this alone changes last digits and, after long training, results"
         )
     libraries = {name for trial in (*baseline, *new) for name in trial.record.versions} - {"gsbench"}
     for name in sorted(libraries):

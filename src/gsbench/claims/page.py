@@ -67,10 +67,9 @@ def make_page(
         lines.insert(
             1,
             f"The chance that any of the {counted(tested, 'verdict')} is false is at most {100 * file.error_rate:g} %, "
-            "which they share equally, each over all its looks at the trials, where trainings differ about normally "
-            "(docs/verdict.md). A verdict is about these scenes at this size; what six scenes and more say of scenes "
-            "like "
-            "these stands beside it, with an error rate of its own.",
+            "if trainings differ about normally (docs/verdict.md). The verdicts share it equally, each over all its "
+            "looks. A verdict is about these scenes at this size. From six scenes on there is also a statement about "
+            "scenes like these, with its own error rate.",
         )
     judged = list({trial.path: trial for one in verdicts for trial in one.verdict.pairs.trials}.values())
     lines += [f"The paper: {file.size}."] if file.size else []
@@ -149,8 +148,8 @@ def _late_words(one: ClaimVerdict) -> str:
     if not one.verdict.late:
         return ""
     return (
-        f"{counted(one.verdict.late, 'trial')} had been measured before this was declared: the metric is one of those "
-        "that could have been chosen, which share the error rate"
+        f"{counted(one.verdict.late, 'trial')} had been measured before this was declared. So the metric shares the "
+        "error rate with all metrics that could have been chosen"
     )
 
 
@@ -164,10 +163,10 @@ def _fairness(one: ClaimVerdict) -> tuple[tuple[Table, ...], str]:
 
 
 def _declared_line(declared: Declaration, every: Sequence[Declaration]) -> str:
-    line = f"Claims were declared {declared.when}; a claim says where trials were there before."
+    line = f"The claims were declared {declared.when}. A claim says so if trials had been measured before."
     earlier = {one.hash for one in every if one.of_claims and one.moment < declared.moment}
     if earlier:
-        line += f" Before, {counted(len(earlier), 'other declaration')} had been made under this name."
+        line += f" Earlier declarations under this name: {len(earlier)}."
     return line
 
 

@@ -92,8 +92,8 @@ def describe(pooled: Pooled) -> list[str]:
     if len({study.budget for study in pooled.studies}) > 1:
         budgets = "; ".join(f"{study.name}: {study.budget or 'not known'}" for study in pooled.studies)
         lines.append(
-            f"caution: unlike budgets ({budgets}): at one count, and where each arm grows as it likes, a difference "
-            "answers two questions, and this mean neither of them"
+            f"caution: the budgets differ ({budgets}): a difference at equal counts and one at free counts answer two "
+            "questions, and this mean answers neither"
         )
     return lines
 
@@ -102,12 +102,12 @@ def _check(studies: Sequence[Study]) -> None:
     names = [study.name for study in studies]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(f"{twice[0]} stands twice: results that are counted twice look surer than they are")
+        raise InputError(f"{twice[0]} is given twice: results that are counted twice look surer than they are")
 
 
 def _refusal(studies: Sequence[Study]) -> str:
     if len(studies) < MIN_STUDIES:
-        return f"{len(studies)} of {MIN_STUDIES} studies that a mean needs"
+        return f"a mean needs {MIN_STUDIES} studies, and there are {len(studies)}"
     if len({study.protocol for study in studies}) > 1:
         shown = "; ".join(f"{study.name}: {study.protocol or 'unknown'}" for study in studies)
         return f"the studies differ in protocol ({shown})"
@@ -193,7 +193,7 @@ def _pairs(trials: Sequence[TrialResult], wanted: Wanted, path: Path) -> list[tu
         if len(ones) > 1 or len(others) > 1:
             several = ones if len(ones) > 1 else others
             raise InputError(
-                f"{path}: {' and '.join(map(str, several))} go by one name: choose trials with --where "
+                f"{path}: the name fits {' and '.join(map(str, several))}: choose trials with --where "
                 "KEY=VALUE, or give the whole name of one"
             )
         if ones and others:

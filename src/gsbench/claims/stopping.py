@@ -111,7 +111,8 @@ def plan_sweep(trials: Sequence[T]) -> Stopping[T]:
     least = values["launch"]["least_difference"] or facts.worthwhile
     if least is None:
         raise InputError(
-            f"launch.stop_when_decided: what of {metric} matters is not known: give launch.least_difference"
+            f"launch.stop_when_decided: {metric} has no usual least difference that matters: give "
+            "launch.least_difference"
         )
     expected = with_variants([_expected(trial) for trial in trials])
     seeds = _seeds(expected)

@@ -79,7 +79,7 @@ def check_words(words: Sequence[str]) -> None:
         key = override.get_key_element().lstrip("+~")
         if key.startswith(("hydra.", "hydra/")):  # what of these cannot be is said of the whole (app/command.py)
             if override.is_sweep_override():
-                raise InputError(f"{word}: Hydra's own settings are one for all trials, so choose one value")
+                raise InputError(f"{word}: Hydra's own settings apply to all trials, so choose one value")
         elif key == "experiment" or key.startswith(("experiment/", "experiment@", "experiment.")):
             _check_experiment_word(word, override)
         elif "@" in key:
@@ -211,7 +211,7 @@ def check_makes_trials(override: Override) -> None:
     first, _, last = key.partition(".")
     without_effect = last in (*WITHOUT_EFFECT, *DECLARED.get(first, ()))
     if (first in NOT_HASHED and first not in NAMED_APART) or without_effect:
-        raise InputError(f"{override.input_line}: {key} makes no other trial, so choose one value of it")
+        raise InputError(f"{override.input_line}: {key} does not make a different trial, so choose one value")
 
 
 def options(group: str, folders: Sequence[Path] = ()) -> list[str]:
@@ -247,7 +247,7 @@ def _check_experiment_word(word: str, override: Override) -> None:
 def _check_deletion(word: str, key: str) -> None:
     group = key.partition(".")[0]
     if key == group or group not in (*COMPONENTS, "raster"):
-        raise InputError(f"{word!r}: a setting cannot be taken away: give it another value")
+        raise InputError(f"{word!r}: a setting cannot be removed: give it another value")
 
 
 def _is_choice(override: Override) -> bool:

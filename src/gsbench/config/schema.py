@@ -183,7 +183,9 @@ def check(config: DictConfig) -> None:
     if late := [step for step in config.eval.at if step > config.train.iterations]:
         raise InputError(f"eval.at names iteration {late[0]}, and train.iterations is {config.train.iterations}")
     if config.scene.transparent == "white" and list(config.train.background) != [1, 1, 1]:
-        raise InputError("scene.transparent=white: the model is rendered over the same: add train.background=[1,1,1]")
+        raise InputError(
+            "scene.transparent=white: the model must be rendered over white, too: add train.background=[1,1,1]"
+        )
     if config.train.iterations == 0 and config.densify.get("_target_") != NO_DENSIFIER:
         raise InputError("train.iterations=0 trains nothing, so nothing grows: add densify=none")
     if is_external(config.densify):
@@ -236,7 +238,7 @@ def _convert(node: DictConfig, schema: type, given: Mapping[str, Any], group: st
     prefix = f"{group}." if group else ""
     for name in (entry.name for entry in dataclasses.fields(schema)):
         if name not in given and name != "_target_" and name not in GROUP_SCHEMAS and name not in COMPONENTS:
-            raise InputError(f"{prefix}{name} has been taken away: give it a value instead")
+            raise InputError(f"{prefix}{name} was removed: give it a value instead")
     for key, value in check_group(schema, given, group).items():
         if isinstance(value, tuple) and isinstance(given[key], list):  # OmegaConf 2.3 knows no tuples, 2.4 does
             value = list(value)
@@ -249,7 +251,7 @@ def check_external(config: DictConfig) -> None:
     settings = _group(config, "densify")
     require_values(settings, "densify")
     if config.eval.at:
-        raise InputError("eval.at: another program's model is seen at its end only: leave eval.at empty")
+        raise InputError("eval.at: another program shows its model only at the end: leave eval.at empty")
     if config.train.max_seconds is not None:
         raise InputError("train.max_seconds: another program cannot be stopped early: give it fewer train.iterations")
     if config.train.resolution_schedule != "none":

@@ -186,7 +186,7 @@ def check_composed(config: DictConfig, allowed: Sequence[str]) -> None:
             _check_interpolation(place, key, value)
         # `_partial_` makes a function of anything, to be called later; 1.4's `_execution_whitelist_` allows any class
         if key in SPECIAL_KEYS and (key not in OF_CALLBACKS or place[:2] != ("hydra", "callbacks")):
-            raise InputError(f"{'.'.join((*place, key))}: gsbench makes no objects so: leave it out")
+            raise InputError(f"{'.'.join((*place, key))}: gsbench makes no objects this way: leave it out")
     known = known_plugins()
     for place, target in targets_in(raw):
         _check_place(place, target, allowed, known)
@@ -225,7 +225,7 @@ def _check_interpolation(place: tuple[str, ...], key: str, value: str) -> None:
         return
     for name in resolvers:
         if name == "hydra" and place[:1] != ("hydra",):
-            raise InputError(f"{where}={value}: a trial has its settings from gsbench, so none may ask Hydra")
+            raise InputError(f"{where}={value}: a trial gets its settings from gsbench, so they cannot read Hydra's")
         if name not in RESOLVERS:
             raise InputError(f"{where}={value}: ${{{name}:…}} is not resolved here, only {', '.join(RESOLVERS)}")
 
@@ -280,7 +280,8 @@ def _check_hydra(hydra: Any, allowed: Sequence[str]) -> None:
         for text in (key, value) if key != TARGET else ():
             if isinstance(text, str) and NOT_SWEPT.match(text):
                 raise InputError(
-                    f"{'.'.join(place)}: {text} cannot differ from job to job, and no file can allow it: type it"
+                    f"{'.'.join(place)}: {text} cannot differ from job to job, and no file can allow it: "
+                    "type it on the command line"
                 )
 
 

@@ -46,7 +46,7 @@ def opened(where: str, patience: Patience) -> Iterator[zipfile.ZipFile]:
     try:
         file = path.open("rb")
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}): mend --mirror") from error
+        raise InputError(f"{path} cannot be read ({error.strerror}): correct --mirror") from error
     with file, open_archive(file, str(path)) as archive:
         yield archive
 
@@ -88,7 +88,7 @@ def open_archive(file: IO[bytes], where: str) -> zipfile.ZipFile:
 
 
 def _no_archive(where: str, error: Exception) -> InputError:
-    return InputError(f"{where} is no whole zip archive ({error}): give another address with --mirror")
+    return InputError(f"{where} is not a complete zip archive ({error}): give another address with --mirror")
 
 
 def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], where: str) -> dict[str, zipfile.ZipInfo]:

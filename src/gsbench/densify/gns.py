@@ -134,8 +134,8 @@ class GNS(EdgeAware):
         kept = draw(torch.ones_like(opacities, dtype=torch.bool), opacities, self.max_gaussians, refinement.rng)
         if len(opacities) > CLOSE * self.max_gaussians:
             log.warning(
-                "the pressure on opacities ended with %d Gaussians, and %d of them were drawn to go: it was too "
-                "short; raise densify.pressure_length, or lower densify.interval (the pressure's is half of it)",
+                "the opacity pressure was too short: it ended with %d Gaussians, and %d of them were removed at "
+                "random; raise densify.pressure_length, or lower densify.interval (the pressure's is half of it)",
                 len(opacities),
                 int((~kept).sum()),
             )

@@ -121,7 +121,7 @@ class Evaluator:
             place = traceback.extract_tb(error.__traceback__)[-1]
             said = " ".join(f"{type(error).__name__} {str(error)[:200]}".split())
             raise InputError(
-                f"eval.extra.{key} raised {said} ({place.filename}, line {place.lineno}): mend it"
+                f"eval.extra.{key} raised {said} ({place.filename}, line {place.lineno}): correct it"
             ) from error
         if isinstance(value, Tensor | np.ndarray | np.generic) and math.prod(value.shape) == 1:
             value = value.item()

@@ -30,7 +30,7 @@ ProtocolName = Annotated[
     str, Predicate(lambda name: name in PROTOCOLS), doc(" or ".join(f"'{name}'" for name in PROTOCOLS))
 ]
 AT_RULE = "a list of different iterations, at which the test views are measured beside the last"
-CONTROLS_RULE = "a mapping {ARM: ARM} of names of densifiers: which arms, beside the baseline, an arm is compared with"
+CONTROLS_RULE = "a mapping {ARM: ARM}: the arm, beside the baseline, that an arm is compared with"
 LPIPS_RULE = f"a list of {', '.join(lpips_variants())}, each at most once"
 LpipsVariant = Annotated[str, Predicate(lambda name: name in lpips_variants())]
 FPS_RULE = "two sides in px, width and height, each from 16 to 16384"

@@ -52,7 +52,7 @@ def run_program(
         what = describe_exit(ended.code)
     else:
         what = f"still ran after {readable_time(limit or 0.0)} (densify.time_limit_minutes)"
-    raise TrainingError(f"{name} {what}; its last words: {telling_tail(log)}; log: {log}")
+    raise TrainingError(f"{name} {what}; its last lines: {telling_tail(log)}; log: {log}")
 
 
 def watch(command: Sequence[str], folder: Path, environment: Mapping[str, str], limit: float | None) -> Ended:

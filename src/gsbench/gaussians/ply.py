@@ -113,7 +113,7 @@ def read_ply(path: Path, device: torch.device | str = "cpu") -> Gaussians:
             f"it has {len(found)}" + (f", with {min(found - set(rest))}" if found != set(rest) else "")
         )
     if missing or len(vertices) == 0:
-        odd = ", ".join(missing) or "all, for it is empty"
+        odd = ", ".join(missing) or "all, since it is empty"
         raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {odd}")
     for name in (*required, *rest):
         if vertices[name].dtype.kind not in "fiu" or not np.isfinite(vertices[name]).all():

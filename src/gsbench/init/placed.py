@@ -106,7 +106,7 @@ class Random(PlacedCloud):
         centers = [poses[name][0] for name in capture.train_names if name in poses]
         extent = report.training_extent(model, capture)
         if extent == 0:
-            raise InputError(f"init=random: the training cameras of scene {capture.name} stand all at one place")
+            raise InputError(f"init=random: the training cameras of scene {capture.name} are all at one place")
         return random_cloud(np.mean(centers, axis=0), self.size * extent, self.count, self.seed)
 
 

@@ -138,11 +138,11 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
     if counts["done"] == len(trials):
         return lines
     if unknown:
-        time = "no estimate, since no finished trial tells how long one takes here with its rasterizer and pictures"
+        time = "no estimate: no finished trial with this rasterizer and picture size tells how long one takes here"
     elif learned == 0:
         time = "seconds, since other experiments have the results"
     else:
         at_once = f", {parallel} at once" if parallel > 1 else ""
         took = readable_time(remaining / parallel)
-        time = f"about {took}{at_once}, judged by {counted(learned, 'finished trial')}"
+        time = f"about {took}{at_once}, estimated from {counted(learned, 'finished trial')}"
     return [*lines, f"time: {time}"]

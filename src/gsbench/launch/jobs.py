@@ -29,6 +29,7 @@ from gsbench.system.own_modules import allowed_modules, take_over
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
 from gsbench.system.stopping import Stopped, stop_on_signals
 from gsbench.tracking import Mirror
+from gsbench.words import counted
 
 if TYPE_CHECKING:
     from submitit import Executor, Job
@@ -86,11 +87,16 @@ class TrialJob:
 def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
     """Run the trials in processes of this machine, ``launch.parallel`` at once; returns when all have ended."""
     values = trials[0].values
+    parallel, name = values["launch"]["parallel"], values["name"]
     import submitit
 
+    # Minutes may pass before the first trial ends, and trials write their own logs.
+    log.info(
+        "%s, %d at once; to see how far they are: gsbench status %s", counted(len(trials), "trial"), parallel, name
+    )
     executor = submitit.LocalExecutor(job_folder(values))
     executor.update_parameters(timeout_min=values["launch"]["timeout_min"] or 365 * DAYS)
-    return _run(trials, executor, values["launch"]["parallel"], mirror)
+    return _run(trials, executor, parallel, mirror)
 
 
 def job_folder(values: dict[str, Any]) -> Path:

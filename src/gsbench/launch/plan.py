@@ -102,7 +102,7 @@ def read_plan(home: Path) -> dict[Path, PlannedTrial]:
     except FileNotFoundError:
         return {}
     except DamagedError as error:
-        log.warning("left out: %s: each command of a sweep writes it anew, with its own trials", error)
+        log.warning("left out: %s: to write it again, run the sweep's command", error)
         return {}
     return {home / name: trial for name, trial in sorted(trials.items())}
 

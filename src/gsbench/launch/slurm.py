@@ -90,7 +90,7 @@ def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[
     homes = [trial.folder for trial in trials]
     queue = ask_queue(homes)
     if queue is None:
-        raise InputError("Slurm does not say what it has (squeue failed), so nothing was submitted: try again later")
+        raise InputError("Slurm does not list its jobs (squeue failed), so nothing was submitted: try again later")
     jobs: dict[Path, Job[Outcome]] = {}
     fresh: dict[Path, Trial] = {}
     for home, trial in zip(homes, trials, strict=True):

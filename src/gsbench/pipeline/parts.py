@@ -48,8 +48,8 @@ log = logging.getLogger(__name__)
 
 # Offers of rasterizers beyond the contract, by the attribute with which a densifier asks; and a refusal in words.
 ASKED_OF_RENDERS = {
-    "needs_footprint": ("has_footprint", "asks which pixels a Gaussian covers, and raster={} does not say"),
-    "needs_splitting_matrix": ("has_splitting_matrix", "asks for splitting matrices, and raster={} does not give them"),
+    "needs_footprint": ("has_footprint", "needs the pixels that a Gaussian covers, and raster={} does not give them"),
+    "needs_splitting_matrix": ("has_splitting_matrix", "needs splitting matrices, and raster={} does not give them"),
 }
 RESERVED = ("_target_", "name", "switches")  # keys of a group that are not options of its class
 METHODS = {
@@ -236,7 +236,8 @@ def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Ra
     target, name = values["_target_"], getattr(rasterizer, "name", None)
     if not isinstance(name, str) or any(name == executor.name for executor in EXECUTORS):
         raise InputError(
-            f"raster._target_={target} needs a name of its own, as results and tables will call it; it has {name!r}"
+            f"raster._target_={target} needs an attribute name, a text that results and tables show and that no other "
+            f"rasterizer has; it has {name!r}"
         )
     return rasterizer
 
@@ -288,10 +289,12 @@ def locate(target: str, group: str, allow_targets: list[str]) -> type:
         return found
     module, named = target.split(".")[0], {name.split(".")[0] for name in allow_targets}
     if module_digest(module) is None:  # the first call notes the files as they are, while they are what runs
-        log.warning("no file of %s was found: results do not know its version", target)
+        log.warning("no file of %s was found: results do not record its version", target)
     if unnamed := unnamed_modules(before, {module, *named}):
         words = ", ".join(unnamed)
-        log.warning("%s imports %s, whose versions results do not know: name them in allow_targets too", target, words)
+        log.warning(
+            "%s imports %s, and results do not record their versions: name them in allow_targets too", target, words
+        )
     return found
 
 

@@ -107,7 +107,7 @@ def _lines(
     if matching.rule:
         lines.append(f"names matched {matching.rule}")
     if matching.left_out:
-        lines.append(f"left out, for want of a photograph: {some_of(matching.left_out)}")
+        lines.append(f"left out, without a photograph: {some_of(matching.left_out)}")
     lines.append("  ".join([" " * width, *names.values()]))
     for view, row in [*per_view.items(), ("mean", metrics)]:
         cells = [f"{row[key]:.{facts[key].decimals + 1}f}".rjust(len(names[key])) for key in metrics]

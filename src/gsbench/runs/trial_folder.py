@@ -212,7 +212,7 @@ class TrialFolder:
         record = record_from(content, path)
         made_of = typed(content, OnDisk, path).made_of
         if made_of is not None and made_of.results != content_hash(content):
-            raise DamagedError(path, f"is not as it was written: `gsbench retry {self.home.name}` mends it")
+            raise DamagedError(path, f"was changed after it was written: `gsbench retry {self.home.name}` repairs it")
         self._digests = {} if made_of is None else made_of.digests
         return record
 
@@ -335,7 +335,7 @@ class TrialFolder:
         wanted = (self._digests or {}).get(name)
         if wanted is not None and hashlib.sha256(content).hexdigest() != wanted:
             raise DamagedError(
-                self.path / name, "is not as it was written: delete it, and `gsbench retry` mends the trial"
+                self.path / name, "was changed after it was written: delete it, and `gsbench retry` repairs the trial"
             )
         return content
 
@@ -346,7 +346,7 @@ def _lacking(
     """The metrics that a trial lacks and that could be computed now, in words; "" where there are none."""
     awaited = set(record.awaited)  # those that may still come, once their weights or packages are there
     missing = sorted(awaited - set(unavailable_now(options))) if awaited else []
-    return f"it lacks {', '.join(missing)}, which may be computed now" if missing else ""
+    return f"it lacks {', '.join(missing)}, which can be computed now" if missing else ""
 
 
 def _number(text: str) -> float:

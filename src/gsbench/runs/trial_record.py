@@ -20,7 +20,7 @@ from gsbench.runs.layout import METRICS, TRAINING
 FROM_MODEL: Final = "model"
 FROM_RENDERS: Final = "renders"
 MADE_ELSEWHERE = "made by another program"  # how the reason of a quantity starts that nobody can know of such a trial
-RENDERS_ALONE = f"{MADE_ELSEWHERE}, of which only the renders are known"
+RENDERS_ALONE = f"{MADE_ELSEWHERE}; only the renders are known"
 
 BY_LISTS = "list"  # of `split_text`
 

@@ -75,7 +75,7 @@ def read_mask(path: Path) -> Mask:
         pixels = pixels[..., 0]
     counts = pixels != 0
     if not counts.any():
-        raise InputError(f"{path}: the mask is black all over, so no pixel counts: mend it, or leave the image out")
+        raise InputError(f"{path}: the mask is black all over, so no pixel counts: correct it, or leave the image out")
     between = float((counts & (pixels != pixels.max())).mean())
     if between > MOST_GREY:
         raise InputError(

@@ -85,10 +85,12 @@ def split_names(
         training = [name for name in names if name not in chosen]
     testing = [name for name in names if name in chosen]
     if not training:
-        raise InputError(f"the split leaves no training view of {len(names)}: raise scene.test_every or mend the lists")
+        raise InputError(
+            f"the split leaves no training view of {len(names)}: raise scene.test_every or correct the lists"
+        )
     if not testing and test_every:
         raise InputError(
-            f"the split leaves no test view of {len(names)}: mend the lists, or scene.test_every=0 for none"
+            f"the split leaves no test view of {len(names)}: correct the lists, or give scene.test_every=0 for none"
         )
     return training, testing
 

@@ -266,7 +266,7 @@ def _resolve(wanted: Sequence[str], names: Sequence[str], folder: Path) -> list[
     matches = match_names(wanted, names)
     if unknown := [entry for entry in wanted if entry not in matches]:
         raise InputError(
-            f"the split lists name {some_of(unknown)}, not among the usable images of {folder}: mend the lists"
+            f"the split lists name {some_of(unknown)}, not among the usable images of {folder}: correct the lists"
         )
     return sorted(matches.values())
 

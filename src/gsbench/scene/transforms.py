@@ -155,7 +155,7 @@ def read_transforms(folder: Path) -> Transforms:
                 missing.append(entry.file_path)
                 continue
             if name in frames:
-                raise InputError(f"{path}: {name} stands there twice: name each image once")
+                raise InputError(f"{path}: {name} is there twice: name each image once")
             frames[name] = Frame(name, _camera(folder / name, path, record, entry), *_pose(path, entry, undo))
             by_part[part].append(name)
         if missing:
@@ -211,7 +211,7 @@ def rotation_of(matrix: Array, what: str) -> Array:
     left, _, right = np.linalg.svd(matrix)
     nearest: Array = left @ right
     if np.abs(nearest - matrix).max() > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
-        raise InputError(f"{what} does not turn and move alone: it scales, shears or mirrors")
+        raise InputError(f"{what} must only rotate and move, but it scales, shears or mirrors")
     return nearest
 
 

@@ -153,7 +153,7 @@ def run_isolated(
             start = stream.seek(0, os.SEEK_END)
             code = _run_child(call, result, stream)
         if code != 0 or not result.is_file():
-            raise CrashError(f"{what} {describe_exit(code)}; its last words: {telling_tail(output, start)}")
+            raise CrashError(f"{what} {describe_exit(code)}; its last lines: {telling_tail(output, start)}")
         succeeded, value, trace = pickle.loads(result.read_bytes())
     if succeeded:
         return value

@@ -45,8 +45,8 @@ def hold(path: Path, what: str, wait: bool = True) -> Iterator[None]:
         lock.acquire(timeout=0)
     except Timeout:
         if not wait:
-            raise BusyError(f"{what}: {describe_holder(path)} is at it") from None
-        log.info("waiting for %s: %s is at it", what, describe_holder(path))
+            raise BusyError(f"{what}: {describe_holder(path)} works on it") from None
+        log.info("waiting for %s: %s works on it", what, describe_holder(path))
         lock.acquire(poll_interval=SECONDS_BETWEEN_TRIES)
     holder = _holder_file(path)
     with suppress(OSError):  # it only informs

@@ -115,7 +115,7 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
             if line:
                 yield line
         process.finish(None)
-        yield f"{counted(new, 'trial')} mirrored, {len(places) - new} were"
+        yield f"{counted(new, 'trial')} mirrored now, {len(places) - new} before"
     finally:
         process.kill()  # Ctrl-C ends it, whatever the tracker does
 
@@ -179,7 +179,7 @@ class FollowerProcess:
             log.debug("tracking failed:\n%s", text)
             raise MirrorError(text.splitlines()[-1])
         if code != 0:
-            raise MirrorError(f"the mirror {describe_exit(code)}; its last words: {telling_lines(said)}")
+            raise MirrorError(f"the mirror {describe_exit(code)}; its last lines: {telling_lines(said)}")
 
     def kill(self) -> None:
         """End the process, whatever it is doing."""

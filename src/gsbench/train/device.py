@@ -104,7 +104,7 @@ def room_for_images(free: int | None, initial: int, cap: int | None, pixels: int
     if at_cap > free:
         log.warning(
             "with the %s Gaussians that densify.max_gaussians allows, this training needs about %s of the device's "
-            "memory, and %s are free; should it grow so far, %s",
+            "memory, and %s are free; if it grows so far, %s",
             f"{cap:,}", readable_bytes(at_cap), readable_bytes(free), ADVICE,
         )  # fmt: skip
     return max(0, free - at_cap)

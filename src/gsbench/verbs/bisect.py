@@ -35,14 +35,14 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser(
         prog="gsbench bisect",
         description="Find the commit that made results worse in the git repository of this folder: one with a "
-        "densifier of your own, or gsbench's checkout. Each step trains one commit in a work tree of its own and holds "
-        "it against GOOD, as gsbench gate does; all steps share an error rate of 5 %. The same command goes on after a "
-        "kill. Exit code 0: found, 3: not told (docs/gate.md).",
+        "densifier of your own, or gsbench's checkout. Each step trains one commit in a work tree of its own and "
+        "compares it with GOOD, as gsbench gate does; all steps share an error rate of 5 %. The same command goes on "
+        "after a kill. Exit code 0: found, 3: not found (docs/gate.md).",
     )
     parser.add_argument("good", help="a commit, tag or branch whose results are good")
     parser.add_argument("bad", help="a later one whose results are worse")
     add_question(parser)
-    parser.add_argument("--seeds", type=int, default=6, help="at most so many for each commit (6)")
+    parser.add_argument("--seeds", type=int, default=6, help="the largest number of seeds for each commit (6)")
     options = parser.parse_args(argv)
     with tempfile.TemporaryDirectory(prefix="gsbench-bisect-") as scratch:
         trees = WorkTrees(Path.cwd(), Path(scratch).resolve())

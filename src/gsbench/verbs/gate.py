@@ -33,9 +33,9 @@ def main(argv: Sequence[str], runs: Path) -> int:
         "until it is decided. The exit code says whether it is worse: 0 no (better, or worse by less than what "
         "matters), 1 yes, or its trials fail, 3 the seeds do not tell, 2 bad input (docs/gate.md).",
     )
-    parser.add_argument("archive", type=path, help="the results of the version that is held to be good")
+    parser.add_argument("archive", type=path, help="the results of the version that you trust")
     add_question(parser)
-    parser.add_argument("--seeds", type=int, help="the most seeds; default: all that the archive has")
+    parser.add_argument("--seeds", type=int, help="the largest number of seeds; default: all that the archive has")
     add_where(parser)
     options = parser.parse_args(argv)
     first = first_trials("gate", options.settings, options.metric)

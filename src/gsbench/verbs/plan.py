@@ -38,7 +38,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         raise InputError(f"--metric {options.metric}: only metrics can be planned for, not counts and times")
     difference = options.difference or shown.worthwhile
     if difference is None:
-        raise InputError(f"--difference is needed: what of {shown.name} is worth resolving is not known")
+        raise InputError(f"--difference is needed: {shown.name} has no usual least difference that matters")
     pairs = choose_pairs(sorted({trial.arm for trial in trials}), options.baseline)
     if not pairs:
         raise InputError(f"{options.experiment} has one arm, and planning needs pairs of trials of two")
@@ -60,13 +60,15 @@ def _lines(found: Components, shown: Quantity, difference: float) -> list[str]:
         f"(from {counted(found.trials, 'pair')} on {counted(found.scenes, 'scene')})"
     ]
     for like_these in (False, True):
-        of_whom = f"scenes like these (from {MIN_SCENES} scenes on)" if like_these else "these scenes"
+        group = f"scenes like these (from {MIN_SCENES} scenes on)" if like_these else "these scenes"
         if like_these and found.between is None:
-            lines.append(f"  of {of_whom}: run pilot trials on a second scene")
+            lines.append(f"  for {group}: run pilot trials on a second scene")
             continue
         sizes = sorted(sizes_needed(difference, found, like_these), key=lambda size: (size.trials, size.scenes))
         texts = [f"{size.scenes} × {size.seeds} ({size.trials} trials)" for size in sizes[:MOST_SHOWN]]
-        lines.append(f"  {difference:g} of {of_whom}, scenes × seeds: {', '.join(texts) or 'beyond reach'}")
+        lines.append(
+            f"  to see {difference:g} on {group}, scenes × seeds: {', '.join(texts) or 'no number that can be run'}"
+        )
     return lines
 
 

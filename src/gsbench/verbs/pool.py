@@ -25,7 +25,9 @@ def main(argv: Sequence[str], runs: Path) -> int:
     )
     parser.add_argument("sources", nargs="+", type=path, metavar="ARCHIVE")
     parser.add_argument("--arm", type=names, required=True, help="a densifier; names it goes by, comma between")
-    parser.add_argument("--baseline", type=names, default=(BASELINE,), help=f"what it is held against ({BASELINE})")
+    parser.add_argument(
+        "--baseline", type=names, default=(BASELINE,), help=f"the densifier to compare with ({BASELINE})"
+    )
     parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_vgg")
     add_where(parser)
     parser.add_argument("--protocol", help="only studies by this one, such as paper-1")

@@ -74,8 +74,8 @@ def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
     for trial in trials:
         if strange := untyped_address(trial.values["tracking"], typed):
             raise InputError(
-                f"{trial.files.label} would send its results to {strange}, as a file says: to allow it, type "
-                f"{TRACKER}={strange} (in no plan: set {VARIABLE}={strange}); tracking=none sends nothing"
+                f"{trial.files.label} would send its results to {strange}, an address from a file: to allow it, type "
+                f"{TRACKER}={strange} (for a trial in no plan: set {VARIABLE}={strange}); tracking=none sends nothing"
             )
 
 

@@ -26,7 +26,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("experiment", nargs="?", help="its name; without one, a line for each experiment")
     parser.add_argument("--all", action="store_true", help="list the finished trials too")
     parser.add_argument("--json", action="store_true", help="a list of objects instead of lines")
-    parser.add_argument("--forget", action="store_true", help="take trials that were never started out of the plan")
+    parser.add_argument("--forget", action="store_true", help="remove trials from the plan that never started")
     parser.add_argument(
         "--forget-superseded",
         action="store_true",
@@ -47,7 +47,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     if options.forget:
         missing = [trial.folder for trial in trials if trial.state == "missing"]
         forget(home, missing)
-        print(f"{counted(len(missing), 'trial')} taken out of the plan")
+        print(f"{counted(len(missing), 'trial')} removed from the plan")
         return 0
     if options.json:
         print(json.dumps([_as_dict(trial) for trial in trials], indent=1))

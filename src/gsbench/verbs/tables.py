@@ -98,8 +98,8 @@ def _as_file(arm: Arm) -> str:
 def _parser() -> ArgumentParser:
     parser = ArgumentParser(
         prog="gsbench tables",
-        description="Tables of an experiment, from its result files; `gsbench tables paper` lists what the paper's own "
-        "numbers contradict.",
+        description="Tables of an experiment, from its result files; `gsbench tables paper` lists where the paper's "
+        "own numbers contradict each other.",
     )
     parser.add_argument(
         "experiment", help="its name; table1, table2 and their _own come in the paper's layout, with its values beside"

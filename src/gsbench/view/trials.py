@@ -128,7 +128,7 @@ def _model_folder(trial: TrialResult) -> Path:
     runs = trial.path.parents[3]
     folder = Store(runs / STORE).folder(INIT, trial.record.hashes.get("init", "")) / MODEL_FOLDER
     if not folder.is_dir():
-        raise InputError(f"{folder} is gone, which has the cameras of {trial.label}: run this trial again")
+        raise InputError(f"{folder} is gone, and it had the cameras of {trial.label}: run this trial again")
     return folder
 
 

@@ -65,7 +65,7 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
     scenes = list(dict.fromkeys(scene for scene, _ in paper.printed))
     own = sorted((trial for trial in trials if trial.scene in scenes), key=lambda trial: scenes.index(trial.scene))
     if not own:
-        raise InputError(f"{name} has the scenes {', '.join(scenes)}, of which no trial is here")
+        raise InputError(f"{name} has the scenes {', '.join(scenes)}, and no trial here is of one of them")
     shown = [quantity(key, own) for key in paper.quantities]
     tally: Counter[Agreement] = Counter()
     rows = []

@@ -52,8 +52,8 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
     """
     if views.capture.masks:
         raise InputError(
-            f"densify={parts.values['densify']['name']}: another program is not told of masks, and would learn what "
-            "stands in for ignored pixels: leave scene.masks out, or train with gsbench"
+            f"densify={parts.values['densify']['name']}: another program gets no masks, so it would train on "
+            "ignored pixels: leave scene.masks out, or train with gsbench"
         )
     iterations, seed, device, threads = parts.train.iterations, parts.seed, parts.device, parts.threads
     inputs: dict[str, Any] = {

@@ -88,7 +88,10 @@ def step_of(
         late = [f"gsbench's {room}" for room in changed_since_asked(rooms)]
         late += [f"the code of {name}" for name in user.modules if has_changed_since_import(name)]
         if late:
-            raise InputError(f"{', '.join(late)} changed while {stage.name} ran, which may have used both: start again")
+            raise InputError(
+                f"{', '.join(late)} changed while {stage.name} ran, so it may have used the old and the new "
+                "code: start again"
+            )
 
     changed = edited(states)
     every = inputs | ({"code": changed} if changed else {})
