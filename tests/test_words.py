@@ -155,6 +155,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "init._target_=5": "the import path of a class",
     # verbs and questions
     "tables": "required: experiment",
+    "check": "required: claims (see",
     "tables x --format pdf": "invalid choice: 'pdf'",
     "tables x --metrics psnr,psnr": "must be different names",
     "tables nosuch": "no experiment 'nosuch'",

@@ -351,7 +351,7 @@ def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> N
     (tmp_path / "exp" / "tuning.json").write_text(json.dumps(record))
     page = build_report(load_experiment(tmp_path, "exp"))
     assert "Verdicts, " not in page
-    assert "So there is no verdict" in page
+    assert "so there is no verdict" in page
     assert "densify.volume_threshold = 0.6841 (point 1)" in page
 
 

@@ -77,7 +77,7 @@ EXECUTORS = (
         "reference",
         "gsbench.raster.reference.ReferenceRasterizer",
         devices=(),
-        text="plain torch, float32 or float64: the definition that all others are tested against; slow",
+        text="plain torch, float32 or float64: the definition; all others are tested against it; slow",
     ),
     Executor(
         "cpu",

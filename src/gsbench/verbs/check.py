@@ -35,6 +35,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument(
         "permissions",
         nargs="*",
+        default=[],
         metavar="allow_targets=[MINE]",
         help="what the claims' arms may run beside gsbench; a file of claims cannot allow it",
     )
