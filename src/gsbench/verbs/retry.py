@@ -40,7 +40,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         nargs="*",
         default=[],
         metavar="KEY=VALUE",
-        help="settings that do not make a different trial: launch=slurm …; allow_targets=[mine] where trials have code of yours",
+        help="settings that do not make a different trial: launch=slurm …; allow_targets=[mine] for your own code",
     )
     parser.add_argument("--dry-run", action="store_true", help="only list them")
     options = parser.parse_args(argv)
