@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from gsbench.raster.readback import Readback
+from gsbench.raster.staged import Readback
 
 OWN_CODE = "gsbench."
 # Operations whose result, or its size, the host has to know before it goes on.

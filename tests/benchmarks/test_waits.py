@@ -10,7 +10,7 @@ import sys
 import pytest
 import torch
 
-from gsbench.raster.readback import Readback
+from gsbench.raster.staged import Readback
 from tests.benchmarks.counters import counting_waits
 from tests.conftest import ROOT
 

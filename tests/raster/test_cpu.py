@@ -14,7 +14,7 @@ import torch
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.raster.cpu import CpuRasterizer, binning, executor, shuffle, simd, vector
+from gsbench.raster.cpu import CpuRasterizer, binning, executor, shuffle, simd
 from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
 from gsbench.raster.reference import ReferenceRasterizer
 from tests.raster.strategies import Case, render_with_gradients
@@ -238,7 +238,7 @@ def test_vector_functions() -> None:
 
 @numba.njit
 def _logarithms(x, out):  # type: ignore[no-untyped-def]
-    for i in range(0, len(x), vector.LANES):
+    for i in range(0, len(x), simd.LANES):
         value = simd.load(x, i)
         simd.store(out[0], i, simd.log2(value))
         simd.store(out[1], i, simd.square_root(value) + simd.floor(value) - simd.ceil(value))

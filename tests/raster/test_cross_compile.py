@@ -13,13 +13,13 @@ import torch
 
 from gsbench.gaussians.trainable import LearningRates, TrainableGaussians
 from gsbench.raster.contract import Case
-from gsbench.raster.cpu import CpuRasterizer, backprojection, binning, composite, projection
+from gsbench.raster.cpu import CpuRasterizer, binning, composite, projection
 from gsbench.train import loss_cpu
 from gsbench.train.loss import photometric_loss
 
 pytestmark = pytest.mark.slow
 
-MODULES = (backprojection, binning, composite, projection, loss_cpu)
+MODULES = (binning, composite, projection, loss_cpu)
 TARGETS = {  # triple, processor
     "neon": ("aarch64-unknown-linux-gnu", "neoverse-n1"),
     "sve": ("aarch64-unknown-linux-gnu", "neoverse-v1"),

@@ -34,7 +34,7 @@ WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "is_nonz
 
 
 class Answer:
-    """In place of `gsbench.raster.readback.Readback`: as if 2 rows of blocks and 7 pairs had been counted."""
+    """In place of `gsbench.raster.staged.Readback`: as if 2 rows of blocks and 7 pairs had been counted."""
 
     asked = 0
 

@@ -23,7 +23,7 @@ from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.raster.triton import composite, layout, lists
 from gsbench.raster.triton.executor import TritonRasterizer
-from gsbench.raster.triton.memory import BYTES_OF_BORDER, PAIRS_OF_BORDER, Workspace, workspace_bytes
+from gsbench.raster.triton.launch import BYTES_OF_BORDER, PAIRS_OF_BORDER, Workspace, workspace_bytes
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import Scene, View
 from gsbench.train.loss import torch_photometric_loss

@@ -18,7 +18,7 @@ from gsbench.bench.measure import NEVER, standing_still
 from gsbench.bench.scenes import make_scene
 from gsbench.densify import ADC, MCMC
 from gsbench.raster import create_rasterizer, validate
-from gsbench.raster.readback import Readback
+from gsbench.raster.staged import Readback
 from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.trainer import Trainer
 from tests.benchmarks.counters import counting_waits

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsbench.raster.readback import Readback
+from gsbench.raster.staged import Readback
 from gsbench.train.journal import LossLog, volume_histogram
 
 

@@ -7,7 +7,7 @@ import torch
 
 from gsbench.errors import TrainingError
 from gsbench.gaussians.model import NUM_SH_REST
-from gsbench.raster.triton.memory import render_bytes
+from gsbench.raster.triton.launch import render_bytes
 from gsbench.train.device import (
     BYTES_OF_MODEL,
     BYTES_OF_PIXEL,

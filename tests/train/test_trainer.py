@@ -15,7 +15,7 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.raster import create_rasterizer
 from gsbench.raster.base import Rasterizer, RenderOutput
-from gsbench.raster.readback import Readback
+from gsbench.raster.staged import Readback
 from gsbench.scene.types import Scene
 from gsbench.train import trainer
 from gsbench.train.checkpoint import CheckpointWriter

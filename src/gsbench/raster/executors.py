@@ -10,7 +10,12 @@ import importlib.util
 import logging
 import os
 import re
+import shutil
+import sys
+import sysconfig
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 from gsbench.errors import InputError
 from gsbench.raster import executors
@@ -158,6 +163,43 @@ def _automatic(device_type: str) -> Executor:
     hints = "; ".join(f"{executor.name} needs {executor.package}: {executor.install}" for executor in wanted)
     log.warning("raster=auto: the slow reference rasterizer runs%s", f" ({hints})" if hints else "")
     return find("reference")
+
+
+def missing_tools() -> list[str]:
+    """List what Triton lacks of a C compiler and Python's headers, by which it compiles the piece of C that starts its
+    kernels; each with the package that has it."""
+    missing = []
+    compiler = os.environ.get("CC")
+    found = shutil.which(compiler.split()[0]) if compiler else shutil.which("gcc") or shutil.which("clang")
+    if found is None:
+        named = f" (CC is {compiler}, which is not there)" if compiler else ""
+        missing.append(f"a C compiler{named}: install the package gcc")
+    scheme = sysconfig.get_default_scheme()
+    if scheme == "posix_local":  # Debian's own; the headers are where they always were
+        scheme = "posix_prefix"
+    header = Path(sysconfig.get_paths(scheme=scheme)["include"]) / "Python.h"
+    if not header.exists():
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+        missing.append(f"{header}: install the package python{version}-dev (python{version}-devel on Fedora)")
+    return missing
+
+
+@cache
+def load_driver() -> None:
+    """Let Triton find the GPU and load its launcher, compiling it if need be; InputError says what is missing."""
+    try:
+        from triton import knobs
+        from triton.runtime import driver
+
+        if not Path(knobs.cache.dir).exists():
+            log.info("compiling the GPU kernels, once: they are kept in %s", knobs.cache.dir)
+        driver.active.get_current_target()
+    except (RuntimeError, OSError, AssertionError, ImportError) as error:
+        missing = missing_tools()
+        reason = "Triton needs " + " and ".join(missing) if missing else f"Triton cannot start: {error}"
+        if old := find("triton").too_old():
+            reason = f"raster=triton {old}"
+        raise InputError(reason) from error
 
 
 @dataclass

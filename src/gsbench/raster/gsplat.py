@@ -31,8 +31,7 @@ from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, RasterConstants, RenderOutput
 from gsbench.raster.executors import find
-from gsbench.raster.readback import Readback
-from gsbench.raster.validate import bad_values, check_settings, raise_for_values
+from gsbench.raster.staged import Readback, bad_values, check_settings, raise_for_values
 from gsbench.scene.camera import Camera
 
 MAX_RADIUS = 2**24  # px; keeps the tile arithmetic of an absurdly large Gaussian inside int32

@@ -1,19 +1,138 @@
-"""Compiled rasterizers as executors of the contract: one bridge between their stages and autograd."""
+"""What executors share: checks of what they are given, values read back without a wait, and for compiled ones a bridge
+between their stages and autograd."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from functools import partial
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.raster.base import Footprint, RenderOutput
-from gsbench.raster.validate import check_settings
 from gsbench.scene.camera import Camera
+
+MAX_SIDE = 16384  # px; beyond it an image is taken for a slip in the settings, not for a wish
+MIN_QUATERNION_NORM = 1e-12  # below, torch's ``normalize`` no longer gives a unit quaternion, so no rotation
+FOCAL_RANGE = (1e-3, 1e6)  # focal length over image side: fields of view between 0.2 arc seconds and 179.8 degrees
+MAX_PRINCIPAL_OFFSET = 100.0  # image sides that the principal point may lie outside the image
+
+
+def check_inputs(gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor) -> None:
+    """Raise ValueError, naming the parameter, on anything that ``Rasterizer.render`` cannot use.
+
+    Looks at every value of ``gaussians``, and waits for a device once. An executor that meets the values anyway calls
+    ``check_settings`` alone and ``raise_for_values`` when it finds a bad one; one that waits for its device later asks
+    ``bad_values`` and reads the answer then.
+    """
+    check_settings(gaussians, camera, sh_degree, background)
+    if bad_values(gaussians, background):
+        raise_for_values(gaussians, background)
+
+
+def bad_values(gaussians: Gaussians, background: Tensor) -> Tensor:
+    """One bool, still on the device: whether ``raise_for_values`` has to look.
+
+    It may be True for sound values whose sum overflows; it is never False for a bad one.
+    """
+    tensors = [background, *gaussians.tensors().values()]
+    bad = ~torch.stack([tensor.detach().sum() for tensor in tensors]).isfinite().all()
+    if len(gaussians):
+        bad = bad | (gaussians.quaternions.detach().norm(dim=-1).amin() < MIN_QUATERNION_NORM)
+    return bad
+
+
+def check_settings(gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor) -> None:
+    """The part of ``check_inputs`` that looks at no value that a device would have to be waited for."""
+    if not 0 <= sh_degree <= MAX_SH_DEGREE:
+        raise ValueError(f"sh_degree: must be 0 to {MAX_SH_DEGREE}, got {sh_degree}")
+    dtype, device = gaussians.means.dtype, gaussians.means.device
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"gaussians: dtype must be float32 or float64, got {dtype}")
+    for name, tensor in [*gaussians.tensors().items(), ("background", background)]:
+        if tensor.dtype != dtype or tensor.device != device:
+            raise ValueError(f"{name}: is {tensor.dtype} on {tensor.device}, but means is {dtype} on {device}")
+    if tuple(background.shape) != (3,):
+        raise ValueError(f"background: must be three numbers, got shape {tuple(background.shape)}")
+    if device.type == "cpu":
+        _check_background(background)
+    _check_camera(camera)
+
+
+def _check_camera(camera: Camera) -> None:
+    for side, size, focal, principal in (
+        ("width", camera.width, camera.fx, camera.cx),
+        ("height", camera.height, camera.fy, camera.cy),
+    ):
+        axis = "x" if side == "width" else "y"
+        if size > MAX_SIDE:
+            raise ValueError(f"camera: {side} is {size} px, more than {MAX_SIDE}; resize the images")
+        if not FOCAL_RANGE[0] * size <= focal <= FOCAL_RANGE[1] * size:
+            raise ValueError(f"camera: f{axis} is {focal} px, which is degenerate for a {side} of {size} px")
+        if abs(principal) > MAX_PRINCIPAL_OFFSET * size:
+            raise ValueError(f"camera: c{axis} is {principal} px, which is degenerate for a {side} of {size} px")
+
+
+def _check_background(background: Tensor) -> None:
+    if not torch.isfinite(background).all():
+        raise ValueError(f"background: must be three finite numbers, got {background.tolist()}")
+
+
+def raise_for_values(gaussians: Gaussians, background: Tensor | None = None) -> None:
+    """Raise ValueError on the first parameter that has a non-finite value or, of quaternions, no length."""
+    if background is not None:
+        _check_background(background)
+    for name, tensor in gaussians.tensors().items():
+        finite = torch.isfinite(tensor.detach())
+        while finite.dim() > 1:
+            finite = finite.all(-1)  # in the end [N]
+        if not finite.all():
+            index = int((~finite).nonzero()[0])
+            raise ValueError(f"{name}: not finite at Gaussian {index} ({int((~finite).sum())} in all)")
+    short = gaussians.quaternions.detach().norm(dim=-1) < MIN_QUATERNION_NORM  # [N]
+    if short.any():
+        index = int(short.nonzero()[0])
+        raise ValueError(f"quaternions: no length, so no rotation, at Gaussian {index} ({int(short.sum())} in all)")
+
+
+class Readback:
+    """The values of a small tensor, copied to the host behind the device's back.
+
+    On a CUDA device the copy is put into the stream and the host goes on; ``values`` waits for it, which costs nothing
+    once the device has come so far, for example an iteration later. On any other device the values are there at once.
+    ``waits`` counts, over all of them, how often that was too early.
+    """
+
+    waits: ClassVar[int] = 0
+
+    def __init__(self, source: Tensor) -> None:
+        self._event: torch.cuda.Event | None = None
+        source = source.detach()
+        if source.device.type == "cuda":
+            self._host = torch.empty(source.shape, dtype=source.dtype, pin_memory=True)
+            self._host.copy_(source, non_blocking=True)
+            self._event = torch.cuda.Event()
+            self._event.record(torch.cuda.current_stream(source.device))
+        else:
+            self._host = source.cpu()
+
+    @property
+    def arrived(self) -> bool:
+        """Return whether ``values`` would not wait."""
+        return self._event is None or self._event.query()
+
+    def values(self) -> Tensor:
+        """The values as a tensor on the CPU."""
+        if not self.arrived:
+            Readback.waits += 1
+        if self._event is not None:
+            self._event.synchronize()
+            self._event = None
+        return self._host
+
 
 FrameT = TypeVar("FrameT")
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.raster.triton.memory import render_bytes
+from gsbench.raster.triton.launch import render_bytes
 from gsbench.words import readable_bytes
 
 

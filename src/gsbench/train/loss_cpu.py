@@ -15,8 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
-from gsbench.raster.cpu.simd import absolute, fma, lane_sums, load, load_numbers, select, splat, store
-from gsbench.raster.cpu.vector import LANES
+from gsbench.raster.cpu.simd import LANES, absolute, fma, lane_sums, load, load_numbers, select, splat, store
 from gsbench.raster.cpu.workspace import ArenaPool, ShardRunner, TensorPool
 from gsbench.raster.staged import Lifetime
 from gsbench.system.jit import inlined, kernel

@@ -16,9 +16,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
+from gsbench.raster.executors import load_driver
 from gsbench.raster.staged import Lifetime
-from gsbench.raster.triton.launch import launch_grid, load_driver
-from gsbench.raster.triton.memory import WorkspacePool
+from gsbench.raster.triton.launch import WorkspacePool, launch_grid
 
 STRIP = 128  # numbers of a row that a program takes
 LEAST_ROWS = 8  # that it takes

@@ -110,7 +110,7 @@ def check_devices() -> Iterator[Finding]:
 
 def check_triton() -> Iterator[Finding]:
     """Check the compiler that raster=triton needs at its first run on a GPU."""
-    from gsbench.raster.triton.launch import missing_tools
+    from gsbench.raster.executors import missing_tools
 
     if version_of("triton") is None:  # torch for CUDA would have brought it along
         return

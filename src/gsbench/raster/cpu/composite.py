@@ -15,6 +15,7 @@ from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.shuffle import BLOCK, CHANNELS, load_colors, store_block, store_colors
 from gsbench.raster.cpu.simd import (
+    LANES,
     absolute,
     exp2,
     fma,
@@ -32,7 +33,6 @@ from gsbench.raster.cpu.simd import (
     square_root,
     store,
 )
-from gsbench.raster.cpu.vector import LANES
 from gsbench.system.jit import inlined, kernel
 
 LOG2_ALPHA_MIN = np.float32(math.log2(CONSTANTS.alpha_min))

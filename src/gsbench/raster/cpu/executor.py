@@ -13,7 +13,6 @@ from torch import Tensor
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, Footprint, view_depths
 from gsbench.raster.cpu import layout as at
-from gsbench.raster.cpu.backprojection import backproject_shards
 from gsbench.raster.cpu.binning import (
     BUCKETS,
     PASSES,
@@ -24,11 +23,10 @@ from gsbench.raster.cpu.binning import (
     start_tiles,
 )
 from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_backward_tiles, composite_tiles, cover_tiles
-from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, project_shards
+from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, backproject_shards, project_shards
 from gsbench.raster.cpu.shuffle import REST
 from gsbench.raster.cpu.workspace import HEADROOM, Arena, ArenaPool, ShardRunner, TensorPool
-from gsbench.raster.staged import Gradients, Lifetime, Request, StagedRasterizer
-from gsbench.raster.validate import raise_for_values
+from gsbench.raster.staged import Gradients, Lifetime, Request, StagedRasterizer, raise_for_values
 from gsbench.scene.camera import Camera
 from gsbench.system.resources import available_cores
 

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.raster.base import projection_numbers
-from gsbench.raster.cpu.simd import SUM_LANES
-from gsbench.raster.cpu.vector import LANES
+from gsbench.raster.cpu.simd import LANES, SUM_LANES
 from gsbench.scene.camera import Camera
 
 TILE = 16  # px; a tile is 4x4 blocks, row by row; fixed by the 16-bit masks, checked against RasterConstants.tile

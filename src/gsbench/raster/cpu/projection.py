@@ -1,4 +1,4 @@
-"""Projection of Gaussians to records.
+"""Projection of Gaussians to records, and its gradients, derived by hand; 16 at a time.
 
 Of a shard, the Gaussians ``begin`` to ``end``, the visible ones become the records ``begin``, ``begin + 1``, ... in the
 order of their index.
@@ -14,13 +14,18 @@ import numpy as np
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.geometry import (
+    F0,
     LOG2_E,
+    MATRIX,
+    direction_gradient,
     dot,
     exponential,
+    fill_basis,
     from_camera,
     gather_quaternions,
     gather_vectors,
     image_axes,
+    image_rows,
     normalized,
     rotation_matrix,
     scaled,
@@ -28,9 +33,19 @@ from gsbench.raster.cpu.geometry import (
     times,
     to_view,
 )
-from gsbench.raster.cpu.harmonics import F0, MATRIX, fill_basis
-from gsbench.raster.cpu.shuffle import REST, as_integers, as_span, by_channel, index_bits, load_rest, transpose
+from gsbench.raster.cpu.shuffle import (
+    REST,
+    as_integers,
+    as_span,
+    by_channel,
+    index_bits,
+    load_rest,
+    outer_rest,
+    store_rest,
+    transpose,
+)
 from gsbench.raster.cpu.simd import (
+    LANES,
     absolute,
     ceil,
     floor,
@@ -41,13 +56,14 @@ from gsbench.raster.cpu.simd import (
     mask_bits,
     maximum,
     minimum,
+    prefetch,
+    scatter,
     select,
     splat,
     square_root,
     store,
 )
-from gsbench.raster.cpu.vector import LANES
-from gsbench.raster.validate import MIN_QUATERNION_NORM
+from gsbench.raster.staged import MIN_QUATERNION_NORM
 from gsbench.system.jit import inlined, kernel
 
 NEAR, SIGMA_EXTENT, EIGENVALUE_FLOOR = CONSTANTS.near, CONSTANTS.sigma_extent, CONSTANTS.eigenvalue_floor
@@ -225,3 +241,252 @@ def _row_sums(array: Any, place: int) -> Any:
     for k in range(1, LANES):
         total += load(array, place + k * LANES)
     return total
+
+
+AHEAD = 16  # records that the prefetch runs ahead
+
+
+@inlined
+def _take_rows(
+    record: int, count: int, past: int, v: Any, record_ints: Any, tile_shard: Any, rows: Any, indices: Any, sums: Any
+) -> None:
+    """Sum the rows of ``count`` records over the shards of their tiles; clear the rows.
+
+    ``sums`` [16 * 16] gets a row for each place of a row, and ``indices`` [16] the Gaussians; where there are fewer
+    than 16, the last one again.
+    """
+    # Cleared while they are in the cache: clearing all before each backward pass would go to memory once more.
+    shard_rows = len(record_ints)  # a row is as long as a record
+    for lane in range(count):
+        ahead = min(record + lane + AHEAD, past - 1) * at.RECORD
+        tiles_x, tiles_y = record_ints[ahead + at.TILES_X], record_ints[ahead + at.TILES_Y]
+        shard = tile_shard[(tiles_y & 0xFFFF) * v.tiles_x + (tiles_x & 0xFFFF)]
+        prefetch(rows, shard * shard_rows + ahead)
+        prefetch(record_ints, min(record + lane + 3 * AHEAD, past - 1) * at.RECORD)
+    for lane in range(count):
+        base = (record + lane) * at.RECORD
+        indices[lane] = record_ints[base + at.INDEX]
+        tiles_x, tiles_y = record_ints[base + at.TILES_X], record_ints[base + at.TILES_Y]
+        first = tile_shard[(tiles_y & 0xFFFF) * v.tiles_x + (tiles_x & 0xFFFF)]
+        last = tile_shard[((tiles_y >> 16) - 1) * v.tiles_x + (tiles_x >> 16) - 1]
+        total = splat(ZERO)
+        for shard in range(first, last + 1):
+            row = shard * shard_rows + base
+            total += load(rows, row)
+            store(rows, row, splat(ZERO))
+        store(sums, lane * LANES, total)
+    for lane in range(count, LANES):
+        indices[lane] = indices[count - 1]
+        store(sums, lane * LANES, load(sums, (count - 1) * LANES))
+    transpose(sums, 0)
+
+
+@kernel
+def backproject_shards(
+    memory: Any,
+    first: int,
+    past: int,
+    edges: Any,
+    visible: Any,
+    gaussians: Any,
+    degree: int,
+    frame: Any,
+    rows: Any,
+    gradients: Any,
+    g_screen: Any,
+    g_absolute: Any,
+    g_splitting: Any,
+) -> None:
+    """Write all ``gradients`` of the shards ``first`` to ``past`` of Gaussians, which lie between ``edges``; read and
+    clear their ``rows`` [shards of tiles * N * 16].
+
+    ``visible`` counts the records of each shard; ``g_absolute`` and ``g_splitting`` [N, 9] may be empty.
+    """
+    for shard in range(first, past):
+        begin, end = edges[shard], edges[shard + 1]
+        outputs = gradients, g_screen, g_absolute, g_splitting
+        _backproject(memory, begin, end, visible[shard], gaussians, degree, frame, rows, outputs)
+
+
+@inlined
+def _backproject(
+    memory: Any, begin: int, end: int, visible: int, gaussians: Any, degree: int, frame: Any, rows: Any, outputs: Any
+) -> None:
+    gradients, g_screen, g_absolute, g_splitting = outputs
+    v, record_ints, tile_shard = frame.camera, frame.record_ints, frame.tile_shard
+    g_means, g_log_scales, g_quaternions = gradients.means, gradients.log_scales, gradients.quaternions
+    g_logits, g_sh_dc, g_sh_rest = gradients.logits, gradients.sh_dc, gradients.sh_rest
+    unseen = begin  # the first Gaussian whose gradients are not written yet
+    for record in range(begin, begin + visible + 1):
+        past = end if record == begin + visible else record_ints[record * at.RECORD + at.INDEX]
+        if past > unseen:
+            _clear(g_means, unseen, past)
+            _clear(g_log_scales, unseen, past)
+            _clear(g_quaternions, unseen, past)
+            _clear(g_logits, unseen, past)
+            _clear(g_sh_dc, unseen, past)
+            _clear(g_sh_rest, unseen, past)
+            _clear(g_screen, unseen, past)
+            if len(g_absolute) > 0:
+                _clear(g_absolute, unseen, past)
+            if len(g_splitting) > 0:
+                _clear(g_splitting, unseen, past)
+        unseen = past + 1
+    floats, indices = memory
+    sums, basis, pulled = floats[:MATRIX], floats[MATRIX : 2 * MATRIX], floats[2 * MATRIX :]
+    colors = floats[3 * MATRIX :]
+    for record in range(begin, begin + visible, LANES):
+        count = min(LANES, begin + visible - record)
+        _take_rows(record, count, begin + visible, v, record_ints, tile_shard, rows, indices, sums)
+        mean, log_scale = gather_vectors(gaussians.means, indices), gather_vectors(gaussians.log_scales, indices)
+        offset = from_camera(mean, v)
+
+        # Colour; a channel below 0 is clamped and passes nothing.
+        to, inverse_distance = normalized(offset)
+        red, green, blue = _unclamped(record, count, record_ints, sums, colors)
+        scatter(g_sh_dc, indices, 3, 0, red * F0)
+        scatter(g_sh_dc, indices, 3, 1, green * F0)
+        scatter(g_sh_dc, indices, 3, 2, blue * F0)
+        if degree > 0:
+            fill_basis(degree, to[0], to[1], to[2], basis)
+            for lane in range(LANES):
+                place = lane * LANES
+                r, g, b = colors[lane], colors[LANES + lane], colors[2 * LANES + lane]
+                by_red, by_green, by_blue = by_channel(load_rest(gaussians.sh_rest, indices[lane] * REST))
+                store(pulled, place, by_red * r + by_green * g + by_blue * b)
+                store_rest(g_sh_rest, indices[lane] * REST, outer_rest(load(basis, place), r, g, b))
+        else:
+            for lane in range(LANES):
+                store_rest(g_sh_rest, indices[lane] * REST, (splat(ZERO), splat(ZERO), splat(ZERO)))
+        through = direction_gradient(degree, to[0], to[1], to[2], pulled)
+
+        # The forward geometry once more.
+        quaternion, inverse_norm, _ = gather_quaternions(gaussians.quaternions, indices)
+        qw, qx, qy, qz = quaternion
+        matrix = rotation_matrix(qw, qx, qy, qz)
+        x, y, z = to_view(offset, v)
+        inverse_z = ONE / z
+        axis_x, axis_y, slope_x, slope_y = image_axes(x * inverse_z, y * inverse_z, inverse_z, v)
+        scales = (exponential(log_scale[0]), exponential(log_scale[1]), exponential(log_scale[2]))
+        n0, n1 = times(axis_x, matrix), times(axis_y, matrix)
+        m0, m1 = scaled(n0, scales), scaled(n1, scales)
+        _, xy, yy, a = spread(m0, m1)
+        e, shear = ONE / yy, -xy / yy  # power = -(a t^2 + e dy^2) / 2, t = dx + shear dy
+
+        # Mean on the image: d power / d mean = (a t, shear a t + e dy).
+        g_column = a * load(sums, at.SUM_H_T * LANES)
+        g_row = shear * g_column + e * load(sums, at.SUM_H_Y * LANES)
+        scatter(g_screen, indices, 2, 0, g_column * (0.5 * v.width))
+        scatter(g_screen, indices, 2, 1, g_row * (0.5 * v.height))
+        if len(g_absolute) > 0:
+            absolute_t = a * load(sums, at.SUM_ABS_T * LANES)
+            scatter(g_absolute, indices, 2, 0, absolute_t * (0.5 * v.width))
+            absolute_y = load(sums, at.SUM_ABS_Y * LANES)
+            scatter(g_absolute, indices, 2, 1, absolute_y * (0.5 * v.height))
+
+        # M = N S, N = A R: d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U = [[1, shear], [0, 1]], G the
+        # second moments of h over (t, dy). The first row of U M is short for a needle: U N comes first.
+        q00 = a * a * load(sums, at.SUM_H_TT * LANES)
+        q01 = a * e * load(sums, at.SUM_H_TY * LANES)
+        q11 = e * e * load(sums, at.SUM_H_YY * LANES)
+        if len(g_splitting) > 0:
+            of_h = load(sums, at.SUM_H * LANES)
+            free = image_rows(x * inverse_z, y * inverse_z, inverse_z, v)
+            _scatter_splitting(g_splitting, indices, q00 - a * of_h, q01, q11 - e * of_h, shear, free)
+        u0 = (n0[0] + shear * n1[0], n0[1] + shear * n1[1], n0[2] + shear * n1[2])
+        g0 = (q00 * u0[0] + q01 * n1[0], q00 * u0[1] + q01 * n1[1], q00 * u0[2] + q01 * n1[2])
+        g1 = (q01 * u0[0] + q11 * n1[0], q01 * u0[1] + q11 * n1[1], q01 * u0[2] + q11 * n1[2])
+        variances = (scales[0] * scales[0], scales[1] * scales[1], scales[2] * scales[2])
+        scatter(g_log_scales, indices, 3, 0, (u0[0] * g0[0] + n1[0] * g1[0]) * variances[0])
+        scatter(g_log_scales, indices, 3, 1, (u0[1] * g0[1] + n1[1] * g1[1]) * variances[1])
+        scatter(g_log_scales, indices, 3, 2, (u0[2] * g0[2] + n1[2] * g1[2]) * variances[2])
+
+        # Turned by small angles w about its own axes, R S^2 R^T changes by a commutator: the gradient at w has
+        # differences of variances as factors. Taken first, they make that of a ball 0, where the rounding of terms that
+        # cancel would become full steps of Adam. The quaternion moves by q (0, w) / 2.
+        w_x = (u0[1] * g0[2] + n1[1] * g1[2]) * _difference(scales[1], scales[2])
+        w_y = (u0[2] * g0[0] + n1[2] * g1[0]) * _difference(scales[2], scales[0])
+        w_z = (u0[0] * g0[1] + n1[0] * g1[1]) * _difference(scales[0], scales[1])
+        twice = inverse_norm + inverse_norm
+        scatter(g_quaternions, indices, 4, 0, -(qx * w_x + qy * w_y + qz * w_z) * twice)
+        scatter(g_quaternions, indices, 4, 1, (qw * w_x + qy * w_z - qz * w_y) * twice)
+        scatter(g_quaternions, indices, 4, 2, (qw * w_y + qz * w_x - qx * w_z) * twice)
+        scatter(g_quaternions, indices, 4, 3, (qw * w_z + qx * w_y - qy * w_x) * twice)
+
+        # A = J W: d loss / d A, then J's entries, then the position in the view.
+        s0, s1 = scaled(g0, variances), scaled(g1, variances)
+        s1 = (s1[0] + shear * s0[0], s1[1] + shear * s0[1], s1[2] + shear * s0[2])
+        a0 = (dot(s0, matrix[0]), dot(s0, matrix[1]), dot(s0, matrix[2]))
+        a1 = (dot(s1, matrix[0]), dot(s1, matrix[1]), dot(s1, matrix[2]))
+        j00, j02 = a0[0] * v.r00 + a0[1] * v.r01 + a0[2] * v.r02, a0[0] * v.r20 + a0[1] * v.r21 + a0[2] * v.r22
+        j11, j12 = a1[0] * v.r10 + a1[1] * v.r11 + a1[2] * v.r12, a1[0] * v.r20 + a1[1] * v.r21 + a1[2] * v.r22
+        fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
+        free_x, free_y = x * inverse_z, y * inverse_z
+        # The clamp of the slope passes the gradient only within its limits.
+        g_slope_x = select((free_x >= v.slope_x_min) & (free_x <= v.slope_x_max), -fx_z * j02, ZERO)
+        g_slope_y = select((free_y >= v.slope_y_min) & (free_y <= v.slope_y_max), -fy_z * j12, ZERO)
+        view_x = g_column * fx_z + g_slope_x * inverse_z
+        view_y = g_row * fy_z + g_slope_y * inverse_z
+        through_focal = fx_z * (j00 - slope_x * j02) + fy_z * (j11 - slope_y * j12)
+        view_z = -(through_focal * inverse_z + view_x * free_x + view_y * free_y)
+
+        # Position: through the image and through the direction of the colour.
+        radial = dot(through, to)
+        from_x = (through[0] - radial * to[0]) * inverse_distance
+        from_y = (through[1] - radial * to[1]) * inverse_distance
+        from_z = (through[2] - radial * to[2]) * inverse_distance
+        scatter(g_means, indices, 3, 0, view_x * v.r00 + view_y * v.r10 + view_z * v.r20 + from_x)
+        scatter(g_means, indices, 3, 1, view_x * v.r01 + view_y * v.r11 + view_z * v.r21 + from_y)
+        scatter(g_means, indices, 3, 2, view_x * v.r02 + view_y * v.r12 + view_z * v.r22 + from_z)
+
+        # d log(alpha) / d logit = 1 - opacity
+        g_logit = load(sums, at.SUM_H * LANES) / (exponential(gather(gaussians.logits, indices, 1, 0)) + ONE)
+        scatter(g_logits, indices, 1, 0, g_logit)
+
+
+@inlined
+def _scatter_splitting(g_splitting: Any, indices: Any, d00: Any, d01: Any, d11: Any, shear: Any, rows: Any) -> None:
+    """Write F^T U^T (D G D - h D) U F for the derivative F = ``rows`` of the mean on the image, ``d`` what is between.
+
+    The second derivative of alpha by the mean on the image is alpha (u u^T - C), with u = C (dx, dy) and the conic
+    C = U^T D U; summed with weights h / alpha that is U^T (D G D - h D) U.
+    """
+    r0 = (rows[0][0] + shear * rows[1][0], rows[0][1] + shear * rows[1][1], rows[0][2] + shear * rows[1][2])
+    r1 = rows[1]
+    s0 = (d00 * r0[0] + d01 * r1[0], d00 * r0[1] + d01 * r1[1], d00 * r0[2] + d01 * r1[2])
+    s1 = (d01 * r0[0] + d11 * r1[0], d01 * r0[1] + d11 * r1[1], d01 * r0[2] + d11 * r1[2])
+    xy, xz, yz = r0[0] * s0[1] + r1[0] * s1[1], r0[0] * s0[2] + r1[0] * s1[2], r0[1] * s0[2] + r1[1] * s1[2]
+    scatter(g_splitting, indices, 9, 0, r0[0] * s0[0] + r1[0] * s1[0])
+    scatter(g_splitting, indices, 9, 1, xy)
+    scatter(g_splitting, indices, 9, 2, xz)
+    scatter(g_splitting, indices, 9, 3, xy)
+    scatter(g_splitting, indices, 9, 4, r0[1] * s0[1] + r1[1] * s1[1])
+    scatter(g_splitting, indices, 9, 5, yz)
+    scatter(g_splitting, indices, 9, 6, xz)
+    scatter(g_splitting, indices, 9, 7, yz)
+    scatter(g_splitting, indices, 9, 8, r0[2] * s0[2] + r1[2] * s1[2])
+
+
+@inlined
+def _difference(a: Any, b: Any) -> Any:
+    """a^2 - b^2, to the last digits and without overflow of what does not overflow."""
+    return (a - b) * (a + b)
+
+
+@inlined
+def _unclamped(record: int, count: int, record_ints: Any, sums: Any, colors: Any) -> Any:
+    """The gradients of red, green and blue, zero where the channel was clamped; also written to ``colors`` [3 * 16]."""
+    for lane in range(LANES):
+        clamped = record_ints[(record + min(lane, count - 1)) * at.RECORD + at.CLAMPED]
+        colors[lane] = ZERO if clamped & 1 else sums[at.SUM_RED * LANES + lane]
+        colors[LANES + lane] = ZERO if clamped & 2 else sums[at.SUM_GREEN * LANES + lane]
+        colors[2 * LANES + lane] = ZERO if clamped & 4 else sums[at.SUM_BLUE * LANES + lane]
+    return load(colors, 0), load(colors, LANES), load(colors, 2 * LANES)
+
+
+@inlined
+def _clear(gradient: Any, first: int, past: int) -> None:
+    """Zero the rows ``first`` to ``past`` of ``gradient`` [N, C]."""
+    for i in range(first, past):
+        for c in range(gradient.shape[1]):
+            gradient[i, c] = ZERO

@@ -13,8 +13,7 @@ from llvmlite import ir
 from numba.core import types
 
 from gsbench.gaussians.model import NUM_SH_REST
-from gsbench.raster.cpu.simd import address, intrinsic
-from gsbench.raster.cpu.vector import LANES, VECTOR, lane_indices
+from gsbench.raster.cpu.simd import LANES, VECTOR, address, intrinsic, lane_indices
 
 CHANNELS = 3
 BLOCK = 4  # px, the sides of the 16 pixels of a vector

@@ -9,11 +9,10 @@ from torch import Tensor
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, Footprint, view_depths
+from gsbench.raster.executors import load_driver
 from gsbench.raster.staged import Gradients, Lifetime, Request, StagedRasterizer
-from gsbench.raster.triton.backprojection import backproject, sum_units
-from gsbench.raster.triton.composite import composite, composite_backward
-from gsbench.raster.triton.footprint import cover, sum_cover
-from gsbench.raster.triton.launch import launch, launch_grid, load_driver
+from gsbench.raster.triton.composite import composite, composite_backward, cover, sum_cover
+from gsbench.raster.triton.launch import Workspace, WorkspacePool, launch, launch_grid
 from gsbench.raster.triton.layout import (
     BLOCK_PIXELS,
     BORDER,
@@ -28,8 +27,7 @@ from gsbench.raster.triton.layout import (
     make_view,
 )
 from gsbench.raster.triton.lists import Lists, Projected, Units, find_all_units, make_lists
-from gsbench.raster.triton.memory import Workspace, WorkspacePool
-from gsbench.raster.triton.projection import project
+from gsbench.raster.triton.projection import backproject, project, sum_units
 from gsbench.scene.camera import Camera
 
 

@@ -1,4 +1,4 @@
-"""The geometry of projection, shared by the forward and the backward kernel; float32, a lane a Gaussian.
+"""The geometry of projection and spherical harmonics, for both passes; float32, a lane a Gaussian.
 
 Matrices are tuples of rows, vectors tuples. Nothing here subtracts large numbers: see ``spread``.
 """
@@ -8,9 +8,14 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from gsbench.gaussians.model import C0, C1, C2, C3, NUM_SH_REST
 from gsbench.raster.base import CONSTANTS
 
 BLUR = tl.constexpr(CONSTANTS.blur)
+F0, F1 = tl.constexpr(C0), tl.constexpr(C1)
+D0, D1, D2, D3, D4 = (tl.constexpr(value) for value in C2)
+T0, T1, T2, T3, T4, T5, T6 = (tl.constexpr(value) for value in C3)
+REST = tl.constexpr(3 * NUM_SH_REST)  # numbers of a Gaussian
 
 
 @triton.jit
@@ -116,3 +121,118 @@ def spread(m0, m1):
     cross = (m0[1] * n1[2] - m0[2] * n1[1], m0[2] * n1[0] - m0[0] * n1[2], m0[0] * n1[1] - m0[1] * n1[0])
     given = dot(cross, cross) + BLUR * (xx + yy) / yy
     return xx + BLUR, xy, yy, 1.0 / given
+
+
+@triton.jit
+def basis(direction, DEGREE: tl.constexpr):
+    """The basis functions of degrees 1 to ``DEGREE``, at least 1, at unit directions."""
+    x, y, z = direction
+    values = (y * -F1, z * F1, x * -F1)
+    if DEGREE >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        quadratic = (x * y * D0, y * z * D1, (2 * zz - xx - yy) * D2, x * z * D3, (xx - yy) * D4)
+        values = values + quadratic  # type: ignore[assignment]
+        if DEGREE >= 3:
+            cubic = (
+                y * (3 * xx - yy) * T0,
+                x * y * z * T1,
+                y * (4 * zz - xx - yy) * T2,
+                z * (2 * zz - 3 * xx - 3 * yy) * T3,
+                x * (4 * zz - xx - yy) * T4,
+                z * (xx - yy) * T5,
+                x * (xx - 3 * yy) * T6,
+            )
+            values = values + cubic  # type: ignore[assignment]
+    return values
+
+
+@triton.jit
+def _coefficients(sh_rest, index, k: tl.constexpr, mask):
+    """The k-th coefficients of degree 1 and up, in red, green and blue."""
+    place = index * REST + 3 * k
+    red = tl.load(sh_rest + place, mask=mask, other=0.0)
+    green = tl.load(sh_rest + place + 1, mask=mask, other=0.0)
+    blue = tl.load(sh_rest + place + 2, mask=mask, other=0.0)
+    return red, green, blue
+
+
+@triton.jit
+def _add(sums, coefficients, factor):
+    return (
+        sums[0] + coefficients[0] * factor,
+        sums[1] + coefficients[1] * factor,
+        sums[2] + coefficients[2] * factor,
+    )
+
+
+@triton.jit
+def colors(
+    direction,
+    dc,
+    sh_rest,
+    index,
+    mask,
+    DEGREE: tl.constexpr,
+):
+    """SH + 0.5 (not clamped) at the unit ``direction`` of each Gaussian ``index``, whose constant terms are ``dc``, and
+    its derivatives by x, y and z of the direction (not yet tangential), each for red, green and blue.
+    """
+    x, y, z = direction
+    rgb = (dc[0] * F0 + 0.5, dc[1] * F0 + 0.5, dc[2] * F0 + 0.5)
+    zero = tl.zeros_like(x)
+    by_x, by_y, by_z = (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
+    if DEGREE >= 1:
+        values = basis(direction, DEGREE)
+        c = _coefficients(sh_rest, index, 0, mask)
+        rgb, by_y = _add(rgb, c, values[0]), _add(by_y, c, -F1)
+        c = _coefficients(sh_rest, index, 1, mask)
+        rgb, by_z = _add(rgb, c, values[1]), _add(by_z, c, F1)
+        c = _coefficients(sh_rest, index, 2, mask)
+        rgb, by_x = _add(rgb, c, values[2]), _add(by_x, c, -F1)
+    if DEGREE >= 2:
+        c = _coefficients(sh_rest, index, 3, mask)
+        rgb, by_x, by_y = _add(rgb, c, values[3]), _add(by_x, c, D0 * y), _add(by_y, c, D0 * x)
+        c = _coefficients(sh_rest, index, 4, mask)
+        rgb, by_y, by_z = _add(rgb, c, values[4]), _add(by_y, c, D1 * z), _add(by_z, c, D1 * y)
+        c = _coefficients(sh_rest, index, 5, mask)
+        rgb, by_x = _add(rgb, c, values[5]), _add(by_x, c, -2 * D2 * x)
+        by_y, by_z = _add(by_y, c, -2 * D2 * y), _add(by_z, c, 4 * D2 * z)
+        c = _coefficients(sh_rest, index, 6, mask)
+        rgb, by_x, by_z = _add(rgb, c, values[6]), _add(by_x, c, D3 * z), _add(by_z, c, D3 * x)
+        c = _coefficients(sh_rest, index, 7, mask)
+        rgb, by_x, by_y = _add(rgb, c, values[7]), _add(by_x, c, 2 * D4 * x), _add(by_y, c, -2 * D4 * y)
+    if DEGREE >= 3:
+        xx, yy, zz = x * x, y * y, z * z
+        xy, yz, xz = x * y, y * z, x * z
+        c = _coefficients(sh_rest, index, 8, mask)
+        rgb, by_x, by_y = _add(rgb, c, values[8]), _add(by_x, c, 6 * T0 * xy), _add(by_y, c, 3 * T0 * (xx - yy))
+        c = _coefficients(sh_rest, index, 9, mask)
+        rgb, by_x = _add(rgb, c, values[9]), _add(by_x, c, T1 * yz)
+        by_y, by_z = _add(by_y, c, T1 * xz), _add(by_z, c, T1 * xy)
+        c = _coefficients(sh_rest, index, 10, mask)
+        rgb, by_x = _add(rgb, c, values[10]), _add(by_x, c, -2 * T2 * xy)
+        by_y, by_z = _add(by_y, c, T2 * (4 * zz - xx - 3 * yy)), _add(by_z, c, 8 * T2 * yz)
+        c = _coefficients(sh_rest, index, 11, mask)
+        rgb, by_x = _add(rgb, c, values[11]), _add(by_x, c, -6 * T3 * xz)
+        by_y, by_z = _add(by_y, c, -6 * T3 * yz), _add(by_z, c, T3 * (6 * zz - 3 * xx - 3 * yy))
+        c = _coefficients(sh_rest, index, 12, mask)
+        rgb, by_x = _add(rgb, c, values[12]), _add(by_x, c, T4 * (4 * zz - 3 * xx - yy))
+        by_y, by_z = _add(by_y, c, -2 * T4 * xy), _add(by_z, c, 8 * T4 * xz)
+        c = _coefficients(sh_rest, index, 13, mask)
+        rgb, by_x = _add(rgb, c, values[13]), _add(by_x, c, 2 * T5 * xz)
+        by_y, by_z = _add(by_y, c, -2 * T5 * yz), _add(by_z, c, T5 * (xx - yy))
+        c = _coefficients(sh_rest, index, 14, mask)
+        rgb, by_x, by_y = _add(rgb, c, values[14]), _add(by_x, c, 3 * T6 * (xx - yy)), _add(by_y, c, -6 * T6 * xy)
+    return rgb, by_x, by_y, by_z
+
+
+@triton.jit
+def store_gradients(direction, g_rgb, g_sh_rest, index, mask, DEGREE: tl.constexpr):
+    """Store the gradients of the coefficients of degree 1 and up."""
+    if DEGREE >= 1:
+        values = basis(direction, DEGREE)
+        for k in tl.static_range(0, (DEGREE + 1) * (DEGREE + 1) - 1):
+            place = g_sh_rest + index * REST + 3 * k
+            tl.store(place, values[k] * g_rgb[0], mask=mask)
+            tl.store(place + 1, values[k] * g_rgb[1], mask=mask)
+            tl.store(place + 2, values[k] * g_rgb[2], mask=mask)

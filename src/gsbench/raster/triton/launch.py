@@ -1,63 +1,14 @@
-"""Start of the Triton kernels: the tools that a machine needs for the first one, and how each is launched.
-
-Triton compiles the piece of C that starts its kernels. Loads neither torch nor Triton.
-"""
+"""Launches of Triton kernels, and the device memory that they use again."""
 
 from __future__ import annotations
 
-import logging
-import os
-import shutil
-import sys
-import sysconfig
+import weakref
+from collections import defaultdict
 from collections.abc import Callable
-from functools import cache
-from pathlib import Path
 from typing import Any
 
-from gsbench.errors import InputError
-from gsbench.raster.executors import find
-
-log = logging.getLogger(__name__)
-
-
-def missing_tools() -> list[str]:
-    """List what is missing of a C compiler and Python's headers, each with the package that has it. Loads neither torch
-    nor Triton.
-    """
-    missing = []
-    compiler = os.environ.get("CC")
-    found = shutil.which(compiler.split()[0]) if compiler else shutil.which("gcc") or shutil.which("clang")
-    if found is None:
-        named = f" (CC is {compiler}, which is not there)" if compiler else ""
-        missing.append(f"a C compiler{named}: install the package gcc")
-    scheme = sysconfig.get_default_scheme()
-    if scheme == "posix_local":  # Debian's own; the headers are where they always were
-        scheme = "posix_prefix"
-    header = Path(sysconfig.get_paths(scheme=scheme)["include"]) / "Python.h"
-    if not header.exists():
-        version = f"{sys.version_info.major}.{sys.version_info.minor}"
-        missing.append(f"{header}: install the package python{version}-dev (python{version}-devel on Fedora)")
-    return missing
-
-
-@cache
-def load_driver() -> None:
-    """Let Triton find the GPU and load its launcher, compiling it if need be; InputError says what is missing."""
-    try:
-        from triton import knobs
-        from triton.runtime import driver
-
-        if not Path(knobs.cache.dir).exists():
-            log.info("compiling the GPU kernels, once: they are kept in %s", knobs.cache.dir)
-        driver.active.get_current_target()
-    except (RuntimeError, OSError, AssertionError, ImportError) as error:
-        missing = missing_tools()
-        reason = "Triton needs " + " and ".join(missing) if missing else f"Triton cannot start: {error}"
-        if old := find("triton").too_old():
-            reason = f"raster=triton {old}"
-        raise InputError(reason) from error
-
+import torch
+from torch import Tensor
 
 # Products and sums are contracted to fma: Triton's default today, but no longer from 3.10 on.
 OPTIONS = {"enable_fp_fusion": True}
@@ -80,3 +31,85 @@ def launch_grid(kernel: Any, *programs: int) -> Callable[..., None]:
         kernel[programs](*arguments, **OPTIONS, **constants)
 
     return run
+
+
+# Bytes that stay from step to step, in the workspaces of `stages` and `lists`.
+BYTES_OF_GAUSSIAN = (
+    64 + 36 + 3 * 4 + 3 * 8
+)  # record; slopes of the colour; depth and key, rows of blocks; their places, the order
+BYTES_OF_UNIT = 3 * 4 + 8  # a row of blocks of a Gaussian: owner, first block, width; end of its pairs
+BYTES_OF_PAIR = 64 + 8 + 2 * 4 + 2 * 2  # row of gradient sums; slot; Gaussian, twice; key, twice
+BYTES_OF_BLOCK = 128 * (4 + 4) + 3 * 4 + 2 * 8  # of 128 pixels transmittance and last entry; list, last slot
+BYTES_OF_BORDER = 128 * 4 * 4  # of 128 pixels transmittance and colour
+PAIRS_OF_BORDER = 256  # between two, where a list is walked backward by several programs
+BYTES_OF_RENDER = 64 + 4 + 4 + 3 * 8  # the record that cannot be seen, the end of the lists, flags, status
+UNITS_AT_FIRST = 2  # rows of blocks that a Gaussian has room for, before they are counted
+
+# While pairs are sorted: the numbers of the slots, and a second copy of these and of the keys.
+BYTES_OF_SORTING = 8 + 8 + 2
+
+
+def workspace_bytes(gaussians: int, units: int, pairs: int, blocks: int) -> int:
+    """The buffers of one render with its backward pass, those for rows of blocks having room for ``units``."""
+    return (
+        BYTES_OF_RENDER
+        + BYTES_OF_GAUSSIAN * gaussians
+        + BYTES_OF_UNIT * units
+        + BYTES_OF_PAIR * pairs
+        + BYTES_OF_BLOCK * blocks
+        + BYTES_OF_BORDER * (max(pairs - 1, 0) // PAIRS_OF_BORDER)
+    )
+
+
+def render_bytes(gaussians: int, units: int, pairs: int, blocks: int) -> int:
+    """Bytes that renders hold at once, with their backward passes, beside their results and gradients.
+
+    ``pairs`` (Gaussian, block) stand in ``units`` rows of blocks. A buffer that has to grow becomes at least twice as
+    large as it was, so that after some growth it may be up to twice what is counted here.
+    """
+    room = UNITS_AT_FIRST * gaussians
+    return workspace_bytes(gaussians, room if units <= room else 2 * units, pairs, blocks) + BYTES_OF_SORTING * pairs
+
+
+class Workspace:
+    """Named one-dimensional tensors that grow by doubling. ``take`` gives a view with what was left there."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self._buffers: dict[str, Tensor] = {}
+
+    def take(self, name: str, count: int, dtype: torch.dtype) -> Tensor:
+        """``count`` numbers of ``dtype``; one name always has one dtype."""
+        if count > self.capacity(name):
+            grown = max(count, 2 * self.capacity(name))
+            self._buffers.pop(name, None)  # before the new one is made
+            with torch.inference_mode(False):  # it will be written to in other modes
+                self._buffers[name] = torch.empty(grown, dtype=dtype, device=self.device)
+        elif name not in self._buffers:
+            return torch.empty(0, dtype=dtype, device=self.device)
+        return self._buffers[name][:count]
+
+    def capacity(self, name: str) -> int:
+        """The number of values that ``take`` gives without growing."""
+        buffer = self._buffers.get(name)
+        return 0 if buffer is None else len(buffer)
+
+
+class WorkspacePool:
+    """Workspaces that outlive the graph of a render: one comes back when its ``holder`` is freed.
+
+    One that comes back is given only to work on the same stream, which waits for what still reads it.
+    """
+
+    def __init__(self) -> None:
+        self._free: defaultdict[tuple[torch.device, int], list[Workspace]] = defaultdict(list)
+
+    def lease(self, holder: object, device: torch.device) -> Workspace:
+        stream = torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
+        free = self._free[device, stream]
+        try:
+            workspace = free.pop()  # atomic
+        except IndexError:
+            workspace = Workspace(device)
+        weakref.finalize(holder, free.append, workspace).atexit = False
+        return workspace

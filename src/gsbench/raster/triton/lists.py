@@ -16,8 +16,8 @@ import triton.language as tl
 from torch import Tensor
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.raster.readback import Readback
-from gsbench.raster.triton.launch import launch, launch_grid
+from gsbench.raster.staged import Readback, raise_for_values
+from gsbench.raster.triton.launch import UNITS_AT_FIRST, Workspace, launch, launch_grid
 from gsbench.raster.triton.layout import (
     BLOCK_HEIGHT,
     BLOCK_WIDTH,
@@ -34,8 +34,6 @@ from gsbench.raster.triton.layout import (
     SHEAR,
     Grid,
 )
-from gsbench.raster.triton.memory import UNITS_AT_FIRST, Workspace
-from gsbench.raster.validate import raise_for_values
 
 # Rounding must not lose a pixel of the contour.
 REACH_MARGIN = tl.constexpr(1e-3)  # in log2(alpha)

@@ -1,4 +1,7 @@
-"""Projection of Gaussians to records, a lane a Gaussian."""
+"""Projection of Gaussians to records, and its gradients, derived by hand; a lane a Gaussian.
+
+Sums are made in a fixed order and without atomics, so they have the same bits on every run.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +9,23 @@ import triton
 import triton.language as tl
 
 from gsbench.raster.base import CONSTANTS
+from gsbench.raster.staged import MIN_QUATERNION_NORM
 from gsbench.raster.triton.geometry import (
+    F0,
+    colors,
     dot,
     from_camera,
     image_axes,
+    image_rows,
     load_quaternion,
     load_vector,
     rotation_matrix,
     scaled,
     spread,
+    store_gradients,
     times,
     to_view,
 )
-from gsbench.raster.triton.harmonics import colors
 from gsbench.raster.triton.layout import (
     ALPHA_MIN,
     BLOCK_HEIGHT,
@@ -40,10 +47,21 @@ from gsbench.raster.triton.layout import (
     RECORD,
     RED,
     RIGHTMOST_Y,
+    ROW,
     SHEAR,
+    SUM_ABS_T,
+    SUM_ABS_Y,
+    SUM_BLUE,
+    SUM_GREEN,
+    SUM_H,
+    SUM_H_T,
+    SUM_H_TT,
+    SUM_H_TY,
+    SUM_H_Y,
+    SUM_H_YY,
+    SUM_RED,
     TILE,
 )
-from gsbench.raster.validate import MIN_QUATERNION_NORM
 
 NEAR = tl.constexpr(CONSTANTS.near)
 SIGMA_EXTENT = tl.constexpr(CONSTANTS.sigma_extent)
@@ -166,3 +184,220 @@ def project(
     tl.store(record_ints + place + FIRST_ROW, first_y, mask=seen)
     tl.store(record_ints + place + CLAMPED, clamped, mask=seen)
     tl.store(flags, 1, mask=tl.max((bad & inside).to(tl.int32), 0) > 0)
+
+
+@triton.jit(do_not_specialize=["units"])
+def sum_units(pair_ends, unit_widths, unit_blocks, last_slots, units, rows, GROUP: tl.constexpr):
+    """Add the ``rows`` [pairs, 16] of each unit into the first of them. Its slots are neighbours.
+
+    Only those that compositing came to have been written. They are the ones up to ``last_slots`` [blocks], since the
+    list of a block has its slots in rising order.
+    """
+    unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
+    inside = unit < units
+    width = tl.load(unit_widths + unit, mask=inside, other=0)
+    first = tl.load(pair_ends + unit, mask=inside, other=0) - width
+    block = tl.load(unit_blocks + unit, mask=inside, other=0)
+    place = rows + first[:, None] * ROW + tl.arange(0, ROW)[None, :]  # [GROUP, ROW]
+    total = tl.zeros([GROUP, ROW], tl.float32)
+    for k in range(0, tl.max(width, 0)):
+        written = first + k <= tl.load(last_slots + block + k, mask=k < width, other=-1)
+        total += tl.load(place + k * ROW, mask=(written & (k < width))[:, None], other=0.0)
+    written = first <= tl.load(last_slots + block, mask=width == 1, other=-1)
+    tl.store(place, total, mask=((width > 1) | ((width == 1) & ~written))[:, None])
+
+
+@triton.jit
+def _sum_rows(index, rows_of_blocks, first_units, pair_ends, unit_widths, rows, ABSOLUTE: tl.constexpr):
+    """The gradient sums of each Gaussian over its units: nine, and two more if ``ABSOLUTE``."""
+    unit = tl.load(first_units + index, mask=rows_of_blocks > 0, other=0)
+    zero = tl.zeros_like(rows_of_blocks).to(tl.float32)
+    sums = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
+    for k in range(0, tl.max(rows_of_blocks, 0)):
+        active = k < rows_of_blocks
+        width = tl.load(unit_widths + unit + k, mask=active, other=0)
+        slot = tl.load(pair_ends + unit + k, mask=active, other=0) - width
+        active = width > 0
+        place = rows + slot * ROW
+        sums = (
+            sums[0] + tl.load(place + SUM_H, mask=active, other=0.0),
+            sums[1] + tl.load(place + SUM_H_T, mask=active, other=0.0),
+            sums[2] + tl.load(place + SUM_H_Y, mask=active, other=0.0),
+            sums[3] + tl.load(place + SUM_H_TT, mask=active, other=0.0),
+            sums[4] + tl.load(place + SUM_H_TY, mask=active, other=0.0),
+            sums[5] + tl.load(place + SUM_H_YY, mask=active, other=0.0),
+            sums[6] + tl.load(place + SUM_RED, mask=active, other=0.0),
+            sums[7] + tl.load(place + SUM_GREEN, mask=active, other=0.0),
+            sums[8] + tl.load(place + SUM_BLUE, mask=active, other=0.0),
+            sums[9] + tl.load(place + SUM_ABS_T, mask=active & ABSOLUTE, other=0.0),
+            sums[10] + tl.load(place + SUM_ABS_Y, mask=active & ABSOLUTE, other=0.0),
+        )
+    return sums
+
+
+@triton.jit
+def _store_vector(array, index, values, mask):
+    tl.store(array + 3 * index, values[0], mask=mask)
+    tl.store(array + 3 * index + 1, values[1], mask=mask)
+    tl.store(array + 3 * index + 2, values[2], mask=mask)
+
+
+@triton.jit
+def _store_splitting(place, d00, d01, d11, shear, rows, mask):
+    """Write F^T U^T (D G D - h D) U F for the derivative F = ``rows`` of the mean on the image, ``d`` what is between.
+
+    The second derivative of alpha by the mean on the image is alpha (u u^T - C), with u = C (dx, dy) and the conic
+    C = U^T D U; summed with weights h / alpha that is U^T (D G D - h D) U.
+    """
+    r0 = (rows[0][0] + shear * rows[1][0], rows[0][1] + shear * rows[1][1], rows[0][2] + shear * rows[1][2])
+    r1 = rows[1]
+    s0 = (d00 * r0[0] + d01 * r1[0], d00 * r0[1] + d01 * r1[1], d00 * r0[2] + d01 * r1[2])
+    s1 = (d01 * r0[0] + d11 * r1[0], d01 * r0[1] + d11 * r1[1], d01 * r0[2] + d11 * r1[2])
+    xy, xz, yz = r0[0] * s0[1] + r1[0] * s1[1], r0[0] * s0[2] + r1[0] * s1[2], r0[1] * s0[2] + r1[1] * s1[2]
+    tl.store(place, r0[0] * s0[0] + r1[0] * s1[0], mask=mask)
+    tl.store(place + 1, xy, mask=mask)
+    tl.store(place + 2, xz, mask=mask)
+    tl.store(place + 3, xy, mask=mask)
+    tl.store(place + 4, r0[1] * s0[1] + r1[1] * s1[1], mask=mask)
+    tl.store(place + 5, yz, mask=mask)
+    tl.store(place + 6, xz, mask=mask)
+    tl.store(place + 7, yz, mask=mask)
+    tl.store(place + 8, r0[2] * s0[2] + r1[2] * s1[2], mask=mask)
+
+
+@triton.jit(do_not_specialize=["count"])
+def backproject(
+    means,
+    log_scales,
+    quaternions,
+    logits,
+    count,
+    v,
+    record_ints,
+    color_slopes,
+    row_counts,
+    first_units,
+    pair_ends,
+    unit_widths,
+    rows,
+    g_means,
+    g_log_scales,
+    g_quaternions,
+    g_logits,
+    g_sh_dc,
+    g_sh_rest,
+    g_screen,
+    g_absolute,
+    g_splitting,
+    DEGREE: tl.constexpr,
+    ABSOLUTE: tl.constexpr,
+    SPLITTING: tl.constexpr,
+    GROUP: tl.constexpr,
+):
+    """Write the gradients of the Gaussians that were seen; those of the others stay as they are."""
+    index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
+    row_count = tl.load(row_counts + index, mask=index < count, other=0)
+    seen = row_count > 0
+    h, h_t, h_y, h_tt, h_ty, h_yy, red, green, blue, abs_t, abs_y = _sum_rows(
+        index, row_count, first_units, pair_ends, unit_widths, rows, ABSOLUTE
+    )
+    mean, log_scale = load_vector(means, index, seen), load_vector(log_scales, index, seen)
+    offset = from_camera(mean, v)
+
+    # Colour, and the position through the direction of the colour.
+    clamped = tl.load(record_ints + index * RECORD + CLAMPED, mask=seen, other=0)
+    g_rgb = (
+        tl.where(clamped & 1 != 0, 0.0, red),
+        tl.where(clamped & 2 != 0, 0.0, green),
+        tl.where(clamped & 4 != 0, 0.0, blue),
+    )
+    distance = tl.sqrt(dot(offset, offset))
+    inverse_distance = 1.0 / tl.where(distance > 0, distance, 1.0)
+    to = scaled(offset, (inverse_distance, inverse_distance, inverse_distance))
+    _store_vector(g_sh_dc, index, scaled(g_rgb, (F0, F0, F0)), seen)
+    zero = tl.zeros_like(distance)
+    pulled = (zero, zero, zero)
+    if DEGREE > 0:
+        for c in tl.static_range(3):
+            slope = load_vector(color_slopes + 3 * c, 3 * index, seen)
+            pulled = (pulled[0] + g_rgb[c] * slope[0], pulled[1] + g_rgb[c] * slope[1], pulled[2] + g_rgb[c] * slope[2])
+    store_gradients(to, g_rgb, g_sh_rest, index, seen, DEGREE)
+    radial = dot(pulled, to)
+    from_x = (pulled[0] - radial * to[0]) * inverse_distance
+    from_y = (pulled[1] - radial * to[1]) * inverse_distance
+    from_z = (pulled[2] - radial * to[2]) * inverse_distance
+
+    # The forward geometry once more.
+    quaternion, inverse_norm, _ = load_quaternion(quaternions, index, seen)
+    qw, qx, qy, qz = quaternion
+    matrix = rotation_matrix(quaternion)
+    x, y, z = to_view(offset, v)
+    inverse_z = 1.0 / tl.where(seen, z, 1.0)
+    axis_x, axis_y, slope_x, slope_y = image_axes(x * inverse_z, y * inverse_z, inverse_z, v)
+    scales = (tl.exp(log_scale[0]), tl.exp(log_scale[1]), tl.exp(log_scale[2]))
+    n0, n1 = times(axis_x, matrix), times(axis_y, matrix)
+    m0, m1 = scaled(n0, scales), scaled(n1, scales)
+    _, xy, yy, a = spread(m0, m1)
+    e, shear = 1.0 / yy, -xy / yy  # power = -(a t^2 + e dy^2) / 2, t = dx + shear dy
+
+    # Mean on the image: d power / d mean = (a t, shear a t + e dy).
+    g_column = a * h_t
+    g_row = shear * g_column + e * h_y
+    half_width, half_height = 0.5 * v.width, 0.5 * v.height
+    tl.store(g_screen + 2 * index, g_column * half_width, mask=seen)
+    tl.store(g_screen + 2 * index + 1, g_row * half_height, mask=seen)
+    if ABSOLUTE:
+        tl.store(g_absolute + 2 * index, a * abs_t * half_width, mask=seen)
+        tl.store(g_absolute + 2 * index + 1, abs_y * half_height, mask=seen)
+
+    # M = N S, N = A R: d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U = [[1, shear], [0, 1]], G the second
+    # moments of h over (t, dy). The first row of U M is short for a needle: U N comes first.
+    q00, q01, q11 = a * a * h_tt, a * e * h_ty, e * e * h_yy
+    if SPLITTING:
+        free = image_rows(x * inverse_z, y * inverse_z, inverse_z, v)
+        _store_splitting(g_splitting + 9 * index, q00 - a * h, q01, q11 - e * h, shear, free, seen)
+    u0 = (n0[0] + shear * n1[0], n0[1] + shear * n1[1], n0[2] + shear * n1[2])
+    g0 = (q00 * u0[0] + q01 * n1[0], q00 * u0[1] + q01 * n1[1], q00 * u0[2] + q01 * n1[2])
+    g1 = (q01 * u0[0] + q11 * n1[0], q01 * u0[1] + q11 * n1[1], q01 * u0[2] + q11 * n1[2])
+    variances = scaled(scales, scales)
+    along = (u0[0] * g0[0] + n1[0] * g1[0], u0[1] * g0[1] + n1[1] * g1[1], u0[2] * g0[2] + n1[2] * g1[2])
+    _store_vector(g_log_scales, index, scaled(along, variances), seen)
+
+    # Turned by small angles w about its own axes, R S^2 R^T changes by a commutator: the gradient at w has differences
+    # of variances as factors. Taken first, they make that of a ball 0, where the rounding of terms that cancel would
+    # become full steps of Adam. The quaternion moves by q (0, w) / 2.
+    w_x = (u0[1] * g0[2] + n1[1] * g1[2]) * (scales[1] - scales[2]) * (scales[1] + scales[2])
+    w_y = (u0[2] * g0[0] + n1[2] * g1[0]) * (scales[2] - scales[0]) * (scales[2] + scales[0])
+    w_z = (u0[0] * g0[1] + n1[0] * g1[1]) * (scales[0] - scales[1]) * (scales[0] + scales[1])
+    twice = inverse_norm + inverse_norm
+    tl.store(g_quaternions + 4 * index, -(qx * w_x + qy * w_y + qz * w_z) * twice, mask=seen)
+    tl.store(g_quaternions + 4 * index + 1, (qw * w_x + qy * w_z - qz * w_y) * twice, mask=seen)
+    tl.store(g_quaternions + 4 * index + 2, (qw * w_y + qz * w_x - qx * w_z) * twice, mask=seen)
+    tl.store(g_quaternions + 4 * index + 3, (qw * w_z + qx * w_y - qy * w_x) * twice, mask=seen)
+
+    # A = J W: d loss / d A, then J's entries, then the position in the view.
+    s0, s1 = scaled(g0, variances), scaled(g1, variances)
+    s1 = (s1[0] + shear * s0[0], s1[1] + shear * s0[1], s1[2] + shear * s0[2])
+    a0 = (dot(s0, matrix[0]), dot(s0, matrix[1]), dot(s0, matrix[2]))
+    a1 = (dot(s1, matrix[0]), dot(s1, matrix[1]), dot(s1, matrix[2]))
+    j00, j02 = a0[0] * v.r00 + a0[1] * v.r01 + a0[2] * v.r02, a0[0] * v.r20 + a0[1] * v.r21 + a0[2] * v.r22
+    j11, j12 = a1[0] * v.r10 + a1[1] * v.r11 + a1[2] * v.r12, a1[0] * v.r20 + a1[1] * v.r21 + a1[2] * v.r22
+    fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
+    free_x, free_y = x * inverse_z, y * inverse_z
+    # The clamp of the slope passes the gradient only within its limits.
+    g_slope_x = tl.where((free_x >= v.slope_x_min) & (free_x <= v.slope_x_max), -fx_z * j02, 0.0)
+    g_slope_y = tl.where((free_y >= v.slope_y_min) & (free_y <= v.slope_y_max), -fy_z * j12, 0.0)
+    view_x = g_column * fx_z + g_slope_x * inverse_z
+    view_y = g_row * fy_z + g_slope_y * inverse_z
+    through_focal = fx_z * (j00 - slope_x * j02) + fy_z * (j11 - slope_y * j12)
+    view_z = -(through_focal * inverse_z + view_x * free_x + view_y * free_y)
+    g_mean = (
+        view_x * v.r00 + view_y * v.r10 + view_z * v.r20 + from_x,
+        view_x * v.r01 + view_y * v.r11 + view_z * v.r21 + from_y,
+        view_x * v.r02 + view_y * v.r12 + view_z * v.r22 + from_z,
+    )
+    _store_vector(g_means, index, g_mean, seen)
+
+    # d log(alpha) / d logit = 1 - opacity
+    g_logit = h / (tl.exp(tl.load(logits + index, mask=seen, other=0.0)) + 1.0)
+    tl.store(g_logits + index, g_logit, mask=seen)
