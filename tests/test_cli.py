@@ -66,8 +66,8 @@ def test_help_and_reading_verbs_load_no_torch(runs: Path) -> None:
     [
         (InputError("bad photo"), 2, "gsbench: bad photo\n"),
         (GsbenchError("went wrong"), 1, "gsbench: went wrong\n"),
-        (Stopped(15), 143, "gsbench: stopped by SIGTERM; the same command goes on from here\n"),
-        (KeyboardInterrupt(), 130, "gsbench: stopped; the same command goes on from here\n"),
+        (Stopped(15), 143, "gsbench: stopped by SIGTERM; to continue, give the same command again\n"),
+        (KeyboardInterrupt(), 130, "gsbench: stopped; to continue, give the same command again\n"),
     ],
 )
 def test_errors_become_a_line_and_an_exit_code(
@@ -284,7 +284,7 @@ def test_a_stop_while_a_native_module_is_imported_is_told_as_a_stop(
 
     monkeypatch.setattr(cli, "_trials", stopped)
     assert cli.run(["seed=1"]) == 130
-    assert capsys.readouterr().err == "gsbench: stopped; the same command goes on from here\n"
+    assert capsys.readouterr().err == "gsbench: stopped; to continue, give the same command again\n"
     monkeypatch.setattr(cli, "_trials", lambda argv: importlib.import_module("nosuch_module"))
     with pytest.raises(ModuleNotFoundError):
         cli.run(["seed=1"])

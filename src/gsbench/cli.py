@@ -59,13 +59,14 @@ def run(argv: list[str]) -> int:
         return _refuse(error, TRIAL_FAILED)
     except KeyboardInterrupt as stop:
         print(
-            f"gsbench: stopped{f' by {stop}' if str(stop) else ''}; the same command goes on from here", file=sys.stderr
+            f"gsbench: stopped{f' by {stop}' if str(stop) else ''}; to continue, give the same command again",
+            file=sys.stderr,
         )
         return getattr(stop, "exit_code", INTERRUPTED)
     except ImportError as error:
         if not _is_interrupt(error):
             raise
-        print("gsbench: stopped; the same command goes on from here", file=sys.stderr)
+        print("gsbench: stopped; to continue, give the same command again", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:  # the reader of our output, such as `head`, has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

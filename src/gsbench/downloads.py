@@ -60,7 +60,7 @@ def retried(action: Callable[[], T], url: str, patience: Patience) -> T:
             reason = _reason(error)
             if failures == patience.tries:
                 raise FetchError(
-                    f"{url}: {failures} failures in a row ({reason}): the same command goes on from here"
+                    f"{url}: {failures} failures in a row ({reason}): to continue, give the same command again"
                 ) from error
         pause = min(MAX_PAUSE_SECONDS, patience.pause * 2 ** (failures - 1))
         log.info("%s: trying again in %.3g s", reason, pause)

@@ -223,7 +223,9 @@ def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
     number = error.errno if isinstance(error, OSError) else None
     place = getattr(error, "filename", None) or folder
     if number in FULL or FULL_TEXT.search(str(error)) or (_is_write_error(error) and _free(folder) < NEARLY_NOTHING):
-        return DiskFullError(f"the disk of {folder} is full: free some space, and the same command goes on from here")
+        return DiskFullError(
+            f"the disk of {folder} is full: free some space, then give the same command again: it continues"
+        )
     if number == errno.EFBIG:
         return InputError(
             f"{place} may not grow any more ({os.strerror(number)}): raise `ulimit -f`, or set runs=FOLDER"

@@ -39,7 +39,7 @@ def test_full_disk_ends_the_sweep_in_one_line_and_more_space_mends_it(
     assert "Traceback" not in done.stderr
     lines = [line for line in done.stderr.strip().splitlines() if line.startswith("gsbench:")]
     assert lines == [
-        f"gsbench: the disk of {small_disk} is full: free some space, and the same command goes on from here"
+        f"gsbench: the disk of {small_disk} is full: free some space, then give the same command again: it continues"
     ]
     subprocess.run(["mount", "-o", "remount,size=200m", str(small_disk)], check=True)
     done = gsbench(*sweep, "densify=adc", GSBENCH_RUNS=str(small_disk))

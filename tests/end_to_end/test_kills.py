@@ -58,7 +58,9 @@ def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
         process.send_signal(signal.SIGTERM)
         output, _ = process.communicate(timeout=300)
         assert process.returncode == 128 + signal.SIGTERM, output
-        assert output.strip().splitlines()[-1] == "gsbench: stopped by SIGTERM; the same command goes on from here"
+        assert (
+            output.strip().splitlines()[-1] == "gsbench: stopped by SIGTERM; to continue, give the same command again"
+        )
         assert "Traceback" not in output
         assert list(runs.glob("store/train/.*.partial/checkpoint-*.pt")), output
     process = start(environment, tmp_path, runs, *SWEEP)

@@ -33,8 +33,32 @@ def test_from_a_checkout_the_hint_installs_the_checkout(tmp_path: Path, monkeypa
 
 def test_elsewhere_the_hint_names_the_distribution(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(install, "__file__", "/usr/lib/python3/site-packages/gsbench/install.py")
+    monkeypatch.setattr(install, "installed_from", lambda: None)
     assert install_command() == "pip install 'gsbench-3dgs'"
     assert install_command("view") == "pip install 'gsbench-3dgs[view]'"
+
+
+@pytest.mark.parametrize(
+    ("record", "found"),
+    [
+        ('{"dir_info": {}, "url": "file://FOLDER"}', True),
+        ('{"dir_info": {}, "url": "file://FOLDER/gone"}', False),
+        ('{"archive_info": {}, "url": "https://example.org/a.whl"}', False),
+        (None, False),
+    ],
+)
+def test_installed_from_a_folder_the_hint_names_the_folder(
+    record: str | None, found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Known:
+        def read_text(self, name: str) -> str | None:
+            assert name == "direct_url.json"
+            return record and record.replace("FOLDER", tmp_path.as_posix())
+
+    monkeypatch.setattr(install, "__file__", "/usr/lib/python3/site-packages/gsbench/install.py")
+    monkeypatch.setattr(install, "distribution", lambda name: Known())
+    assert install.installed_from() == (tmp_path if found else None)
+    assert install_command("view") == f"pip install '{tmp_path if found else DISTRIBUTION}[view]'"
 
 
 def test_no_text_sends_anyone_to_the_project_that_has_our_name() -> None:

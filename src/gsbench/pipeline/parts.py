@@ -39,10 +39,11 @@ from gsbench.raster.executors import AUTO, offers, resolve
 from gsbench.runs.code import OWN, module_digest, unnamed_modules, user_modules
 from gsbench.runs.declaration import metric_and_question
 from gsbench.scene.options import SceneConfig
-from gsbench.settings import checked, unknown_setting
+from gsbench.settings import checked, option_fields, unknown_setting
 from gsbench.system.resources import available_threads
 from gsbench.train.device import select_device
 from gsbench.train.options import TrainConfig
+from gsbench.words import closest
 
 log = logging.getLogger(__name__)
 
@@ -197,6 +198,7 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     options = {key: value for key, value in values.items() if key not in RESERVED}
     own = target.startswith(OWN)
     if dataclasses.is_dataclass(cls) and not own:
+        _check_fields(cls, target, options, group)
         options = checked(cls, options, group)
     else:
         _check_names(cls, options, group)
@@ -215,6 +217,17 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
         if own:
             raise
         raise InputError(f"{group}: {target} cannot be made ({type(error).__name__}: {error})") from error
+
+
+def _check_fields(cls: type, target: str, options: dict[str, Any], group: str) -> None:
+    """Raise InputError for a setting that the user's class lacks, mostly one of the choice that it started from."""
+    known = [field.name for field in option_fields(cls)]
+    if strange := next((name for name in options if name not in known), None):
+        key = f"{group}.{strange}"
+        raise InputError(
+            f"{key} is not a setting{closest(strange, known)} ({target} has: {', '.join(known) or 'none'}); remove it "
+            f"by ~{key}, or start from another choice, {group}=NAME"
+        )
 
 
 def build_rasterizer(

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 from gsbench.errors import InputError
 
@@ -17,12 +21,23 @@ DISTRIBUTION = "gsbench-3dgs"  # on the package index, where plain "gsbench" is 
 
 
 def install_command(extra: str = "") -> str:
-    """The shell command that installs gsbench with an extra such as ``view``; from a checkout, that checkout."""
+    """The shell command that installs gsbench with an extra such as ``view``, from where gsbench was installed."""
     wanted = f"[{extra}]" if extra else ""
     root = checkout()
     if root is None:
-        return f"pip install '{DISTRIBUTION}{wanted}'"
+        return f"pip install '{installed_from() or DISTRIBUTION}{wanted}'"
     return f"pip install -e '{'.' if root == Path.cwd() else root}{wanted}'"
+
+
+def installed_from() -> Path | None:
+    """The folder that pip installed gsbench from, by pip's own record (PEP 610); None for a package index."""
+    try:
+        record = distribution(DISTRIBUTION).read_text("direct_url.json")
+    except PackageNotFoundError:
+        return None
+    address = urlsplit(json.loads(record)["url"]) if record else urlsplit("")
+    folder = Path(url2pathname(address.path))
+    return folder if address.scheme == "file" and folder.is_dir() else None
 
 
 def checkout() -> Path | None:

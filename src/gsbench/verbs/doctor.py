@@ -134,9 +134,10 @@ def check_weights() -> Iterator[Finding]:
         try:
             yield Finding("ok", "weights", f"{purpose}: {find_any(specs, None, download=False)}")
         except MissingWeights as error:
-            missing = f"{specs[0].names[0]} is not here; it is downloaded when needed, or put it into "
-            place = f"${WEIGHTS_VARIABLE} or {hub_cache()}"
-            text = missing + place if "not found" in str(error) else str(error)
+            origin = specs[0].url or specs[0].source
+            missing = f"{specs[0].names[0]} is not here; gsbench downloads it when needed from {origin}"
+            place = f"or put it into ${WEIGHTS_VARIABLE} or {hub_cache()}"
+            text = f"{missing}; {place}" if "not found" in str(error) else str(error)
             yield Finding("note", "weights", f"{purpose}: {text}")
 
 

@@ -54,9 +54,9 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 def _lines(found: Components, shown: Quantity, difference: float) -> list[str]:
     digits = f".{shown.decimals + 1}f"
-    between = "not known from one scene" if found.between is None else f"{found.between:{digits}}"
+    between = "" if found.between is None else f", between scenes by {found.between:{digits}}"
     lines = [
-        f"  differences in {shown.name} vary by {found.within:{digits}} between seeds, and between scenes by {between} "
+        f"  differences in {shown.name} vary between seeds by {found.within:{digits}}{between} "
         f"(from {counted(found.trials, 'pair')} on {counted(found.scenes, 'scene')})"
     ]
     for like_these in (False, True):

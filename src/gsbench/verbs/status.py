@@ -83,7 +83,7 @@ def lines_of(trials: list[TrialState], everything: bool) -> list[str]:
             continue
         for trial in trials:
             if trial.state == state:
-                lines.append(f"{state:<8} {trial.label:<50} {_age(trial):>10}  {trial.note}".rstrip())
+                lines.append(f"{state:<8} {trial.label:<50} {_age(trial):>12}  {trial.note}".rstrip())
     lines.append(summary_of(trials))
     return lines
 
@@ -106,7 +106,11 @@ def _overview(runs: Path) -> int:
 
 
 def _age(trial: TrialState) -> str:
-    return "" if trial.since is None else readable_time(max(0.0, time.time() - trial.since))
+    """``for 5 min`` of a state that lasts, ``5 min ago`` of one that was reached."""
+    if trial.since is None:
+        return ""
+    time_since = readable_time(max(0.0, time.time() - trial.since))
+    return f"for {time_since}" if trial.state in ("running", "queued") else f"{time_since} ago"
 
 
 def _as_dict(trial: TrialState) -> dict[str, object]:
