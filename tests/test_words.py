@@ -146,7 +146,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "--dry-run densify.volume_threshold=-1": "densify.volume_threshold must be",
     "densify._target_=gsbench.errors.InputError": "not a class for densify",
     "densify._target_=os.system": "allow_targets=[os]",
-    "densify._target_=own.Own allow_targets=[own]": "remove it by ~densify.volume_threshold, or start from another choice",
+    "densify._target_=own.Own allow_targets=[own]": "remove it by ~densify.volume_threshold, or start",
     "densify._target_=nosuch.X allow_targets=[nosuch]": "No module named 'nosuch'",
     "densify._target_=broken.X allow_targets=[broken]": "SyntaxError",
     "densify=adc densify._target_=own.Raises allow_targets=[own]": "own.Raises cannot be made (KeyError",
