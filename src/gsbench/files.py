@@ -150,7 +150,7 @@ def require_regular(path: Path) -> None:
     with suppress(OSError):
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-            raise InputError(f"{path} is no regular file: put a copy of its content there")
+            raise InputError(f"{path} is not a regular file: put a copy of its content there")
 
 
 def sync_to_disk(path: Path) -> None:

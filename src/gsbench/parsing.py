@@ -72,7 +72,7 @@ def _opened(path: Path) -> Iterator[int]:
     """A descriptor of a regular file, closed afterwards; what goes wrong meanwhile is said of the file."""
     try:
         if not stat.S_ISREG(os.lstat(path).st_mode):  # a link is none: see `gsbench.files.require_own`
-            raise DamagedError(path, "cannot be read: it is no regular file")
+            raise DamagedError(path, "cannot be read: it is not a regular file")
         descriptor = open_plain(path)
         try:
             yield descriptor

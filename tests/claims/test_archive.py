@@ -180,7 +180,7 @@ def flip_a_bit(file: Path) -> None:
         (resigned("results.jsonl", b'"status":"complete"', b'"status":"well"'), "unfinished"),
         (resigned("results.jsonl", b"{", b"["), "not that of an archive"),
         (resigned("results.jsonl", b"{", b"[" * 200_000), "not that of an archive"),
-        (resigned("results.jsonl", b"-seed1", b"-seed0"), "stands twice"),
+        (resigned("results.jsonl", b"-seed1", b"-seed0"), "is in it twice"),
         (resigned("configurations.jsonl", b'"name":"adc"', b'"name":"volumetric"'), "says densify volumetric"),
         (resigned("configurations.jsonl", b"-seed1", b"-seed0"), "configuration says seed 1, its results 0"),
         (resigned("per_view.csv", b"-seed1,", b"-seed9,"), "per_view.csv"),

@@ -144,7 +144,14 @@ def test_the_page_says_all(tmp_path: Path) -> None:
     verdicts = looked(check, FakeRunner(noise=0.001))
     older = replace(check.declaration, time="2019-01-01T00:00:00Z", error_rate=0.1)
     page = make_page(check.file, verdicts, check.declaration, [older, check.declaration])
-    for part in ("supported", "PSNR", "courtyard", "1 other declaration", "looks planned at 2, 3, 4 seeds", "abstract"):
+    for part in (
+        "supported",
+        "PSNR",
+        "courtyard",
+        "Earlier declarations under this name: 1.",
+        "looks planned at 2, 3, 4 seeds",
+        "abstract",
+    ):
         assert part in to_html(page)
     assert "<better>" not in to_html(page)
     assert "<svg" in to_html(page)

@@ -118,8 +118,8 @@ BAD: list[tuple[str, Callable[[], Any], str]] = [
     ("an unknown baseline", lambda: changed("claims", 0, "baseline", to="adcc"), "baseline 'adcc'.*did you mean adc"),
     ("an unknown metric", lambda: changed("claims", 0, "metric", to="lpips_squeze"), "did you mean lpips_squeeze"),
     ("an unknown scene", lambda: changed("claims", 0, "scenes", to=["courtyrad"]), "did you mean courtyard"),
-    ("a scene twice", lambda: changed("claims", 0, "scenes", to=["own", "own"]), "stands twice"),
-    ("an arm against itself", lambda: changed("claims", 0, "arm", to="adc"), "against itself"),
+    ("a scene twice", lambda: changed("claims", 0, "scenes", to=["own", "own"]), "is listed twice"),
+    ("an arm against itself", lambda: changed("claims", 0, "arm", to="adc"), "compared with itself"),
     ("zero width", lambda: changed("claims", 0, "least", to=0), "above 0"),
     ("zero percent", lambda: changed("claims", 0, "least", to="0%"), "above 0"),
     ("a negative width", lambda: changed("claims", 0, "least", to=-0.1), "above 0"),
@@ -183,7 +183,7 @@ def test_files_that_cannot_be_read_say_so(tmp_path: Path) -> None:
         read_claims(tmp_path)
     for text, message in (
         ("a: [", "not YAML"),
-        ("name: a\nname: b\n", "stands twice"),
+        ("name: a\nname: b\n", "is in it twice"),
         ("a: {b: [{c: 1, c: 2}]}", r"'c' is in it twice \(line 1\)"),
         ("", "mapping"),
         ("name: 2001-99-99", "not YAML"),

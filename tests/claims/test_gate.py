@@ -134,7 +134,7 @@ def test_questions_that_cannot_be_judged_are_refused() -> None:
     ):
         with pytest.raises(InputError, match=message):
             asked(*words)
-    with pytest.raises(InputError, match="2 seeds at least"):
+    with pytest.raises(InputError, match="needs at least 2 seeds, and there is 1"):
         asked(seeds=1)
     assert asked("gaussians", "10%").questions[0].sign == -1
     assert asked(least=None).questions[0].least == 0.1
@@ -149,7 +149,7 @@ def test_questions_that_cannot_be_judged_are_refused() -> None:
         (["exp.zip", "densify=adc,volumetric"], "only scene may list values"),
         (["exp.zip", "scene=photos", "scene.path=/"], "the archive has no trial on"),
         (["exp.zip", "--seeds", "9"], "has 3 seeds of all scenes"),
-        (["exp.zip", "--seeds", "1"], "2 seeds at least"),
+        (["exp.zip", "--seeds", "1"], "needs at least 2 seeds, and there is 1"),
         (["exp.zip", "--metric", "psn"], "psn"),
         (["exp.zip", "densify=none"], "several arms on courtyard"),
         (["exp.zip", "--where", "densify=x"], "no trial has densify=x"),

@@ -281,7 +281,7 @@ def test_finished_trial_is_recognised_until_something_changes(runs: Path) -> Non
         ("store gone", "stage train .*manifest.json is missing"),
         ("stage", "version 1 of the stage train, which is now at 2"),
         ("package", "made with pycolmap 0.1, and .* is installed"),
-        ("results", "results.json is not as it was written"),
+        ("results", "results.json was changed after it was written"),
         ("no inputs", "results.json does not say what it was made of"),
         ("an input less", "results.json is damaged: it lacks 'made_of.entries'"),
         ("inputs of another kind", "results.json is damaged: made_of.sources is "),

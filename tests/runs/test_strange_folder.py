@@ -120,7 +120,7 @@ def test_a_trial_that_holds_something_strange_is_left_out(
     found = read_experiment(trial.parents[2])
     assert not found.trials
     assert name in found.warnings[0]
-    with pytest.raises(InputError, match="no regular file"):
+    with pytest.raises(InputError, match="not a regular file"):
         require_own(trial.parents[3], trial, below=True)
 
 

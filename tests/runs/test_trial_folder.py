@@ -36,7 +36,7 @@ def test_changed_results_are_left_out_and_named(trial: Path, capsys: pytest.Capt
     experiment = load_experiment(trial.parents[3], EXPERIMENT)
     assert [one.seed for one in experiment.trials] == [1]
     (line,) = experiment.warnings
-    assert "results.json is not as it was written" in line
+    assert "results.json was changed after it was written" in line
     assert f"gsbench retry {EXPERIMENT}" in line
     assert TrialFolder(trial).state() == "damaged"
     assert cli.run(["tables", EXPERIMENT]) == 0
@@ -46,7 +46,7 @@ def test_changed_results_are_left_out_and_named(trial: Path, capsys: pytest.Capt
     assert cli.run(["status", EXPERIMENT]) == 1
     shown = capsys.readouterr().out
     assert "damaged" in shown
-    assert "results.json is not as it was written" in shown
+    assert "results.json was changed after it was written" in shown
     assert "2 trials: 1 done, 1 damaged" in shown
 
 
@@ -71,10 +71,10 @@ def test_changed_views_and_curves_are_not_used(trial: Path, caplog: pytest.LogCa
     edit(trial / "per_view.csv", "a,25.5\nb,27.5", "a,24.5\nb,28.5")  # the mean is as it was
     edit(trial / "metrics.jsonl", "20.2", "40.2")
     (one,) = (one for one in load_experiment(trial.parents[3], EXPERIMENT).trials if one.path == trial)
-    with pytest.raises(InputError, match=r"per_view\.csv is not as it was written"):
+    with pytest.raises(InputError, match=r"per_view\.csv was changed after it was written"):
         read_views(one)
     assert one.folder.curves() == []
-    assert "metrics.jsonl is not as it was written" in caplog.text
+    assert "metrics.jsonl was changed after it was written" in caplog.text
     assert len(one.folder.events()) == 10
 
 

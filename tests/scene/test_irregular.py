@@ -76,13 +76,13 @@ def test_pipes_and_devices_are_refused(
     suffix: str, read: Callable[[Path], object], tmp_path: Path, photos: Path
 ) -> None:
     for path in odd_files(tmp_path, suffix):
-        with pytest.raises(InputError, match="is no regular file"):
+        with pytest.raises(InputError, match="is not a regular file"):
             read(path)
 
 
 def test_a_pipe_among_photographs_is_named(photos: Path, tmp_path: Path) -> None:
     os.mkfifo(photos / "d.png")
-    with pytest.raises(InputError, match=r"d\.png is no regular file"):
+    with pytest.raises(InputError, match=r"d\.png is not a regular file"):
         read_photos("x", tmp_path)
 
 
