@@ -313,9 +313,9 @@ class TrialFolder:
 
         Raises FileNotFoundError and DamagedError.
         """
-        path = self.path / PER_VIEW
+        path, content = self.path / PER_VIEW, self._unchanged(PER_VIEW)
         try:
-            text = self._unchanged(PER_VIEW).decode("utf-8")
+            text = content.decode("utf-8")
             return {
                 row["view"]: {key: _number(value) for key, value in row.items() if key != "view" and value != ""}
                 for row in csv.DictReader(io.StringIO(text, newline=""))
