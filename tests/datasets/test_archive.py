@@ -139,7 +139,7 @@ def test_a_member_comes_whole_and_alone(served: Server, tmp_path: Path, manners:
 @pytest.mark.parametrize(
     ("manners", "kind", "said"),
     [
-        (Manners(cut_every=100), FetchError, r"3 failures in a row .*cut.*the same command goes on"),
+        (Manners(cut_every=100), FetchError, r"3 failures in a row .*cut.*give the same command again"),
         (Manners(stall_every=1), FetchError, "no answer in time"),
         (Manners(status={"/file.zip": 403}), InputError, r"403 Forbidden.*--mirror"),
         (Manners(status={"/file.zip": 503}), FetchError, r"3 failures in a row .*503"),

@@ -112,8 +112,8 @@ def test_only_rasterizers_with_a_name_of_their_own(folder: Path) -> None:
         "    def render(self): pass\n"
     )
     for target, options, message in (
-        ("Same", {}, "a name of its own.* it has 'reference'"),
-        ("Nameless", {}, "a name of its own.* it has None"),
+        ("Same", {}, "needs an attribute name.* it has 'reference'"),
+        ("Nameless", {}, "needs an attribute name.* it has None"),
         ("Blind", {}, r"no render\(\)"),
         ("Options", {"size": 2}, "no dataclass"),
         ("Absent", {}, "cannot be imported"),

@@ -221,7 +221,7 @@ def test_the_file_is_among_what_a_trial_is_made_of(tmp_path: Path) -> None:
         (lambda d: d["frames"][1].update(file_path="/etc/passwd"), "lies outside the folder"),
         (lambda d: d.update(ply_file_path="/etc/passwd"), "lies outside the folder"),
         (lambda d: d.update(ply_file_path="p.ply"), "names p.ply, which is not there"),
-        (lambda d: d["frames"][1].update(file_path="images/0.png"), r"images/0\.png stands there twice"),
+        (lambda d: d["frames"][1].update(file_path="images/0.png"), r"images/0\.png is there twice"),
     ],
 )
 def test_what_cannot_be_understood_is_one_line_that_names_the_file(tmp_path: Path, change, said) -> None:

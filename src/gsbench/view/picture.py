@@ -24,7 +24,7 @@ from gsbench.view.trials import ViewedTrial
 
 DIMMED = 0.35  # brightness of the render behind Gaussians that are shown by their causes
 TEXT_COLOR, SHADOW_COLOR = (255, 255, 255), (0, 0, 0)
-TEXT_SIZE = 1 / 36  # of a picture's height; smaller where a label would not fit its pane
+TEXT_SIZE = 1 / 36  # of a picture's height; smaller where a word would not fit its pane
 MARGIN = 0.5  # of the text's size
 Picture = NDArray[np.uint8]
 
@@ -118,11 +118,23 @@ def side_by_side(panes: Sequence[tuple[str, Picture]]) -> Picture:
     left = 0
     for label, picture in panes:
         height, width = picture.shape[:2]
-        size = TEXT_SIZE * height
-        size *= min(1.0, width / (ImageFont.load_default(size).getlength(label) + 2 * MARGIN * size))
+        text, size = _fitted(label, TEXT_SIZE * height, width)
         if left:
             draw.line([(left, 0), (left, height)], fill=TEXT_COLOR)
         at, stroke = (left + MARGIN * size, MARGIN * size), max(1, round(size / 8))
-        draw.text(at, label, TEXT_COLOR, ImageFont.load_default(size), stroke_width=stroke, stroke_fill=SHADOW_COLOR)
+        draw.text(at, text, TEXT_COLOR, ImageFont.load_default(size), stroke_width=stroke, stroke_fill=SHADOW_COLOR)
         left += width
     return np.asarray(image)
+
+
+def _fitted(label: str, size: float, width: int) -> tuple[str, float]:
+    """The label in lines that fit into ``width`` px, and its text's size, smaller where a single word would not fit."""
+    length, room = ImageFont.load_default(size).getlength, width - 2 * MARGIN * size
+    first, *others = label.split()
+    lines = [first]
+    for word in others:
+        if length(f"{lines[-1]} {word}") <= room:
+            lines[-1] += f" {word}"
+        else:
+            lines.append(word)
+    return "\n".join(lines), size * min(1.0, room / max(map(length, lines)))
