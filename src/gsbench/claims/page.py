@@ -64,12 +64,12 @@ def make_page(
         _declared_line(declared, every),
     ]
     if tested:
+        which = "the verdict" if tested == 1 else f"any of the {tested} verdicts"
         lines.insert(
             1,
-            f"The chance that any of the {counted(tested, 'verdict')} is false is at most {100 * file.error_rate:g} %, "
-            "if trainings differ about normally (docs/verdict.md). The verdicts share it equally, each over all its "
-            "looks. A verdict is about these scenes at this size. From six scenes on there is also a statement about "
-            "scenes like these, with its own error rate.",
+            f"The chance that {which} is false is at most {100 * file.error_rate:g} %, over all looks, if trainings "
+            "differ about normally (docs/verdict.md). A verdict is about these scenes at this size. From six scenes on "
+            "there is also a statement about scenes like these, with its own error rate.",
         )
     judged = list({trial.path: trial for one in verdicts for trial in one.verdict.pairs.trials}.values())
     lines += [f"The paper: {file.size}."] if file.size else []

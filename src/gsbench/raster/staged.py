@@ -1,4 +1,4 @@
-"""What executors share: checks of what they are given, values read back without a wait, and for compiled ones a bridge
+"""Parts that executors share: checks of their inputs, values read back without a wait, and for compiled ones a bridge
 between their stages and autograd."""
 
 from __future__ import annotations

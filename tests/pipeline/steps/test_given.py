@@ -127,7 +127,7 @@ def test_the_version_that_a_program_tells_must_be_the_one_that_is_set(views: Any
 
 def test_a_program_is_not_told_of_masks(views: Any, tmp_path: Path) -> None:
     views.capture = replace(views.capture, masks={"0.png": tmp_path})
-    with pytest.raises(InputError, match="not told of masks"):
+    with pytest.raises(InputError, match="gets no masks"):
         external_step(views, trainer(tmp_path, "none"), parts_of())
 
 
