@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Quickstart
 #
-# A **trial** is one scene, one initial cloud, one densifier and one seed, taken through three stages: initialise,
-# train, evaluate. This notebook runs one on the built-in courtyard, which needs no download, and looks at what came
-# out. It takes some minutes on a CPU. On Colab or any other Jupyter, run `%pip install gsbench-3dgs` in a cell first.
+# A **trial** is one scene, one initial cloud, one densifier and one seed. It has three stages: initialise, train,
+# evaluate. This notebook runs two trials on the built-in courtyard, without any download, and looks at the results.
+# It takes some minutes on a CPU. On Colab or any other Jupyter, first install gsbench in a cell (`%pip install …`).
 
 # %%
 import json
@@ -34,8 +34,8 @@ runs = Path(os.environ["GSBENCH_RUNS"])
 # %% [markdown]
 # ## Settings
 #
-# Every setting is a word `key=value`, the same here and on the command line. With `GSBENCH_SMALL` set, as in
-# gsbench's own tests, the notebook takes a smaller scene and fewer iterations, and the pictures are worse.
+# Every setting is a word `key=value`, the same here and on the command line. gsbench's own tests set `GSBENCH_SMALL`:
+# then the scene is smaller, iterations are fewer, and the pictures are worse.
 
 # %% tags=["parameters"]
 small = bool(os.environ.get("GSBENCH_SMALL"))
@@ -59,8 +59,8 @@ run(["scene=courtyard", "densify=volumetric", "seed=0", "name=quickstart", *sett
 # %% [markdown]
 # ## A trial from the command line
 #
-# In a terminal the same is `gsbench scene=courtyard densify=adc …`. ADC, the adaptive density control of 3D Gaussian
-# Splatting, is the baseline. The photographs and the initial cloud are not made again: both trials share them.
+# In a terminal, type `gsbench scene=courtyard densify=adc …`. ADC, the adaptive density control of 3D Gaussian
+# Splatting, is the baseline. Both trials share the photographs and the initial cloud: gsbench does not make them again.
 
 # %%
 words = " ".join(["scene=courtyard", "densify=adc", "seed=0", "name=quickstart", *settings])
@@ -69,7 +69,7 @@ words = " ".join(["scene=courtyard", "densify=adc", "seed=0", "name=quickstart",
 # %% [markdown]
 # ## The results
 #
-# One table of the experiment, from the files of its trials:
+# This table of the experiment comes from the files of its trials:
 
 # %%
 # !gsbench tables quickstart
@@ -110,7 +110,7 @@ figure.tight_layout()
 # ## How the model grew
 #
 # `metrics.jsonl` has the loss and the number of Gaussians over the iterations. Where the loss jumps up, ADC has reset
-# the opacities: what the picture needs comes back, the rest is removed.
+# the opacities: Gaussians that the picture needs become opaque again, and the others are removed.
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.2))
@@ -126,6 +126,6 @@ figure.tight_layout()
 
 # %% [markdown]
 # Two trials say little: another seed gives another number. [Reading a result](03_reading_a_result.ipynb) repeats them
-# and asks whether the difference is more than chance. To walk through both models in the browser:
+# and asks whether the difference is more than chance. To look at both models in the browser:
 #
 #     gsbench view quickstart:courtyard:adc quickstart:courtyard:volumetric

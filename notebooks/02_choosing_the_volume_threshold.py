@@ -14,9 +14,9 @@
 # # Choosing the volume threshold
 #
 # The volumetric rule splits every Gaussian with a volume $V = \frac{4}{3}\pi s_1 s_2 s_3$ above a threshold $V_{th}$.
-# The paper takes $V_{th} = 0.03$ for all its scenes. But a volume has a unit, the cube of whatever unit of length the
-# camera poses have, and structure from motion picks that unit as it likes. So the first question on a scene of one's
-# own is: *what does 0.03 mean here?*
+# The paper uses $V_{th} = 0.03$ for all its scenes. But a volume has a unit: the cube of the unit of length of the
+# camera poses. Structure from motion chooses that unit arbitrarily. So the first question about your own scene is:
+# *what does 0.03 mean here?*
 
 # %%
 import json
@@ -75,8 +75,8 @@ print(f"which is                               {gauge['threshold_radius_over_ext
 print(f"V_th / extent³                         {gauge['threshold_over_extent_cubed']:.2e}")
 
 # %% [markdown]
-# The courtyard is modelled in metres, so here 0.03 is a ball of 19 cm radius in a yard of some ten metres. Were the
-# same model scaled, the number would mean something else:
+# The courtyard is modelled in metres, so here 0.03 is a ball of 19 cm radius in a yard of some ten metres. If the
+# same model is scaled, the number means something else:
 
 # %%
 for scale in (0.2, 1, 5):
@@ -86,7 +86,7 @@ for scale in (0.2, 1, 5):
 # %% [markdown]
 # ## The volumes of a trained baseline
 #
-# Volumes spread over many decades. Almost all are tiny; the few large ones are what the rule is after.
+# Volumes spread over many decades. Almost all are tiny; the rule splits the few large ones.
 
 # %%
 gaussians = read_ply(baseline / "point_cloud.ply")
@@ -97,16 +97,16 @@ for q in (0.5, 0.9, 0.99, 0.9978, 0.999):
 print(f"{(volumes > 0.03).mean():7.2%} lie above 0.03, that is {(volumes > 0.03).sum()} of {len(volumes):,} Gaussians")
 
 # %% [markdown]
-# The paper reports that 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03, which is one way to choose: take the
-# same quantile here.
+# The paper reports that 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03. So one way to choose is to use the same
+# quantile here.
 #
 # ## Four ways to set it
 #
 # | `densify.threshold_mode` | the threshold |
 # |---|---|
-# | `absolute` | `volume_threshold`, as the paper has it |
+# | `absolute` | `volume_threshold`, as in the paper |
 # | `extent_relative` | `volume_threshold` times the extent cubed: the same in any unit of length |
-# | `quantile` | what lies above `volume_quantile` of all volumes, found anew at each refinement |
+# | `quantile` | the quantile `volume_quantile` of all volumes, computed at each refinement |
 # | `auto` | the upper Tukey fence of log V, third quartile + 1.5 interquartile ranges |
 
 # %%
@@ -193,7 +193,7 @@ right.legend()
 figure.tight_layout()
 
 # %% [markdown]
-# `quantile` always splits the same share, also when nothing stands out. `auto` follows the histogram. Neither needs a
-# unit of length, so both mean the same in any reconstruction of a scene. None of these trials was repeated: to learn
+# `quantile` always splits the same share, even if no Gaussian stands out. `auto` follows the histogram. Both do not
+# depend on the unit of length, so they mean the same in any reconstruction of a scene. We ran each trial once. To learn
 # which threshold *helps*, run `gsbench +experiment=threshold` and read its table as in [Reading a
 # result](03_reading_a_result.ipynb).

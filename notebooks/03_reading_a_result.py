@@ -13,7 +13,7 @@
 # %% [markdown]
 # # Reading a result
 #
-# Baseline and idea, several seeds each: is the difference more than chance, and where on the picture is it? This
+# Baseline and idea, several seeds each: is the difference more than chance, and where in the picture is it? This
 # notebook runs a small sweep and reads it with the functions behind `gsbench tables` and `gsbench report`.
 
 # %%
@@ -63,15 +63,15 @@ run(["-m", "scene=courtyard", "densify=adc,volumetric", "seed=0,1,2", "name=read
 # %% [markdown]
 # ## The table
 #
-# One cell is the mean over trials, with their deviation. Bold is the best mean. Bold is no test.
+# A cell is the mean over trials, with their deviation. Bold marks the best mean; it is not a test.
 
 # %%
 experiment = load_experiment(runs, "reading")
 Markdown(to_markdown(build_table(experiment)))
 
 # %% [markdown]
-# Or everything as a data frame, one row a trial, for whatever pandas can do with it. `gsbench tables reading --format
-# trials` writes the same as CSV.
+# Or take everything as a data frame for pandas, one row a trial. `gsbench tables reading --format trials` writes the
+# same as CSV.
 
 # %%
 frame = to_frame(experiment)
@@ -104,14 +104,14 @@ plt.title("one dot a pair of trials; their mean in red")
 plt.tight_layout()
 
 # %% [markdown]
-# The views of one trial share its training, so they are no independent repetitions. The pair of trials is the unit
-# that a test may count: here there are three.
+# The views of one trial share its training, so they are not independent repetitions. A test counts pairs of trials:
+# here there are three.
 #
 # ## The verdict
 #
 # There are four outcomes. *Supported*: the interval of the mean difference lies on the claimed side of zero. *Refuted*:
 # on the other side. *Too small to matter*: within ± the least difference that matters. *Undecided*: these trials cannot
-# tell, which is not the same as *no difference*.
+# tell; that does not mean *no difference*.
 
 # %%
 print(f"mean difference  {verdict.mean:+.3f} dB ({verdict.relative:+.2%})")
@@ -120,21 +120,21 @@ print(f"p                {verdict.p:.3f}")
 print(f"verdict          {verdict.outcome}, on {', '.join(verdict.pairs.scenes)}")
 
 # %% [markdown]
-# With few trials, only a large difference can be seen. How many seeds would it take to see a given one in eight of
-# ten such experiments?
+# Few trials show only a large difference. How many seeds does a given difference need, to be seen in eight of ten such
+# experiments?
 
 # %%
 for difference in (0.05, 0.1, 0.2, 0.5):
     print(f"{difference:4} dB: {seeds_needed(verdict.deviation, 1, difference) or 'more than 40'} seeds an arm")
 
 # %% [markdown]
-# More seeds tell more about *this* scene only. For "scenes like these", gsbench wants at least six scenes, which then
-# are the units.
+# More seeds tell more about *this* scene only. For "scenes like these", gsbench needs at least six scenes; then the
+# scenes are the units.
 #
 # ## Where it helps
 #
-# The view that gains most and the one that gains least, as the report shows them. In the last picture, blue is where
-# the second arm is nearer to the photograph, red where the first is.
+# These are the views with the largest and the least gain, as in the report. In the last picture, blue means that
+# volumetric is nearer to the photograph, red that adc is.
 
 # %%
 views, _ = choose_views(pair_trials(experiment.trials, adc, volumetric))
@@ -150,7 +150,7 @@ HTML(f"<table>{''.join(rows)}</table>")
 # %% [markdown]
 # ## Is the comparison fair?
 #
-# More Gaussians usually mean a better picture. If the arms end with different counts, ask again at equal ones:
+# More Gaussians usually mean a better picture. If the arms end with different counts, compare again at equal counts:
 # `gsbench +experiment=budget` gives every arm exactly the same number.
 
 # %%
@@ -159,5 +159,5 @@ for arm in (adc, volumetric):
     print(f"{arm.densify:>10}: {', '.join(f'{count:,}' for count in counts)} Gaussians")
 
 # %% [markdown]
-# All of this, for every metric and with pictures, is in one file: `gsbench report reading`. To see what lies behind
-# one cell of the table: `gsbench explain reading:courtyard:psnr:volumetric`.
+# `gsbench report reading` writes all of this into one file, for every metric and with pictures. `gsbench explain
+# reading:courtyard:psnr:volumetric` shows the trials behind one cell of the table.

@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Writing your own densifier
 #
-# A densifier decides when Gaussians are added and removed. Yours is a Python class in a file of your own; gsbench
-# itself stays as it is. The idea of this notebook: late in training, gradients are small and noisy. So *ask for a
-# larger gradient the later it is*.
+# A densifier decides when Gaussians are added and removed. Yours is a Python class in your own file; gsbench itself
+# stays as it is. The idea of this notebook: late in training, gradients are small and noisy. So *raise the gradient
+# threshold during training*.
 
 # %%
 import json
@@ -46,10 +46,10 @@ settings += ["eval.lpips=[]", "eval.flip=false", "tracking=none"]
 # %% [markdown]
 # ## The class
 #
-# It extends `ADC`, the baseline, and is a dataclass: its fields are its settings. `ADC` gathers, for each Gaussian,
-# the sum of its screen gradients and the number of iterations in which it was seen; what has a large mean is cloned
-# or split. A round of it is a list of rules, each a method: `grow_by_gradient`, `prune`, `reset_statistics`. So it is
-# enough to scale the sum before the first of them looks at it; the last forgets the sums after each round.
+# It extends `ADC`, the baseline, and is a dataclass: its fields are its settings. For each Gaussian, `ADC` gathers the
+# sum of its screen gradients and the number of iterations that saw it. Gaussians with a large mean are cloned or split.
+# A round is a list of rules, each a method: `grow_by_gradient`, `prune`, `reset_statistics`. So it is enough to scale
+# the sums before the first rule reads them; the last rule resets them after each round.
 
 # %%
 # %%writefile tightening.py
@@ -76,9 +76,9 @@ class Tightening(ADC):
 # %% [markdown]
 # ## Run it beside the baseline
 #
-# `densify=adc` brings the settings of ADC, `_target_` puts our class in its place, and `+` adds a setting that ADC
-# does not have. `allow_targets` says that we trust this module: gsbench runs no code from a configuration otherwise.
-# The same words work in a terminal.
+# `densify=adc` starts from the settings of ADC, `_target_` names our class, and `+` adds a setting that ADC does not
+# have. `allow_targets` says that we trust this module: otherwise gsbench does not run it. The same words work in a
+# terminal.
 
 # %%
 own = ["densify=adc", "densify._target_=tightening.Tightening", "densify.name=tightening", "+densify.final_factor=3"]
@@ -95,8 +95,8 @@ run([*own[:-1], "+densify.final_factor=0.5", *common, "name=wrong"])
 # %% [markdown]
 # ## What it did
 #
-# Every refinement leaves an event: how many were cloned, split and pruned. The counts always add up: `after = before
-# + cloned + split − pruned`.
+# Every refinement writes an event: how many Gaussians were cloned, split and pruned. The counts always add up: `after =
+# before + cloned + split − pruned`.
 
 # %%
 folders = {path.parent.parent.name.split("-")[1]: path.parent for path in Path("runs/own").glob("*/*/*/results.json")}
@@ -125,6 +125,6 @@ figure.tight_layout()
 
 # %% [markdown]
 # Fewer Gaussians for a similar picture, or a worse picture because there are fewer? One trial cannot tell. Give each
-# arm `seed=0,1,2` with `-m`, and equal counts with `densify.max_gaussians=… densify.cap=hard`, then read the result
-# as in [Reading a result](03_reading_a_result.ipynb). Densifiers that do not build on ADC are described in
-# `docs/densifier.md`.
+# arm `seed=0,1,2` with `-m`, and equal counts with `densify.max_gaussians=… densify.cap=hard`. Then read the result
+# as in [Reading a result](03_reading_a_result.ipynb). `docs/densifier.md` has the whole contract, also for densifiers
+# that do not extend ADC.
