@@ -98,7 +98,7 @@ def test_more_than_a_file_can_hold_is_not_read(tmp_path: Path, text: bool, bytes
     """Its header alone says so: of 62 numbers, one of double precision; in text each takes two characters or more."""
     write_ply(random_gaussians(4), tmp_path / "a.ply")
     path = rewritten(tmp_path / "a.ply", b"property float opacity", b"property double opacity")
-    path = rewritten(path, b"element vertex 4", b"element vertex 1000000")
+    path = rewritten(path, b"element vertex 4", b"comment a property float b\nelement vertex 1000000")
     if text:
         path = rewritten(path, b"format binary_little_endian", b"format ascii")
     with pytest.raises(InputError, match=f"cut short: its header promises {1_000_000 * bytes_each} bytes or more"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,17 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from gsbench.init.base import PoseErrors
 from gsbench.init.colmap.reconstruct import similarity_to
-from gsbench.init.report import compare_poses, draw_cloud, make_report, measure_gauge, training_extent, view_from_above
+from gsbench.init.report import (
+    compare_poses,
+    draw_cloud,
+    find_warnings,
+    make_report,
+    measure_gauge,
+    training_extent,
+    view_from_above,
+)
 from gsbench.scene.types import Capture
 
 NAMES = ("a.png", "b.png", "c.png", "d.png")
@@ -79,6 +89,51 @@ def test_missing_images_and_doubtful_numbers_are_warnings(tmp_path: Path):
         assert part in text
 
 
+POSES = PoseErrors(4, True, 0.1, 0.1, 0.1, 0.04, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("sound", "doubtful", "said"),
+    [
+        ({"num_registered": 9}, {"num_registered": 8}, "only 8 of 10 images have a pose (missing: a, b, c, d, e …)"),
+        ({"num_points": 100}, {"num_points": 99}, "only 99 points"),
+        ({"mean_reprojection_error": 1.5}, {"mean_reprojection_error": 1.52}, "1.52 px is large"),
+        ({"mean_reprojection_error": None}, {"mean_reprojection_error": 40.0}, "40.00 px is large"),
+        (
+            {"pose_errors": replace(POSES, rotation_mean_deg=2.0, rotation_max_deg=90.0)},
+            {"pose_errors": replace(POSES, rotation_mean_deg=2.1)},
+            "turned 2.1 degrees against the true ones",
+        ),
+        (
+            {"pose_errors": replace(POSES, center_rmse_relative=0.05)},
+            {"pose_errors": replace(POSES, center_rmse_relative=0.051, exact=False)},
+            "5.1% of the scene extent away from the reference ones",
+        ),
+        ({"pose_errors": replace(POSES, center_rmse_relative=None)}, {"num_points": 0}, "only 0 points"),
+    ],
+)
+def test_a_model_is_doubted_beyond_each_limit(
+    capture: Capture, sound: dict[str, object], doubtful: dict[str, object], said: str
+) -> None:
+    model = model_of(CENTERS)
+    report = make_report("x", "own", capture, model, None, settings={}, seconds={}, packages=())
+    report = replace(report, num_images=10, num_registered=10, unregistered=tuple("abcdef"), num_points=100)
+    assert find_warnings(report, model) == ()
+    assert find_warnings(replace(report, **sound), model) == ()
+    (warning,) = find_warnings(replace(report, **doubtful), model)
+    assert said in warning
+
+
+@pytest.mark.parametrize(("focal", "view"), [(1140.0, 5.02), (1150.0, 4.98), (13.5, 149.8), (13.2, 150.4)])
+def test_a_field_of_view_beyond_5_to_150_degrees_is_doubted(capture: Capture, focal: float, view: float) -> None:
+    """Of the longest side, 100 px: twice the arc tangent of 50 px over the focal length."""
+    assert math.degrees(2 * math.atan(50 / focal)) == pytest.approx(view, abs=0.05)
+    model = model_of(CENTERS)
+    model.cameras[1].params = [focal, focal, 50.0, 40.0]
+    report = make_report("x", "own", capture, model, None, settings={}, seconds={}, packages=())
+    assert any("implausible" in warning for warning in report.warnings) == (not 5 < view < 150)
+
+
 def test_pose_errors_after_a_similarity():
     """A model moved by a similarity has no error; one camera displaced by 0.3 shows it, and only it."""
     turn = Rotation.from_rotvec([0.2, 0.1, -0.4])
@@ -139,3 +194,24 @@ def test_picture_shows_points_in_their_colours(tmp_path: Path, monkeypatch: pyte
     pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB")).reshape(-1, 3)
     assert (np.abs(pixels - [10, 20, 30]).max(axis=1) < 8).any()
     assert (np.abs(pixels.astype(int) - [214, 39, 40]).max(axis=1) < 8).any()  # the cameras' red
+
+
+def test_the_picture_is_a_map_seen_from_the_cameras_side(tmp_path: Path) -> None:
+    """All cameras look along +z from the plane z = 0: x is right, y is down. Five units and a twentieth more at either
+    side fill 840 of 960 px, so a unit takes 840 / 5.5 px about the middle, (0, 2.5)."""
+    draw_cloud(model_of(CENTERS), tmp_path / "cloud.png", "hand-made")
+    pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB")).astype(int)
+    assert pixels.shape == (960, 960, 3)
+    scale = 840 / 5.5
+    for x, y, *_ in CENTERS:
+        column, row = 480 + x * scale, 480 + (y - 2.5) * scale
+        red = np.argwhere(np.abs(pixels - [214, 39, 40]).max(axis=-1) < 8)
+        near = red[np.abs(red - [row, column]).max(axis=1) < 8]
+        np.testing.assert_allclose(near.mean(axis=0), [row, column], atol=1.1)
+        assert len(near) == pytest.approx(math.pi * 3.5**2, rel=0.3)
+    for x, y in ((0, 0), (0.5, 0.5)):
+        column, row = math.floor(480 + x * scale), math.floor(480 + (y - 2.5) * scale)
+        assert (pixels[row : row + 3, column : column + 3] == [10, 20, 30]).all()
+    assert (pixels == [10, 20, 30]).all(axis=-1).sum() == 2 * 9
+    bar = np.flatnonzero((pixels[960 - 24] == 0).all(axis=-1))
+    np.testing.assert_allclose([bar.min(), bar.max()], [60, 60 + scale], atol=1.0)  # one unit

@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.protocol import PAPER
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.ply import write_ply
+from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.steps import inputs as inputs_module
 from gsbench.pipeline.steps.evaluate import evaluate_step, measure_speed
 from gsbench.pipeline.steps.inputs import UserCode
 from gsbench.raster import create_rasterizer
 from gsbench.raster.contract import CASES
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.runs.stages import TRAIN, Step
+from gsbench.runs.stages import INIT, TRAIN, Step
+from gsbench.runs.store import Store
+from gsbench.scene.camera import ANGLE, COUNTED, DISTANCE
+from gsbench.scene.colmap import write_model
 from gsbench.scene.types import Scene, View
+from gsbench.train.trainer import snapshot_file
 
 TRAINED = Step(TRAIN, {}, lambda folder: None)
 FOUR_LPIPS = ["lpips_alex", "lpips_squeeze", "lpips_vgg", "lpips_vgg_raw"]
@@ -68,3 +80,97 @@ def test_speed_is_measured_at_the_size_that_is_asked_for() -> None:
     found = measure_speed(Watched(), case.gaussians(), scene, torch.zeros(3, dtype=torch.float64), [64, 20])
     assert set(sizes) == {(64, 20)}
     assert found["a"] > 0
+
+
+def test_an_evaluation_measures_what_its_pictures_hold(tmp_path: Path, truth: Gaussians, tiny_scene: Scene) -> None:
+    """Metrics by the formula from the PNG files; the nearest training view by trying all; an earlier model's means."""
+    store, init = Store(tmp_path), Step(INIT, {}, lambda folder: None)
+    masked = replace(tiny_scene.test[1], mask=np.arange(32 * 40).reshape(32, 40) % 4 > 0)
+    scene = replace(tiny_scene, test=(tiny_scene.test[0], masked))
+    training = store.path(TRAINED)
+    (training / snapshot_file(7)).parent.mkdir(parents=True)
+    faint = truth.map(lambda tensor: tensor.clone())
+    faint.opacity_logits -= 3
+    write_ply(truth, training / "point_cloud.ply")
+    earlier = faint.select(torch.arange(50))
+    write_ply(earlier, training / snapshot_file(7))
+    np.savez(training / "lineage.npz", causes=np.zeros(80, dtype=np.int64), ids=np.arange(80))
+    cloud = (truth.means.double().numpy(), np.zeros((80, 3), np.uint8))
+    write_model(store.path(init) / MODEL_FOLDER, {view.name: view.camera for view in scene.train}, cloud=cloud)
+    parts: Any = SimpleNamespace(
+        evaluator=Evaluator(PAPER, lpips=[], flip=False),
+        rasterizer=ReferenceRasterizer(),
+        device=torch.device("cpu"),
+        train=SimpleNamespace(background=(0.1, 0.2, 0.3)),
+        eval=SimpleNamespace(maps=True, fps=[20, 16]),
+        measured_earlier=[7, 9],  # a limit of time came before the ninth
+        user_code=UserCode(),
+        program=None,
+    )
+    views: Any = SimpleNamespace(store=store, scene=scene, init=init)
+    folder = tmp_path / "built"
+    folder.mkdir()
+    evaluate_step(views, TRAINED, parts).build(folder)
+    with (folder / "per_view.csv").open() as stream:
+        rows = {row["view"]: row for row in csv.DictReader(stream)}
+
+    def rendered(model: Gaussians, view: View) -> np.ndarray:
+        image = ReferenceRasterizer().render(model, view.camera, 3, torch.tensor([0.1, 0.2, 0.3])).image
+        return np.floor(255 * image.detach().clamp(0, 1).numpy() + 0.5)
+
+    means = {"last": 0.0, "earlier": 0.0}
+    for view in scene.test:
+        picture = np.asarray(Image.open(folder / "renders" / view.name)).astype(float)
+        np.testing.assert_array_equal(picture, rendered(truth, view))
+        counted = np.ones((32, 40), dtype=bool) if view.mask is None else view.mask
+        for name, image in (("last", picture), ("earlier", rendered(earlier, view))):
+            means[name] += 0.5 * 10 * np.log10(255**2 / ((image - view.image)[counted] ** 2).mean())
+        row = rows[view.name]
+        errors = (picture - view.image)[counted]
+        assert float(row["psnr"]) == pytest.approx(10 * np.log10(255**2 / (errors**2).mean()), abs=1e-5)
+        assert float(row[COUNTED]) == pytest.approx(counted.mean())
+        angles = [np.arccos(min(1.0, view.camera.rotation[2] @ other.camera.rotation[2])) for other in scene.train]
+        assert float(row[ANGLE]) == pytest.approx(np.degrees(min(angles)), abs=1e-5)
+        places = [np.linalg.norm(view.camera.center - other.camera.center) for other in scene.train]
+        assert float(row[DISTANCE]) == pytest.approx(min(places) / scene.extent)
+        assert float(row["fps"]) > 0
+        with np.load(folder / "maps" / f"{Path(view.name).stem}.npz") as maps:
+            assert maps["depth"].shape == (32, 40)
+            assert np.nanmax(maps["distance"]) < 2
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["metrics"]["psnr"] == pytest.approx(means["last"], abs=1e-5)
+    assert metrics["at"].keys() == {"7"}
+    assert metrics["at"]["7"]["num_gaussians"] == 50
+    assert metrics["at"]["7"]["metrics"]["psnr"] == pytest.approx(means["earlier"], abs=1e-3)
+    assert {path.name for path in (folder / "renders").iterdir()} == {view.name for view in scene.test}
+    assert Image.open(folder / "figures" / "ellipsoids.png").size[0] == 40
+
+
+def test_another_programs_renders_are_measured_as_they_are(tmp_path: Path, tiny_scene: Scene) -> None:
+    store = Store(tmp_path)
+    renders = store.path(TRAINED) / "renders"
+    renders.mkdir(parents=True)
+    for shift, view in enumerate(tiny_scene.test, 4):
+        Image.fromarray((view.image // 2 + shift).astype(np.uint8)).save(renders / view.name)
+    parts: Any = SimpleNamespace(
+        evaluator=Evaluator(PAPER, lpips=[], flip=False),
+        eval=SimpleNamespace(fps=[20, 16]),
+        user_code=UserCode(),
+        program=SimpleNamespace(leaves_model=False),
+    )
+    views: Any = SimpleNamespace(store=store, scene=tiny_scene)
+    folder = tmp_path / "built"
+    folder.mkdir()
+    step = evaluate_step(views, TRAINED, parts)
+    step.build(folder)
+    assert step.inputs["renders"] == TRAINED.key
+    with (folder / "per_view.csv").open() as stream:
+        found = [float(row["psnr"]) for row in csv.DictReader(stream)]
+    expected = [
+        10 * np.log10(255**2 / ((view.image // 2 + shift - view.image.astype(float)) ** 2).mean())
+        for shift, view in enumerate(tiny_scene.test, 4)
+    ]
+    assert found == pytest.approx(expected, abs=1e-5)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["unavailable"]["fps"] == "another program's renders are known, not its model"
+    assert len(list((folder / "renders").iterdir())) == 2

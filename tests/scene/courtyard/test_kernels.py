@@ -32,7 +32,7 @@ SOLIDS = [LAYOUT.kind, LAYOUT.center, LAYOUT.rotation, LAYOUT.size]
 GROUPS = [LAYOUT.group_start, LAYOUT.group_low, LAYOUT.group_high]
 SHAPES = {
     "box": (BOX, (0.5, 0.8, 0.3)),
-    "sphere": (SPHERE, (0.7, 0.7, 0.7)),
+    "sphere": (SPHERE, (0.7, 9.0, 9.0)),
     "tube": (TUBE, (0.6, 0.4, 0.0)),
     "tube with a bore": (TUBE, (0.8, 0.5, 0.5)),
 }
