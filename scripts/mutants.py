@@ -83,7 +83,7 @@ def changed_node(node: ast.AST) -> tuple[str, ast.AST] | None:
     if isinstance(new, ast.AugAssign) or (isinstance(new, ast.Expr) and isinstance(new.value, ast.Call)):
         return "dropped", ast.Pass()
     if isinstance(new, ast.Call) and len(new.args) > 1 and all(isinstance(arg, ast.Name) for arg in new.args[:2]):
-        if ast.unparse(new.func).rpartition(".")[2] in SYMMETRIC:
+        if ast.unparse(new.func).rpartition(".")[2] in SYMMETRIC or new.args[0].id == new.args[1].id:
             return None
         new.args[:2] = new.args[1::-1]
         return "swapped", new

@@ -82,6 +82,7 @@ def test_of_nothing_no_ratio_is_taken(make_experiment: Callable[..., Experiment]
         if (trial.densify, trial.seed) == (densify, 1):
             trial.record.metrics["psnr"] = 0.0
     assert pair(trials, PSNR).seeds == 3
+    assert pair(trials, replace(PSNR, metric="ssim", relative=True)).seeds == 3  # all below one
     found = pair(trials, replace(PSNR, relative=True))
     assert found.rows[0].seeds == (0, 2)
     assert "garden seed 1: PSNR (dB) is 0, of which no ratio can be taken" in found.left_out

@@ -339,5 +339,8 @@ def test_counts_from_a_million_and_times_from_ten_minutes_have_the_larger_unit(
     scales = [{"(s)": 1, "(min)": 60, "(k)": 1e3, "(M)": 1e6}[name.split()[-1]] for name in headings]
     own = [gaussians, seconds, 3000, seconds + 7]
     assert values == pytest.approx([value / scale for value, scale in zip(own, scales, strict=True)])
+    decimals = [{"(s)": 1, "(min)": 1, "(k)": 1, "(M)": 2}[name.split()[-1]] for name in headings]
+    assert [one.format(1.23456) for one in found] == [f"{1.23456:.{places}f}" for places in decimals]
     fixed = [quantity(name, trials[:1]) for name in ("gaussians_millions", "train_minutes", "peak_memory_mb")]
+    assert [one.format(1.26) for one in fixed] == ["1.26", "1.3", "1"]
     assert [one.read(trials[0]) for one in fixed] == pytest.approx([gaussians / 1e6, seconds / 60, 900])
