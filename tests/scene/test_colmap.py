@@ -12,7 +12,7 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import points_of, read_model, read_reference, write_model
-from gsbench.scene.colmap_files import ModelChecks
+from gsbench.scene.colmap_files import ModelChecks, check_model
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap, read_photos
 from tests.scene.cameras import cameras_of
@@ -179,3 +179,72 @@ def test_what_no_model_may_hold_is_refused(call: int | None, argument: int, valu
             getattr(checks, name)(*changed)
         return
     assert call is None
+
+
+@pytest.fixture(params=["bin", "txt"])
+def rigs(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A model of two rigs with three cameras each, as COLMAP writes it."""
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=2, num_cameras_per_rig=3, num_frames_per_rig=2, num_points3D=9)
+    model = pycolmap.synthesize_dataset(options)
+    if request.param == "bin":
+        model.write_binary(tmp_path)
+    else:
+        model.write_text(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("stem", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_each_file_of_a_model_with_rigs_is_walked_to_its_end(rigs: Path, stem: str) -> None:
+    check_model(rigs)
+    (file,) = rigs.glob(f"{stem}.*")
+    whole = file.read_bytes()
+    for torn in (whole[:-1], whole + b"\0") if file.suffix == ".bin" else (b"1 2", whole + b"\xff"):
+        file.write_bytes(torn)
+        with pytest.raises(InputError, match=f"{file.name}: .*: copy or export it again"):
+            check_model(rigs)
+
+
+@pytest.mark.parametrize(("stem", "start", "said"), [("rigs", 33, "a sensor of rig 1"), ("frames", 16, "frame 1")])
+def test_a_pose_of_a_rig_or_a_frame_without_a_direction_is_refused(
+    rigs: Path, stem: str, start: int, said: str
+) -> None:
+    """``start``: of the first pose, behind the count, ids and, in a rig, the reference, the sensor and a mark."""
+    (file,) = rigs.glob(f"{stem}.*")
+    if file.suffix == ".bin":
+        data = file.read_bytes()
+        file.write_bytes(data[:start] + bytes(32) + data[start + 32 :])
+    else:
+        first, *rest = [line for line in file.read_text().splitlines() if not line.startswith("#")]
+        words, at = first.split(), 7 if stem == "rigs" else 2
+        words[at : at + 4] = ["0"] * 4
+        file.write_text("\n".join([" ".join(words), *rest]))
+    with pytest.raises(InputError, match=f"{said} has no pose that can be used"):
+        check_model(rigs)
+
+
+@pytest.mark.parametrize(
+    ("stem", "line", "said"),
+    [
+        ("cameras", "1 PINHOLE 40 30 50 50 20", "lacks parameters"),
+        ("cameras", "1 OTHER 40 30 50 50 20 15", "unknown model"),
+        ("images", "1 1 0 0 0 0 0 5 1 a.png\n1 2", "image 1 lacks numbers"),
+        ("images", "1 1 0 0 0 0 0 5 1 a.png\n1 nan -1", "image 1 lacks numbers"),
+        ("images", "1 1 0 0 0 0 0 5 1\n", "image 1 lacks numbers"),
+        ("points3D", "1 0 0 5 256 0 0 0.1", "has no colour"),
+        ("points3D", "1 0 0 5 -1 0 0 0.1", "has no colour"),
+        ("points3D", "1 0 0 5 0 0 0", "point 1 lacks numbers"),
+        ("points3D", "1 0 0 5 0 255 0 0.1 1", "point 1 lacks numbers"),
+    ],
+)
+def test_a_line_of_a_text_model_that_lacks_something_is_named(tmp_path: Path, stem: str, line: str, said: str) -> None:
+    lines = {
+        "cameras": "# a comment\n1 PINHOLE 40 30 50 50 20 15",
+        "images": "1 1 0 0 0 0 0 5 1 a.png\n1 2 -1",
+        "points3D": "1 0 0 5 0 255 0 0.1 1 0",
+    }
+    for name, text in lines.items():
+        (tmp_path / f"{name}.txt").write_text(f"{text}\n\n")
+    check_model(tmp_path)
+    (tmp_path / f"{stem}.txt").write_text(line)
+    with pytest.raises(InputError, match=rf"{stem}\.txt: .*{said}"):
+        check_model(tmp_path)

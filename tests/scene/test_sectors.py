@@ -81,6 +81,15 @@ def test_parallel_and_outward_looking_cameras_are_cut_by_planes() -> None:
     assert "do not look at one place" in arrange(outward).description
 
 
+def test_nine_of_ten_cameras_must_look_towards_the_centre() -> None:
+    """Those that look away do so on the line through it."""
+    for away, surrounds in ((1, True), (2, False)):
+        around = ring([36.0 * k for k in range(10)])
+        for k in range(away):
+            around[k] = looking(around[k].center, 2 * around[k].center)
+        assert ("surround" in arrange(around).description) == surrounds
+
+
 def test_a_first_camera_straight_above_has_no_azimuth_to_count_from() -> None:
     """All directions in which it looks and their means are exact here, so that it is above to the last digit."""
     around = np.array([[3.0, 0, 0], [0, 3, 0], [-3, 0, 0], [0, -3, 0]])
