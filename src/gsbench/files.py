@@ -1,4 +1,4 @@
-"""Files that are whole or absent, and what to say when the disk is full or may not be written to."""
+"""Files that are whole or absent, and what to say when the disk is full or cannot be written to."""
 
 from __future__ import annotations
 
@@ -240,7 +240,7 @@ def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
             f"{place} cannot be opened ({os.strerror(number)}): look at its disk and its links, or set runs=FOLDER"
         )
     if number in FORBIDDEN:
-        return InputError(f"{place} may not be written to ({os.strerror(number)}): set runs=FOLDER or GSBENCH_RUNS")
+        return InputError(f"{place} cannot be written to ({os.strerror(number)}): set runs=FOLDER or GSBENCH_RUNS")
     return None
 
 

@@ -220,7 +220,7 @@ def _fault_of_leaf(item: Any) -> str:
     if kind is str:
         return "" if item.isascii() or _is_unicode(item) else "a text with half a character"
     if kind is float:
-        return "" if item - item == 0 else f"{item}, which is no finite number"
+        return "" if item - item == 0 else f"{item}, which is not a finite number"
     if kind is int:
         return "" if -LARGEST_INT < item < LARGEST_INT else "an integer beyond all bounds"
     return "" if kind is bool or item is None else f"of type {kind.__name__}"

@@ -110,8 +110,8 @@ def test_values_that_were_tried_here_are_said(tmp_path: Path) -> None:
     arms = {f"volumetric-{v}": densifier("volumetric", volume_threshold=v) for v in (0.01, 0.03, 0.1)}
     write_arms(tmp_path, {"adc": densifier("adc"), **arms, "absgrad": densifier("absgrad")})
     notes = sheet(tmp_path, "volumetric-0.01").notes
-    (line,) = [note for note in notes if "sfm-volumetric-0.01: 3 choices of the settings of its class" in note]
-    assert "differ in densify.volume_threshold, all measured on the held-out views that the verdict uses" in line
+    (line,) = [note for note in notes if "sfm-volumetric-0.01: 3 choices of its settings" in note]
+    assert "They differ in densify.volume_threshold, and all were measured on the test views" in line
 
 
 def test_a_search_that_proposed_the_settings_is_named(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def test_of_nothing_no_ratio_is_taken(make_experiment: Callable[..., Experiment]
     assert pair(trials, replace(PSNR, metric="ssim", relative=True)).seeds == 3  # all below one
     found = pair(trials, replace(PSNR, relative=True))
     assert found.rows[0].seeds == (0, 2)
-    assert "garden seed 1: PSNR (dB) is 0, of which no ratio can be taken" in found.left_out
+    assert "garden seed 1: PSNR (dB) is 0, and a ratio needs numbers above 0" in found.left_out
 
 
 def test_a_look_waits_for_every_scene_and_stops_where_it_is_decided(make_experiment: Callable[..., Experiment]) -> None:

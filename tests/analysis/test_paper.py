@@ -170,7 +170,7 @@ def test_the_verb_names_bad_options_and_left_out_trials(tmp_path: Path, capsys: 
     assert "left out: exp/courtyard/sfm-adc/c0ffee00-seed0: damaged" in capsys.readouterr().err
     with pytest.raises(InputError, match="KEY=VALUE"):
         tables.main(["exp", "--where", "iterations"], tmp_path)
-    with pytest.raises(InputError, match="scene stands in --rows and --columns"):
+    with pytest.raises(InputError, match="scene is in --rows and --columns"):
         tables.main(["exp", "--rows", "scene", "--columns", "scene"], tmp_path)
     assert load_experiment(tmp_path, "exp").trials
 

@@ -143,7 +143,7 @@ BAD: list[tuple[str, Callable[[], Any], str]] = [
     ("a seed of its own", lambda: changed("settings", to={"seed": 3}), "set by the plan"),
     ("a name of its own", lambda: changed("arms", "adc", to={"name": "x"}), "set by the plan"),
     ("a primary metric", lambda: changed("settings", to={"eval.primary": "psnr"}), "set by the plan"),
-    ("no setting", lambda: changed("settings", to={"scene max": 160}), "no setting"),
+    ("no setting", lambda: changed("settings", to={"scene max": 160}), "is not a setting"),
     ("an error rate of 1", lambda: changed("error_rate", to=1.0), "error_rate"),
     ("a list", lambda: [], "must be a mapping"),
     ("nothing", lambda: None, "must be a mapping"),

@@ -144,8 +144,8 @@ def test_rules_name_the_key(overrides: list[str], key: str) -> None:
 @pytest.mark.parametrize(
     ("words", "error"),
     [
-        (["eval.primary=lpips_vg"], r"is no metric; did you mean lpips_vgg\? \(known are psnr, ssim, .*flip"),
-        (["eval.primary=sharpness"], "is no metric .*eval.extra"),
+        (["eval.primary=lpips_vg"], r"is not a metric; did you mean lpips_vgg\? \(known are psnr, ssim, .*flip"),
+        (["eval.primary=sharpness"], "is not a metric .*eval.extra"),
         (["eval.primary=lpips_alex", "eval.lpips=[vgg]"], r"lpips_alex is not measured: add alex to eval\.lpips"),
         (["eval.primary=flip", "eval.flip=false"], r"eval\.flip=false"),
     ],

@@ -160,7 +160,7 @@ def test_two_folders_and_no_trial_at_all(
     [
         (["RENDERS", "--truth", "nowhere"], "is no folder, no trial"),
         (["RENDERS", "--truth", "gardn"], "did you mean garden?"),
-        (["nowhere", "--truth", "small:courtyard:adc"], "nowhere is no folder of renders"),
+        (["nowhere", "--truth", "small:courtyard:adc"], "nowhere is not a folder of renders"),
         (["RENDERS", "--truth", "small:courtyard:adc", "scene.views=3"], "only eval.… can be set here"),
         (["RENDERS", "--truth", "PHOTOGRAPHS", "--as", "small:x"], "give it with --scene"),
         (["RENDERS", "--truth", "small:courtyard:adc", "--as", "small"], "is not EXPERIMENT:ARM"),

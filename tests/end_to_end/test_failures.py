@@ -1,4 +1,4 @@
-"""The program where something fails: a full disk, a folder that may not be written to, a trial that raises."""
+"""The program where something fails: a full disk, a folder that cannot be written to, a trial that raises."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_read_only_runs_folder_is_bad_input(gsbench: Run, small_disk: Path) -> N
     assert done.returncode == 2, done.stderr
     *_, line = done.stderr.strip().splitlines()  # after what the models may need of the disk
     assert line.startswith("gsbench:")
-    assert "may not be written to" in line
+    assert "cannot be written to" in line
     assert "GSBENCH_RUNS" in line
     assert os.listdir(small_disk) == []
 

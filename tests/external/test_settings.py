@@ -25,8 +25,8 @@ def test_patterns_below_the_output_folder_pass(result: str) -> None:
 @pytest.mark.parametrize(
     ("result", "words"),
     [
-        ("**.ply", "no pattern of files"),
-        ("a**/b.ply", "no pattern of files"),
+        ("**.ply", "not a pattern of files"),
+        ("a**/b.ply", "not a pattern of files"),
         ("/home/me/a.ply", "below the program's output folder"),
         ("{output}/a.ply", "below the program's output folder"),
         ("{kind}/a.ply", "below the program's output folder"),  # an option can say as much
@@ -35,7 +35,7 @@ def test_patterns_below_the_output_folder_pass(result: str) -> None:
         ("C:/a.ply", "below the program's output folder"),
         (".", "below the program's output folder"),
         ("a\0.ply", "below the program's output folder"),
-        ("x" * 300, "no pattern of files"),
+        ("x" * 300, "not a pattern of files"),
     ],
 )
 def test_patterns_that_fit_no_file_are_refused_before_any_training(result: str, words: str) -> None:

@@ -133,7 +133,7 @@ def cut_header(path: Path) -> None:
         ("a.npy", cut_header, "not a readable file of points"),
         ("a.npy", lambda path: np.save(path, XYZ[:, :2]), "3 or 6 columns"),
         ("a.npy", lambda path: np.save(path, XYZ[:0]), "holds no point"),
-        ("a.npy", lambda path: np.save(path, np.where(XYZ > 1.9, np.nan, XYZ)), "no finite numbers"),
+        ("a.npy", lambda path: np.save(path, np.where(XYZ > 1.9, np.nan, XYZ)), "not finite numbers"),
         ("a.xyz", lambda path: path.write_text("1 2 x\n"), "not a readable file of points"),
         ("a.las", lambda path: path.write_bytes(b"LASF"), "known are .ply"),
         ("a.npy", lambda path: np.save(path, XYZ + 1e6), "no point is in view of a training camera"),
@@ -162,7 +162,7 @@ def test_matrices_that_are_no_similarity(tmp_path: Path, matrix: np.ndarray, mes
 
 
 def test_a_file_that_is_not_there_and_photos_without_cameras(bare_photos: Capture, tmp_path: Path):
-    with pytest.raises(InputError, match=r"init\.path=nowhere\.ply is no file"):
+    with pytest.raises(InputError, match=r"init\.path=nowhere\.ply is not a file"):
         Points(path="nowhere.ply")
     np.save(tmp_path / "a.npy", XYZ)
     assert Points(path=tmp_path / "a.npy").needs_reference(replace(bare_photos))

@@ -580,7 +580,7 @@ def test_what_is_done_is_found_in_a_folder_that_may_not_be_written_to(
     (outcome,) = run_batch(trials)
     assert outcome.status == "done"
     assert sorted(path for path in runs.rglob("*")) == before
-    with pytest.raises(InputError, match="may not be written to"):
+    with pytest.raises(InputError, match="cannot be written to"):
         run_batch([replace(_composed(), values=trial_values("seed=1"))])
 
 

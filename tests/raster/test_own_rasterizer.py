@@ -115,7 +115,7 @@ def test_only_rasterizers_with_a_name_of_their_own(folder: Path) -> None:
         ("Same", {}, "needs an attribute name.* it has 'reference'"),
         ("Nameless", {}, "needs an attribute name.* it has None"),
         ("Blind", {}, r"no render\(\)"),
-        ("Options", {"size": 2}, "no dataclass"),
+        ("Options", {"size": 2}, "not a dataclass"),
         ("Absent", {}, "cannot be imported"),
     ):
         with pytest.raises(InputError, match=message):

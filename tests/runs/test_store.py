@@ -293,5 +293,5 @@ def test_read_only_store_serves_what_it_has_and_says_so(small_disk: Path) -> Non
     store.get(Step(LETTERS, {"x": 1}, write_letters))
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
     assert store.get(Step(LETTERS, {"x": 1}, refuse)).cached
-    with pytest.raises(InputError, match="may not be written to"):
+    with pytest.raises(InputError, match="cannot be written to"):
         store.get(Step(LETTERS, {"x": 2}, write_letters))

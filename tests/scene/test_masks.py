@@ -1,4 +1,4 @@
-"""Masks: which file belongs to which photograph, what is no mask, and what is left of what they hide."""
+"""Masks: which file belongs to which photograph, what is not a mask, and what is left of what they hide."""
 
 from __future__ import annotations
 

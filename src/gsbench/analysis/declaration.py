@@ -69,7 +69,7 @@ class ActiveDeclaration:
         missing = planned - (self.trials - len(self.added)) if planned else 0
         if self.declaration.looks:
             lines.append(
-                "Seeds come in planned looks (launch.stop_when_decided), which each interval takes into account; "
+                "Seeds come in planned looks (launch.stop_when_decided), and each interval counts all looks; "
                 f"{missing} "
                 f"of the {planned} declared trials are missing."
             )

@@ -190,7 +190,7 @@ def _values(question: Question, one: TrialResult, other: TrialResult) -> tuple[f
     asked = asked_quantity(question.metric, [one, other])
     before, after = value_of(asked, one), value_of(asked, other)
     if question.relative and min(before, after) <= 0:
-        raise InputError(f"{asked.name} is {min(before, after):g}, of which no ratio can be taken")
+        raise InputError(f"{asked.name} is {min(before, after):g}, and a ratio needs numbers above 0")
     return before, after
 
 

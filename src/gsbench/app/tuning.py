@@ -326,7 +326,7 @@ def _sign_of(metric: str, direction: str | None) -> Literal[-1, 1]:
     own = direction if facts is None else DIRECTIONS.get(facts.direction, direction)
     if own is None:
         raise InputError(
-            f"{PLACE}.metric={metric} is no metric whose direction is known{closest(metric, known_keys())} "
+            f"{PLACE}.metric={metric} is not a metric whose direction is known{closest(metric, known_keys())} "
             f"(choose: {', '.join(known_keys())}; for a metric of your own give {PLACE}.direction, too)"
         )
     if facts is not None and direction not in (None, own):

@@ -53,7 +53,7 @@ def choose_switches(found: Mapping[str, Switch], names: Sequence[str], densify: 
     for name in names:
         if name not in found:
             raise InputError(
-                f"{name!r} is no switch of densify={densify}{closest(name, found)} (there are "
+                f"{name!r} is not a switch of densify={densify}{closest(name, found)} (there are "
                 f"{', '.join(found) or 'none'})"
             )
     if not found:

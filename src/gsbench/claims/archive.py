@@ -195,7 +195,7 @@ def _member(archive: zipfile.ZipFile, name: str) -> bytes:
     try:
         info = archive.getinfo(name)
     except KeyError:
-        raise InputError(f"it lacks {name}: it is no archive of gsbench's, or was cut") from None
+        raise InputError(f"it lacks {name}: it is not an archive of gsbench, or it is incomplete") from None
     if info.file_size > MOST_BYTES:
         raise InputError(f"{name} would be {info.file_size} bytes: no archive of gsbench's has so many")
     with archive.open(info) as stream:
@@ -271,7 +271,7 @@ def read_configuration(trial: TrialResult) -> dict[str, Any]:
     except FileNotFoundError:
         raise InputError(NO_CONFIGURATION) from None
     if not isinstance(values, dict):
-        raise InputError(f"its {CONFIG} is no mapping")
+        raise InputError(f"its {CONFIG} is not a mapping")
     return values
 
 

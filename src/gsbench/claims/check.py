@@ -187,7 +187,7 @@ def recheck(file: ClaimsFile, archive: Path, folder: Path) -> tuple[list[ClaimVe
         raise InputError(f"{archive} is of the experiment {experiment.name}, not of {file.name}")
     every = [one for one in read_declarations(experiment.folder) if one.of_claims]
     if not every:
-        raise InputError(f"{archive}: no claims were declared in it: it is no archive of a gsbench check")
+        raise InputError(f"{archive}: it declares no claims, so it is not an archive of a gsbench check")
     declaration = standing_one(every)
     _check_same_claims(file, declaration)
     return claim_verdicts(file, declaration, judge(experiment.trials, declaration)), declaration, every

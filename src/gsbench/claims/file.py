@@ -231,7 +231,7 @@ def _named_settings(groups: Mapping[str, Any], where: str, group: str) -> dict[s
 def _check_settings(settings: Mapping[str, Any], where: str) -> None:
     for key, value in settings.items():
         if not isinstance(key, str) or not KEY.fullmatch(key):
-            raise InputError(f"{where}: {key!r} is no setting such as scene.max_size")
+            raise InputError(f"{where}: {key!r} is not a setting such as scene.max_size")
         if key.lstrip("+~") in GIVEN_BY_CHECK:
             raise InputError(f"{where}: {key} is set by the plan itself: leave it out")
         if key.lstrip("+~") == PERMISSIONS:
@@ -271,7 +271,7 @@ def _check_metric(claim: Claim, file: ClaimsFile) -> None:
     own = f"eval.extra.{claim.metric}."
     if claim.metric not in names and not any(key.lstrip("+").startswith(own) for key in file.settings):
         raise InputError(
-            f"{where}: {claim.metric!r} is no metric{closest(claim.metric, names)} (choose {', '.join(names)}; one "
+            f"{where}: {claim.metric!r} is not a metric{closest(claim.metric, names)} (choose {', '.join(names)}; one "
             f"of your own by settings: {{{own}_target_: mine.MyMetric}})"
         )
     effect = claim.effect

@@ -179,7 +179,7 @@ def _quoted(word: str) -> str:
         return ""  # in quotes it would be a text, not a list of values
     start, value, end = (f"{key}=glob(", function.group(2), ")") if function else (f"{key}=", value, "")
     quoted = f"{start}'{value}'{end}" if '"' in value else f'{start}"{value}"{end}'
-    return f"; special characters need quotes of their own, which the shell must leave: {shlex.quote(quoted)}"
+    return f"; special characters need their own quotes inside those of the shell: {shlex.quote(quoted)}"
 
 
 def check_single(words: Sequence[str], mend: str) -> None:

@@ -87,8 +87,8 @@ class _WithoutHydrasLine:
 MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood
 HINTS = {  # where a word may name a class of the user's, or a plug-in of Hydra's that is not installed
     **{group: f"; a class of your own is named by {group}._target_" for group in ("densify", "init", "raster")},
-    "hydra/launcher": "; other launchers are packages of their own, which launch=serial, local or slurm do not need",
-    "hydra/sweeper": "; others are packages of their own; a search is an interval and hydra.sweeper.tune.points",
+    "hydra/launcher": "; other launchers are separate packages; launch=serial, local or slurm need none",
+    "hydra/sweeper": "; others are separate packages; a search is an interval and hydra.sweeper.tune.points",
 }
 
 Errors = type[Exception] | tuple[type[Exception], ...]

@@ -84,7 +84,9 @@ class Volumetric(ADC):
         "shrink": Switch(
             {"condition_of": "nothing"}, "eq. 7's scales of its children, instead of ADC's", "volume_rule"
         ),
-        "no_resplit": Switch({"split_isotropic": True}, "what would be split again is left alone", "volume_rule"),
+        "no_resplit": Switch(
+            {"split_isotropic": True}, "a Gaussian is not split if its children would be split again", "volume_rule"
+        ),
     }
 
     volume_threshold: PositiveFloat = VOLUME_THRESHOLD

@@ -87,7 +87,7 @@ def check_pattern(pattern: str) -> None:
             list(Path(empty).glob(pattern))
     except (ValueError, NotImplementedError, IndexError, OSError, RecursionError) as error:
         raise InputError(
-            f"{key} is no pattern of files ({error}): ** stands for folders, so it is a part of its own"
+            f"{key} is not a pattern of files ({error}): ** stands for folders, so it is a part of its own"
         ) from None
 
 

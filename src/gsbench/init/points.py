@@ -36,7 +36,7 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
 
     ``.ply``: vertices with x, y, z in any order and type, text or binary; colours as whole numbers or in [0, 1].
     ``.npy`` and text: columns x, y, z, and perhaps red, green, blue. Raises ``InputError`` for a file that cannot be
-    read, holds no point, or a coordinate or colour that is no finite number.
+    read, holds no point, or a coordinate or colour that is not a finite number.
     """
     suffix = path.suffix.lower()
     require_regular(path)
@@ -55,11 +55,13 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
         raise InputError(f"{path}: holds no point")
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
-        raise InputError(f"{path}: {bad.sum():,} of {len(points):,} points have coordinates that are no finite numbers")
+        raise InputError(
+            f"{path}: {bad.sum():,} of {len(points):,} points have coordinates that are not finite numbers"
+        )
     if colors is None:
         return points, None
     if not np.isfinite(colors.astype(np.float64)).all() or colors.min() < 0:
-        raise InputError(f"{path}: has colours that are negative or no finite numbers")
+        raise InputError(f"{path}: has colours that are negative or not finite numbers")
     return points, _eight_bits(colors)
 
 
@@ -136,7 +138,7 @@ class Points(PlacedCloud):
         super().__post_init__()
         for key, path in (("path", self.path), ("transform", self.transform)):
             if path is not None and not Path(path).expanduser().is_file():
-                raise InputError(f"init.{key}={path} is no file")
+                raise InputError(f"init.{key}={path} is not a file")
 
     def content(self) -> str:
         """sha256 over the files: what the result depends on beside the options."""
@@ -199,7 +201,9 @@ class Ply(PlacedCloud):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.file.is_file():
-            raise InputError(f"init.path={self.path} is no file: name a PLY of Gaussians, as a trial's point_cloud.ply")
+            raise InputError(
+                f"init.path={self.path} is not a file: name a PLY of Gaussians, as a trial's point_cloud.ply"
+            )
         from gsbench.gaussians.ply import check_ply
 
         check_ply(self.file)

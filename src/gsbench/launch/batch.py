@@ -78,7 +78,7 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
     except OSError as error:
         if unfinished or error.errno not in FORBIDDEN:
             raise
-        log.info("%s may not be written to (%s), so its plan stays as it is", runs, error.strerror)
+        log.info("%s cannot be written to (%s), so its plan stays as it is", runs, error.strerror)
         return
     Store(runs / STORE).sweep(STAGES)
     add_to_plan(trials)

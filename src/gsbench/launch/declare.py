@@ -81,8 +81,8 @@ def declare(metrics: Mapping[Path, str | None], planned: Mapping[Path, Planned])
             _write(home, [*every, added])
         if same:
             log.warning(
-                "%s: trials are added to those declared with %s; if there are results already, it no longer makes the "
-                "verdict alone",
+                "%s: trials are added to those declared with %s; if there are results already, it no longer decides "
+                "the verdict alone",
                 home.name,
                 metric,
             )

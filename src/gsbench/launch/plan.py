@@ -43,7 +43,7 @@ class PlannedTrial(Record):
 def _is_below(name: str) -> str:
     parts = name.split("/")
     if len(parts) != LEVELS or not all(map(is_folder_name, parts)):
-        raise ValueError("it is no folder of a trial")
+        raise ValueError("it is not a folder of a trial")
     return name
 
 

@@ -204,8 +204,8 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
         _check_names(cls, options, group)
         if options and not own:
             raise InputError(
-                f"{group}._target_={target} has options but is no dataclass: make it one, so that results are stored "
-                "under their values"
+                f"{group}._target_={target} has options but is not a dataclass: make it one, so that results are "
+                "stored under their values"
             )
     try:
         return cls(**options)

@@ -40,7 +40,7 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
         check_place(place, truth, runs)
     renders = Path(options.renders).expanduser()
     if not renders.is_dir():
-        raise InputError(f"{renders} is no folder of renders")
+        raise InputError(f"{renders} is not a folder of renders")
     matching = _match(truth, list_images(renders), options.by_order)
     pairs = [
         Pair(view, path, renders / matching.pairs[view], truth.masks.get(view))

@@ -112,7 +112,7 @@ class Declaration(Record):
 
     def __post_init__(self) -> None:
         if unix_time(self.time) is None:
-            raise ValueError("time is no moment")
+            raise ValueError("time is not a time")
 
     @property
     def moment(self) -> int:

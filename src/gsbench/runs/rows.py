@@ -22,7 +22,7 @@ Exponent = Annotated[float, Field(ge=-300, le=300)]  # ten to this power is a nu
 def _with_step(row: dict[str, bool | int | float]) -> dict[str, bool | int | float]:
     step = row.get(STEP)
     if not isinstance(step, int) or isinstance(step, bool) or step < 0:
-        raise ValueError(f"{STEP} is no iteration")
+        raise ValueError(f"{STEP} is not an iteration")
     return row
 
 

@@ -352,5 +352,5 @@ def _lacking(
 def _number(text: str) -> float:
     value = float(text)
     if not abs(value) <= MOST:
-        raise ValueError(f"{text} is no measured number")
+        raise ValueError(f"{text} is not a measured number")
     return value

@@ -44,7 +44,7 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 def check_sizes(images: Path, masks: Mapping[str, Path]) -> None:
-    """Raise `InputError` naming a mask that is no image, or not of the size of its photograph below ``images``."""
+    """Raise `InputError` naming a mask that is not an image, or not of the size of its photograph below ``images``."""
     for name, mask in masks.items():
         size, wanted = image_size(mask), image_size(images / name)
         if size != wanted:
@@ -57,7 +57,7 @@ def check_sizes(images: Path, masks: Mapping[str, Path]) -> None:
 def read_mask(path: Path) -> Mask:
     """The mask [H, W] of a file: False where it is black.
 
-    Raises InputError for what is no mask: a picture in colours or of many greys, or one that is black all over.
+    Raises InputError for what is not a mask: a picture in colours or of many greys, or one that is black all over.
     """
     with open_image(path) as image:
         try:
@@ -79,8 +79,8 @@ def read_mask(path: Path) -> Mask:
     between = float((counts & (pixels != pixels.max())).mean())
     if between > MOST_GREY:
         raise InputError(
-            f"{path}: {between:.0%} of its pixels are grey, so it is no mask: make it black where pixels are ignored, "
-            "else white"
+            f"{path}: {between:.0%} of its pixels are grey, so it is not a mask: make it black where pixels are "
+            "ignored, else white"
         )
     return counts
 

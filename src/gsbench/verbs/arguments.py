@@ -49,7 +49,7 @@ def port(text: str) -> int:
 def path(text: str) -> Path:
     """A path that is not empty, with ``~`` in place; an argument's ``type``."""
     if not is_path(text):
-        raise argparse.ArgumentTypeError(f"{text!r} is no path")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a path")
     return Path(text).expanduser()
 
 

@@ -51,13 +51,15 @@ def parser() -> ArgumentParser:
         "--scene",
         default="trained",
         choices=("trained", "random", "skewed"),
-        help="like a trained model (default), as one begins, or like one whose detail lies at few places",
+        help="like a trained model (default), like one at the start, or like one with its detail at few places",
     )
     made.add_argument("--ply", type=path, help="time this model instead of a synthetic scene")
     made.add_argument("--repeats", type=_count, default=5, help="turns that count (default 5)")
     made.add_argument("--threads", type=_count, help="CPU threads (default: as many as torch takes)")
     made.add_argument("--json", action="store_true", help="print JSON")
-    made.add_argument("--no-memory", action="store_true", help="leave out peak memory, which takes a process each")
+    made.add_argument(
+        "--no-memory", action="store_true", help="do not measure peak memory, which needs one process each"
+    )
     return made
 
 

@@ -147,7 +147,7 @@ def check_runs(runs: Path) -> Iterator[Finding]:
         with tempfile.TemporaryFile(dir=place):
             free = shutil.disk_usage(place).free
     except OSError:
-        yield Finding("bad", "runs", f"{runs} may not be written to: set GSBENCH_RUNS")
+        yield Finding("bad", "runs", f"{runs} cannot be written to: set GSBENCH_RUNS")
     else:
         yield Finding("note" if free < LITTLE_SPACE else "ok", "runs", f"{runs}, {readable_bytes(free)} free")
 

@@ -39,5 +39,5 @@ def _parser() -> ArgumentParser:
     )
     parser.add_argument("--seed", type=int, default=0, help="which repetition of the arm they are (0)")
     parser.add_argument("--scene", metavar="NAME", help="with --as, where PLACE is a folder: what to call the scene")
-    parser.add_argument("--json", action="store_true", help="an object instead of a table")
+    parser.add_argument("--json", action="store_true", help="print a JSON object instead of a table")
     return parser

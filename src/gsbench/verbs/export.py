@@ -75,7 +75,7 @@ def export_results(name: str, runs: Path, out: Path | None, pictures: bool = Fal
     from gsbench.claims.archive import write_archive
 
     if not is_folder_name(name):
-        raise InputError(f"{name!r} is no name of an experiment: give that of its folder below {runs}")
+        raise InputError(f"{name!r} is not the name of an experiment: give that of its folder below {runs}")
     file = Path(f"{name}.zip") if out is None else out
     if file.is_dir():
         file = file / f"{name}.zip"

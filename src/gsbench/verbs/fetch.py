@@ -122,7 +122,7 @@ def _parser(names: Sequence[str]) -> ArgumentParser:
     )
     parser.add_argument("dataset", nargs="?", metavar="DATASET", help=", ".join(names))
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="the scenes wanted; none: all of the data set")
-    parser.add_argument("--list", action="store_true", help="what there is, and what is here")
+    parser.add_argument("--list", action="store_true", help="list all scenes, and which ones are here")
     parser.add_argument("--images", metavar="FOLDER", help="another image folder than the scene file's, such as images")
     parser.add_argument(
         "--mirror",

@@ -29,7 +29,9 @@ def main(argv: Sequence[str], runs: Path) -> int:
     )
     parser.add_argument("experiment")
     parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_squeeze")
-    parser.add_argument("--difference", type=_above_zero, help="to be resolved; default: what papers count as one")
+    parser.add_argument(
+        "--difference", type=_above_zero, help="the difference to see; default: what papers count as an improvement"
+    )
     parser.add_argument("--baseline", default=BASELINE, help=f"the densifier to compare with ({BASELINE})")
     options = parser.parse_args(argv)
     trials = with_variants(load_experiment(runs, options.experiment).trials)

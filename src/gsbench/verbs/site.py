@@ -19,8 +19,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
     parser = ArgumentParser(
         prog="gsbench site",
-        description="Write a static site, which needs no server, from archives (gsbench export --results): tables of "
-        "arms and scenes that sort, all verdicts, pictures where an archive has them, and the report of each.",
+        description="Write a static site from archives (gsbench export --results); it needs no server. It has sortable "
+        "tables of arms and scenes, all verdicts, pictures if an archive has them, and the report of each.",
     )
     parser.add_argument("archives", nargs="+", type=path, metavar="ARCHIVE")
     parser.add_argument("--out", type=path, required=True, metavar="DIR", help="the folder to write into")

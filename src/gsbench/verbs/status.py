@@ -25,7 +25,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser(prog="gsbench status", description="The state of every trial of an experiment.")
     parser.add_argument("experiment", nargs="?", help="its name; without one, a line for each experiment")
     parser.add_argument("--all", action="store_true", help="list the finished trials too")
-    parser.add_argument("--json", action="store_true", help="a list of objects instead of lines")
+    parser.add_argument("--json", action="store_true", help="print a JSON list instead of lines")
     parser.add_argument("--forget", action="store_true", help="remove trials from the plan that never started")
     parser.add_argument(
         "--forget-superseded",

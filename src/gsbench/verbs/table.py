@@ -5,7 +5,7 @@ from __future__ import annotations
 VERBS = {
     "fetch": (
         "gsbench.verbs.fetch",
-        "bring public scenes here: Mip-NeRF 360, Tanks and Temples, Deep Blending",
+        "download public scenes: Mip-NeRF 360, Tanks and Temples, Deep Blending",
     ),
     "evaluate": (
         "gsbench.verbs.evaluate",
@@ -14,9 +14,9 @@ VERBS = {
     "tables": ("gsbench.verbs.tables", "Markdown, CSV, LaTeX or HTML tables of an experiment"),
     "report": ("gsbench.verbs.report", "one HTML file with the evidence of an experiment"),
     "check": ("gsbench.verbs.check", "test the claims of a paper, written in a file: supported, refuted or undecided"),
-    "gate": ("gsbench.verbs.gate", "for continuous integration: is this version worse than an archive of another?"),
+    "gate": ("gsbench.verbs.gate", "for continuous integration: is this version worse than a trusted one?"),
     "bisect": ("gsbench.verbs.bisect", "which commit of a trainer made its results worse?"),
-    "plan": ("gsbench.verbs.plan", "how many scenes and seeds resolve a difference"),
+    "plan": ("gsbench.verbs.plan", "how many scenes and seeds you need to see a difference"),
     "ablate": (
         "gsbench.verbs.ablate",
         "which part of a densifier makes its gain: train all combinations of its switches",

@@ -66,7 +66,7 @@ def _tables(experiment: Experiment, trials: Sequence[TrialResult], options: argp
         rows, columns = options.rows, options.columns or ()
         if set(rows or ()) & set(columns):
             raise InputError(
-                f"{', '.join(sorted(set(rows or ()) & set(columns)))} stands in --rows and --columns: choose one"
+                f"{', '.join(sorted(set(rows or ()) & set(columns)))} is in --rows and --columns: choose one"
             )
         tables = [build_table(experiment, trials, rows, columns, metrics)]
     else:

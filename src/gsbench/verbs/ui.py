@@ -35,7 +35,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("--print-url", action="store_true", help="only print the address")
     options = parser.parse_args(argv)
     if options.uri is not None and "://" not in options.uri:
-        raise InputError(f"--uri {options.uri} is no address such as sqlite:///FILE or http://HOST:PORT")
+        raise InputError(f"--uri {options.uri} is not an address such as sqlite:///FILE or http://HOST:PORT")
     from gsbench.tracking import default_uri, tracker_uri
 
     uri = tracker_uri(options.uri, runs)
