@@ -81,8 +81,8 @@ class EvalConfig:
         if facts is None:
             known = [*known_keys(), *self.extra]
             raise InputError(
-                f"eval.primary={key} is not a metric{closest(key, known)} (known are {', '.join(known)}; your own metric "
-                "by its name under eval.extra)"
+                f"eval.primary={key} is not a metric{closest(key, known)} (known are {', '.join(known)}; your own "
+                "metric by its name under eval.extra)"
             )
         if facts.setting == "eval.flip" and not self.flip:
             raise InputError("eval.primary=flip is not measured with eval.flip=false")
