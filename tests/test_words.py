@@ -17,7 +17,7 @@ from gsbench import cli
 from gsbench.app.command import compose_trials
 from gsbench.config.schema import GROUP_SCHEMAS
 from gsbench.errors import InputError
-from gsbench.runs.hashing import config_hash
+from gsbench.runs.keys import config_hash
 from gsbench.settings import checked, option_fields
 
 REFUSED = {  # command line: a part of the line that refuses it
@@ -40,15 +40,14 @@ REFUSED = {  # command line: a part of the line that refuses it
     "densify=none densify.start=4": "densify.start is not a setting",
     "hydra.job.chdir=true": "where the command was given",
     "+experiment=moves --config-dir conf": "where the command was given",
-    "+hydra.callbacks.x._target_=os.system": "allow_targets=[os]",
-    "+hydra.callbacks.x.size=3": "hydra.callbacks.x names no _target_",
-    "+hydra.callbacks.x._target_=own.Nothing allow_targets=[own]": "own.Nothing",
-    "+experiment=calls --config-dir conf": "allow_targets=[os]",
-    "hydra/job_logging=default": "does not read hydra/job_logging",
+    "+hydra.callbacks.x._target_=os.system": "hydra.callbacks: gsbench runs the trials itself",
+    "+hydra.callbacks.x.size=3": "hydra.callbacks: gsbench runs the trials itself",
+    "+hydra.callbacks.x._target_=own.Nothing allow_targets=[own]": "hydra.callbacks: gsbench runs",
+    "+experiment=calls --config-dir conf": "hydra.callbacks: gsbench runs the trials itself",
+    "hydra/job_logging=default": "hydra.job_logging: log.txt",
     "hydra/launcher=nosuch": "launch=serial, local or slurm",
-    "hydra/launcher=basic": "add -m",
-    "-m hydra/launcher=basic launch=local seed=0,1": "two launchers",
-    "-m hydra/launcher=basic train.iterations=2.5": "a whole number of at least 0, got 2.5",
+    "hydra/launcher=basic": "hydra.launcher: gsbench runs the trials itself, as launch=serial, local or slurm says",
+    "-m hydra/launcher=basic launch=local seed=0,1": "as launch=serial, local or slurm says",
     "hydra/sweeper=nosuch": "choose: basic, gsbench",
     "-m hydra.job.name=a,b": "apply to all trials",
     "hydra.sweeper.parms=1": "did you mean params?",
@@ -96,7 +95,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "-m hydra/sweeper=optuna seed=0,1": "a search is an interval and hydra.sweeper.tune.points",
     "-m hydra.sweeper.params=x seed=0,1": "must map settings to their values",
     "hydra.sweeper.params.seed=1": "type seed=… itself, with -m",
-    "-m hydra.sweep.subdir=/proc/nosuch seed=0,1": "add hydra/launcher=basic",
+    "-m hydra.sweep.subdir=/proc/nosuch seed=0,1": "hydra.sweep: gsbench runs the trials itself",
     "-m seed=0,-1": "seed must be a whole number",
     "-m device=cpu,cuda": "does not make a different trial",
     "-m launch=serial,local": "does not make a different trial",

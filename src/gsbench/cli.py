@@ -20,7 +20,7 @@ try:
     from gsbench.files import checked_runs_folder, storage_errors
     from gsbench.logs import printable_output, set_up_logging
     from gsbench.system.own_modules import SAFE_PATH
-    from gsbench.verbs.table import VERBS
+    from gsbench.verbs import VERBS
     from gsbench.words import closest
 except KeyboardInterrupt:  # Ctrl-C before `run` could catch it
     print("gsbench: stopped before it began", file=sys.stderr)
@@ -99,7 +99,7 @@ def _verb(name: str, argv: list[str]) -> int:
             f"{name!r} is neither a verb nor a setting like key=value{hint_for(name) or closest(name, list(VERBS))} "
             f"(verbs: {', '.join(VERBS)})"
         )
-    main_function: Callable[[list[str], Path], int] = importlib.import_module(VERBS[name][0]).main
+    main_function: Callable[[list[str], Path], int] = importlib.import_module(f"gsbench.verbs.{name}").main
     runs = runs_dir()
     with storage_errors(runs):
         return main_function(argv, runs)
@@ -138,7 +138,7 @@ def _help(words: list[str]) -> int:
     folders = searched_folders(parse(words)[0])  # whose choices are listed too
     print(USAGE)
     print("Verbs (gsbench VERB --help):")
-    for name, (_, text) in VERBS.items():
+    for name, text in VERBS.items():
         print(f"  {name:<10} {text}")
     print("\n" + options_text(folders))
     return DONE

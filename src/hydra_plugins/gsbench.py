@@ -48,7 +48,7 @@ class GsbenchSweeper(Sweeper):
 LAUNCHER = {"_target_": "hydra_plugins.gsbench.GsbenchLauncher"}
 SWEEPER = {"_target_": "hydra_plugins.gsbench.GsbenchSweeper", "params": {}, "grids": []}
 # as gsbench.app.tuning.TuneSettings
-TUNE = {"points": 20, "at_once": 1, "metric": None, "direction": None, "seed": 100}
+TUNE = {"points": 20, "at_once": 1, "metric": None, "seed": 100}
 # Hydra imports this file more than once; from 1.4 on it says so unless it is told that the same may come again.
 AGAIN: dict[str, Any] = {"replace": True} if "replace" in signature(ConfigStore.store).parameters else {}
 for group, node in (("launcher", LAUNCHER), ("sweeper", {**SWEEPER, "tune": TUNE})):

@@ -28,7 +28,7 @@ from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.runs.declaration import Arm
-from gsbench.runs.hashing import config_hash
+from gsbench.runs.keys import config_hash
 from tests.analysis.synthetic import write_arms
 from tests.conftest import ROOT
 

@@ -12,7 +12,7 @@ import pytest
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.errors import InputError
 from gsbench.runs.experiments import list_experiments
-from gsbench.runs.rows import read_rows
+from gsbench.runs.trial_record import read_rows
 from tests.analysis.synthetic import Plan, write_runs
 
 

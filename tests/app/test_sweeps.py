@@ -14,8 +14,7 @@ from gsbench.analysis.declaration import standing
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import Trial
-from gsbench.launch.declare import declare, declared_metrics, planned_trials
-from gsbench.launch.plan import add_to_plan
+from gsbench.launch.record import add_to_plan, declare, declared_metrics, planned_trials
 from gsbench.launch.serial import Outcome, outcome_of_results
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.layout import CONFIG, RESULTS
@@ -172,14 +171,6 @@ def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(sweep: Cal
     assert len(read_declarations(runs / "stop")) == 2
     (verdict,) = verdicts_of(runs)
     assert verdict.late
-
-
-@pytest.mark.slow
-def test_another_launcher_of_hydras_gets_one_look_at_a_time(sweep: Callable[..., int]) -> None:
-    fake = Fake(noise)
-    assert sweep(fake, "hydra/launcher=basic", "launch=serial") == 0
-    assert len(fake.batches) == 8  # a call for each trial
-    assert [seed for ((_, seed),) in fake.batches] == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
 def test_settings_make_arms_and_the_report_opens_with_the_looks(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,7 @@ from gsbench.analysis.tables import build_table
 from gsbench.app.tuning import TuneSettings
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError
-from gsbench.launch.declare import declare, declared_metrics, planned_trials
-from gsbench.launch.plan import add_to_plan
+from gsbench.launch.record import add_to_plan, declare, declared_metrics, planned_trials
 from gsbench.launch.serial import Outcome, outcome_of_error, outcome_of_results
 from gsbench.runs.declaration import Arm
 from gsbench.runs.experiments import TuningRecord, read_tuning
@@ -199,15 +199,6 @@ def test_seeds_may_be_added_to_a_tuned_sweep_and_it_may_stop_when_decided(sweep:
 
 
 @pytest.mark.slow
-@pytest.mark.slow
-def test_another_launcher_gets_the_points_and_their_trials(sweep: Sweep) -> None:
-    fake = Fake()
-    assert sweep(fake, "hydra/launcher=basic", "launch=serial") == 0
-    assert fake.batches == [1] * 12
-    assert len(fake.tuning("adc")) == len(fake.tuning("volumetric")) == 4
-
-
-@pytest.mark.slow
 def test_a_point_is_judged_on_all_scenes_and_seeds_of_the_tuning(sweep: Sweep, runs: Path) -> None:
     fake = Fake()
     words = ["scene.sector=0,1", "scene.split=sector", "hydra.sweeper.tune.seed='7,8'", "hydra.sweeper.tune.points=2"]
@@ -275,16 +266,17 @@ def test_an_interval_searches_one_arm(runs: Path, monkeypatch: pytest.MonkeyPatc
     assert {trial.values["densify"]["volume_threshold"] for trial in fake.judged()} == {best}
 
 
-@pytest.mark.parametrize(("direction", "best"), [("minimize", min), ("maximize", max)])
 @pytest.mark.slow
-def test_a_metric_of_ones_own_is_made_best_in_the_direction_that_is_given(
-    direction: str, best: Any, sweep: Sweep, runs: Path
+def test_a_metric_of_ones_own_is_made_best_in_the_direction_of_its_class(
+    sweep: Sweep, runs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ["hydra.sweeper.tune.metric=mine", f"hydra.sweeper.tune.direction={direction}"]
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    Path("own.py").write_text("class Mine:\n    direction = -1\n    def measure(self, *given): ...\n")
+    words = ["hydra.sweeper.tune.metric=mine", "eval.extra.mine._target_=own.Mine", "allow_targets=[own]"]
     assert sweep(Fake(own_metric=True), *words, "hydra.sweeper.tune.points=2") == 0
     search = tuning(runs, "adc")
-    assert search.direction == (1 if direction == "maximize" else -1)
-    assert search.best == best(search.points, key=lambda point: point.value)
+    assert search.direction == -1
+    assert search.best == min(search.points, key=lambda point: point.value or 0.0)
 
 
 # --- what is printed
@@ -352,9 +344,7 @@ INTERVAL = "tag(log, interval(1e-3, 1e-1))"
 MISTAKES = [
     (FILE, "hydra.sweeper.tune.point=3", "did you mean points?"),
     (FILE, "hydra.sweeper.tune.metric=psnrr", "did you mean psnr?"),
-    (FILE, "hydra.sweeper.tune.direction=minimize", "PSNR is better the other way"),
-    (FILE, "hydra.sweeper.tune.direction=up", "'maximize' or 'minimize' or null"),
-    (FILE, "hydra.sweeper.tune.metric=mine", "for a metric of your own give hydra.sweeper.tune.direction, too"),
+    (FILE, "hydra.sweeper.tune.metric=mine", "there is no such metric"),
     (FILE, "hydra.sweeper.tune.seed='1,2'", "tune.seed: 1 is a seed of the sweep, too"),
     (FILE, "hydra.sweeper.tune.seed=one", "must list whole numbers"),
     (FILE, "scene.validation=true", "leave scene.validation out"),

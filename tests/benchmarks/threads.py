@@ -27,11 +27,11 @@ from gsbench.densify import ADC
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.pipeline.parts import Parts
-from gsbench.pipeline.wiring import TrialSteps
+from gsbench.pipeline.trial import TrialSteps
 from gsbench.raster.cpu import CpuRasterizer, executor
 from gsbench.raster.cpu.workspace import ShardRunner
+from gsbench.runs.keys import TRAIN
 from gsbench.runs.layout import POINT_CLOUD, STORE
-from gsbench.runs.stages import TRAIN
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.types import Scene, View

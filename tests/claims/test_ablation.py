@@ -27,7 +27,7 @@ from gsbench.config.compose import compose_one
 from gsbench.densify.volumetric import Volumetric
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import build
-from gsbench.runs.hashing import config_hash
+from gsbench.runs.keys import config_hash
 from gsbench.settings import Switch
 from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.launch.test_declare import TINY
@@ -152,8 +152,7 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path: Path) -
         (["densify=adc,volumetric"], "one densifier"),
         (["densify=adc", "densify.split_shrink=1.5,2"], "only scene and seed"),
         (["densify=adc", "--switches", "opacity_rest"], "did you mean opacity_reset"),
-        (["densify=adc", "--switch", "a:split_shrink"], "NAME:KEY=VALUE"),
-        (["densify=adc", "--switch", "a:split_shrnk=2"], "split_shrnk"),
+        (["densify=adc", "+densify.switches.a.off.split_shrnk=2"], "split_shrnk"),
         (["densify=adc", "--fast"], "--fast is not an option"),
         (["densify=adc", "launch.stop_when_decided=true", "eval.primary=psnr", "seed=0,1"], "stop_when_decided"),
     ],
@@ -175,7 +174,7 @@ def test_the_verb_trains_each_run_once_and_judges_it(
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     words = [*(word for word in TINY if word != "densify=none"), "densify=adc", "seed=0,1", "name=parts"]
-    words += ["--switch", "size:split_size=0.5", "--switches", "size"]
+    words += ["+densify.switches.size.off.split_size=0.5", "--switches", "size"]
     assert run(["ablate", *words]) == 0
     out = capsys.readouterr().out
     assert "adc: 1 part (size), 2 runs, 4 trials" in out

@@ -17,8 +17,7 @@ from gsbench.claims.file import parse_claims
 from gsbench.claims.page import make_page, to_html
 from gsbench.claims.stopping import Planned, run_looks
 from gsbench.cli import run
-from gsbench.config.compose import Trial
-from gsbench.config.jobs import with_seed
+from gsbench.config.compose import Trial, with_seed
 from gsbench.errors import InputError
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.trial_folder import TrialFolder

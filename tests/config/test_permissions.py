@@ -15,7 +15,7 @@ from gsbench.app.command import compose_trials
 from gsbench.config.compose import compose_one
 from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
-from gsbench.launch.plan import add_to_plan
+from gsbench.launch.record import add_to_plan
 from gsbench.pipeline.parts import build
 from gsbench.runs.trial_folder import TrialFolder
 from tests.strange import no_trial

@@ -14,11 +14,11 @@ from omegaconf import OmegaConf
 
 from gsbench.app.command import compose_trials
 from gsbench.config.compose import compose_one
-from gsbench.config.schema import check, plain, register_schemas
+from gsbench.config.schema import checked_values, register_schemas
 from gsbench.config.trust import check_target
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import build, build_metrics
-from gsbench.runs.hashing import config_hash
+from gsbench.runs.keys import config_hash
 from gsbench.system.install import conf_dir
 from gsbench.train.options import TrainConfig
 
@@ -33,8 +33,7 @@ def composed(*overrides: str) -> dict[str, Any]:
     register_schemas()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         config = compose("config", overrides=list(overrides))
-    check(config)
-    return plain(config)
+    return checked_values(config)
 
 
 # What the user of another program must say: its version, where it lies, and that it may run.

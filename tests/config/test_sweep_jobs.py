@@ -8,8 +8,7 @@ import pytest
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 
 from gsbench.app.command import compose_trials
-from gsbench.config.compose import compose_one
-from gsbench.config.jobs import _plain_values
+from gsbench.config.compose import _plain_values, compose_one
 from gsbench.errors import InputError
 from gsbench.launch.jobs import job_of
 

@@ -25,77 +25,43 @@ from tests.strange import place as place
 
 pytestmark = pytest.mark.usefixtures("place")
 MKDIR = {"_target_": "os.mkdir", "path": "exploded"}
-LOG_CALLBACK = "hydra.experimental.callbacks.LogJobReturnCallback"
-
-
-def calls(**settings: Any) -> dict[str, Any]:
-    """Settings with one of Hydra's own callbacks, and beside its name what a stranger adds."""
-    return {"hydra": {"callbacks": {"x": {"_target_": LOG_CALLBACK} | settings}}}
-
 
 STRANGE: dict[str, tuple[dict[str, Any], str]] = {  # settings of a file, and a part of the line that refuses them
-    "a callback": ({"hydra": {"callbacks": {"x": MKDIR}}}, "allow_targets=[os]"),
-    "below a callback": (calls(inner=MKDIR), "allow_targets=[os]"),
-    "in a list below a callback": (
-        calls(inner=[{"a": [[MKDIR]]}]), "callbacks.x.inner.0.a.0.0."
-    ),
-    "among positional arguments": (
-        calls(_args_=[MKDIR]), "allow_targets=[os]"
-    ),
-    "a module of the folder": (
-        {"hydra": {"callbacks": {"x": {"_target_": LOG_CALLBACK, "in": {"_target_": "bomb.Bomb"}}}}},
-        "allow_targets=[bomb]",
-    ),
-    "beside Hydra's callbacks": (calls(_target_="hydra.experimental.callbacks.pickle.loads"), "allow_targets=[hydra]"),
-    "what gsbench's modules import": (
-        calls(_target_="gsbench.files.os.mkdir", path="exploded"), "is not a class for hydra.callbacks.x"
-    ),
-    "a class of gsbench in a strange place": (
-        calls(_target_="gsbench.logs._QuietFileHandler", filename="exploded"), "is not a class for hydra.callbacks.x"
-    ),
+    "a callback": ({"hydra": {"callbacks": {"x": MKDIR}}}, "hydra.callbacks: gsbench runs the trials itself"),
     "below the sweeper": (
         {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"in": MKDIR}}}}, "sweeper.params.in._target_=os.mkdir"
     ),
     "beside the sweeper's settings": ({"hydra": {"sweeper": {"grids": [MKDIR]}}}, "hydra.sweeper.grids.0"),
-    "a sweeper": ({"hydra": {"sweeper": {"_target_": "hydra_plugins.bomb.Bomb"}}}, "no sweeper that gsbench"),
-    "a launcher": ({"hydra": {"launcher": {"_target_": "hydra_plugins.gsbench.os.mkdir"}}}, "no launcher that gsbench"),
-    "a launcher that hands lines to a shell": (
-        {"hydra": {"launcher": {"_target_": "hydra_plugins.hydra_submitit_launcher.submitit_launcher.SlurmLauncher"}}},
-        "no launcher that gsbench",
-    ),
-    "a launcher in a copy": (
-        calls(inner="${hydra.launcher}"), "copies others"
-    ),
+    "a sweeper": ({"hydra": {"sweeper": {"_target_": "hydra_plugins.bomb.Bomb"}}}, "gsbench has its own"),
+    "a launcher": ({"hydra": {"launcher": {"_target_": "hydra_plugins.gsbench.os.mkdir"}}}, "hydra.launcher: gsbench"),
+    "beside the launcher": ({"hydra": {"launcher": {"in": MKDIR}}}, "hydra.launcher"),
     "a name in parts": (
-        {"name": "mkdir", "hydra": {"callbacks": {"x": {"_target_": "os.${name}", "path": "exploded"}}}},
-        "write the name itself",
+        {"name": "mkdir", "densify": {"_target_": "os.${name}", "path": "exploded"}}, "write the name itself"
     ),
     "made of a text": (
-        calls(inner="${oc.create:{_target_:os.mkdir,path:exploded}}"), "${oc.create:…} is not resolved"
+        {"densify": {"inner": "${oc.create:{_target_:os.mkdir,path:exploded}}"}}, "${oc.create:…} is not resolved"
     ),
     "decoded from a text": ({"hydra": {"job": {"name": "${oc.decode:'1'}"}}}, "${oc.decode:…} is not resolved"),
     "a resolver with a made name": ({"hydra": {"job": {"name": "${oc.${name}:1}"}}}, "is not resolved"),
-    "an alias for a component": ({"hydra": {"callbacks": {"x": "${densify}"}}}, "write the settings"),
+    "a copy for the sweeper": ({"hydra": {"sweeper": {"tune": "${densify}"}}}, "write the settings"),
+    "a copy in the sweeper": ({"hydra": {"sweeper": {"tune": {"metric": "${densify}"}}}}, "write the settings"),
     "a partial object": (
-        calls(_partial_=True), "_partial_: gsbench makes no"
+        {"densify": {"_partial_": True}}, "_partial_: gsbench makes no"
     ),
-    "a copy for logging": ({"hydra": {"job_logging": "${train}"}}, "hydra.job_logging=${train}: write the settings"),
+    "a copy for logging": ({"hydra": {"job_logging": "${train}"}}, "hydra.job_logging: log.txt"),
     "help": ({"hydra": {"help": {"_target_": "bomb.Bomb"}}}, "_target_ is not a setting"),
     "logging": (
         {"hydra": {"job_logging": {"handlers": {"x": {"class": "bomb.Bomb"}}, "root": {"handlers": ["x"]}}}},
-        "does not read hydra/job_logging",
+        "hydra.job_logging: log.txt",
     ),
     "logging by a factory": (
-        {"hydra": {"hydra_logging": {"formatters": {"x": {"()": "bomb.Bomb"}}}}}, "does not read hydra/hydra_logging"
+        {"hydra": {"hydra_logging": {"formatters": {"x": {"()": "bomb.Bomb"}}}}}, "hydra.hydra_logging: log.txt"
     ),
     "a densifier": ({"densify": {"_target_": "bomb.Bomb"}}, "allow_targets=[bomb]"),
     "a package": ({"densify": {"_target_": "bombs.Bomb"}}, "allow_targets=[bombs]"),
     "a module of a package": ({"densify": {"_target_": "bombs.one.Bomb"}}, "allow_targets=[bombs]"),
     "a densifier that allows itself": (
         {"allow_targets": ["bomb"], "densify": {"_target_": "bomb.Bomb"}}, "no file can allow it"
-    ),
-    "a callback that allows itself": (
-        {"allow_targets": ["os"], "hydra": {"callbacks": {"x": MKDIR}}}, "no file can allow it"
     ),
     "below a densifier": ({"densify": {"inner": [{"_target_": "bomb.Bomb"}]}}, "densify.inner.0._target_=bomb.Bomb"),
     "another group's class": ({"densify": {"_target_": "gsbench.init.Random"}}, "is not a class for densify"),
@@ -149,11 +115,9 @@ JOBS: dict[str, tuple[dict[str, Any], str]] = {  # the words that a file's sweep
 
 
 @pytest.mark.parametrize("place_of_words", ["params", "grids"])
-@pytest.mark.parametrize("launcher", ["gsbench", "basic"])
 @pytest.mark.parametrize("case", JOBS)
 def test_nor_what_only_the_jobs_of_a_sweep_say(
     case: str,
-    launcher: str,
     place_of_words: str,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -161,9 +125,16 @@ def test_nor_what_only_the_jobs_of_a_sweep_say(
     words, said = JOBS[case]
     words = words | {"seed": "0,1"}
     node = {"params": words} if place_of_words == "params" else {"grids": [words]}
-    run = [*experiment({"hydra": {"mode": "MULTIRUN", "sweeper": node}}), f"hydra/launcher={launcher}"]
-    assert said in ask(run, capsys, monkeypatch)
+    assert said in ask(experiment({"hydra": {"mode": "MULTIRUN", "sweeper": node}}), capsys, monkeypatch)
     assert not Path("exploded").exists()
+
+
+@pytest.mark.parametrize("variables", [{"PYTHONPATH": "/strange"}, {"OMP_NUM_THREADS": "2"}, "${launch.sbatch}"])
+def test_a_file_sets_no_variable(
+    variables: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = ask(experiment({"hydra": {"job": {"env_set": variables}}}), capsys, monkeypatch)
+    assert "hydra.job.env_set: set variables in the shell" in line
 
 
 VARIABLES = """
@@ -176,26 +147,12 @@ GSBENCH_WEIGHTS path
 """
 
 
-@pytest.mark.parametrize("name", VARIABLES.split())
-def test_a_file_sets_no_variable_that_could_start_code(name: str) -> None:
-    run = experiment({"hydra": {"job": {"env_set": {name: "/strange"}}}})
-    with pytest.raises(InputError, match=rf"{name}='/strange'.*allow_targets=\[{name}\]"):
-        compose_trials(["hydra.searchpath=[conf]", *run[2:]])
-
-
-def test_variables_that_choose_threads_and_devices_may_be_set(monkeypatch: pytest.MonkeyPatch) -> None:
-    harmless = {"OMP_NUM_THREADS": "2", "CUDA_VISIBLE_DEVICES": "1"}
-    compose_trials(["hydra.searchpath=[conf]", *experiment({"hydra": {"job": {"env_set": harmless}}})[2:]])
-    compose_trials(["+hydra.job.env_set.MINE=1", "allow_targets=[MINE]"])
+def test_only_variables_that_choose_threads_and_devices_are_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of another trainer's environment; all others could start code."""
+    assert foreign_variables({"OMP_NUM_THREADS": "2", "CUDA_VISIBLE_DEVICES": "1"}, []) == {}
+    assert list(foreign_variables(dict.fromkeys(VARIABLES.split(), "/strange"), [])) == VARIABLES.split()
     monkeypatch.setenv("MINE", "as it is")
-    compose_trials(["hydra.job.env_copy=[PATH,MINE]"])  # Hydra's own way to hand variables on sets what is set
     assert foreign_variables({"MINE": "as it is", "PATH": "other"}, []) == {"PATH": "other"}
-
-
-def test_variables_cannot_come_as_a_copy(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = {"launch": {"sbatch": {"PYTHONPATH": "/strange"}}, "hydra": {"job": {"env_set": "${launch.sbatch}"}}}
-    line = ask(experiment(settings), capsys, monkeypatch)
-    assert "hydra.job.env_set=${launch.sbatch}: write the settings themselves" in line
 
 
 @pytest.mark.parametrize(
@@ -272,29 +229,6 @@ def test_trust_in_a_module_extends_to_gsbenchs_classes_in_it() -> None:
     allow_modules(["mine"])
     assert load_class("mine.ADC", "densify", ["mine"]).__module__.startswith("gsbench.")
     assert load_class("mine.Mine", "densify", ["mine"]).__name__ == "Mine"
-
-
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"_target_": "mine.Popen", "args": "true"}, "is subprocess.Popen"),
-        ({"_target_": "mine.Mine"}, "is not a class of hydra.experimental.callback.Callback"),
-        ({"_target_": "mine.Calls", "in": {"_target_": "mine.Popen"}}, "is subprocess.Popen"),
-        ({"_target_": "mine.Calls", "in": {"_target_": "mine.os.mkdir"}}, "cannot be imported"),
-        ({"size": 3}, "hydra.callbacks.x names no _target_"),
-    ],
-)
-def test_callbacks_are_classes_of_the_allowed_module(
-    settings: dict[str, Any], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = [*experiment({"hydra": {"callbacks": {"x": settings}}}), "allow_targets=[mine]"]
-    assert said in ask(run, capsys, monkeypatch)
-
-
-def test_an_allowed_callback_is_made(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    nested = {"_target_": "mine.Calls", "in": {"_target_": "mine.Calls"}, "_recursive_": True, "_convert_": "all"}
-    run = [*experiment({"hydra": {"callbacks": {"x": nested}}}), "allow_targets=[mine]"]
-    assert "the trials began" in ask(run, capsys, monkeypatch)
 
 
 def test_only_allowed_modules_of_the_folder_are_found_and_behind_what_is_installed(place: Path) -> None:

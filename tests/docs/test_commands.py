@@ -26,8 +26,8 @@ from gsbench.external.settings import External
 from gsbench.raster.executors import RasterConfig
 from gsbench.scene.options import SceneConfig
 from gsbench.train.options import TrainConfig
+from gsbench.verbs import VERBS
 from gsbench.verbs.queries import QUERIES
-from gsbench.verbs.table import VERBS
 from tests.conftest import ROOT
 
 DOCUMENTS = [
@@ -72,7 +72,7 @@ def keys_of(group: str) -> frozenset[str]:
 @cache
 def options_of(verb: str) -> frozenset[str]:
     with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
-        importlib.import_module(VERBS[verb][0]).main(["--help"], Path("runs"))
+        importlib.import_module(f"gsbench.verbs.{verb}").main(["--help"], Path("runs"))
     return frozenset(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", text.getvalue()))
 
 

@@ -19,7 +19,7 @@ from gsbench.external.exchange import write_test_cameras, write_training_views
 from gsbench.external.program import run_program
 from gsbench.external.settings import External, fill, words_of
 from gsbench.init.base import PointCloud
-from gsbench.runs.hashing import config_hash
+from gsbench.runs.keys import config_hash
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
 from gsbench.system.isolate import telling_tail

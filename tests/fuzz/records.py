@@ -31,7 +31,7 @@ from gsbench.analysis.tuning import tuning_lines
 from gsbench.errors import InputError
 from gsbench.launch import states
 from gsbench.launch.dry_run import FinishedTrials
-from gsbench.launch.plan import read_plan
+from gsbench.launch.record import read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.trial_folder import TrialFolder

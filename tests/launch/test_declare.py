@@ -14,7 +14,7 @@ from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import Trial, compose_one
 from gsbench.errors import InputError
-from gsbench.launch.declare import declare, declare_questions, declared_metrics, planned_trials
+from gsbench.launch.record import declare, declare_questions, declared_metrics, planned_trials
 from gsbench.runs.declaration import Declaration, Question, read_declarations
 from tests.end_to_end.conftest import SMALL
 

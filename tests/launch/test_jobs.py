@@ -1,9 +1,8 @@
-"""What a job returned is read from a file of the runs folder, and nothing that such a file names is run."""
+"""How a job ended is told by the files of its trial; what it returned is not read."""
 
 from __future__ import annotations
 
-import os
-import pickle
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,53 +15,36 @@ from gsbench.launch.jobs import clouds_first, collect, job_folder
 from gsbench.launch.serial import Outcome
 
 
-class Bomb:
-    def __init__(self, mark: Path) -> None:
-        self.mark = mark
-
-    def __reduce__(self) -> Any:
-        return os.mkdir, (str(self.mark),)
-
-
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     return tmp_path
 
 
-def collected(folder: Path, returned: Any) -> Outcome:
+def collected(folder: Path, failure: str | None = None) -> Outcome:
+    """How a job ended that left a result of its own, which nobody reads, and perhaps a failure."""
     trial = compose_one(["name=x"])
-    result = folder / "1_0_result.pkl"
-    result.write_bytes(pickle.dumps(returned))
-    job: Any = SimpleNamespace(paths=SimpleNamespace(result_pickle=result, stderr=folder / "log"))
+    if failure is not None:
+        trial.folder.mkdir(parents=True)
+        (trial.folder / "failed.json").write_text(failure)
+    (folder / "1_0_result.pkl").write_bytes(b"cos\nmkdir\n(S'exploded'\ntR.")
+    (folder / "log").write_text("loading\nRuntimeError: no luck\n")
+    paths = SimpleNamespace(result_pickle=folder / "1_0_result.pkl", stderr=folder / "log")
+    job: Any = SimpleNamespace(paths=paths)
     return collect(job, trial.folder, [trial])
 
 
-def test_an_outcome_comes_back(folder: Path) -> None:
-    outcome = Outcome(folder / "trial", "failed", "no luck", bad_input=True)
-    assert collected(folder, ("success", outcome)) == outcome
+def test_a_failed_job_is_told_by_the_trials_folder(folder: Path) -> None:
+    outcome = collected(folder, json.dumps({"message": "no scene\nat all", "bad_input": True}))
+    assert outcome.message == f"no scene; log: {folder / 'log'}"
+    assert (outcome.status, outcome.bad_input) == ("failed", True)
 
 
-def test_an_error_is_its_last_line(folder: Path) -> None:
-    outcome = collected(folder, ("error", "Traceback\nRuntimeError: no luck"))
-    assert (outcome.status, outcome.message) == ("failed", f"RuntimeError: no luck; log: {folder / 'log'}")
-
-
-@pytest.mark.parametrize("wrap", [lambda bomb: bomb, lambda bomb: ("success", bomb), lambda bomb: ("error", [bomb])])
-def test_nothing_is_run(folder: Path, wrap: Any) -> None:
-    outcome = collected(folder, wrap(Bomb(folder / "exploded")))
+def test_a_job_that_left_nothing_is_told_by_its_log(folder: Path) -> None:
+    outcome = collected(folder)
     assert outcome.status == "failed"
-    assert "cannot be read" in outcome.message
-    assert not (folder / "exploded").exists()
-
-
-@pytest.mark.parametrize("content", [b"", b"no pickle", b"\x80\x05."])
-def test_what_cannot_be_read_is_said(folder: Path, content: bytes) -> None:
-    trial = compose_one(["name=x"])
-    (folder / "r.pkl").write_bytes(content)
-    job: Any = SimpleNamespace(paths=SimpleNamespace(result_pickle=folder / "r.pkl", stderr=folder / "log"))
-    outcome = collect(job, trial.folder, [trial])
-    assert "cannot be read" in outcome.message
+    assert "ended without a result" in outcome.message
+    assert "its last words: RuntimeError: no luck" in outcome.message
 
 
 def test_one_trial_of_each_cloud_begins_first() -> None:

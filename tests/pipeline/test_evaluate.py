@@ -18,17 +18,15 @@ from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.protocol import PAPER
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
-from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.steps import inputs as inputs_module
 from gsbench.pipeline.steps.evaluate import evaluate_step, measure_speed
 from gsbench.pipeline.steps.inputs import UserCode
 from gsbench.raster import create_rasterizer
 from gsbench.raster.contract import CASES
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.runs.stages import INIT, TRAIN, Step
+from gsbench.runs.keys import INIT, TRAIN, Step
 from gsbench.runs.store import Store
 from gsbench.scene.camera import ANGLE, COUNTED, DISTANCE
-from gsbench.scene.colmap import write_model
 from gsbench.scene.types import Scene, View
 from gsbench.train.trainer import snapshot_file
 
@@ -95,8 +93,6 @@ def test_an_evaluation_measures_what_its_pictures_hold(tmp_path: Path, truth: Ga
     earlier = faint.select(torch.arange(50))
     write_ply(earlier, training / snapshot_file(7))
     np.savez(training / "lineage.npz", causes=np.zeros(80, dtype=np.int64), ids=np.arange(80))
-    cloud = (truth.means.double().numpy(), np.zeros((80, 3), np.uint8))
-    write_model(store.path(init) / MODEL_FOLDER, {view.name: view.camera for view in scene.train}, cloud=cloud)
     parts: Any = SimpleNamespace(
         evaluator=Evaluator(PAPER, lpips=[], flip=False),
         rasterizer=ReferenceRasterizer(),
@@ -134,9 +130,6 @@ def test_an_evaluation_measures_what_its_pictures_hold(tmp_path: Path, truth: Ga
         places = [np.linalg.norm(view.camera.center - other.camera.center) for other in scene.train]
         assert float(row[DISTANCE]) == pytest.approx(min(places) / scene.extent)
         assert float(row["fps"]) > 0
-        with np.load(folder / "maps" / f"{Path(view.name).stem}.npz") as maps:
-            assert maps["depth"].shape == (32, 40)
-            assert np.nanmax(maps["distance"]) < 2
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["metrics"]["psnr"] == pytest.approx(means["last"], abs=1e-5)
     assert metrics["at"].keys() == {"7"}

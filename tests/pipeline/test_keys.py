@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 
 from gsbench.config.compose import compose_one
-from gsbench.pipeline import wiring
+from gsbench.pipeline import trial as pipeline_trial
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps import init as init_module
 from gsbench.pipeline.steps import inputs as inputs_module
 from gsbench.pipeline.steps.scene import CaptureSource
-from gsbench.pipeline.wiring import TrialSteps
-from gsbench.runs.hashing import config_hash
+from gsbench.pipeline.trial import TrialSteps
+from gsbench.runs.keys import config_hash
 from gsbench.runs.store import Store
 from gsbench.scene.types import Capture
 
@@ -42,7 +42,7 @@ def test_the_keys_of_a_known_trial_stay(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(init_module, "version", lambda package: "4.0.0")
     monkeypatch.setattr(inputs_module, "edited", lambda files: {})  # as in a release
     values = compose_one(WORDS).values
-    monkeypatch.setattr(wiring, "CaptureSource", BareSource)
+    monkeypatch.setattr(pipeline_trial, "CaptureSource", BareSource)
     trial = TrialSteps(Parts(values), Store(tmp_path / "store"))
     keys = [("config", config_hash(values)), *((step.stage.name, step.key) for step in trial.steps())]
     assert keys == KEYS

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from gsbench.config.compose import compose_one
-from gsbench.pipeline import wiring
+from gsbench.pipeline import trial as pipeline_trial
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.scene import makers_of_views
-from gsbench.pipeline.wiring import TrialSteps
-from gsbench.runs.hashing import config_hash
+from gsbench.pipeline.trial import TrialSteps
+from gsbench.runs.keys import config_hash
 from gsbench.runs.store import Store
 from gsbench.system.own_modules import allowed_modules
 from tests.pipeline.test_keys import WORDS, BareSource
@@ -47,7 +47,7 @@ def _forget() -> None:
 
 @pytest.fixture(autouse=True)
 def bare_capture(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(wiring, "CaptureSource", BareSource)
+    monkeypatch.setattr(pipeline_trial, "CaptureSource", BareSource)
 
 
 def keys_of(home: Path, *words: str) -> dict[str, str]:

@@ -18,7 +18,7 @@ from gsbench.errors import InputError
 from gsbench.pipeline.parts import build_rasterizer, check_offers
 from gsbench.pipeline.steps.inputs import rasterizer_inputs
 from gsbench.raster import create_rasterizer
-from gsbench.runs.hashing import config_hash
+from gsbench.runs.keys import config_hash
 from tests.config.test_schema import composed
 from tests.conftest import ROOT
 

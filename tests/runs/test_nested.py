@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import doctest
 
-from gsbench.runs import hashing as nested
-from gsbench.runs.hashing import flatten
+from gsbench.runs import keys as nested
+from gsbench.runs.keys import flatten
 
 
 def test_the_example_of_the_documentation_holds() -> None:

@@ -15,8 +15,8 @@ import pytest
 
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError
+from gsbench.runs.keys import Stage, Step
 from gsbench.runs.layout import MANIFEST
-from gsbench.runs.stages import Stage, Step
 from gsbench.runs.store import Manifest, Store, read_manifest
 from tests.runs.toy import TOY, expected_text, toy_inputs
 

@@ -12,13 +12,12 @@ import pytest
 from gsbench.analysis.results import read_experiment
 from gsbench.errors import InputError
 from gsbench.files import remove_strange, require_own
-from gsbench.launch.declare import declare
-from gsbench.launch.plan import forget, remove
+from gsbench.launch.record import declare, forget, remove
 from gsbench.launch.states import states_of_experiment
 from gsbench.logs import log_to
 from gsbench.parsing import DamagedError, read_bytes
 from gsbench.runs.experiments import list_experiments
-from gsbench.runs.stages import Step
+from gsbench.runs.keys import Step
 from gsbench.runs.store import Store
 from gsbench.system.locks import describe_holder, hold, is_held
 from tests.finished import write_results

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gsbench.runs.stages import Stage, Step
+from gsbench.runs.keys import Stage, Step
 from gsbench.runs.store import Store
 
 TOY = Stage("toy", 1, resumable=True, scratch=("*.progress",))

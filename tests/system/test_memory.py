@@ -50,6 +50,6 @@ def test_systems_without_proc_use_what_they_have(tmp_path: Path, monkeypatch: py
 
 def test_the_pipeline_is_imported_where_there_is_no_resource_module() -> None:
     """As on Windows, where psutil does without it."""
-    code = "import sys, psutil; sys.modules['resource'] = None; import gsbench.runs.stages, gsbench.bench"
+    code = "import sys, psutil; sys.modules['resource'] = None; import gsbench.runs.keys, gsbench.bench"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

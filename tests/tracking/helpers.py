@@ -13,7 +13,7 @@ from typing import Any
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
 from gsbench.tracking import Mirror
-from gsbench.tracking.follower import TrackerRun
+from gsbench.tracking.follower import mirror_ended
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = 150
@@ -46,14 +46,7 @@ def following(settings: dict[str, Any], folder: Path) -> Iterator[None]:
 
 def mirror_trial(settings: dict[str, Any], folder: Path, values: dict[str, Any]) -> bool:
     """Mirror what is missing of an ended trial; False if nothing was missing. Raises what the tracker raises."""
-    run = TrackerRun(settings, TrialFolder(folder), values)
-    try:
-        if run.is_complete:
-            return False
-        run.end()
-        return True
-    finally:
-        run.close()
+    return mirror_ended(TrialFolder(folder), settings, values)
 
 
 def write_trial(folder: Path, values: dict[str, Any], records: int = RECORDS, psnr: float = 20.0) -> None:

@@ -10,8 +10,7 @@ import pytest
 from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.tracking import connect
-from gsbench.tracking.client import VARIABLE, untyped_address
-from gsbench.tracking.mlflow_sink import STATE
+from gsbench.tracking.mlflow_sink import STATE, VARIABLE, untyped_address
 from tests.tracking.helpers import begin_trial, found_runs, free_port, mirror_trial, options, trial_values, write_trial
 
 

@@ -19,7 +19,7 @@ import pytest
 
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, ensure_experiment
-from gsbench.tracking.client import SETTINGS
+from gsbench.tracking.mlflow_sink import SETTINGS
 from tests.end_to_end.conftest import SMALL
 from tests.processes import heed_interrupts
 from tests.tracking.helpers import (
@@ -137,12 +137,9 @@ def test_sync_can_be_stopped_while_the_tracker_hangs(runs: Path) -> None:
             text=True,
             preexec_fn=heed_interrupts,
         )
-        mirrors = mirrors_of(program)
         wait_until(lambda: bool(tracker.connections))
         program.send_signal(signal.SIGINT)
         _, errors = program.communicate(timeout=SECONDS)
-        _, alive = psutil.wait_procs(mirrors, timeout=SECONDS)
-    assert not alive
     assert program.returncode == 128 + signal.SIGINT
     assert "Traceback" not in errors
 

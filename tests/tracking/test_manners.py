@@ -1,4 +1,4 @@
-"""What people who know MLflow look for: address, user, source, reasons of failures, files that are found."""
+"""What people who know MLflow look for: address, user, reasons of failures, files that are found."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ import pytest
 
 from gsbench.errors import InputError
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking import connect, default_uri, ensure_experiment, sync, tracker_uri
-from gsbench.tracking.client import source_tags
-from gsbench.verbs.ui import address_of
+from gsbench.tracking import connect, default_uri, ensure_experiment, tracker_uri
 from tests.tracking.helpers import (
     RECORDS,
     begin_trial,
+    child_environment,
     following,
     found_runs,
     history,
@@ -75,34 +74,7 @@ def test_a_trial_goes_where_the_environment_says(runs: Path, tmp_path: Path, mon
     assert not (tmp_path / "mlflow.db").exists()
     (run,) = [run for run in found_runs(connect(None, runs), "tracked") if run.data.tags["seed"] == "20"]
     assert run.info.status == "FINISHED"
-    assert run.data.tags["mlflow.source.name"] == Path(sys.argv[0]).name
     assert run.data.tags["mlflow.user"] == getpass.getuser()
-
-
-def git(folder: Path, *words: str) -> str:
-    identity = ("-c", "user.name=x", "-c", "user.email=x@localhost", "-c", "commit.gpgsign=false")
-    return subprocess.run(
-        ["git", "-C", str(folder), *identity, *words], check=True, capture_output=True, text=True
-    ).stdout
-
-
-@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
-def test_commit_and_dirty_flag_are_those_of_the_folder_that_one_works_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    git(tmp_path, "init")
-    (tmp_path / "mine.py").write_text("x = 1\n")
-    git(tmp_path, "add", ".")
-    git(tmp_path, "commit", "-m", "first")
-    (tmp_path / "notes.txt").touch()  # untracked: no part of the code
-    monkeypatch.chdir(tmp_path)
-    tags = source_tags("gsbench")
-    assert tags["mlflow.source.git.commit"] == git(tmp_path, "rev-parse", "HEAD").strip()
-    assert tags["mlflow.source.git.dirty"] == "false"
-    (tmp_path / "mine.py").write_text("x = 2\n")
-    assert source_tags("gsbench")["mlflow.source.git.dirty"] == "true"
-    monkeypatch.setenv("PATH", str(tmp_path))  # no git
-    assert source_tags("gsbench") == {"mlflow.source.type": "LOCAL", "mlflow.source.name": "gsbench"}
 
 
 def test_a_failed_run_holds_its_reason_until_it_is_mended(runs: Path) -> None:
@@ -143,24 +115,11 @@ def test_the_mirror_of_a_moved_runs_folder_is_made_again_from_the_files(runs: Pa
         mirror_trial(options(), folder, values)
     (moved / "mlflow.db").unlink()
     shutil.rmtree(moved / "mlartifacts")
-    said = list(sync([TrialFolder(folder)], None))  # by a process that has not opened the old one
-    assert said == [f"mirrored {TrialFolder(folder).label}", "1 trial mirrored, 0 were"]
+    command = [sys.executable, "-m", "gsbench.cli", "sync", "tracked"]  # a process that has not opened the old one
+    environment = child_environment() | {"GSBENCH_RUNS": str(moved)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
+    assert f"mirrored {TrialFolder(folder).label}" in done.stdout.splitlines(), done.stderr
     assert list((moved / "mlartifacts" / "tracked").rglob("results.json"))
-
-
-def test_the_comparison_shows_final_metrics_first(runs: Path) -> None:
-    client, run = mirrored(runs, seed=29)
-    url = address_of("http://127.0.0.1:5000", default_uri(runs), runs, "tracked")
-    assert f"/experiments/{run.info.experiment_id}/runs?viewStateShareKey=gsbench&" in url
-    view = json.loads(client.get_experiment(run.info.experiment_id).tags["mlflow.sharedViewState.gsbench"])
-    assert view["runsHiddenMode"] == "SHOW_ALL"  # not the ten youngest alone
-    (section,) = view["compareRunSections"]
-    assert {chart["metricSectionId"] for chart in view["compareRunCharts"]} == {section["uuid"]}
-    bars = [chart["metricKey"] for chart in view["compareRunCharts"] if chart["type"] == "BAR"]
-    assert bars[0] == "psnr"
-    assert {"psnr", "num_gaussians", "seconds_train"} <= set(bars) & run.data.metrics.keys()
-    with pytest.raises(InputError, match=r"no experiment 'nothing'; it has .*tracked"):
-        address_of("http://127.0.0.1:5000", default_uri(runs), runs, "nothing")
 
 
 def test_a_run_that_was_deleted_is_mirrored_anew(runs: Path) -> None:

@@ -65,24 +65,3 @@ def test_eight_jobs_at_once_on_a_new_sqlite_database(tmp_path: Path) -> None:
 def test_eight_jobs_at_once_on_a_new_postgresql_database(tmp_path: Path, postgresql: str) -> None:
     run_jobs(tmp_path, postgresql)
     check_jobs(connect(postgresql, tmp_path))
-
-
-def test_machines_that_share_no_folder_create_one_experiment(tmp_path: Path, postgresql: str) -> None:
-    """No file lock is shared: the database itself has to keep them apart."""
-    code = (
-        "import sys\nfrom pathlib import Path\nfrom gsbench.tracking import connect, ensure_experiment\n"
-        "runs = Path(sys.argv[2]); runs.mkdir()\nprint(ensure_experiment(connect(sys.argv[1], runs), 'shared', runs))"
-    )
-    jobs = [
-        subprocess.Popen(
-            [sys.executable, "-c", code, postgresql, str(tmp_path / f"machine{i}")],
-            env=child_environment(),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for i in range(4)
-    ]
-    outputs = [job.communicate(timeout=240) for job in jobs]
-    assert [job.returncode for job in jobs] == [0] * 4, [error[-500:] for _, error in outputs]
-    assert len({out.strip().splitlines()[-1] for out, _ in outputs}) == 1

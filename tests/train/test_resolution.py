@@ -18,7 +18,7 @@ from gsbench.events import RefineEvent
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster import create_rasterizer
 from gsbench.raster.base import Rasterizer
-from gsbench.runs.hashing import config_hash
+from gsbench.runs.keys import config_hash
 from gsbench.scene.types import Scene, View
 from gsbench.train.options import TrainConfig
 from gsbench.train.resolution import Levels, Pictures, Resolution, levels

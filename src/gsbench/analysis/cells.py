@@ -16,7 +16,7 @@ from gsbench.analysis.differences import (
 from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.results import TrialResult, by_key
 from gsbench.errors import InputError
-from gsbench.runs.hashing import NOT_HASHED
+from gsbench.runs.keys import NOT_HASHED
 
 K = TypeVar("K", bound=Hashable)
 

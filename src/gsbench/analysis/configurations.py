@@ -18,7 +18,7 @@ from typing import Any
 import yaml
 
 from gsbench.parsing import DamagedError
-from gsbench.runs.hashing import NOT_HASHED, flatten
+from gsbench.runs.keys import NOT_HASHED, flatten
 from gsbench.runs.layout import CONFIG
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.install import conf_dir

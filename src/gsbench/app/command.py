@@ -7,34 +7,27 @@ Before Hydra runs, one look at the whole configuration refuses what cannot be (`
 from __future__ import annotations
 
 import logging
-import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
-from hydra.types import HydraContext, RunMode
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsbench.config.command_words import check_words, is_sweep, parse, parse_word
-from gsbench.config.compose import Trial, compose_whole, look_at, ready_trial
+from gsbench.analysis.quantities import COSTS
+from gsbench.config.command_words import check_words, is_sweep, parse
+from gsbench.config.compose import Trial, compose_whole, look_at, ready_trial, typed
 from gsbench.config.hydra_entry import explained, hydra_ready, run_main
-from gsbench.config.jobs import typed
-from gsbench.config.trust import PERMISSIONS, check_composed, load_callbacks
+from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import GsbenchError, InputError
+from gsbench.eval.options import EvalConfig
 from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.serial import Outcome
-from gsbench.logs import set_up_logging
-from gsbench.system.own_modules import allow_modules
-
-OWN = "gsbench"  # the names of gsbench's own launcher and sweeper
-OWN_FOLDER = {"dir": "${runs}/.hydra", "subdir": "."}  # of Hydra's files of a sweep, as conf/config.yaml has it
 
 log = logging.getLogger(__name__)
 
@@ -59,57 +52,55 @@ def compose_trials(words: Sequence[str], multirun: bool = False) -> list[Trial]:
     return task.trials
 
 
+def first_trials(verb: str, settings: Sequence[str], metric: str) -> dict[str, Trial]:
+    """A trial of each scene for a verb that holds two versions of one trainer against each other (gate, bisect).
+
+    Raises InputError for settings that make more than one arm, and for a metric that they do not compute.
+    """
+    keys = [word.partition("=")[0].lstrip("+") for word in settings]
+    if given := [key for key in keys if key in ("seed", "eval.primary")]:
+        raise InputError(f"{verb}: {given[0]} follows from the other words: leave it out")
+    trials = compose_trials([*settings, "seed=0", *([] if "name" in keys else [f"name={verb}"])], multirun=True)
+    by_scene = {trial.values["scene"]["name"]: trial for trial in trials}
+    if len(by_scene) < len(trials):
+        raise InputError(f"{verb} is about one arm: only scene may list values")
+    if not trials[0].values["launch"]["wait"]:
+        raise InputError(f"{verb} needs results to go on: leave launch.wait=false out")
+    if metric not in COSTS:
+        EvalConfig(**trials[0].values["eval"] | {"primary": metric})
+    return by_scene
+
+
 def run_trials(trials: Sequence[Trial]) -> int:
     """Run what is not done among ``trials`` by the launcher that they name; the exit code."""
     return summarize(run_batch(trials), trials)
-
-
-class StopAfterListing(GsbenchError):  # noqa: N818 - it is no error
-    """Signal that the trials were listed, and that none is to be run."""
 
 
 @dataclass
 class Task:
     """The function that Hydra runs. ``handle`` runs trials; where it shall ``look_only``, it says what would run.
 
-    ``allowed`` is what the command line permits, with the user's modules in ``folder``; ``grids`` are what gsbench's
-    sweeper joins. ``trials`` and ``outcomes`` are what has come together, over all batches of a sweep.
+    ``allowed`` is what the command line permits, ``grids`` are what gsbench's sweeper joins. ``trials`` and
+    ``outcomes`` are what has come together, over all batches of a sweep.
     """
 
     handle: Callable[[Sequence[Trial]], list[Outcome]]
     look_only: bool = False
     allowed: tuple[str, ...] = ()
-    folder: str = field(default_factory=os.getcwd)
     grids: Any = None
     trials: list[Trial] = field(default_factory=list)
     outcomes: list[Outcome] = field(default_factory=list)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Task, (self.handle, self.look_only, self.allowed, self.folder)  # nothing of what came together here
-
     def __call__(self, config: DictConfig) -> None:
-        """One trial, as Hydra or another launcher calls it, perhaps in a process of its own; raises how it failed."""
-        allow_modules(self.allowed, self.folder)
-        set_up_logging()
-        hydra: Any = HydraConfig.instance().cfg
-        # A job's files may say other things of Hydra than those that were looked at.
-        check_composed(hydra, self.allowed)
-        for_hydra, words = typed(hydra.hydra.overrides)
-        (outcome,) = self.handle([ready_trial(look_at(config, self.allowed), [*for_hydra, *words])])
-        if outcome.status == "failed":
-            raise (InputError if outcome.bad_input else GsbenchError)(outcome.message)
-        if hydra.hydra.mode == RunMode.RUN:
-            self.outcomes.append(outcome)  # those of a sweep its launcher tells
+        """One trial, as Hydra calls it."""
+        given: Any = HydraConfig.get().overrides
+        for_hydra, words = typed(given)
+        self.launch([ready_trial(look_at(config, self.allowed), [*for_hydra, *words])])
 
     def launch(self, trials: Sequence[Trial]) -> None:
-        """Run a batch of trials; raises GsbenchError where no other trial can succeed either."""
+        """Run a batch of trials."""
         self.trials += trials
-        outcomes = self.handle(trials)
-        if self.look_only:
-            raise StopAfterListing
-        self.outcomes += outcomes
-        if fatal := next((outcome for outcome in outcomes if outcome.fatal), None):
-            raise (InputError if fatal.bad_input else GsbenchError)(fatal.message)
+        self.outcomes += self.handle(trials)
 
 
 def run_app(words: Sequence[str], multirun: bool, task: Task) -> None:
@@ -121,37 +112,17 @@ def run_app(words: Sequence[str], multirun: bool, task: Task) -> None:
     swept = [word for word in words if is_sweep(word)]
     with hydra_ready():
         config = compose_whole([*words, "hydra.mode=MULTIRUN"] if multirun else words)
-        multirun = config.hydra.mode == RunMode.MULTIRUN
-        if swept and not multirun:
-            raise InputError(f"{swept[0]} lists several values: add -m to run one trial for each")
-        with explained(words):
-            check_hydra_settings(config, multirun)
-        task.allowed = tuple(config[PERMISSIONS])
-        task.grids = OmegaConf.to_container(config.hydra.sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
-        # Hydra would resolve ${…} in the grids when it makes the sweeper; there it is for each trial to do.
-        chosen = [*words, *["hydra.sweeper.grids=[]"] * bool(task.grids)]
-        trial = None if multirun else ready_trial(config, words)
-        if task.look_only:
-            try:
-                _look(config, chosen, trial, task)
-            except StopAfterListing:
-                return
-        task.trials += [] if trial is None else [trial]
-        load_callbacks(config, task.allowed)
-    with explained(words, (HydraException, OmegaConfBaseException, OSError)):  # such as of a folder for Hydra's files
-        run_main(task, [*chosen, f"hydra.mode={(RunMode.MULTIRUN if multirun else RunMode.RUN).name}"], task.allowed)
-
-
-def _look(config: DictConfig, words: Sequence[str], trial: Trial | None, task: Task) -> None:
-    """Say what would run: a single trial, or those of a sweep as far as its sweeper knows; no callback hears of it."""
-    if trial is not None:
-        task.launch([trial])
-    if task.grids:
-        config = compose_whole([*words, "hydra.mode=MULTIRUN"])
+    multirun = config.hydra.mode == RunMode.MULTIRUN
+    if swept and not multirun:
+        raise InputError(f"{swept[0]} lists several values: add -m to run one trial for each")
     with explained(words):
-        context = HydraContext(GlobalHydra.instance().config_loader(), None)  # type: ignore[arg-type]
-        sweeper = Plugins.instance().instantiate_sweeper(hydra_context=context, task_function=task, config=config)
-        sweeper.sweep(arguments=[word for word in words if not parse_word(word).is_hydra_override()])
+        check_sweep_settings(config, multirun)
+    task.allowed = tuple(config[PERMISSIONS])
+    task.grids = OmegaConf.to_container(config.hydra.sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
+    # Hydra would resolve ${…} in the grids when it makes the sweeper; there it is for each trial to do.
+    chosen = [*words, *["hydra.sweeper.grids=[]"] * bool(task.grids)]
+    with explained(words, (HydraException, OmegaConfBaseException, OSError)):
+        run_main(task, [*chosen, f"hydra.mode={(RunMode.MULTIRUN if multirun else RunMode.RUN).name}"])
 
 
 def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
@@ -163,41 +134,18 @@ def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
     return []
 
 
-def check_hydra_settings(config: DictConfig, multirun: bool) -> None:
-    """Refuse of Hydra's own settings what cannot be, wherever it was said: on the command line or in a file."""
-    hydra, launcher = config.hydra, config.hydra.runtime.choices["hydra/launcher"]
-    if hydra.job.chdir:
-        raise InputError(
-            "hydra.job.chdir=true: trials run in the folder where the command was given, and paths start there; "
-            "${hydra:runtime.output_dir} names Hydra's folder"
-        )
-    if not multirun and hydra.mode is None and (hydra.sweeper.get("params") or hydra.sweeper.get("grids")):
+def check_sweep_settings(config: DictConfig, multirun: bool) -> None:
+    """Refuse what goes with a sweep alone where there is none, and parameters of a sweep that are no mapping."""
+    sweeper = config.hydra.sweeper
+    params = sweeper.get("params")
+    if not multirun and config.hydra.mode is None and (params or sweeper.get("grids")):
         raise InputError("hydra.sweeper lists values: add -m to run a trial for each, or hydra.mode=RUN for one")
-    if not multirun and launcher != OWN:
-        raise InputError(f"hydra/launcher={launcher} launches sweeps: add -m, or leave it out")
-    params = hydra.sweeper.get("params")
     if params is not None and not OmegaConf.is_dict(params):
         raise InputError(
             f"hydra.sweeper.params={params} must map settings to their values; seed=0,1 can be typed itself"
         )
-    if launcher != OWN and config.launch.name != "serial":
-        raise InputError(f"hydra/launcher={launcher} and launch={config.launch.name} are two launchers: choose one")
-    if multirun and launcher == OWN and (unread := _read_by_jobs_of_hydra(hydra)):
-        raise InputError(f"{unread}: in a sweep only Hydra's own launcher reads it: add hydra/launcher=basic")
     if config.launch.stop_when_decided and not multirun:
         raise InputError("launch.stop_when_decided adds seeds to a sweep: add -m, two densifiers and seed=0,1,2,3")
-
-
-def _read_by_jobs_of_hydra(hydra: DictConfig) -> str:
-    """The first setting that acts where Hydra runs a job, which gsbench's launcher does not ask it to; "" for none."""
-    raw: Any = OmegaConf.to_container(hydra, resolve=False)
-    given = {
-        "hydra.callbacks": raw["callbacks"],
-        "hydra.job.env_set": raw["job"]["env_set"],
-        "hydra.output_subdir": raw["output_subdir"],
-        "hydra.sweep": raw["sweep"] != OWN_FOLDER,
-    }
-    return next((name for name, value in given.items() if value), "")
 
 
 def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
@@ -206,10 +154,8 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
     A single trial's failure is raised, so that it is the one line that the program prints.
     """
     failed = [outcome for outcome in outcomes if outcome.status == "failed"]
-    fatal = next((outcome for outcome in failed if outcome.fatal), None)
-    if failed and (fatal or len(outcomes) == 1):
-        worst = fatal or failed[0]
-        raise (InputError if worst.bad_input else GsbenchError)(worst.message)
+    if failed and len(outcomes) == 1:
+        raise (InputError if failed[0].bad_input else GsbenchError)(failed[0].message)
     for outcome in failed:
         print(f"gsbench: failed: {outcome.label}: {outcome.message}", file=sys.stderr)
     name = trials[-1].values["name"]  # a tuning comes before, in experiments of its own

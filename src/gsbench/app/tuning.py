@@ -11,6 +11,7 @@ killed asks it from the first point on again, and finds what was trained in the 
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import math
 import statistics
@@ -25,13 +26,15 @@ from omegaconf import OmegaConf
 from pydantic import NonNegativeInt, PositiveInt
 
 from gsbench.app.grids import bare, grid, text_of
+from gsbench.claims.stopping import facts_for
 from gsbench.config.command_words import check_makes_trials, key_of, parse_word
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
-from gsbench.eval.facts import find, known_keys
+from gsbench.eval.facts import known_keys
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.runs.declaration import metric_and_question
 from gsbench.runs.experiments import Point, TuningRecord, make_home
+from gsbench.runs.keys import flatten
 from gsbench.runs.layout import TUNING
 from gsbench.settings import check_settings
 from gsbench.system.install import install_command
@@ -53,7 +56,6 @@ SEED = "seed"
 MEASURED_ON = ("scene", "eval", "launch", "tracking", "hydra")  # groups that no arm may tune: they say how it is judged
 REPLACED = (SEED, "name", "scene.validation", "eval.primary")  # words of a job that a point's trials have otherwise
 DIGITS = 4  # significant digits of a value: a name for it that people can type
-DIRECTIONS: dict[int, Literal["maximize", "minimize"]] = {1: "maximize", -1: "minimize"}
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,6 @@ class TuneSettings:
     points: NonNegativeInt = DEFAULT_POINTS
     at_once: PositiveInt = 1  # points of an arm that are chosen before the next result is known
     metric: str | None = None  # None: eval.primary, else PSNR
-    direction: Literal["maximize", "minimize"] | None = None
     seed: int | str = 100
 
     def __post_init__(self) -> None:
@@ -75,16 +76,10 @@ class TuneSettings:
 
 @dataclass(frozen=True)
 class Goal:
-    """The measure of a good point: ``metric``, better where there is more of it (``sign`` 1) or less (-1).
-
-    ``points`` are all of an arm, ``at_once`` of them proposed before the next result is known; each is judged by the
-    mean of its trials with ``seeds``.
-    """
+    """The measure of a good point: the mean of ``metric`` over its trials with ``seeds``, times ``sign``."""
 
     metric: str
     sign: Literal[-1, 1]
-    points: int
-    at_once: int
     seeds: tuple[int, ...]
 
 
@@ -98,8 +93,9 @@ class Search:
 
     arm: str
     home: Path
+    settings: TuneSettings
     goal: Goal
-    texts: Mapping[str, str]
+    intervals: Mapping[str, Override]
     ranges: Mapping[str, BaseDistribution]
     jobs: Sequence[Sequence[str]]
     scenes: Sequence[str]
@@ -112,15 +108,16 @@ class Search:
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        sampler = optuna.samplers.TPESampler(seed=0, constant_liar=self.goal.at_once > 1)
-        study = optuna.create_study(direction=DIRECTIONS[self.goal.sign], sampler=sampler)
+        sampler = optuna.samplers.TPESampler(seed=0, constant_liar=self.settings.at_once > 1)
+        direction: Literal["maximize", "minimize"] = "maximize" if self.goal.sign > 0 else "minimize"
+        study = optuna.create_study(direction=direction, sampler=sampler)
         if self.first is not None:
             study.enqueue_trial(dict(self.first))
         return study
 
     def propose(self) -> list[Proposal]:
         """The next points; none where all are judged."""
-        count = min(self.goal.at_once, self.goal.points - len(self.points))
+        count = min(self.settings.at_once, self.settings.points - len(self.points))
         return [self.study.ask(dict(self.ranges)) for _ in range(count)]
 
     def jobs_of(self, values: Mapping[str, Any]) -> list[list[str]]:
@@ -151,10 +148,10 @@ class Search:
             arm=self.arm,
             metric=self.goal.metric,
             direction=self.goal.sign,
-            wanted=self.goal.points,
+            wanted=self.settings.points,
             seeds=list(self.goal.seeds),
             scenes=list(self.scenes),
-            ranges=dict(self.texts),
+            ranges={key: text_of(one) for key, one in self.intervals.items()},
             log=[key for key, one in self.ranges.items() if getattr(one, "log", False)],
             as_it_is=self.first is not None,
             points=self.points,
@@ -203,13 +200,13 @@ def _search(begun: Sweep, searches: Sequence[Search]) -> bool:
             return False
         if missing:
             _write(searches)  # what is searched stands there before it is trained
-            begun.launch(missing)
+            begun.task.launch(missing)
         for (search, proposal), own in zip(asked, of_points, strict=True):
             point = search.judge(proposal, own)
             if missing:
                 came = "failed" if point.value is None else f"{point.value:.5g}"
                 where, number = ", ".join(words_of_values(point.settings)), len(search.points)
-                place = f"{search.home.name}: point {number} of {search.goal.points}"
+                place = f"{search.home.name}: point {number} of {search.settings.points}"
                 log.info("%s: %s: %s %s", place, where, search.goal.metric, came)
     if not begun.task.look_only:
         _write(searches)
@@ -241,13 +238,13 @@ def _best_words(search: Search) -> list[str]:
 
 def _describe(searches: Sequence[Search]) -> str:
     """A line that a dry run prints of the searches."""
-    goal, scenes = searches[0].goal, searches[0].scenes
-    each = {search.arm: len(search.jobs) * len(goal.seeds) for search in searches if search.ranges}
+    one = searches[0]
+    trials = {search.arm: len(search.jobs) * len(one.goal.seeds) for search in searches if search.ranges}
     left = [search.arm for search in searches if not search.ranges]
     return (
-        f"tunes first: {counted(goal.points, 'point')} each for {listed(list(each))}, by {goal.metric} of validation "
-        f"views on {listed(scenes)} with {counted(len(goal.seeds), 'seed')}, {sum(each.values()) * goal.points} "
-        "trainings" + (f"; not tuned: {listed(left)}" if left else "")
+        f"tunes first: {counted(one.settings.points, 'point')} each for {listed(list(trials))}, by {one.goal.metric} "
+        f"of validation views on {listed(one.scenes)} with {counted(len(one.goal.seeds), 'seed')}, "
+        f"{sum(trials.values()) * one.settings.points} trainings" + (f"; not tuned: {listed(left)}" if left else "")
     )
 
 
@@ -264,7 +261,8 @@ def _plan(
 
     Raises InputError for what cannot be searched.
     """
-    _check_installed()
+    if importlib.util.find_spec("optuna") is None:
+        raise InputError(f"a search needs Optuna: {install_command('search')}")
     homes = {trial.files.home for trial in trials}
     if len(homes) > 1:
         raise InputError(f"{PLACE}: all trials of the sweep need one name, got {listed(sorted(h.name for h in homes))}")
@@ -285,53 +283,37 @@ def _plan(
             Search(
                 arm=name,
                 home=home.with_name(f"{home.name}-tune-{name}"),
+                settings=wanted,
                 goal=goal,
-                texts={key: text_of(one) for key, one in given.items()},
+                intervals=given,
                 ranges=ranges,
                 jobs=list(dict.fromkeys(own)),
                 scenes=list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
-                first=_as_it_is(trials[places[0]].values, ranges),
+                first=_own_values(trials[places[0]].values, ranges),
             )
         )
     return searches
 
 
-def _check_installed() -> None:
-    """Raise InputError, one line that says what to install, where Optuna is not."""
-    try:
-        import optuna  # noqa: F401
-    except ImportError:
-        raise InputError(f"a search needs Optuna: {install_command('search')}") from None
-
-
 def _goal(wanted: TuneSettings, trials: Sequence[Trial]) -> Goal:
+    """Raises InputError for a metric that is not known, or of which it is not known whether more of it is better."""
+    values = trials[0].values
     declared = {str(trial.values["eval"].get("primary") or "") for trial in trials}
     primary = metric_and_question(declared.pop())[0] if len(declared) == 1 else ""
     metric = wanted.metric or primary or DEFAULT_METRIC
+    known = (*known_keys(), *(values["eval"].get("extra") or ()))
+    if metric not in known:
+        raise InputError(f"{PLACE}.metric={metric}: there is no such metric{closest(metric, known)}")
+    sign = facts_for(metric, values).direction
+    if not sign:
+        raise InputError(f"{PLACE}.metric={metric}: whether more or less of it is better is not known")
     try:
         seeds = tuple(int(text.partition("=")[2]) for (text,) in grid([parse_word(f"{SEED}={wanted.seed}")]))
     except ValueError:
         raise InputError(f"{PLACE}.seed must list whole numbers, as 100,101, got {wanted.seed!r}") from None
     if both := sorted(set(seeds) & {trial.values["seed"] for trial in trials}):
         raise InputError(f"{PLACE}.seed: {listed(list(map(str, both)))} is a seed of the sweep, too: tune with others")
-    return Goal(metric, _sign_of(metric, wanted.direction), wanted.points or 0, wanted.at_once, seeds)
-
-
-def _sign_of(metric: str, direction: str | None) -> Literal[-1, 1]:
-    """The sign of a metric, 1 where more of it is better, -1 where less: its own, else the ``direction`` given.
-
-    Raises InputError for a metric that is not known, and for one that goes the other way.
-    """
-    facts = find(metric)
-    own = direction if facts is None else DIRECTIONS.get(facts.direction, direction)
-    if own is None:
-        raise InputError(
-            f"{PLACE}.metric={metric} is not a metric whose direction is known{closest(metric, known_keys())} "
-            f"(choose: {', '.join(known_keys())}; for a metric of your own give {PLACE}.direction, too)"
-        )
-    if facts is not None and direction not in (None, own):
-        raise InputError(f"{PLACE}.direction={direction}: {facts.label} is better the other way; leave direction out")
-    return 1 if own == DIRECTIONS[1] else -1
+    return Goal(metric, 1 if sign > 0 else -1, seeds)
 
 
 # ---- ranges
@@ -361,26 +343,18 @@ def distribution(override: Override) -> BaseDistribution:
         raise InputError(f"{override.input_line}: {error}") from error
 
 
-def _as_it_is(values: Mapping[str, Any], ranges: Mapping[str, BaseDistribution]) -> dict[str, Any] | None:
+def _own_values(values: Mapping[str, Any], ranges: Mapping[str, BaseDistribution]) -> dict[str, Any] | None:
     """The arm's own values of what is searched; None where the ranges lack one, or nothing is searched."""
-    found: dict[str, Any] = {}
-    for key, one in ranges.items():
-        value: Any = values
-        for part in bare(key).split("."):
-            value = value.get(part) if isinstance(value, Mapping) else None
-        if (own := _in_range(value, one)) is None:
-            return None
-        found[key] = own
-    return found or None
+    settings = flatten(values)
+    found = {key: settings.get(bare(key)) for key in ranges}
+    return found if found and all(_is_in(found[key], one) for key, one in ranges.items()) else None
 
 
-def _in_range(value: Any, one: Any) -> Any:
-    """The value as the range ``one`` has it; None where that lacks it."""
+def _is_in(value: Any, one: Any) -> bool:
+    """Return whether the range ``one`` has a value, as a point's trials would have it."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not one.low <= value <= one.high:
-        return None
-    if isinstance(one.low, int):
-        return value if isinstance(value, int) else None
-    return float(value) if _rounded(float(value)) == value else None
+        return False
+    return isinstance(value, int) if isinstance(one.low, int) else _rounded(float(value)) == value
 
 
 def words_of_values(values: Mapping[str, Any]) -> list[str]:

@@ -58,8 +58,8 @@ def choose_switches(found: Mapping[str, Switch], names: Sequence[str], densify: 
             )
     if not found:
         raise InputError(
-            f"densify={densify} declares no switch that is on: name one by --switch NAME:KEY=VALUE, where the setting "
-            "turns a part off (docs/claims.md)"
+            f"densify={densify} declares no switch that is on: name one by +densify.switches.NAME.off.KEY=VALUE, where "
+            "the setting turns a part off (docs/claims.md)"
         )
     chosen = {name: found[name] for name in names or found}
     if len(chosen) > MAX_SWITCHES:

@@ -18,8 +18,7 @@ from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.file import Claim, ClaimsFile
 from gsbench.claims.stopping import Planned, trials_of_look
-from gsbench.config.compose import Trial, compose_one
-from gsbench.config.jobs import with_seed
+from gsbench.config.compose import Trial, compose_one, with_seed
 from gsbench.errors import InputError
 from gsbench.records import read_if_sound
 from gsbench.runs.declaration import Declaration, declared_now, read_declarations, standing_one

@@ -25,7 +25,7 @@ from gsbench.analysis.statistics import ALPHA, Interval, student
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Question
-from gsbench.runs.hashing import sha256_of
+from gsbench.runs.keys import sha256_of
 
 MIN_STUDIES = 2
 

@@ -24,7 +24,7 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find
 from gsbench.runs.declaration import Declaration, Question, declared_now
-from gsbench.runs.hashing import flatten
+from gsbench.runs.keys import flatten
 from gsbench.runs.layout import SEED
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord

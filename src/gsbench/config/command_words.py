@@ -16,7 +16,7 @@ from hydra.errors import HydraException
 from gsbench.config.schema import COMPONENTS
 from gsbench.config.trust import PACKAGE, PERMISSIONS, is_allowed, to_type
 from gsbench.errors import InputError
-from gsbench.runs.hashing import DECLARED, NOT_HASHED, WITHOUT_EFFECT
+from gsbench.runs.keys import DECLARED, NOT_HASHED, WITHOUT_EFFECT
 from gsbench.system.install import conf_dir
 from gsbench.words import closest
 
@@ -208,10 +208,15 @@ def check_sweep(override: Override) -> None:
 def check_makes_trials(override: Override) -> None:
     """Raise InputError for a setting whose values would all give one and the same trial."""
     key = override.get_key_element().lstrip("+~")
+    if not makes_other_trials(key):
+        raise InputError(f"{override.input_line}: {key} does not make a different trial, so choose one value")
+
+
+def makes_other_trials(key: str) -> bool:
+    """Return whether each value of a setting has a trial of its own."""
     first, _, last = key.partition(".")
     without_effect = last in (*WITHOUT_EFFECT, *DECLARED.get(first, ()))
-    if (first in NOT_HASHED and first not in NAMED_APART) or without_effect:
-        raise InputError(f"{override.input_line}: {key} does not make a different trial, so choose one value")
+    return not without_effect and (first not in NOT_HASHED or first in NAMED_APART)
 
 
 def options(group: str, folders: Sequence[Path] = ()) -> list[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Annotated, Any, Literal
@@ -140,8 +140,6 @@ GROUP_SCHEMAS: dict[str, type] = {
     "launch": LaunchConfig,
 }
 COMPONENTS = ("init", "densify")  # groups whose keys are the options of a class
-# Settings of a schema, as they are given, and the name of their group: the same settings, allowed and converted.
-Check = Callable[[type, Mapping[str, Any], str], dict[str, Any]]
 
 
 @cache
@@ -155,7 +153,7 @@ def register_schemas() -> None:
 
 @cache
 def _names_and_defaults(schema: type) -> type:
-    """A dataclass for Hydra with the fields of ``schema`` and no types: what values are allowed is said by `check`."""
+    """A dataclass for Hydra with the fields of ``schema`` and no types: `checked_values` says what is allowed."""
     fields: list[tuple[str, Any, Any]] = []
     for entry in dataclasses.fields(schema):
         factory: Any = entry.default_factory
@@ -167,31 +165,43 @@ def _names_and_defaults(schema: type) -> type:
     return dataclasses.make_dataclass(schema.__name__, fields)
 
 
-def check(config: DictConfig) -> None:
-    """Hold the values of a composed configuration against their schemas and each other, and convert them (``1e3``).
+def checked_values(config: DictConfig) -> dict[str, Any]:
+    """The resolved values of a composed configuration, without Hydra's: converted (``1e3``), and held against their
+    schemas and each other.
 
     The classes that ``init`` and ``densify`` name check their own options when they are made. Raises InputError naming
     the key.
     """
+    values = plain(config)
+    for group in (*GROUP_SCHEMAS, *COMPONENTS):
+        if not isinstance(values.get(group), dict):
+            raise InputError(f"{group} must be chosen, as {group}=NAME (see gsbench --help), got {values.get(group)!r}")
     for group, schema in GROUP_SCHEMAS.items():
-        _convert(config[group], schema, _settings_of(config, group), group, _made)
-    groups = (*GROUP_SCHEMAS, *COMPONENTS)
-    _convert(config, Config, {str(key): _unwrapped(config[key]) for key in config if key not in groups}, "", checked)
+        given = values[group]
+        require_values(given, group)
+        if given.get("_target_") is not None:  # the others are options of a user's own class
+            given = {key: given.get(key) for key in ("name", "_target_")}
+        _require_all(schema, given, f"{group}.")
+        values[group] |= plain(_made(schema, given, group))
+    root = {key: value for key, value in values.items() if key not in (*GROUP_SCHEMAS, *COMPONENTS)}
+    _require_all(Config, values, "")
+    values |= checked(Config, root, "")
     for group in COMPONENTS:
-        values = _group(config, group)
-        checked(ComponentConfig, {key: values.get(key) for key in ("name", "_target_")}, group)
-    if late := [step for step in config.eval.at if step > config.train.iterations]:
-        raise InputError(f"eval.at names iteration {late[0]}, and train.iterations is {config.train.iterations}")
-    if config.scene.transparent == "white" and list(config.train.background) != [1, 1, 1]:
+        checked(ComponentConfig, {key: values[group].get(key) for key in ("name", "_target_")}, group)
+    scene, train, densify, launch = values["scene"], values["train"], values["densify"], values["launch"]
+    if late := [step for step in values["eval"]["at"] if step > train["iterations"]]:
+        raise InputError(f"eval.at names iteration {late[0]}, and train.iterations is {train['iterations']}")
+    if scene["transparent"] == "white" and train["background"] != [1, 1, 1]:
         raise InputError(
             "scene.transparent=white: the model must be rendered over white, too: add train.background=[1,1,1]"
         )
-    if config.train.iterations == 0 and config.densify.get("_target_") != NO_DENSIFIER:
+    if train["iterations"] == 0 and densify.get("_target_") != NO_DENSIFIER:
         raise InputError("train.iterations=0 trains nothing, so nothing grows: add densify=none")
-    if is_external(config.densify):
-        check_external(config)
-    if config.launch.parallel == "auto":
-        config.launch.parallel = trials_at_once(config.densify.get("max_gaussians"), config.device)
+    if is_external(densify):
+        check_external(values)
+    if launch["parallel"] == "auto":
+        launch["parallel"] = trials_at_once(densify.get("max_gaussians"), values["device"])
+    return values
 
 
 def _made(schema: type, given: Mapping[str, Any], group: str) -> dict[str, Any]:
@@ -202,6 +212,13 @@ def _made(schema: type, given: Mapping[str, Any], group: str) -> dict[str, Any]:
             raise InputError(unknown_setting(f"{group}.{name}", name, known))
     made = schema(**given)
     return {name: getattr(made, name) for name in given}
+
+
+def _require_all(schema: type, given: Mapping[str, Any], prefix: str) -> None:
+    """Raise InputError for the first setting of ``schema`` that was taken away (``~train.iterations``)."""
+    for name in (entry.name for entry in dataclasses.fields(schema)):
+        if name not in given and name != "_target_":
+            raise InputError(f"{prefix}{name} was removed: give it a value instead")
 
 
 def require_values(values: Mapping[str, Any], group: str) -> None:
@@ -215,55 +232,24 @@ def require_values(values: Mapping[str, Any], group: str) -> None:
             raise InputError(f"{group}.{key} is not set: give it a value{whose}")
 
 
-def _settings_of(config: DictConfig, group: str) -> dict[str, Any]:
-    """The values of a group that its schema knows: all, but for those that are options of a user's own class."""
-    values = _group(config, group)
-    require_values(values, group)
-    return {key: values.get(key) for key in ("name", "_target_")} if values.get("_target_") is not None else values
-
-
-def _group(config: DictConfig, group: str) -> dict[str, Any]:
-    node = config.get(group)
-    if not isinstance(node, DictConfig):
-        raise InputError(f"{group} must be chosen, as {group}=NAME (see gsbench --help), got {node!r}")
-    return plain(node)
-
-
-def _unwrapped(value: Any) -> Any:
-    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-
-
-def _convert(node: DictConfig, schema: type, given: Mapping[str, Any], group: str, check_group: Check) -> None:
-    """Hold ``given``, what ``node`` has, against the fields of ``schema``, and convert it in ``node``."""
-    prefix = f"{group}." if group else ""
-    for name in (entry.name for entry in dataclasses.fields(schema)):
-        if name not in given and name != "_target_" and name not in GROUP_SCHEMAS and name not in COMPONENTS:
-            raise InputError(f"{prefix}{name} was removed: give it a value instead")
-    for key, value in check_group(schema, given, group).items():
-        if isinstance(value, tuple) and isinstance(given[key], list):  # OmegaConf 2.3 knows no tuples, 2.4 does
-            value = list(value)
-        if repr(value) != repr(given[key]):
-            node[key] = value
-
-
-def check_external(config: DictConfig) -> None:
+def check_external(values: Mapping[str, Any]) -> None:
     """Check what another program is asked for; raises InputError for what it cannot give."""
-    settings = _group(config, "densify")
-    require_values(settings, "densify")
-    if config.eval.at:
+    require_values(values["densify"], "densify")
+    if values["eval"]["at"]:
         raise InputError("eval.at: another program shows its model only at the end: leave eval.at empty")
-    if config.train.max_seconds is not None:
+    if values["train"]["max_seconds"] is not None:
         raise InputError("train.max_seconds: another program cannot be stopped early: give it fewer train.iterations")
-    if config.train.resolution_schedule != "none":
+    if values["train"]["resolution_schedule"] != "none":
         raise InputError("train.resolution_schedule: another program has its own sizes: leave it at none")
 
 
-def plain(config: DictConfig) -> dict[str, Any]:
-    """The resolved configuration as plain Python, of the types that JSON has: OmegaConf 2.4 keeps tuples."""
-    return _without_tuples(OmegaConf.to_container(config, resolve=True, enum_to_str=True))
-
-
-def _without_tuples(values: Any) -> Any:
+def plain(values: Any) -> Any:
+    """Settings as plain Python, of the types that JSON has (OmegaConf 2.4 keeps tuples); a configuration is resolved,
+    without Hydra's node.
+    """
+    if isinstance(values, DictConfig):
+        own = OmegaConf.masked_copy(values, [str(key) for key in values if key != "hydra"])
+        return plain(OmegaConf.to_container(own, resolve=True, enum_to_str=True))
     if isinstance(values, dict):
-        return {key: _without_tuples(value) for key, value in values.items()}
-    return [_without_tuples(value) for value in values] if isinstance(values, list | tuple) else values
+        return {key: plain(value) for key, value in values.items()}
+    return [plain(value) for value in values] if isinstance(values, list | tuple) else values

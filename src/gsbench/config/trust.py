@@ -12,12 +12,12 @@ from __future__ import annotations
 import importlib
 import os
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import GrammarParseError, OmegaConfBaseException
+from omegaconf.errors import GrammarParseError
 from omegaconf.grammar_parser import parse
 
 from gsbench.errors import InputError
@@ -57,20 +57,33 @@ SBATCH_RESOURCES = frozenset(
 BARE = re.compile(r"[\w./+-]+")  # what needs no quotes in a list on the command line
 
 # ---- of Hydra's own settings
-OF_CALLBACKS = ("_recursive_", "_convert_", "_args_")
-SPECIAL_KEYS = (*OF_CALLBACKS, "_partial_", "_isolate_", "_execution_whitelist_")  # what Hydra reads beside _target_
-HYDRAS_CALLBACKS = tuple(
-    f"hydra.experimental.callbacks.{name}" for name in ("LogJobReturnCallback", "PickleJobInfoCallback")
-)
-MADE_BY_HYDRA = ("callbacks", "launcher", "sweeper")  # nodes below `hydra` of which Hydra makes objects
-PLUGINS = ("GsbenchLauncher", "BasicLauncher", "JoblibLauncher", "GsbenchSweeper")  # the classes that it may make
+SPECIAL_KEYS = (  # what Hydra reads beside _target_
+    "_recursive_", "_convert_", "_args_", "_partial_", "_isolate_", "_execution_whitelist_"
+)  # fmt: skip
+OWN_LAUNCHER, OWN_SWEEPER = "hydra_plugins.gsbench.GsbenchLauncher", "hydra_plugins.gsbench.GsbenchSweeper"
+# Settings of Hydra's that stay as conf/config.yaml has them, and why. Some start code: callbacks, launchers, sweepers
+# and logging name classes, and a variable can name what Python, a library or a program loads.
+RUNS_TRIALS = "gsbench runs the trials itself, as launch=serial, local or slurm says: leave it out"
+IN_LOG = "log.txt in a trial's folder holds everything: leave it out"
+NO_LOGGING = {"version": 1, "root": None, "disable_existing_loggers": False}
+FIXED: dict[str, tuple[Any, str]] = {
+    "launcher": ({"_target_": OWN_LAUNCHER}, RUNS_TRIALS),
+    "callbacks": ({}, RUNS_TRIALS),
+    "output_subdir": (None, RUNS_TRIALS),
+    "run": ({"dir": "."}, RUNS_TRIALS),
+    "sweep": ({"dir": "${runs}/.hydra", "subdir": "."}, RUNS_TRIALS),
+    "job.chdir": (False, "trials run in the folder where the command was given, and paths start there: leave it out"),
+    "job.env_set": ({}, "set variables in the shell, before the command"),
+    "verbose": (False, IN_LOG),
+    "job_logging": (NO_LOGGING, IN_LOG),
+    "hydra_logging": (NO_LOGGING, IN_LOG),
+}
 # Resolvers that make texts and numbers. Those that make mappings of texts (oc.create, oc.decode, oc.dict) could make a
 # class's name after it was looked for; others, of plug-ins, could do anything.
 RESOLVERS = ("hydra", "now", "oc.env", "oc.select", "python_version")
 # Values of Hydra 1.4's own, whose resolvers join the words of a job; with arguments they would call other resolvers.
 HYDRAS_VALUES = ("${hydra_override_dirname:}", "${hydra_deprecated_override_dirname:}")
 PUBLIC_CLASS = re.compile(rf"{PACKAGE}\.\w+\.[A-Z]\w*")  # known by its name; importing it may take seconds
-NO_LOGGING = {"version": 1, "root": None, "disable_existing_loggers": False}
 # Settings that a file's sweep may not give its jobs: the look at the whole comes before these are composed.
 NOT_SWEPT = re.compile(rf"[\s+~]*(hydra|{PERMISSIONS})\s*([./@:=\[]|$)")
 
@@ -181,28 +194,15 @@ def check_composed(config: DictConfig, allowed: Sequence[str]) -> None:
     refused. Raises InputError.
     """
     raw: Any = OmegaConf.to_container(config, resolve=False)
+    if "hydra" in raw:  # else Hydra has taken it already: it runs the job
+        _check_hydra(raw["hydra"])
     for place, key, value in _entries(raw):
         if isinstance(value, str) and "${" in value:
             _check_interpolation(place, key, value)
-        # `_partial_` makes a function of anything, to be called later; 1.4's `_execution_whitelist_` allows any class
-        if key in SPECIAL_KEYS and (key not in OF_CALLBACKS or place[:2] != ("hydra", "callbacks")):
+        if key in SPECIAL_KEYS:  # `_partial_` makes a function of anything, to be called later
             raise InputError(f"{'.'.join((*place, key))}: gsbench makes no objects this way: leave it out")
-    known = known_plugins()
     for place, target in targets_in(raw):
-        _check_place(place, target, allowed, known)
-    if "hydra" in raw:  # else Hydra has taken it already: it runs the job
-        _check_hydra(raw["hydra"], allowed)
-        _check_copies(config, raw["hydra"])
-
-
-def known_plugins() -> set[str]:
-    """The import paths of the launchers and of the sweeper that gsbench works with, as far as they are installed."""
-    from hydra.core.plugins import Plugins
-    from hydra.plugins.launcher import Launcher
-    from hydra.plugins.sweeper import Sweeper
-
-    every = [found for kind in (Launcher, Sweeper) for found in Plugins.instance().discover(kind)]
-    return {f"{found.__module__}.{found.__name__}" for found in every if found.__name__ in PLUGINS}
+        _check_place(place, target, allowed)
 
 
 def _entries(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str, Any]]:
@@ -238,84 +238,42 @@ def _resolvers(tree: Any) -> Iterator[str]:
         yield from _resolvers(child)
 
 
-def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str], plugins: Collection[str]) -> None:
+def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str]) -> None:
     """Refuse a class at a ``place``: Hydra imports what a name leads to, and calls it."""
+    if not isinstance(target, str) or target == "???" or place in (("hydra", "launcher"), ("hydra", "sweeper")):
+        return  # a schema, Hydra or `_check_hydra` says what is wrong with it
     group = ".".join(place)
-    if not isinstance(target, str) or target == "???":
-        return  # a schema or Hydra says what is wrong with it, and nothing can be made of it
-    if place in (("hydra", "launcher"), ("hydra", "sweeper")):
-        if target not in plugins:
-            known = "basic and joblib, beside gsbench's own" if place[-1] == "launcher" else "gsbench's own alone"
-            raise InputError(f"{group}.{TARGET}={target} is no {place[-1]} that gsbench works with: {known}")
-        return
     # Of gsbench's own classes each is for its group: `densify._target_=gsbench.init.…` would run another's constructor.
-    own = HYDRAS_CALLBACKS if place[:2] == ("hydra", "callbacks") and len(place) == 3 else homes_of(place)
-    check_target(target, group, allowed, own)
+    check_target(target, group, allowed, homes_of(place))
     if is_allowed(target, (PACKAGE,)) and not PUBLIC_CLASS.fullmatch(target):
         load_class(target, group, allowed)  # such as gsbench.densify.adc.torch.load
 
 
-def _check_hydra(hydra: Any, allowed: Sequence[str]) -> None:
-    """Refuse of Hydra's own settings what starts code other than by naming a class."""
-    for name in ("job", "job.env_set", "job_logging", "hydra_logging", *MADE_BY_HYDRA):
-        node = hydra
-        for key in name.split("."):
-            node = node.get(key) if isinstance(node, dict) else node
-        if isinstance(node, str):
-            raise InputError(f"hydra.{name}={node}: write the settings themselves here, as ${{…}} may become others")
-    if hydra.get("verbose"):
-        raise InputError("hydra.verbose: leave it out, since log.txt in a trial's folder holds everything")
-    # logging's configuration names classes and functions ("class", "()", "ext://") that are called
-    for group in ("job_logging", "hydra_logging"):
-        if {**NO_LOGGING, **(hydra.get(group) or {})} != NO_LOGGING:
-            raise InputError(f"gsbench does not read hydra/{group}: log.txt in a trial's folder holds everything")
-    # a variable can name code that Python, a library or a program loads: LD_PRELOAD, PYTHONPATH, MPLBACKEND
-    if variables := foreign_variables(hydra["job"].get("env_set") or {}, allowed):
-        raise InputError(
-            f"hydra.job.env_set sets {shown(variables)}; set it in the shell, before the command, or if you trust it, "
-            + to_type(list(variables), allowed)
-        )
-    # a job is composed after this look, by whichever launcher: its words may search packages and set variables
-    for place, key, value in _entries(hydra.get("sweeper") or {}, ("hydra", "sweeper")):
+def _check_hydra(hydra: dict[str, Any]) -> None:
+    """Refuse of Hydra's own settings what is not read here, and what would start code."""
+    for name, (fixed, why) in FIXED.items():
+        group, _, key = name.partition(".")
+        found = hydra.get(group) if not key else hydra[group].get(key)
+        if isinstance(fixed, dict) and (isinstance(found, dict) or found is None):
+            found = {**fixed, **(found or {})}
+        if found != fixed:
+            raise InputError(f"hydra.{name}: {why}")
+    sweeper = hydra["sweeper"]
+    if sweeper.get(TARGET) != OWN_SWEEPER:
+        raise InputError("hydra.sweeper: gsbench has its own, which searches intervals, too: leave hydra/sweeper out")
+    # ${…} may stand for a mapping with a class in it, of which Hydra would make an object when it makes the sweeper.
+    copies = [(place, key) for place, key, value in _entries(sweeper.get("tune"), ("tune",)) if "${" in str(value)]
+    copies += [((), key) for key, value in sweeper.items() if isinstance(value, str) and "${" in value]
+    for place, key in copies:
+        raise InputError(f"hydra.sweeper.{'.'.join((*place, key))}: write the settings themselves here, without ${{…}}")
+    # A job is composed after this look: its words may search packages.
+    for place, key, value in _entries(sweeper, ("hydra", "sweeper")):
         for text in (key, value) if key != TARGET else ():
             if isinstance(text, str) and NOT_SWEPT.match(text):
                 raise InputError(
                     f"{'.'.join(place)}: {text} cannot differ from job to job, and no file can allow it: "
                     "type it on the command line"
                 )
-
-
-def _check_copies(config: DictConfig, hydra: dict[str, Any]) -> None:
-    """Refuse ``${…}`` that stands for a whole mapping where Hydra makes objects: its classes are for other places.
-
-    ``callbacks.x=${densify}`` would make a callback of a class that was allowed as a densifier only.
-    """
-    for node in MADE_BY_HYDRA:
-        for place, key, value in _entries(hydra.get(node), ("hydra", node)):
-            if isinstance(value, str) and value.startswith("${") and place[2:3] not in (("params",), ("grids",)):
-                where = ".".join((*place, key))
-                try:
-                    copied = OmegaConf.is_config(OmegaConf.select(config, where))
-                except OmegaConfBaseException:  # such as ${hydra:job.num}, which no mapping will stand for
-                    continue
-                if copied:
-                    raise InputError(f"{where}={value}: write the settings themselves here, since ${{…}} copies others")
-
-
-def load_callbacks(config: DictConfig, allowed: Sequence[str]) -> None:
-    """Import the classes that ``hydra.callbacks`` names, of which Hydra will make objects; refuse what is none."""
-    from hydra.experimental.callback import Callback
-
-    callbacks: Any = OmegaConf.to_container(config.hydra.callbacks or OmegaConf.create(), resolve=False)
-    for name, callback in callbacks.items():
-        if not isinstance(callback, dict) or not callback.get(TARGET):
-            raise InputError(f"hydra.callbacks.{name!s} names no {TARGET}: the class to use")
-    for place, target in targets_in(callbacks, ("hydra", "callbacks")):
-        group, is_callback = ".".join(place), len(place) == 3
-        found = load_class(target, group, [*allowed, *HYDRAS_CALLBACKS] if is_callback else allowed)
-        if not isinstance(found, type) or (is_callback and not issubclass(found, Callback)):
-            wanted = "a class of hydra.experimental.callback.Callback" if is_callback else "a class"
-            raise InputError(f"{group}.{TARGET}={target} is not {wanted}")
 
 
 def is_external(densify: Mapping[str, Any]) -> bool:

@@ -53,7 +53,7 @@ class EvalConfig:
     # The metric of the verdict, declared before results are seen; psnr@extrapolation of one question; null: none was.
     primary: str | None = None
     controls: Annotated[dict[str, FolderName], doc(CONTROLS_RULE)] = field(default_factory=dict)  # {longaxis: absgrad}
-    maps: bool = False  # keep maps of depth, volume and distance to the initial cloud; picture large Gaussians
+    maps: bool = False  # picture large Gaussians over a test view
     fps: Annotated[list[Side], Len(2, 2), doc(FPS_RULE)] | None = None  # [1920, 1080]: speed at this size, px
     weights: PathName | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
     download: bool = True  # fetch missing weights, checked by checksum

@@ -16,12 +16,11 @@ from gsbench.config.compose import Trial
 from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
-from gsbench.launch.declare import declare, declared_metrics, planned_trials
-from gsbench.launch.plan import add_to_plan
+from gsbench.launch.record import add_to_plan, declare, declared_metrics, planned_trials
 from gsbench.launch.serial import Outcome, outcome_of_results, run_serial
 from gsbench.runs.code import OWN
+from gsbench.runs.keys import STAGES
 from gsbench.runs.layout import STORE
-from gsbench.runs.stages import STAGES
 from gsbench.runs.store import Store
 from gsbench.system.install import install_command
 from gsbench.system.stopping import stop_on_signals
@@ -52,13 +51,6 @@ def _run(trials: Sequence[Trial], launcher: str) -> list[Outcome]:
         from gsbench.launch.jobs import run_local
 
         return run_local(trials, mirror)
-
-
-def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
-    """Do all that precedes the first trial where another launcher will run them, perhaps several at once."""
-    values = trials[0].values
-    with storage_errors(checked_runs_folder(values["runs"])):
-        _begin(trials, [trial for trial in trials if _why_not_done(trial)])
 
 
 def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:

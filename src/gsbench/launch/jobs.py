@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import os
-import pickle
 import signal
 import sys
 import time
@@ -22,9 +21,10 @@ from gsbench.config.compose import Trial
 from gsbench.files import require_own
 from gsbench.launch.serial import Outcome, outcome_of_results
 from gsbench.launch.states import forget_submission
-from gsbench.runs.hashing import sha256_of
+from gsbench.runs.keys import sha256_of
 from gsbench.runs.layout import JOBS
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.system.isolate import telling_tail
 from gsbench.system.own_modules import allowed_modules, take_over
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
 from gsbench.system.stopping import Stopped, stop_on_signals
@@ -69,6 +69,8 @@ class TrialJob:
                 # Where the sweep's process runs here, it mirrors all of its trials.
                 mirror = stack.enter_context(Mirror(idle=launch["name"] == "local"))
                 outcome = run_one(Trial(self.values, ()), mirror, wait=True)
+                if outcome.status == "failed":
+                    print(outcome.message, file=sys.stderr)  # where the trial's folder could not be told
                 if launch["name"] == "slurm":
                     with suppress(OSError):
                         forget_submission(outcome.folder)
@@ -118,7 +120,7 @@ def _run(trials: Sequence[Trial], executor: Executor, parallel: int, mirror: Mir
     waiting, running, outcomes = clouds_first(trials), dict[Path, "Job[Outcome]"](), list[Outcome]()
     try:
         while waiting or running:
-            while waiting and len(running) < parallel and not any(outcome.fatal for outcome in outcomes):
+            while waiting and len(running) < parallel:
                 trial = waiting.pop(0)
                 running[trial.folder] = executor.submit(job_of(trial))
                 mirror.follow(trial.folder, trial.values["tracking"])
@@ -126,8 +128,6 @@ def _run(trials: Sequence[Trial], executor: Executor, parallel: int, mirror: Mir
             for folder in ended:
                 outcomes.append(collect(running.pop(folder), folder, trials))
                 log.info("%s: %s  (%d of %d)", outcomes[-1].label, outcomes[-1].message, len(outcomes), len(trials))
-            if not running and any(outcome.fatal for outcome in outcomes):
-                break
             if not ended:
                 time.sleep(SECONDS_BETWEEN_POLLS)
     except KeyboardInterrupt:
@@ -149,42 +149,18 @@ def clouds_first(trials: Sequence[Trial]) -> list[Trial]:
 
 
 def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome:
-    """The outcome of an ended job: the trial's files first, then what the job returned, then its log's last words."""
+    """The outcome of an ended job, by the trial's files; where they say nothing, by the last words of the job's log."""
     values = next(trial.values for trial in trials if trial.folder == folder)
-    files = TrialFolder(folder)
+    files, log_file = TrialFolder(folder), job.paths.stderr
     if not files.why_not_done(values):
         return outcome_of_results(folder, files.record())
-    if job.paths.result_pickle.exists():
-        try:
-            kind, value = _read_result(job.paths.result_pickle)
-        except Exception as error:  # noqa: BLE001 - a damaged pickle raises many kinds
-            reason = f"what it returned cannot be read ({error})"
-            return Outcome(folder, "failed", f"{reason}; log: {job.paths.stderr}")
-        if isinstance(value, Outcome):
-            return value
-        last = str(value).strip().splitlines()[-1] if str(value).strip() else kind
-        return Outcome(folder, "failed", f"{last}; log: {job.paths.stderr}")
+    if files.has_failed():
+        failure = files.failure()
+        return Outcome(folder, "failed", f"{failure.reason}; log: {log_file}", failure.bad_input)
+    said = f"; its last words: {telling_tail(log_file)}" if log_file.is_file() else ""
     return Outcome(
-        folder, "failed", f"the process ended without a result (killed, or out of memory); log: {job.paths.stderr}"
+        folder, "failed", f"the process ended without a result (killed, or out of memory){said}; log: {log_file}"
     )
-
-
-def _read_result(path: Path) -> tuple[str, Any]:
-    """Read what submitit wrote when a job ended; its own reader would ask Slurm first, and run what the file names."""
-    with path.open("rb") as stream:
-        kind, value = _Outcomes(stream).load()
-    return kind, value
-
-
-class _Outcomes(pickle.Unpickler):
-    """Reads what a job returned: its file lies in the runs folder, which may be somebody else's."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) == (Outcome.__module__, Outcome.__qualname__):
-            return Outcome
-        if module.partition(".")[0] == "pathlib" and name in ("PosixPath", "WindowsPath"):
-            return Path
-        raise pickle.UnpicklingError(f"a job's result holds {module}.{name}")
 
 
 def job_of(trial: Trial) -> TrialJob:

@@ -33,7 +33,6 @@ class Outcome:
     status: Status
     message: str = ""
     bad_input: bool = False
-    fatal: bool = False  # no other trial can succeed either
 
     @property
     def label(self) -> str:
@@ -49,7 +48,7 @@ def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:
 def outcome_of_error(folder: Path, error: Exception) -> Outcome:
     """The outcome of a trial that raised ``error``."""
     if isinstance(error, GsbenchError):
-        return Outcome(folder, "failed", str(error), isinstance(error, InputError), isinstance(error, DiskFullError))
+        return Outcome(folder, "failed", str(error), isinstance(error, InputError))
     text = f"{type(error).__name__}: {error}".splitlines()[0]
     return Outcome(folder, "failed", f"{text}; the traceback is in {folder / LOG}")
 
@@ -66,23 +65,17 @@ def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
         except BusyError as error:
             log.info("%s; later", error)
             busy.append(trial)
-            continue
-        if outcomes[-1].fatal:
-            return outcomes
     return outcomes + [run_one(trial, mirror, wait=True) for trial in busy]
 
 
 def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
-    """Run one trial; only BusyError, and what ends the program, is raised."""
+    """Run one trial, and have it mirrored; only BusyError, a full disk and what ends the program is raised."""
+    mirror.follow(trial.folder, trial.values["tracking"])
     try:
-        return outcome_of_results(trial.folder, _run(trial, mirror, wait))
-    except BusyError:
+        from gsbench.pipeline.trial import run_trial  # here, because a sweep that is done needs no torch
+
+        return outcome_of_results(trial.folder, run_trial(trial, wait))
+    except (BusyError, DiskFullError):
         raise
     except Exception as error:  # noqa: BLE001 - a failed trial does not stop the others
         return outcome_of_error(trial.folder, error)
-
-
-def _run(trial: Trial, mirror: Mirror, wait: bool) -> TrialRecord:
-    from gsbench.pipeline.trial import run_trial  # here, because a sweep that is done needs no torch
-
-    return run_trial(trial, mirror, wait)

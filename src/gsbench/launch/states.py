@@ -17,11 +17,11 @@ from pydantic import Field
 
 from gsbench.errors import InputError
 from gsbench.files import write_json
-from gsbench.launch.plan import read_plan
+from gsbench.launch.record import read_plan
 from gsbench.parsing import DamagedError
 from gsbench.records import Record, read_if_sound
 from gsbench.runs.experiments import places_of_trials
-from gsbench.runs.hashing import determining
+from gsbench.runs.keys import determining
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED
 from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
@@ -115,7 +115,7 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
             return TrialState(folder, found, _changed(folder / SUBMITTED), note)
         lost = f"; Slurm job {submission.job} has ended, log: {submission.log}"
     if state == "failed":
-        return TrialState(folder, state, _changed(folder / FAILED), TrialFolder(folder).failure())
+        return TrialState(folder, state, _changed(folder / FAILED), TrialFolder(folder).failure().reason)
     if state == "partial":
         return TrialState(folder, state, _changed(folder / CONFIG), f"stopped {_reached(folder)}".strip() + lost)
     return TrialState(folder, state, planned, "never started" + lost)

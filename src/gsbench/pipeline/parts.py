@@ -161,7 +161,7 @@ class Parts:
 
         With ``here``, the trial will run on this machine, whose devices are known. Raises InputError naming the key.
         """
-        _ = self.initializer, self.trainer
+        _ = self.initializer, self.trainer, self.metrics
         name, own = self.values["raster"]["name"], self.own_rasterizer
         if here and self.program is not None:
             self.program.executable()
@@ -171,10 +171,6 @@ class Parts:
             device = self.device
             if own is None and name != AUTO:
                 resolve(name, device.type)
-
-    def complete(self) -> None:
-        """Make all that the trial's run will ask for, but for the evaluator. Raises InputError naming a wrong key."""
-        _ = self.initializer, self.trainer, self.scene, self.train, self.eval, self.metrics, self.rasterizer
 
     def _check_offers(self, raster: str) -> None:
         check_offers(self.trainer, self.values["densify"]["name"], raster, self.own_rasterizer)

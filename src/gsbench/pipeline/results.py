@@ -14,11 +14,9 @@ from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.parsing import read_json
 from gsbench.runs.code import user_modules
 from gsbench.runs.declaration import read_declarations
-from gsbench.runs.hashing import config_hash, flatten, sha256_of
+from gsbench.runs.keys import EVALUATE, INIT, STAGES, TRAIN, config_hash, flatten, sha256_of
 from gsbench.runs.layout import EVENTS
 from gsbench.runs.made_of import version_of
-from gsbench.runs.rows import read_rows
-from gsbench.runs.stages import EVALUATE, INIT, STAGES, TRAIN
 from gsbench.runs.store import Entry, read_manifest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import (
@@ -33,6 +31,7 @@ from gsbench.runs.trial_record import (
     Training,
     TrialRecord,
     read_evaluation,
+    read_rows,
     read_training,
     split_text,
 )

@@ -23,9 +23,8 @@ from gsbench.pipeline.results import versions
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.renders.reference_images import Truth
 from gsbench.runs.code import ROOMS, states_of
-from gsbench.runs.hashing import sha256_of
+from gsbench.runs.keys import EVALUATE, sha256_of
 from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, MASKS, PER_VIEW, RENDERS, SEED
-from gsbench.runs.stages import EVALUATE
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, RENDERS_ALONE, Code, TrialRecord
 from gsbench.scene.images import read_image

@@ -12,8 +12,8 @@ from gsbench.config.command_words import options
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import Parts
-from gsbench.pipeline.wiring import TrialSteps
-from gsbench.runs import stages
+from gsbench.pipeline.trial import TrialSteps
+from gsbench.runs import keys
 from gsbench.runs.layout import GROUND_TRUTH, MASKS, RENDERS, RESULTS, STORE
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
@@ -94,9 +94,9 @@ def _scene(name: str, settings: Sequence[str]) -> Truth:
     store = Store(Path(config["runs"]).expanduser().resolve() / STORE)
     trial = TrialSteps(Parts(config), store)
     for step in trial.steps():
-        if step.stage in (stages.CAPTURE, stages.INIT, stages.GROUND_TRUTH):
+        if step.stage in (keys.CAPTURE, keys.INIT, keys.GROUND_TRUTH):
             entry = store.get(step)
-            if step.stage is stages.GROUND_TRUTH:
+            if step.stage is keys.GROUND_TRUTH:
                 folder = entry.path
     scene = trial.views.scene
     photographs = {view.name: folder / png_name(view.name) for view in scene.test}

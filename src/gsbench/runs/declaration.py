@@ -21,7 +21,7 @@ from pydantic import Field
 
 from gsbench.parsing import DamagedError, read_bytes
 from gsbench.records import STRICT, Amount, Count, Record, iterate_rows
-from gsbench.runs.hashing import sha256_of
+from gsbench.runs.keys import sha256_of
 from gsbench.runs.layout import DECLARED
 from gsbench.runs.trial_record import Declared
 

@@ -19,9 +19,8 @@ from gsbench.files import file_sha256
 from gsbench.parsing import DamagedError, fault_of, read_bytes
 from gsbench.records import Record
 from gsbench.runs.code import changed_rooms
-from gsbench.runs.hashing import config_hash, sha256_of
+from gsbench.runs.keys import STAGES, config_hash, sha256_of
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS, PER_VIEW
-from gsbench.runs.stages import STAGES
 from gsbench.runs.store import read_manifest
 from gsbench.runs.trial_record import TrialRecord
 

@@ -31,9 +31,8 @@ from gsbench.files import (
 )
 from gsbench.parsing import DamagedError, fault_of
 from gsbench.records import Amount, Count, Record, read_typed
-from gsbench.runs.hashing import sha256_of
+from gsbench.runs.keys import Stage, Step, sha256_of
 from gsbench.runs.layout import MANIFEST, VIEWS
-from gsbench.runs.stages import Stage, Step
 from gsbench.system.locks import BusyError, hold
 
 log = logging.getLogger(__name__)

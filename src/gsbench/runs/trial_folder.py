@@ -22,7 +22,7 @@ from gsbench.errors import InputError
 from gsbench.files import atomic, require_own
 from gsbench.parsing import DamagedError, one_line, read_bytes, read_tail, read_yaml
 from gsbench.records import MOST, Amount, Count, Record, read_if_sound, read_typed, typed
-from gsbench.runs.hashing import config_hash
+from gsbench.runs.keys import config_hash
 from gsbench.runs.layout import (
     BUILDING,
     CONFIG,
@@ -36,8 +36,7 @@ from gsbench.runs.layout import (
     SEED,
 )
 from gsbench.runs.made_of import MADE_OF, READ_LATER, MadeOf, OnDisk, changes, content_hash, describe_inputs
-from gsbench.runs.rows import Histogram, Row, read_rows
-from gsbench.runs.trial_record import TrialRecord, UnfinishedError, record_from
+from gsbench.runs.trial_record import Histogram, Row, TrialRecord, UnfinishedError, read_rows, record_from
 from gsbench.settings import FolderName
 from gsbench.system.locks import is_held
 
@@ -86,6 +85,7 @@ class Failure(Record):
     traceback: str = field(default="", repr=False)
     time: Amount = 0.0
     seed: Count = 0
+    bad_input: bool = False  # the user's files or settings are the cause
 
     @property
     def reason(self) -> str:
@@ -164,10 +164,9 @@ class TrialFolder:
             return "failed"
         return "partial" if (self.path / CONFIG).exists() else "missing"
 
-    def failure(self) -> str:
-        """The reason why the trial failed, in one line."""
-        failure = read_if_sound(self.path / FAILED, Failure)
-        return f"{FAILED} cannot be read" if failure is None else failure.reason
+    def failure(self) -> Failure:
+        """The reason why the trial failed."""
+        return read_if_sound(self.path / FAILED, Failure) or Failure(message=f"{FAILED} cannot be read")
 
     def has_failed(self) -> bool:
         """Return whether the trial's last run failed."""
@@ -305,7 +304,7 @@ class TrialFolder:
         return self.rows(HISTOGRAMS, Histogram)
 
     def rows(self, name: str, kind: Any = Row) -> list[Any]:
-        """The rows of a file of JSON lines; see `gsbench.runs.rows`."""
+        """The rows of a file of JSON lines; see `gsbench.runs.trial_record`."""
         return read_rows(self.path / name, kind, lambda path: self._unchanged(path.name))
 
     def views(self) -> dict[str, dict[str, float]]:

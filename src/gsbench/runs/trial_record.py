@@ -1,20 +1,23 @@
-"""Content of a finished trial's ``results.json``, and of the records that its stages leave in the store beside their
-files (``training.json``, ``metrics.json``): its writers fill these, its readers are given them.
+"""Content of a trial's files: of ``results.json``, of the records that its stages leave in the store beside their
+files (``training.json``, ``metrics.json``), and of the JSON lines of a training. Writers fill these, readers get them.
 """
 
 from __future__ import annotations
 
+import logging
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
-from gsbench.parsing import DamagedError, fault_of
-from gsbench.records import MOST, Amount, Count, Number, Record, Text, adapter, misfit, read_typed
+from gsbench.parsing import DamagedError, fault_of, read_bytes
+from gsbench.records import MOST, Amount, Count, Number, Record, Text, Whole, adapter, iterate_rows, misfit, read_typed
 from gsbench.runs.layout import METRICS, TRAINING
+
+log = logging.getLogger(__name__)
 
 # ``evaluated_from`` of what gsbench did not train itself: the model was rendered here, or only renders are known.
 FROM_MODEL: Final = "model"
@@ -205,3 +208,63 @@ def split_text(config: Mapping[str, Any]) -> str:
     elif config.get("scene.match_views"):
         text += ", matched" if text.startswith("sector") else f", matched with {sectors}"
     return f"{text}, validation" if config.get("scene.validation") else text
+
+
+# ---- the JSON lines of a training
+
+STEP = "step"  # the key of every row: the iteration
+Exponent = Annotated[float, Field(ge=-300, le=300)]  # ten to this power is a number
+
+
+def _with_step(row: dict[str, bool | int | float]) -> dict[str, bool | int | float]:
+    step = row.get(STEP)
+    if not isinstance(step, int) or isinstance(step, bool) or step < 0:
+        raise ValueError(f"{STEP} is not an iteration")
+    return row
+
+
+Value = bool | Whole | Number
+Row = Annotated[dict[str, Value], AfterValidator(_with_step)]  # of ``metrics.jsonl`` and ``events.jsonl``
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stepped(Record):
+    """A row of any of these files, of which the iteration is asked for."""
+
+    step: Count
+
+
+@dataclass(frozen=True, kw_only=True)
+class Histogram(Stepped):
+    """A row of ``volume_histograms.jsonl``: counts between edges, the logarithms to the base 10 of volumes."""
+
+    log10_edges: list[Exponent]
+    counts: list[Amount]
+
+    def __post_init__(self) -> None:
+        if len(self.log10_edges) != len(self.counts) + 1:
+            raise ValueError("the edges are not one more than the counts")
+
+
+def read_rows(path: Path, kind: Any = Row, read: Callable[[Path], bytes] = read_bytes) -> list[Any]:
+    """The rows of a file, each of type ``kind``; [] where there is none.
+
+    ``read`` gives the content. What cannot be read, and what follows a damaged row, is left out, with a warning.
+    """
+    try:
+        content = read(path)
+    except FileNotFoundError:
+        return []
+    except DamagedError as error:
+        log.warning("left out: %s", error)
+        return []
+    return [row for _, row in iterate_rows(content, kind, path)]
+
+
+def whole_lines(path: Path) -> list[tuple[str, int]]:
+    """The lines of ``metrics.jsonl`` or its like up to the first damaged one, each with its iteration."""
+    try:
+        content = read_bytes(path)
+    except FileNotFoundError:
+        return []
+    return [(line, row.step) for line, row in iterate_rows(content, Stepped, path)]

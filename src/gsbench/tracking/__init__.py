@@ -4,7 +4,7 @@ Files come first. A process beside the trials follows them and writes to the tra
 slow, down or read-only never harms a trial; what it missed, ``gsbench sync`` adds later from the same files.
 """
 
-from gsbench.tracking.client import connect, default_uri, ensure_experiment, tracker_uri
-from gsbench.tracking.mirror import Mirror, sync
+from gsbench.tracking.mirror import Mirror
+from gsbench.tracking.mlflow_sink import connect, default_uri, ensure_experiment, tracker_uri
 
-__all__ = ["Mirror", "connect", "default_uri", "ensure_experiment", "sync", "tracker_uri"]
+__all__ = ["Mirror", "connect", "default_uri", "ensure_experiment", "tracker_uri"]

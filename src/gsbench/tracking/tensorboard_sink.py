@@ -9,8 +9,7 @@ from typing import Any
 
 from gsbench.files import require_own
 from gsbench.runs.layout import TENSORBOARD
-from gsbench.tracking.sink import Point, Summary
-from gsbench.tracking.trial import TrackedTrial
+from gsbench.tracking.trial import Point, Summary, TrackedTrial
 
 
 class TensorBoardSink:
@@ -25,7 +24,7 @@ class TensorBoardSink:
         self._writer: Any = None
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """Open the run as `gsbench.tracking.sink.Sink` says."""
+        """Open the run as `gsbench.tracking.trial.Sink` says."""
         if self._folder.is_dir() and state.get("complete") is not None and state["complete"] == results:
             return state
         from torch.utils.tensorboard import SummaryWriter

@@ -1,23 +1,101 @@
-"""A trial in a tracker's terms: what its files say, and how far that was sent."""
+"""A trial in a tracker's terms: what its files say, how far that was sent, and the contract of a tracker."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from gsbench.records import Count, Record, read_if_sound
 from gsbench.runs import layout
-from gsbench.runs.hashing import flatten, sha256_of
-from gsbench.runs.rows import read_rows
-from gsbench.runs.stages import TRAIN
+from gsbench.runs.keys import TRAIN, flatten, sha256_of
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.trial_record import TrialRecord
-from gsbench.tracking.sink import Point, Summary
+from gsbench.runs.trial_record import TrialRecord, read_rows
 
 FILES = (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS)
 CURVES = {layout.CURVES: "train", layout.EVENTS: "events"}
+
+
+DEFAULT = "mlflow"
+NAMES = {DEFAULT: "MLflow", "tensorboard": "TensorBoard", "wandb": "Weights & Biases"}
+
+
+@dataclass(frozen=True)
+class Point:
+    """One number of a trial: its name, the iteration, and the seconds of training until then."""
+
+    key: str
+    value: float
+    step: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Summary of a complete trial: final numbers, tags, pictures of the test views by name, other files by
+    folder ("" for none).
+    """
+
+    points: Sequence[Point]
+    tags: dict[str, str]
+    pictures: dict[str, Path]
+    files: Sequence[tuple[str, Path]]
+    step: int
+    seconds: float
+
+
+class Sink(Protocol):
+    """One trial in a tracker. Each method may raise whatever the tracker's client raises.
+
+    It is closed by no one: its process ends without tearing anything down, so each method sends what it is given.
+
+    Examples:
+        One that prints:
+
+        >>> class Printed:
+        ...     state_file = "printed.json"
+        ...
+        ...     def open(self, state, results):
+        ...         return state
+        ...
+        ...     def log(self, points):
+        ...         for point in points:
+        ...             print(f"{point.step}: {point.key} {point.value}")
+        ...
+        ...     def complete(self, summary):
+        ...         self.log(summary.points)
+        ...
+        ...     def stop(self, status, reason):
+        ...         print(status, reason)
+
+        >>> sink: Sink = Printed()
+        >>> sink.log([Point("loss", 0.5, step=100, seconds=1.0)])
+        100: loss 0.5
+    """
+
+    state_file: str  # in the trial's folder: what `open` returned, "complete" and "logged" kept by `TrackedTrial`
+
+    def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
+        """Begin the trial's run, or go on with the one that ``state`` tells of; returns the state to keep.
+
+        ``results`` is the hash of the trial's results, if there are any: where ``state["complete"]`` is another, the
+        run shows results that are no longer the trial's, and is replaced.
+        """
+
+    def log(self, points: Sequence[Point]) -> None:
+        """Take numbers; some may be repetitions, where a process was killed after it had sent them."""
+
+    def complete(self, summary: Summary) -> None:
+        """Show what came out, and that the trial is done."""
+
+    def stop(self, status: str, reason: str | None) -> None:
+        """Show that the trial ended without results: ``status`` KILLED, or FAILED for a ``reason``."""
+
+
+def name_of(options: dict[str, Any]) -> str:
+    """The tracker's name, for people."""
+    return NAMES[options.get("sink", DEFAULT)]
 
 
 @dataclass(frozen=True)
@@ -87,7 +165,7 @@ class TrackedTrial:
             for at, measured in results.metrics_at.items()
             for key, value in measured.metrics.items()
         ]
-        tags = {"protocol": results.protocol, "raster": results.raster}
+        tags = {"protocol": results.protocol, "raster": results.raster, "commit": results.code.commit or "unknown"}
         names = (*FILES, *([layout.POINT_CLOUD] if with_model else []))
         files = [("", self.folder.path / name) for name in names if (self.folder.path / name).exists()]
         return Summary(

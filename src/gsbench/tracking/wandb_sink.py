@@ -9,8 +9,7 @@ from typing import Any
 
 from gsbench.files import require_own
 from gsbench.runs.layout import WANDB
-from gsbench.tracking.sink import Point, Summary
-from gsbench.tracking.trial import TrackedTrial
+from gsbench.tracking.trial import Point, Summary, TrackedTrial
 
 STEP = "iteration"  # the axis of our curves: their own counter only goes up, and we read two files
 
@@ -27,7 +26,7 @@ class WandbSink:
         self._run: Any = None
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """Open the run (see `gsbench.tracking.sink.Sink`). One that shows former results stays beside the new one."""
+        """Open the run (see `gsbench.tracking.trial.Sink`). One that shows former results stays beside the new one."""
         if state.get("complete") is not None:
             if state["complete"] == results:
                 return state

@@ -15,7 +15,7 @@ from torch import Tensor
 from gsbench.densify.volumetric import log_volume
 from gsbench.files import write_text
 from gsbench.raster.staged import Readback
-from gsbench.runs.rows import whole_lines
+from gsbench.runs.trial_record import whole_lines
 
 SMOOTHING = 0.9  # of the loss that is shown
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from gsbench.analysis.results import read_experiment
 from gsbench.app.command import compose_trials, run_trials
@@ -39,7 +36,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     words = [*settings, *([] if _names_experiment(settings) else [f"name={_default_name(settings)}"])]
     first = _trials(words)
     densify = _only_densifier(first)
-    found = declared_switches(_class_switches(first[0]), first[0].values["densify"]) | dict(options.switch)
+    found = declared_switches(_class_switches(first[0]), first[0].values["densify"])
     switches = choose_switches(found, options.switches, densify)
     trials = {run: _trials([*words, *_off(words_of(run, switches), first[0])]) for run in runs_to_train(switches)}
     every = list(trials.values())
@@ -75,25 +72,9 @@ def _parser() -> ArgumentParser:
     parser.add_argument(
         "--switches", type=names, default=(), metavar="A,B", help="only these; default: all it declares"
     )
-    parser.add_argument(
-        "--switch",
-        type=_switch,
-        action="append",
-        default=[],
-        metavar="NAME:KEY=VALUE",
-        help="a further switch, taken out by densify.KEY=VALUE (more, with semicolons between)",
-    )
     parser.add_argument("--metric", help="printed; default: eval.primary, else psnr")
     parser.add_argument("--dry-run", action="store_true", help="list the trials and their state; run nothing")
     return parser
-
-
-def _switch(text: str) -> tuple[str, Switch]:
-    name, colon, settings = text.partition(":")
-    pairs = [setting.partition("=") for setting in settings.split(";")]
-    if not name or not colon or not all(key and equals for key, equals, _ in pairs):
-        raise argparse.ArgumentTypeError(f"must be NAME:KEY=VALUE, got {text!r}")
-    return name, Switch({key.removeprefix("densify."): yaml.safe_load(value) for key, _, value in pairs})
 
 
 def _trials(words: Sequence[str]) -> list[Trial]:

@@ -53,6 +53,13 @@ def path(text: str) -> Path:
     return Path(text).expanduser()
 
 
+def add_question(parser: argparse.ArgumentParser) -> None:
+    """Add the words that say what is trained, and what decides."""
+    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="of the trials, as of a sweep; no seeds")
+    parser.add_argument("--metric", default="psnr", help="decides: psnr (the default), lpips_squeeze, gaussians, …")
+    parser.add_argument("--least", help="the least difference that matters, as 0.1 or 10%%; default: the metric's")
+
+
 def add_where(parser: argparse.ArgumentParser) -> None:
     """Add ``--where KEY=VALUE``, whose values `gsbench.analysis.cells.select_trials` takes as a dict."""
     parser.add_argument(

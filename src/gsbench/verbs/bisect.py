@@ -10,18 +10,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult, read_experiment
-from gsbench.app.versions import add_question, first_trials
+from gsbench.app.command import first_trials
 from gsbench.claims.gate import BASELINE, NEW, Gate, ask, describe, first_worse, most_steps, result_of
 from gsbench.claims.stopping import Planned, run_looks
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.program import run_program
 from gsbench.files import checked_runs_folder, make_runs_folder
-from gsbench.launch.declare import declare_questions
+from gsbench.launch.record import declare_questions
 from gsbench.runs.declaration import ERROR_RATE, Declaration
 from gsbench.runs.experiments import make_home
-from gsbench.runs.hashing import sha256_of
+from gsbench.runs.keys import sha256_of
 from gsbench.system.install import WorkTrees
-from gsbench.verbs.arguments import ArgumentParser
+from gsbench.verbs.arguments import ArgumentParser, add_question
 from gsbench.words import counted, printable
 
 FOUND, NOT_FOUND = 0, 3
@@ -86,8 +86,8 @@ class Search:
 
     def _train(self, number: int, home: Path, seeds: Sequence[int]) -> None:
         """Train a commit with those seeds that are not done, by the code of its work tree."""
-        done = {seed: {trial.scene for trial in _trials(home) if trial.seed == seed} for seed in seeds}
-        missing = [str(seed) for seed, scenes in done.items() if not self.scenes <= scenes]
+        done = {(trial.scene, trial.seed) for trial in _trials(home)}
+        missing = [str(seed) for seed in seeds if not {(scene, seed) for scene in self.scenes} <= done]
         if not missing:
             return
         commit, _, subject = self.commits[number]

@@ -14,8 +14,8 @@ from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, place_of, write_text
 from gsbench.launch.batch import missing_folders
-from gsbench.launch.declare import declare_questions
 from gsbench.launch.dry_run import describe_plan
+from gsbench.launch.record import declare_questions
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs.arguments import ArgumentParser, path

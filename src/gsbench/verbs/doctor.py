@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from gsbench.raster.executors import EXECUTORS, find, resolve
-from gsbench.runs.layout import STORE
 from gsbench.runs.made_of import version_of
 from gsbench.system.install import install_command
 from gsbench.system.resources import available_threads, installed_gpus
@@ -40,18 +39,9 @@ class Finding(NamedTuple):
 def main(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if something is bad."""
     parser = ArgumentParser(prog="gsbench doctor", description="Check this machine and say what is missing.")
-    parser.add_argument(
-        "--store", action="store_true", help="also read every stored result whole and name damaged ones"
-    )
-    options = parser.parse_args(argv)
+    parser.parse_args(argv)
     bad = 0
-    for findings in (
-        check_packages(),
-        check_devices(),
-        check_weights(),
-        check_runs(runs),
-        check_store(runs) if options.store else (),
-    ):
+    for findings in (check_packages(), check_devices(), check_weights(), check_runs(runs)):
         for verdict, topic, text in findings:
             print(f"{verdict:<5} {topic:<12} {text}")
             bad += verdict == "bad"
@@ -150,18 +140,3 @@ def check_runs(runs: Path) -> Iterator[Finding]:
         yield Finding("bad", "runs", f"{runs} cannot be written to: set GSBENCH_RUNS")
     else:
         yield Finding("note" if free < LITTLE_SPACE else "ok", "runs", f"{runs}, {readable_bytes(free)} free")
-
-
-def check_store(runs: Path) -> Iterator[Finding]:
-    """Check all stored results by reading them whole."""
-    from gsbench.runs.stages import STAGES
-    from gsbench.runs.store import read_manifest
-
-    sound = 0
-    for folder in sorted(folder for stage in STAGES for folder in (runs / STORE / stage.name).glob("[0-9a-f]*")):
-        try:
-            read_manifest(folder, thorough=True)
-            sound += 1
-        except ValueError as error:
-            yield Finding("note", "store", f"{folder}: {error}; delete the folder, and the next run builds it again")
-    yield Finding("ok", "store", f"{sound:,} results are as they were written")

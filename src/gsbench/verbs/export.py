@@ -10,18 +10,14 @@ from pathlib import Path
 from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
 from gsbench.files import atomic, place_of
+from gsbench.runs.keys import INIT
 from gsbench.runs.layout import STORE
-from gsbench.runs.stages import INIT
 from gsbench.settings import is_folder_name
 from gsbench.verbs.arguments import ArgumentParser, path
 from gsbench.view import ADDRESS
 from gsbench.words import readable_bytes
 
 log = logging.getLogger(__name__)
-
-# Forms that another program writes, from its manual: developer.playcanvas.com/user-manual/splat-transform
-OTHER_FORMS = (".sog", ".splat", ".compressed.ply")
-SPLAT_TRANSFORM = ": export {ply}, then `npm install -g @playcanvas/splat-transform` and `splat-transform {ply} {out}`"
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -89,12 +85,11 @@ def export_results(name: str, runs: Path, out: Path | None, pictures: bool = Fal
 
 def check_form(out: Path) -> None:
     """Raise InputError for the name of a file in another form than the 3DGS PLY."""
-    name = out.name.lower()
-    other = next((suffix for suffix in OTHER_FORMS if name.endswith(suffix)), None)
-    if other is None and name.endswith(".ply"):
-        return
-    mend = "" if other is None else SPLAT_TRANSFORM.format(ply=f"{out.name[: -len(other)]}.ply", out=out)
-    raise InputError(f"--out {out}: gsbench writes the 3DGS .ply, which every viewer and trainer reads{mend}")
+    if not out.name.lower().endswith(".ply") or out.name.lower().endswith(".compressed.ply"):
+        raise InputError(
+            f"--out {out}: gsbench writes the 3DGS .ply, which every viewer and trainer reads (docs/other_models.md "
+            "says what makes other forms of it)"
+        )
 
 
 def export_init(entry: Path, out: Path) -> None:

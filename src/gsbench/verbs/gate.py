@@ -8,18 +8,16 @@ from pathlib import Path
 
 from gsbench.analysis.cells import select_trials
 from gsbench.analysis.results import TrialResult, by_key, read_experiment
-from gsbench.app.command import run_trials
-from gsbench.app.versions import add_question, first_trials
+from gsbench.app.command import first_trials, run_trials
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.gate import NEW, NOT_DECIDED, PASSED, WORSE, Gate, ask, describe, deviations, result_of
 from gsbench.claims.stopping import Planned, run_looks
-from gsbench.config.compose import Trial
-from gsbench.config.jobs import with_seed
+from gsbench.config.compose import Trial, with_seed
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder, make_runs_folder
-from gsbench.launch.declare import declare_questions
+from gsbench.launch.record import declare_questions
 from gsbench.runs.declaration import trial_key
-from gsbench.verbs.arguments import ArgumentParser, add_where, path
+from gsbench.verbs.arguments import ArgumentParser, add_question, add_where, path
 from gsbench.words import listed
 
 EXIT_CODES = {PASSED: 0, WORSE: 1, NOT_DECIDED: 3}
@@ -39,18 +37,19 @@ def main(argv: Sequence[str], runs: Path) -> int:
     add_where(parser)
     options = parser.parse_args(argv)
     first = first_trials("gate", options.settings, options.metric)
+    some = next(iter(first.values()))
+    home = some.files.home
     with tempfile.TemporaryDirectory() as folder:
         every = unpack_archive(options.archive, Path(folder)).trials
         baseline = _baseline(select_trials(every, dict(options.where)), first)
         seeds = _seeds(baseline, options.seeds)
         arms = {scene: (_arm(one[0]), first[scene].folder.parent.name) for scene, one in baseline.items()}
-        declaration = ask(options.metric, options.least, arms, seeds, next(iter(first.values())).values)
+        declaration = ask(options.metric, options.least, arms, seeds, some.values)
         trials = {
             (trial_key(scene, arms[scene][1], NEW), seed): with_seed(one, seed)
             for scene, one in first.items()
             for seed in seeds
         }
-        home = next(iter(first.values())).files.home
         make_runs_folder(checked_runs_folder(str(home.parent)))
         old = [one for own in baseline.values() for one in own if one.seed in seeds]
         gate = Gate(declare_questions(home, declaration), lambda: old, lambda: _done(home, list(trials.values())))

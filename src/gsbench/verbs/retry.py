@@ -7,19 +7,18 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.config.command_words import key_of, typed_permissions
+from gsbench.config.command_words import key_of, makes_other_trials, typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.launch.dry_run import describe_plan
-from gsbench.launch.plan import PlannedTrial, forget, read_plan
+from gsbench.launch.record import PlannedTrial, forget, read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.runs.experiments import experiment_home
-from gsbench.runs.layout import CONFIG
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.own_modules import allow_modules
-from gsbench.tracking.client import VARIABLE, untyped_address
+from gsbench.tracking.mlflow_sink import VARIABLE, untyped_address
 from gsbench.verbs.arguments import ArgumentParser
 
 TRACKER = "tracking.uri"
@@ -45,6 +44,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("--dry-run", action="store_true", help="only list them")
     options = parser.parse_args(argv)
     home = experiment_home(runs, options.experiment)
+    if others := [change for change in options.changes if makes_other_trials(key_of(change))]:
+        raise InputError(f"{others[0]} would make other trials than those of the plan: give the sweep's own command")
     unfinished = [
         trial.folder
         for trial in states_of_experiment(home)
@@ -84,40 +85,21 @@ def recompose(folder: Path, planned: PlannedTrial | None, runs: Path, changes: l
 
     Neither allows anything to run: that ``changes``, which were typed ``here``, must do again.
     """
-    allowed = typed_permissions(changes)
     if planned is not None:
         if Path(planned.cwd).is_dir():
             os.chdir(planned.cwd)  # relative paths were meant from there, and the trials are run from there
-        words = [word for word in planned.overrides if key_of(word) != PERMISSIONS]
-        changed = {key_of(change) for change in changes}
-        own = [word for word in words if key_of(word) not in changed]
+        changed = {PERMISSIONS, *map(key_of, changes)}
+        own = [word for word in planned.overrides if key_of(word) not in changed]
         if any(change.startswith("launch=") and change not in planned.overrides for change in changes):
             own = [word for word in own if not word.startswith("launch.")]  # they were meant for the other launcher
-        permissions = [change for change in changes if key_of(change) == PERMISSIONS]
         # but not the modules: a stranger's plan would name a folder of the stranger's
-        as_planned = compose_one([*words, *permissions], modules=here) if changes else None
         trial = compose_one([*own, *changes], modules=here)
-        if as_planned is not None and _identity(trial) != _identity(as_planned):
-            raise InputError(
-                f"{' '.join(changes)} would make other trials than those of the plan: give the sweep's own command"
-            )
-        found = Trial(trial.values | {"runs": str(runs)}, trial.overrides)
-        # A plan without words may be of a trial that was read from its record, whose settings are not the defaults.
-        if planned.overrides or found.folder == folder or not (folder / CONFIG).exists():
-            return found
+        return Trial(trial.values | {"runs": str(runs)}, trial.overrides)
+    files, allowed = TrialFolder(folder), typed_permissions(changes)
     if any(key_of(change) != PERMISSIONS for change in changes):
-        raise InputError(
-            f"{TrialFolder(folder).label} is in no plan, so no setting of it can be changed: run it by its own command"
-        )
+        raise InputError(f"{files.label} is in no plan, so no setting of it can be changed: run it by its own command")
     allow_modules(allowed, here)
-    files = TrialFolder(folder)
     values = files.configuration() | {"runs": str(runs), PERMISSIONS: list(allowed)}
     if values["densify"].get("evaluated_from") == FROM_RENDERS:
         raise InputError(f"{files.label} was entered from renders: give the command of `gsbench evaluate` again")
-    return Trial(values, (), recorded=True)
-
-
-def _identity(trial: Trial) -> Path:
-    """The trial's place within any runs folder."""
-    folder = TrialFolder.of(trial.values)
-    return folder.path.relative_to(folder.runs)
+    return Trial(values, ())

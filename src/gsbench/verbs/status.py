@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gsbench.analysis.differences import find_superseded
 from gsbench.analysis.results import TrialResult, read_experiment
-from gsbench.launch.plan import forget, read_plan, remove
+from gsbench.launch.record import forget, read_plan, remove
 from gsbench.launch.states import TrialState, states_of_experiment
 from gsbench.runs.code import module_digest
 from gsbench.runs.experiments import experiment_home, list_experiments

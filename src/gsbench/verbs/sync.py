@@ -8,7 +8,7 @@ from pathlib import Path
 from gsbench.errors import GsbenchError
 from gsbench.runs.experiments import experiment_home, list_experiments, places_of_trials
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking import sync
+from gsbench.tracking.follower import sync
 from gsbench.tracking.mirror import MirrorError
 from gsbench.verbs.arguments import ArgumentParser
 

@@ -1,4 +1,4 @@
-"""``gsbench ui``: the MLflow dashboard on this machine, lean, with the address that compares an experiment's trials."""
+"""``gsbench ui``: the MLflow dashboard on this machine, lean."""
 
 from __future__ import annotations
 
@@ -27,42 +27,22 @@ LEAN = {  # the default takes eight processes and 2 GB
 def main(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: it serves until Ctrl-C."""
     parser = ArgumentParser(prog="gsbench ui", description="The MLflow dashboard, on this machine only.")
-    parser.add_argument("experiment", nargs="?", help="whose trials are compared; without one, the youngest")
     parser.add_argument(
-        "--uri", help="the tracker's database or server; default: $MLFLOW_TRACKING_URI, or that of the runs folder"
+        "--uri", help="the tracker's database; default: $MLFLOW_TRACKING_URI, or that of the runs folder"
     )
     parser.add_argument("--port", type=port, default=DEFAULT_PORT)
-    parser.add_argument("--print-url", action="store_true", help="only print the address")
     options = parser.parse_args(argv)
     if options.uri is not None and "://" not in options.uri:
-        raise InputError(f"--uri {options.uri} is not an address such as sqlite:///FILE or http://HOST:PORT")
+        raise InputError(f"--uri {options.uri} is not an address such as sqlite:///FILE")
     from gsbench.tracking import default_uri, tracker_uri
 
     uri = tracker_uri(options.uri, runs)
+    if uri.startswith("http"):
+        raise InputError(f"{uri} is a server, which has its own page: open that in the browser")
     if uri == default_uri(runs) and not (runs / DATABASE).exists():
         raise InputError(f"no MLflow database in {runs}: run a trial first, or `gsbench sync`, or give --uri")
-    base = uri if uri.startswith("http") else f"http://127.0.0.1:{options.port}"
-    print(address_of(base, uri, runs, options.experiment), flush=True)
-    return 0 if options.print_url or uri.startswith("http") else serve(uri, options.port)
-
-
-def address_of(base: str, uri: str, runs: Path, experiment: str | None) -> str:
-    """The address of the page that compares the trials of an experiment: by default, of the one that changed last.
-
-    Raises InputError where there is none of that name. Where there is none at all, it is the address of the list.
-    """
-    from gsbench.tracking.client import comparison_url, connect
-
-    client = connect(uri, runs)
-    known = {each.name: each for each in client.search_experiments(order_by=["last_update_time DESC"])}
-    if experiment is None:
-        own = [each for each in known.values() if "mlflow.experimentKind" in each.tags]
-        return comparison_url(base, client, own[0].experiment_id) if own else f"{base}/#/experiments"
-    if experiment not in known:
-        raise InputError(
-            f"MLflow has no experiment {experiment!r}; it has {', '.join(sorted(known))}; see `gsbench sync`"
-        )
-    return comparison_url(base, client, known[experiment].experiment_id)
+    print(f"http://127.0.0.1:{options.port}", flush=True)
+    return serve(uri, options.port)
 
 
 def serve(uri: str, port: int) -> int:

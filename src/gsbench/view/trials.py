@@ -17,8 +17,8 @@ from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER, PointCloud
+from gsbench.runs.keys import INIT
 from gsbench.runs.layout import GROUND_TRUTH, LINEAGE, POINT_CLOUD, RESULTS, STORE
-from gsbench.runs.stages import INIT
 from gsbench.runs.store import Store
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import (

@@ -21,7 +21,7 @@ from gsbench.gaussians.ply import write_ply
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.steps.external import external_step
 from gsbench.pipeline.steps.init import init_step
-from gsbench.runs.stages import INIT, Step
+from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
 from gsbench.scene.colmap import write_model
 from gsbench.scene.types import Capture, Scene, View

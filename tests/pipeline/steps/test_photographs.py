@@ -13,7 +13,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.pipeline.steps.scene import CaptureSource, Views, ground_truth_step, masked, masked_step
-from gsbench.runs.stages import INIT, Step
+from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
 from gsbench.scene.masks import read_mask
 from gsbench.scene.options import SceneConfig

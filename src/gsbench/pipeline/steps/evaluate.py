@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from PIL import Image
-from scipy.spatial import cKDTree
 
 from gsbench.eval.evaluator import Evaluator, quantize, summarize
 from gsbench.eval.facts import to_record
@@ -22,15 +21,13 @@ from gsbench.files import write_json
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.gaussians.ply import read_ply
-from gsbench.init import read_cloud
-from gsbench.init.base import MODEL_FOLDER
 from gsbench.logs import progress
 from gsbench.pipeline.steps.inputs import UserCode, options_of, rasterizer_inputs, step_of
-from gsbench.pipeline.steps.pictures import draw_ellipsoids, view_maps
+from gsbench.pipeline.steps.pictures import draw_ellipsoids
 from gsbench.pipeline.steps.scene import Views
 from gsbench.raster import Rasterizer
-from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, MAPS, METRICS, PER_VIEW, POINT_CLOUD, RENDERS
-from gsbench.runs.stages import EVALUATE, Step
+from gsbench.runs.keys import EVALUATE, Step
+from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, METRICS, PER_VIEW, POINT_CLOUD, RENDERS
 from gsbench.runs.trial_record import Earlier, Evaluation
 from gsbench.scene.camera import COUNTED, nearness
 from gsbench.scene.images import read_image
@@ -48,31 +45,33 @@ TIMED_RENDERS = 5  # of each view, for its speed
 def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
     """Render and measure the model of ``trained``, and its snapshots of earlier iterations; or renders as they are.
 
-    ``eval.maps`` also keeps maps of the views and pictures large Gaussians; ``eval.fps`` is the size at which the
-    speed of rendering is measured. The key of a training by another program knows nothing of the rendering, so it is
-    in this step's.
+    ``eval.maps`` also pictures large Gaussians; ``eval.fps`` is the size at which the speed of rendering is measured.
     """
-    if parts.program is not None and not parts.program.leaves_model:
-        return _measure_step(views, trained, parts)
-    rasterizer, evaluator, device = parts.rasterizer, parts.evaluator, parts.device
-    background, maps, size = parts.train.background, parts.eval.maps, parts.eval.fps
-    earlier, user = parts.measured_earlier, parts.user_code
+    evaluator, size, user = parts.evaluator, parts.eval.fps, parts.user_code
     inputs: dict[str, Any] = {
-        "train": trained.key,
         "protocol": evaluator.protocol.id,
         "unavailable": sorted(evaluator.unavailable),  # so that weights that arrive later are used
-        "maps": maps,
+        **_further_metrics(evaluator, user, size),
     }
-    if earlier:
-        inputs["earlier"] = list(earlier)
-    if parts.program is not None:
-        inputs |= {"raster": rasterizer_inputs(rasterizer, user), "background": list(background)}
-    inputs |= _further_metrics(evaluator, user, size)
+    if parts.program is not None and not parts.program.leaves_model:
+        return step_of(EVALUATE, {"renders": trained.key} | inputs, _measuring(views, trained, parts), user)
+    inputs |= {"train": trained.key, "maps": parts.eval.maps}
+    if parts.measured_earlier:
+        inputs["earlier"] = parts.measured_earlier
+    if parts.program is not None:  # the key of a training by another program knows nothing of the rendering
+        background = list(parts.train.background)
+        inputs |= {"raster": rasterizer_inputs(parts.rasterizer, user), "background": background}
+    return step_of(EVALUATE, inputs, _rendering(views, trained, parts), user)
+
+
+def _rendering(views: Views, trained: Step, parts: Parts) -> Callable[[Path], None]:
+    """A build that renders the model of ``trained`` and measures that."""
+    rasterizer, evaluator, device = parts.rasterizer, parts.evaluator, parts.device
 
     def build(folder: Path) -> None:
         training, scene = views.store.path(trained), views.scene
         gaussians = read_ply(training / POINT_CLOUD, device)
-        color = torch.tensor(list(background), device=device)  # [3]
+        color = torch.tensor(list(parts.train.background), device=device)  # [3]
         (folder / RENDERS).mkdir(exist_ok=True)
 
         def measure(model: Gaussians, phase: str, renders: Path | None) -> dict[str, dict[str, float]]:
@@ -90,46 +89,37 @@ def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
         at: dict[str, Earlier] = {}
         with progress("evaluate") as report:
             per_view = measure(gaussians, "views", folder / RENDERS)
-            for step in earlier:
+            for step in parts.measured_earlier:
                 if (snapshot := training / snapshot_file(step)).exists():  # else a limit of time came first
                     model = read_ply(snapshot, device)
                     means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
                     at[str(step)] = Earlier(metrics=means, num_gaussians=len(model))
-        if maps:
-            write_maps(folder / MAPS, scene, views.store.path(views.init), gaussians, rasterizer)
+        if parts.eval.maps:
             draw_figures(folder / FIGURES, folder / RENDERS, scene, training, gaussians)
-        if size is not None:
-            for view, speed in measure_speed(rasterizer, gaussians, scene, color, size).items():
+        if parts.eval.fps is not None:
+            for view, speed in measure_speed(rasterizer, gaussians, scene, color, parts.eval.fps).items():
                 per_view[view]["fps"] = speed
         _write_metrics(folder, evaluator, per_view, scene, at=at)
 
-    return step_of(EVALUATE, inputs, build, user)
+    return build
 
 
-def _measure_step(views: Views, trained: Step, parts: Parts) -> Step:
-    """Measure the renders that another program left in ``trained``, as they are."""
-    evaluator, size, user = parts.evaluator, parts.eval.fps, parts.user_code
-    inputs: dict[str, Any] = {
-        "renders": trained.key,
-        "protocol": evaluator.protocol.id,
-        "unavailable": sorted(evaluator.unavailable),
-    }
-    inputs |= _further_metrics(evaluator, user, size)
+def _measuring(views: Views, trained: Step, parts: Parts) -> Callable[[Path], None]:
+    """A build that measures the renders that another program left in ``trained``, as they are."""
+    evaluator = parts.evaluator
 
     def build(folder: Path) -> None:
-        training, scene = views.store.path(trained), views.scene
-        shutil.copytree(training / RENDERS, folder / RENDERS)
-        per_view = {}
+        scene, per_view = views.scene, {}
+        shutil.copytree(views.store.path(trained) / RENDERS, folder / RENDERS)
         with progress("evaluate") as report:
             for done, view in enumerate(scene.test, 1):
-                per_view[view.name] = evaluator.evaluate_view(
-                    read_image(folder / RENDERS / png_name(view.name)), view.image, view.mask
-                )
+                image = read_image(folder / RENDERS / png_name(view.name))
+                per_view[view.name] = evaluator.evaluate_view(image, view.image, view.mask)
                 report("views", done, len(scene.test))
-        unknown = {} if size is None else {"fps": "another program's renders are known, not its model"}
+        unknown = {} if parts.eval.fps is None else {"fps": "another program's renders are known, not its model"}
         _write_metrics(folder, evaluator, per_view, scene, unknown)
 
-    return step_of(EVALUATE, inputs, build, user)
+    return build
 
 
 def _further_metrics(evaluator: Evaluator, user: UserCode, size: Sequence[int] | None) -> dict[str, Any]:
@@ -190,15 +180,6 @@ def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]
         awaited=sorted(evaluator.awaited),
         facts={name: to_record(facts) for name, facts in evaluator.own.items()},
     )
-
-
-def write_maps(folder: Path, scene: Scene, init: Path, gaussians: Gaussians, rasterizer: Rasterizer) -> None:
-    """Write one ``<view>.npz`` for each test view (see ``view_maps``)."""
-    folder.mkdir(exist_ok=True)
-    points = cKDTree(read_cloud(init / MODEL_FOLDER).points)
-    for view in scene.test:
-        maps: dict[str, Any] = view_maps(rasterizer, gaussians, view.camera, points)
-        np.savez_compressed(folder / Path(png_name(view.name)).with_suffix(".npz"), **maps)
 
 
 def draw_figures(folder: Path, renders: Path, scene: Scene, training: Path, gaussians: Gaussians) -> None:

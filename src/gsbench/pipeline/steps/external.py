@@ -25,8 +25,8 @@ from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.steps.inputs import options_of, step_of
 from gsbench.pipeline.steps.scene import Views
+from gsbench.runs.keys import TRAIN, Step
 from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG, TRAINING
-from gsbench.runs.stages import TRAIN, Step
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine

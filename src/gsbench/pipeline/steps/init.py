@@ -9,7 +9,7 @@ from pathlib import Path
 from gsbench.init.base import MODEL_FOLDER, Initializer
 from gsbench.logs import Progress, progress
 from gsbench.pipeline.steps.inputs import GSBENCH_ALONE, UserCode, options_of, split_of, step_of
-from gsbench.runs.stages import INIT, Step
+from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Capture

@@ -17,8 +17,7 @@ from gsbench.runs.code import (
     has_changed_since_import,
     states_of,
 )
-from gsbench.runs.hashing import WITHOUT_EFFECT, sha256_of
-from gsbench.runs.stages import Stage, Step
+from gsbench.runs.keys import WITHOUT_EFFECT, Stage, Step, sha256_of
 from gsbench.scene.types import Capture
 
 

@@ -17,9 +17,9 @@ from gsbench.init.points import GREY, read_points
 from gsbench.logs import progress
 from gsbench.pipeline.steps.inputs import split_of, step_of
 from gsbench.runs.code import VIEWS_ROOMS, edited, states_of
+from gsbench.runs.keys import CAPTURE, GROUND_TRUTH, Step
 from gsbench.runs.layout import MASKS, VIEWS
 from gsbench.runs.made_of import PYCOLMAP, version_of
-from gsbench.runs.stages import CAPTURE, GROUND_TRUTH, Step
 from gsbench.runs.store import Store
 from gsbench.scene.colmap import write_frames
 from gsbench.scene.courtyard.render import render_courtyard

@@ -18,8 +18,8 @@ from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.logs import progress
 from gsbench.pipeline.steps.inputs import options_of, rasterizer_inputs, step_of
 from gsbench.pipeline.steps.scene import Views
+from gsbench.runs.keys import TRAIN, Step
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
-from gsbench.runs.stages import TRAIN, Step
 from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.resources import peak_memory_mb, reset_peak_memory

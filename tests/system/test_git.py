@@ -1,4 +1,4 @@
-"""What a run's tags say of the code, and that git starts nothing that a capture's own repository names."""
+"""What is told of a checkout, and that git starts nothing that its own repository names."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.tracking.client import source_tags
+from gsbench.system.install import Checkout, checkout_of
 
 MARK = "#!/bin/sh\ntouch '{mark}'\ncat\n"
 
@@ -35,10 +35,9 @@ def git(*words: str) -> str:
 
 
 def test_commit_and_changes_are_told(repository: Path) -> None:
-    assert source_tags("x")["mlflow.source.git.commit"] == git("rev-parse", "HEAD")
-    assert source_tags("x")["mlflow.source.git.dirty"] == "false"
+    assert checkout_of(repository) == Checkout(git("rev-parse", "HEAD"), False)
     (repository / "a.txt").write_text("two")
-    assert source_tags("x")["mlflow.source.git.dirty"] == "true"
+    assert checkout_of(repository) == Checkout(git("rev-parse", "HEAD"), True)
 
 
 @pytest.mark.parametrize("setting", ["core.fsmonitor", "filter.x.clean", "filter.x.process", "Filter.y.CLEAN"])
@@ -52,7 +51,9 @@ def test_git_starts_nothing_that_a_capture_names(repository: Path, tmp_path: Pat
     assert (tmp_path / "exploded").exists()  # git alone would start it
     (tmp_path / "exploded").unlink()
     os.utime(repository / "a.txt", (2, 2))
-    assert source_tags("x")["mlflow.source.git.commit"] == git("rev-parse", "HEAD")
+    found = checkout_of(repository)
+    assert found is not None
+    assert found.commit == git("rev-parse", "HEAD")
     assert not (tmp_path / "exploded").exists()
 
 
@@ -61,5 +62,5 @@ def test_nor_hooks(repository: Path, tmp_path: Path) -> None:
     hook.write_text(MARK.format(mark=tmp_path / "exploded"))
     hook.chmod(0o755)
     os.utime(repository / "a.txt", (3, 3))
-    source_tags("x")
+    checkout_of(repository)
     assert not (tmp_path / "exploded").exists()
